@@ -147,7 +147,7 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     """
     from padforge.design.common.plotting import save_figure
     from padforge.design.common.validation import InputError
-    from padforge.design.plan_drawing import draw_plan
+    from padforge.design.report import draw_plan
     from padforge.design.settings import Contact
 
     path = out or pad_folder(morphology) / "plan.svg"

@@ -23,7 +23,7 @@ from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import describe_terms
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.optimize.twin_search import search_for_twin, settings_for_twin, state_folders
-from padforge.design.plan_drawing import draw_plan
+from padforge.design.report import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 if TYPE_CHECKING:
@@ -151,26 +151,14 @@ def _read_request(
     return _DesignRequest(pad, contact, settings, rules, start, origin)
 
 
-def load_result(out: Path) -> SearchResult | None:
-    """Load the result of a search from the folder of a pad.
-
-    Returns:
-        The result, or None where there is none or the morphology there is another one.
-
-    Raises:
-        InputError: a file is damaged.
-    """
-    path, morphology = out / "design.json", out / "morphology.json"
-    if not (path.exists() and morphology.exists()):
-        return None
-    document = read_json(path, FORMAT)
-    with reraise_as_input_error(path):
-        if document["morphology_sha256"] != sha256(morphology):
-            return None
+def load_result(out: Path) -> SearchResult:
+    """Load the result of a search from the folder of a pad; InputError if a file is damaged."""
+    document = read_json(out / "design.json", FORMAT)
+    with reraise_as_input_error(out / "design.json"):
         violations = [Violation(**violation) for violation in document["violations"]]
         list(map(str, violations))  # fails on values of the wrong type
         return SearchResult(
-            Morphology.load(morphology),
+            Morphology.load(out / "morphology.json"),
             {name: float(value) for name, value in document["terms"].items()},
             violations,
             str(document["candidate"]),

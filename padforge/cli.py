@@ -1,6 +1,7 @@
 """The command line: the commands of the three stages and of the studies, `run`, `init`, `report` and `bench`."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -22,6 +23,7 @@ from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs, split_formats
 from padforge.sense.cli.main import sense as sense_group
+from padforge.sense.cli.options import reported
 from padforge.sense.studies.cli import study as study_group
 
 from .report import write_report
@@ -125,7 +127,8 @@ def _run(
     run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
     check_run(run)
     with locked_folder(out):
-        code = run_stages(run, click.echo, lambda message: click.echo(message, err=True), search_progress)
+        warn, training_progress = partial(click.echo, err=True), partial(reported, "training")
+        code = run_stages(run, click.echo, warn, search_progress, training_progress)
         if code != INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")
