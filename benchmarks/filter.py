@@ -76,8 +76,7 @@ def fibre(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         count: number of readings.
         rng: draws presses and noise.
     """
-    presses = -(-count // PERIOD)
-    phase = np.arange(PERIOD // 2)
+    presses, phase = -(-count // PERIOD), np.arange(PERIOD // 2)
     height = rng.uniform(0.01, 0.1, presses) * (rng.random(presses) < 0.5)
     pressed = 1 - 0.2 * (1 - np.exp(-phase / 8))
     released = -0.1 * np.exp(-phase / 5)

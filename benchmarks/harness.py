@@ -6,8 +6,9 @@ can be compared by relative times.
 """
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -79,42 +80,32 @@ class Bench:
     prepare: Callable[[], object] = lambda: None
 
 
-@dataclass
 class BenchRounds:
-    """Measurements of a benchmark in all rounds so far.
+    """Measurements of a benchmark in all rounds so far."""
 
-    Attributes:
-        results: evaluation of every trial.
-        seconds: seconds per item of every trial, one a round.
-        paces: the same relative to the pace of the machine beside the trial.
-        pace_s: best pace, s.
-    """
-
-    results: dict[TrialKey, Mapping[str, Any]] = field(default_factory=dict)
-    seconds: dict[TrialKey, list[float]] = field(default_factory=dict)
-    paces: dict[TrialKey, list[float]] = field(default_factory=dict)
-    pace_s: float = np.inf
+    def __init__(self) -> None:
+        self.results: dict[TrialKey, Mapping[str, Any]] = {}  # evaluation of every trial
+        self.seconds: defaultdict[TrialKey, list[float]] = defaultdict(list)  # per item, one a round
+        self.paces: defaultdict[TrialKey, list[float]] = defaultdict(list)  # the same by the pace beside the trial
+        self.pace_s = np.inf  # best pace of the machine
 
 
 def measure_round(
     bench: Bench, rounds: BenchRounds, on_progress: Callable[[str], None], repeat: Callable[[TrialKey], bool]
 ) -> int:
-    """Measure new trials, and repeat others.
+    """Measure new trials, repeat others, and return how many were measured.
 
     Args:
         bench: the benchmark.
         rounds: measurements so far, to which this round is added.
         on_progress: receives the name of every trial.
         repeat: whether to repeat a trial; slow baselines are never repeated.
-
-    Returns:
-        The number of trials measured.
     """
     if not rounds.seconds:
         bench.prepare()
     n_measured = 0
     for trial in bench.trials():
-        earlier = rounds.seconds.setdefault(trial.key, [])
+        earlier = rounds.seconds[trial.key]
         is_slow_baseline = earlier and trial.way in bench.baselines and min(earlier) * trial.items > MAX_BASELINE_S
         if earlier and (is_slow_baseline or not repeat(trial.key)):
             continue
@@ -126,7 +117,7 @@ def measure_round(
         earlier.append(seconds / trial.items)
         # short work meets a quiet moment, as the best pace does; long work an average one
         pace = float(np.median(paces)) if is_long else min(paces)
-        rounds.paces.setdefault(trial.key, []).append(seconds / trial.items / pace)
+        rounds.paces[trial.key].append(seconds / trial.items / pace)
         if trial.key not in rounds.results:
             rounds.results[trial.key] = trial.evaluate(result)
         n_measured += 1
@@ -146,8 +137,7 @@ def _measure(work: Callable[[], Any]) -> tuple[Any, float, bool]:
 
 def _timed_call(work: Callable[[], Any]) -> tuple[Any, float]:
     """Return the result and the time in s, less the time that this thread waited for a core."""
-    waited = _waited_s()
-    begin = time.perf_counter()
+    waited, begin = _waited_s(), time.perf_counter()
     result = work()
     seconds = time.perf_counter() - begin
     return result, seconds - min(_waited_s() - waited, seconds / 2)
@@ -176,16 +166,12 @@ def run_benches(
 
     Args:
         benches: benchmarks to measure.
-        out: folder of the files.
+        out: folder of the files; InputError if it is not writable.
         on_progress: receives what is being measured.
         earlier: documents of an earlier run by name of the bench, to compare with; may be empty.
 
     Returns:
-        The content of `bench.json`, and what is worse than in the earlier run. A trial counts as slower only if it was
-        slower in all of its rounds.
-
-    Raises:
-        InputError: `out` is not writable; nothing was measured.
+        The content of `bench.json`, and what is worse than in the earlier run, or slower in all rounds.
     """
     check_writable(out)
     rounds = {bench.name: BenchRounds() for bench in benches}
@@ -206,7 +192,6 @@ def run_benches(
     for number in range(MAX_RECHECKS):
         time.sleep(number if slower_trials() else 0)  # a disturbance may take a while
         for bench in benches:
-            slower = {key for name, key in slower_trials() if name == bench.name}
-            if slower:
+            if slower := {key for name, key in slower_trials() if name == bench.name}:
                 measure(bench, "recheck", slower.__contains__)
     return write_summary(documents, out), find_worsenings(earlier, documents)

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance, read_json, write_json, write_text
-from padforge.design.common.plotting import CURVES, FAINT, INK, save_figure
+from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, save_figure, style_axes
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +27,8 @@ FORMAT, SUMMARY_FORMAT = "padforge-bench/1", "padforge-benches/1"
 Row = dict[str, Any]
 """A trial: "case", "way", "size", "repetition", "error", "seconds", "paces", "visited", "speed" and more."""
 TrialKey = tuple[str, str, float, int]
-"""Case, way, size and repetition."""
+KEY = ("case", "way", "size", "repetition")
+"""Columns that identify a trial."""
 
 SLOWER, LESS_ACCURATE, VISITS_MORE = "slower", "less accurate", "visits more"
 MAX_RATIOS = {SLOWER: 1.25, LESS_ACCURATE: 1.25, VISITS_MORE: 1.1}
@@ -38,26 +40,23 @@ MIN_ERROR, MIN_VISITED = 1e-15, 1e-3
 
 
 def write_bench(bench: "Bench", rounds: "BenchRounds", out: Path) -> dict[str, Any]:
-    """Write `NAME.json`, `NAME.csv` and `NAME.png` of a benchmark.
+    """Write `NAME.json`, `NAME.csv` and `NAME.png` of a benchmark, and return the content of the first.
 
     Args:
         bench: the benchmark.
         rounds: its measurements.
         out: folder of the files.
-
-    Returns:
-        The content of the JSON file.
     """
     rows = [
-        dict(zip(("case", "way", "size", "repetition"), key, strict=True))
+        dict(zip(KEY, key, strict=True))
         | {"error": None, "seconds": min(rounds.seconds[key]), "paces": min(rounds.paces[key]), "visited": None}
         | dict(result)
         for key, result in rounds.results.items()
     ]
     medians = _medians(rows)
-    reference = {row["case"]: row["seconds"] for row in medians if (row["way"], row["size"]) == bench.reference}
+    reference_s = {row["case"]: row["seconds"] for row in medians if (row["way"], row["size"]) == bench.reference}
     for row in rows:
-        row["speed"] = reference[row["case"]] / row["seconds"] if row["case"] in reference else None
+        row["speed"] = reference_s[row["case"]] / row["seconds"] if row["case"] in reference_s else None
     document = {
         "format": FORMAT,
         "bench": bench.name,
@@ -76,34 +75,22 @@ def write_bench(bench: "Bench", rounds: "BenchRounds", out: Path) -> dict[str, A
 
 
 def write_summary(documents: Mapping[str, Mapping[str, Any]], out: Path) -> dict[str, Any]:
-    """Write `bench.json` with all documents, and `bench.csv` with the package's way beside the reference per case.
+    """Write and return `bench.json` with all documents, and write `bench.csv`: the package's way beside the reference.
 
     Args:
         documents: documents of the benchmarks by name.
         out: folder of the files.
-
-    Returns:
-        The content of `bench.json`.
     """
     summary: list[Row] = []
     for name, document in documents.items():
-        medians = {(row["case"], row["way"], row["size"]): row for row in _medians(document["rows"])}
+        medians = {_key(row)[:3]: row for row in _medians(document["rows"])}
         for case in dict.fromkeys(case for case, *_ in medians):
             default, reference = (medians.get((case, *document[which])) for which in ("best", "reference"))
             if default and reference:
-                summary.append(
-                    {
-                        "bench": name,
-                        "case": case,
-                        "reference": _way(*document["reference"]),
-                        "reference_error": reference["error"],
-                        "reference_seconds": reference["seconds"],
-                        "way": _way(*document["best"]),
-                        "error": default["error"],
-                        "seconds": default["seconds"],
-                        "speed": reference["seconds"] / default["seconds"],
-                    }
-                )
+                row = {"bench": name, "case": case, "reference": _way(*document["reference"])}
+                row |= {f"reference_{column}": reference[column] for column in ("error", "seconds")}
+                row |= {"way": _way(*document["best"]), "error": default["error"], "seconds": default["seconds"]}
+                summary.append(row | {"speed": reference["seconds"] / default["seconds"]})
     document = {"format": SUMMARY_FORMAT, "summary": summary, "benches": dict(documents)}
     _write_csv(summary, out / "bench.csv")
     write_json(out / "bench.json", document)
@@ -120,52 +107,42 @@ def _write_csv(rows: Sequence[Row], path: Path) -> None:
 
 def _medians(rows: Sequence[Row]) -> list[Row]:
     """Return a row per case, way and size, with medians over its repetitions."""
-    groups: dict[tuple[str, str, float], list[Row]] = {}
+    groups: dict[TrialKey, list[Row]] = {}
     for row in rows:
-        groups.setdefault((row["case"], row["way"], row["size"]), []).append(row)
-    medians = []
-    for (case, way, size), group in groups.items():
-        values = {
-            name: [row[name] for row in group if row[name] is not None] for name in ("error", "seconds", "visited")
-        }
-        medians.append(
-            {"case": case, "way": way, "size": size}
-            | {name: median(column) if column else None for name, column in values.items()}
-        )
+        groups.setdefault((*_key(row)[:3], 0), []).append(row)
+    medians = [dict(zip(KEY, key, strict=True)) for key in groups]
+    for row, group in zip(medians, groups.values(), strict=True):
+        for name in ("error", "seconds", "visited"):
+            values = [trial[name] for trial in group if trial[name] is not None]
+            row[name] = median(values) if values else None
     return medians
+
+
+def _key(row: Row) -> TrialKey:
+    return row["case"], row["way"], row["size"], row["repetition"]
 
 
 def bench_lines(document: Mapping[str, Any]) -> list[str]:
     """Format a benchmark as a table of text."""
     rows, reference = _medians(document["rows"]), tuple(document["reference"])
     reference_s = {row["case"]: row["seconds"] for row in rows if (row["way"], row["size"]) == reference}
-    lines = [
-        f"{document['bench']}: speed relative to {_way(*reference)}",
-        "",
-        f"{'case':<20} {'way':<13} {'size':>7} {'error':>9} {'time':>10} {'speed':>8} {'visited':>8}",
-    ]
+    cells = [["case", "way", "size", "error", "time", "speed", "visited"]]
     for row in rows:
         speed = f"{reference_s[row['case']] / row['seconds']:.2f}x" if row["case"] in reference_s else "-"
         visited = "-" if row["visited"] is None else f"{100 * row['visited']:.1f} %"
-        lines.append(
-            f"{row['case']:<20} {row['way']:<13} {row['size']:>7g} {_error(row['error']):>9} "
-            f"{_time(row['seconds']):>10} {speed:>8} {visited:>8}"
-        )
-    return lines
+        quantities = f"{row['size']:g}", _error(row["error"]), _time(row["seconds"]), speed, visited
+        cells.append([row["case"], row["way"], *quantities])
+    return [f"{document['bench']}: speed relative to {_way(*reference)}", "", *text_table(cells, (0, 1))]
 
 
 def summary_lines(summary: Sequence[Row]) -> list[str]:
     """Format the summary as a table of text."""
-    return [
-        f"{'bench':<10} {'case':<15} {'beside':<17} {'error':>9} {'time':>9}   "
-        f"{'padforge':<17} {'error':>9} {'time':>9} {'speed':>7}",
-        *(
-            f"{row['bench']:<10} {row['case']:<15} {row['reference']:<17} {_error(row['reference_error']):>9} "
-            f"{_time(row['reference_seconds']):>9}   {row['way']:<17} {_error(row['error']):>9} "
-            f"{_time(row['seconds']):>9} {row['speed']:>6.3g}x"
-            for row in summary
-        ),
-    ]
+    cells = [["bench", "case", "beside", "error", "time", "padforge", "error", "time", "speed"]]
+    for row in summary:
+        reference = row["reference"], _error(row["reference_error"]), _time(row["reference_seconds"])
+        default = row["way"], _error(row["error"]), _time(row["seconds"]), f"{row['speed']:.3g}x"
+        cells.append([row["bench"], row["case"], *reference, *default])
+    return text_table(cells, (0, 1, 2, 5))
 
 
 def _way(way: str, size: float) -> str:
@@ -205,10 +182,10 @@ def _draw(name: str, medians: Sequence[Row], error_label: str) -> Figure:
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.set_minor_formatter(NullFormatter())
         axes.grid(color=FAINT, linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
+        style_axes(axes)
     panels[0].set_ylabel(error_label)
     panels[-1].legend(list(handles.values()), list(handles), frameon=False)
-    figure.suptitle(f"{name}: error against run time", x=0.01, ha="left", color=INK)
+    add_title(figure, f"{name}: error against run time")
     return figure
 
 
@@ -239,22 +216,11 @@ class Worsening:
 
 
 def read_earlier(path: Path) -> dict[str, Mapping[str, Any]]:
-    """Read the documents of an earlier run, by name of the benchmark.
-
-    Args:
-        path: `bench.json`, or `NAME.json` of one benchmark.
-
-    Raises:
-        InputError: the file is unreadable or damaged.
-    """
+    """Read the documents of an earlier run, by name of the benchmark, from `bench.json` or `NAME.json`."""
+    content = read_json(path, SUMMARY_FORMAT, FORMAT)
     try:
-        content = read_json(path, SUMMARY_FORMAT)
-    except InputError:
-        content = {"benches": {"": read_json(path, FORMAT)}}
-    try:
-        documents: dict[str, Mapping[str, Any]] = {
-            document["bench"]: document for document in content["benches"].values()
-        }
+        listed = content["benches"].values() if content["format"] == SUMMARY_FORMAT else [content]
+        documents: dict[str, Mapping[str, Any]] = {document["bench"]: document for document in listed}
         find_worsenings(documents, documents)  # reads everything that a comparison reads
     except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"{path}: not as padforge bench writes it ({error!r})") from error
@@ -268,42 +234,29 @@ def find_worsenings(before: Mapping[str, Mapping[str, Any]], now: Mapping[str, M
         before: documents of the earlier run by name of the benchmark.
         now: documents of this run.
     """
-    return [change for name in now if name in before for change in _compare(before[name], now[name])]
-
-
-def _compare(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Worsening]:
-    pace = before["pace_s"] / now["pace_s"]  # above 1 if the machine is faster now
-    changes = []
-    for key, (old, new) in _common_trials(before, now).items():
-        # a machine that is busy all the time never shows its best pace: the pace beside the trial counts as well
-        slowdown = min(pace * new["seconds"] / old["seconds"], new["paces"] / old["paces"])
-        changes.append((SLOWER, key, old["seconds"], new["seconds"], slowdown))
-        for what, column, minimum in ((LESS_ACCURATE, "error", MIN_ERROR), (VISITS_MORE, "visited", MIN_VISITED)):
-            if old[column] is not None and new[column] is not None:
-                ratio = max(new[column], minimum) / max(old[column], minimum)
-                changes.append((what, key, old[column], new[column], ratio))
-    worse = [
-        Worsening(now["bench"], key, what, old, new, ratio)
-        for what, key, old, new, ratio in changes
-        if not ratio <= MAX_RATIOS[what]  # also NaN
-    ]
-    slower_ways = [change.key[1] for change in worse if change.what == SLOWER]
-    return sorted(
-        (
-            change
-            for change in worse
-            if change.what != SLOWER or change.before >= SHORT_S or slower_ways.count(change.key[1]) > 1
-        ),
-        key=lambda change: -change.ratio,
-    )
+    worsenings: list[Worsening] = []
+    for name in [name for name in now if name in before]:
+        pace = before[name]["pace_s"] / now[name]["pace_s"]  # above 1 if the machine is faster now
+        worse: list[Worsening] = []
+        for key, (old, new) in _common_trials(before[name], now[name]).items():
+            # a machine that is busy all the time never shows its best pace: the pace beside the trial counts as well
+            slowdown = min(pace * new["seconds"] / old["seconds"], new["paces"] / old["paces"])
+            changes = [(SLOWER, "seconds", slowdown)]
+            for what, column, minimum in ((LESS_ACCURATE, "error", MIN_ERROR), (VISITS_MORE, "visited", MIN_VISITED)):
+                if old[column] is not None and new[column] is not None:
+                    changes.append((what, column, max(new[column], minimum) / max(old[column], minimum)))
+            for what, column, ratio in changes:
+                if not ratio <= MAX_RATIOS[what]:  # also NaN
+                    worse.append(Worsening(now[name]["bench"], key, what, old[column], new[column], ratio))
+        slower_ways = [change.key[1] for change in worse if change.what == SLOWER]
+        certain = [w for w in worse if w.what != SLOWER or w.before >= SHORT_S or slower_ways.count(w.key[1]) > 1]
+        worsenings += sorted(certain, key=lambda change: -change.ratio)
+    return worsenings
 
 
 def _common_trials(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[TrialKey, tuple[Row, Row]]:
     """Return the rows of the trials of the package's own ways that both documents have."""
-    old, new = (
-        {(row["case"], row["way"], row["size"], row["repetition"]): row for row in document["rows"]}
-        for document in (before, now)
-    )
+    old, new = ({_key(row): row for row in document["rows"]} for document in (before, now))
     return {key: (old[key], new[key]) for key in new if key in old and key[1] not in now["plain"]}
 
 

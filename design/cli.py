@@ -1,11 +1,11 @@
 """`padforge design`: optimise, draw, import, check, score and compare pads."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -48,6 +48,11 @@ twin_option = click.option(
 )
 
 
+def time_budget_option(text: str) -> Callable[..., Any]:
+    """Make the option `--time-budget` with a help text."""
+    return click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help=text)
+
+
 @contextmanager
 def search_progress() -> "Iterator[OnProgress]":
     """Show a progress bar for every start of a search on stderr."""
@@ -73,9 +78,7 @@ def search_progress() -> "Iterator[OnProgress]":
 @click.option("--start-from", metavar="random|straight|FILE", help="Initial fibres (default: random).")
 @twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Device that evaluates the objective.")
-@click.option(
-    "--time-budget", type=click.FloatRange(min=0), metavar="S", help="Stop with the best pad after S seconds."
-)
+@time_budget_option("Stop with the best pad after S seconds.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted search into the same folder.")
 @scheduler_option
 @seed_option
@@ -87,19 +90,15 @@ def search_progress() -> "Iterator[OnProgress]":
 def design(
     context: click.Context,
     spec: Path | None,
-    method: str | None,
-    knots: int | None,
-    starts: int | None,
     start_from: str | None,
     twin: Path | None,
-    device: str | None,
     time_budget: float | None,
     resume: bool,
     scheduler: str | None,
-    seed: int | None,
     out: Path,
     force: bool,
     as_json: bool,
+    **overrides: Any,
 ) -> None:
     """Optimise the paths of the fibres, or evaluate a finished morphology.
 
@@ -124,7 +123,6 @@ def design(
     from padforge.design.optimize.search import SearchOptions
     from padforge.design.twin import Twin
 
-    overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with locked_folder(out), cluster(scheduler) as executor, search_progress() as on_progress:
         options = SearchOptions(on_progress, resume=resume, time_budget=time_budget, executor=executor)
         document, result = run_design(load_spec(spec), out, overrides, start_from, options, twin, force=force)
@@ -239,26 +237,15 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     from padforge.design.common.files import check_writable
     from padforge.design.common.server import LocalPage, page_text
     from padforge.design.common.validation import InputError
-    from padforge.design.morphology import Morphology
-    from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-    from .editor.edits import PathEvaluator
     from .editor.session import EditSession, free_name
 
     out = out or free_name(pad_folder(pad) / ("edited.json" if pad is None else f"{pad.stem}-edited.json"))
     if out.suffix.lower() != ".json":
         raise InputError(f"--out is {out}, allowed is a name that ends in .json")
     check_writable(out.parent)
-    settings = load_spec(spec)
-    layout = settings.section(PadSettings).layout if pad is None else Morphology.load(pad).layout
-    evaluator = PathEvaluator(
-        settings.section(PadSettings, **layout.settings),
-        settings.section(RulesSettings),
-        settings.section(Contact),
-        settings.section(SearchSettings),
-    )
     text = page_text("padforge.design.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
-    session = EditSession(evaluator, pad, out, lambda view: page.show(view), force)
+    session = EditSession(load_spec(spec), pad, out, lambda view: page.show(view), force)
     with LocalPage(port, text, {"/edit": session.edit, "/save": session.save}) as page:
         replaces = " in place of its content" * out.exists()
         click.echo(f"page: {page.url} (Ctrl-C ends), saves to {out}{replaces}", err=True)
@@ -347,7 +334,7 @@ def compare_command(make_pad: "MakePad") -> click.Command:
     @click.command("compare")
     @click.argument("sources", metavar="[SPEC|MORPHOLOGY]...", nargs=-1, type=click.Path(exists=True, path_type=Path))
     @click.option("--vary", metavar="KEY=V,V", multiple=True, help="Values of a setting, such as pad.grid=3,4.")
-    @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Seconds for each search.")
+    @time_budget_option("Seconds for each search.")
     @seed_option
     @out_option("out/comparison")
     @json_option

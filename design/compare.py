@@ -5,12 +5,12 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance, write_json
 from padforge.design.common.plotting import (
     CURVES,
@@ -147,10 +147,11 @@ def compare(
     for variant in variants:
         folder, pad = out / variant.folder, variant.pad
         if pad is None:
-            on_progress = partial(_report_variant, options.on_progress, variant.name)
-            result = run_design(
-                variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=on_progress)
-            )[1]
+
+            def report(run: str, *step: Any, name: str = variant.name) -> None:
+                options.on_progress(f"{name}, {run}", *step)
+
+            _, result = run_design(variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=report))
             if result.stopped == "interrupted":
                 raise KeyboardInterrupt  # ends the comparison, not only this search
             pad = result.morphology
@@ -160,10 +161,6 @@ def compare(
     write_json(out / NAME, document)
     save_figure(_draw_comparison(rows), out / "comparison.png")
     return document
-
-
-def _report_variant(on_progress: Callable[..., None], name: str, run: str, *step: Any) -> None:
-    on_progress(f"{name}, {run}", *step)
 
 
 def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
@@ -200,16 +197,9 @@ def comparison_lines(document: Mapping[str, Any]) -> list[str]:
         cells += [str(row["crossings"]), *(f"{row[key]:.3g}" for key in costs)]
         table.append([*cells, *(f"{error:.2f}" for error in row["errors_mm"])])
         if row["errors_mm"] != row["straight_mm"]:
-            table.append(
-                ["  straight fibres", *[""] * (len(header) - 1), *(f"{error:.2f}" for error in row["straight_mm"])]
-            )
-    columns = list(itertools.zip_longest(*table, fillvalue="-"))
-    widths = [max(map(len, column)) for column in columns]
-    cells = [
-        [cell.rjust(width) if number else cell.ljust(width) for cell in column]
-        for number, (column, width) in enumerate(zip(columns, widths, strict=True))
-    ]
-    return ["  ".join(row) for row in zip(*cells, strict=True)]
+            errors = [f"{error:.2f}" for error in row["straight_mm"]]
+            table.append(["  straight fibres", *[""] * (len(header) - 1), *errors])
+    return text_table(table)
 
 
 def _draw_comparison(rows: Sequence[Mapping[str, Any]]) -> "Figure":

@@ -1,7 +1,7 @@
 """Run a search on the settings of a `pad.toml`, and write morphology.json, design.json and the plan of the pad."""
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,16 +67,15 @@ def run_design(
     Raises:
         InputError: invalid settings, or the pad in `out` is in use; the checkpoints stay.
     """
-    request, regenerated = _read_request(spec, overrides, start_from, twin), {"design.json", *regenerated}
-    path, checkpoints = out / "morphology.json", out / "search"
-    check_replaceable(path, request.provenance, regenerated, force)
+    settings, start, origin = _read_request(spec, overrides, start_from, twin)
+    path, checkpoints, regenerated = out / "morphology.json", out / "search", {"design.json", *regenerated}
+    check_replaceable(path, origin, regenerated, force)
     options = replace(options or SearchOptions(), keep_in=checkpoints)
-    settings = request.pad, request.contact, request.search, request.rules
     if twin is None:
-        result = search(*settings, origin=request.start, run=options)
+        result = search(*settings, origin=start, run=options)
     else:
         nominal = spec.section(SearchSettings, **overrides)
-        result = search_for_twin(*settings, nominal, origin=request.start, run=options)
+        result = search_for_twin(*settings, nominal, origin=start, run=options)
     document = {
         "format": FORMAT,
         "terms": result.terms,
@@ -87,16 +86,17 @@ def run_design(
         "history": result.history,
         "seconds": round(result.seconds, 3),
         "stopped": result.stopped,
-        "provenance": request.provenance,
+        "provenance": origin,
     }
     with stage("figures"), atomic_files(out) as folder:
-        Morphology.from_layout(result.morphology.knots, request.pad.layout, request.provenance).save(folder / path.name)
+        pad, contact = settings[:2]
+        Morphology.from_layout(result.morphology.knots, pad.layout, origin).save(folder / path.name)
         # checked again: an interrupted search with the same settings may end with another pad
         check_replaceable(path, folder / path.name, regenerated, force)
         document["morphology_sha256"] = sha256(folder / path.name)
-        figure = draw_plan(result.morphology, request.contact, result.violations, request.pad.keep_out_mm)
-        save_figure(figure, folder / "design.svg")
-        save_figure(figure, folder / "design.png")
+        figure = draw_plan(result.morphology, contact, result.violations, pad.keep_out_mm)
+        for name in ("design.svg", "design.png"):
+            save_figure(figure, folder / name)
         write_json(folder / "design.json", document)
     on_written(result)
     if not result.stopped:
@@ -113,26 +113,13 @@ def check_design(
     Raises:
         InputError: invalid settings, or the pad in `out` is in use.
     """
-    request = _read_request(spec, overrides)
-    check_replaceable(out / "morphology.json", request.provenance, {"design.json", *regenerated}, force)
-
-
-@dataclass(frozen=True)
-class _DesignRequest:
-    """The settings of a search, the pad it starts from, and the provenance of its result."""
-
-    pad: PadSettings
-    contact: Contact
-    search: SearchSettings
-    rules: RulesSettings
-    start: Morphology | None
-    provenance: dict[str, Any]
+    check_replaceable(out / "morphology.json", _read_request(spec, overrides)[-1], {"design.json", *regenerated}, force)
 
 
 def _read_request(
     spec: "Spec", overrides: Mapping[str, Any], start_from: str | None = None, twin: Path | None = None
-) -> _DesignRequest:
-    """Read the settings and files that `run_design` takes."""
+) -> tuple[tuple[PadSettings, Contact, SearchSettings, RulesSettings], Morphology | None, dict[str, Any]]:
+    """Return the settings of a search, the pad it starts from, and the provenance of its result."""
     inputs: list[Path] = []
     if twin is not None:
         spec, inputs = settings_for_twin(spec, twin), [twin]
@@ -148,7 +135,7 @@ def _read_request(
     sections = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
     origin = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
     origin["settings"] = {name: section.model_dump(mode="json") for name, section in sections.items()}
-    return _DesignRequest(pad, contact, settings, rules, start, origin)
+    return (pad, contact, settings, rules), start, origin
 
 
 def load_result(out: Path) -> SearchResult:
@@ -195,17 +182,17 @@ def _error_lines(result: SearchResult) -> list[str]:
         for terms in (result.terms, result.straight)
     )
     lines = [
-        f"  expected error {format_errors(designed)} mm with {format_errors(range(len(designed)))} failed fibres",
-        f"  straight fibres {format_errors(straight)} mm",
+        f"  expected error  {_format_errors(designed)} mm with {_format_errors(range(len(designed)))} failed fibres",
+        f"  straight fibres {_format_errors(straight)} mm",
     ]
-    if result.candidate == "straight fibres":
-        return [*lines, "  the search found no better pad than straight fibres; try more steps or time"]
     similar = [n for n, (a, b) in enumerate(zip(designed, straight, strict=True)) if a > (1 - SIGNIFICANT) * b]
-    if similar:
-        lines.append(f"  not significantly better than straight fibres with {format_errors(similar)} failed fibres")
+    if result.candidate == "straight fibres":
+        lines.append("  the search found no better pad than straight fibres; try more steps or time")
+    elif similar:
+        lines.append(f"  not significantly better than straight fibres with {_format_errors(similar)} failed fibres")
     return lines
 
 
-def format_errors(errors: Collection[float]) -> str:
+def _format_errors(errors: Collection[float]) -> str:
     """Join errors by slashes, to the hundredth, or counts: "0.21 / 0.24"."""
     return " / ".join(f"{error:.2f}" if isinstance(error, float) else str(error) for error in errors)

@@ -4,10 +4,11 @@ import sys
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 import click
 
-from padforge.design.cli import compare_command, search_progress
+from padforge.design.cli import compare_command, search_progress, time_budget_option
 from padforge.design.cli import design as design_group
 from padforge.design.common.command_line import (
     INTERRUPTED,
@@ -89,23 +90,14 @@ def _init(path: Path, preset: str | None) -> None:
 @cli.command("run")
 @spec_option
 @formats_option
-@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Seconds for all stages together.")
+@time_budget_option("Seconds for all stages together.")
 @click.option("--resume", is_flag=True, help="Reuse the finished stages of an earlier run into the same folder.")
 @seed_option
 @out_option("out/pad")
 @force_option
 @profile_option
 @click.pass_context
-def _run(
-    context: click.Context,
-    spec: Path | None,
-    formats: str,
-    time_budget: float | None,
-    resume: bool,
-    seed: int | None,
-    out: Path,
-    force: bool,
-) -> None:
+def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **options: Any) -> None:
     """Run all stages: optimise, mould, record presses on the simulated rig, calibrate, report.
 
     \b
@@ -124,7 +116,7 @@ def _run(
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
-    run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
+    run = Run(load_spec(spec), out, formats=split_formats(formats), **options)
     check_run(run)
     with locked_folder(out):
         warn, training_progress = partial(click.echo, err=True), partial(reported, "training")

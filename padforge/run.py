@@ -280,10 +280,7 @@ def run_stages(
         pad=digest,
     )
     calibration = cache.get(
-        "calibration",
-        lambda document: ["calibration.json", *FILES],
-        calibrate,
-        recording=recording.digest,
+        "calibration", lambda document: ["calibration.json", *FILES], calibrate, recording=recording.digest
     )
     on_result("\n".join(f"  {line}" for line in calibration_lines(calibration)))
     on_result(contact_line(contacts))

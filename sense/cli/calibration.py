@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -14,7 +15,9 @@ from .options import FEATURES, METHODS, lost_option, model_option, read_recordin
 @recording_argument
 @click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
 @click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
-@click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
+@click.option(
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test."
+)
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
@@ -24,15 +27,12 @@ from .options import FEATURES, METHODS, lost_option, model_option, read_recordin
 @common.profile_option
 def calibrate(
     recording: Path,
-    method: str | None,
-    features: str | None,
-    test_split: str | None,
     time_budget: float | None,
-    seed: int | None,
     spec: Path | None,
     out: Path | None,
     force: bool,
     as_json: bool,
+    **overrides: Any,
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
 
@@ -47,7 +47,6 @@ def calibrate(
     from padforge.sense.report.calibration_results import calibrate_into, calibration_lines
     from padforge.sense.settings import LocalizerSettings
 
-    overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
     folder = out or common.pad_folder(recording)
     with locked_folder(folder):
         options = common.load_spec(spec).section(LocalizerSettings, **overrides)
