@@ -6,22 +6,11 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance, write_json
-from padforge.design.common.plotting import (
-    CURVES,
-    FAINT,
-    INK,
-    add_caption,
-    add_title,
-    new_figure,
-    save_figure,
-    style_axes,
-)
+from padforge.design.common.plotting import CURVES, FAINT, add_caption, add_title, new_figure, save_figure, style_axes
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError, short_repr
@@ -31,9 +20,6 @@ from padforge.design.morphology import Morphology
 from padforge.design.optimize.search import SearchOptions
 from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
@@ -159,7 +145,7 @@ def compare(
     origin = provenance("padforge design compare", seed or 0, packages=("torch",))
     document = {"format": FORMAT, "rows": rows, "provenance": origin}
     write_json(out / NAME, document)
-    save_figure(_draw_comparison(rows), out / "comparison.png")
+    _draw_comparison(rows, out / "comparison.png")
     return document
 
 
@@ -202,7 +188,7 @@ def comparison_lines(document: Mapping[str, Any]) -> list[str]:
     return text_table(table)
 
 
-def _draw_comparison(rows: Sequence[Mapping[str, Any]]) -> "Figure":
+def _draw_comparison(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw the errors by failed fibres, and those with none and most failed by length of fibre."""
     figure, _ = new_figure(9.6, 4.2)
     figure.clear()
@@ -218,12 +204,11 @@ def _draw_comparison(rows: Sequence[Mapping[str, Any]]) -> "Figure":
         style_axes(axes)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         axes.set_ylim(bottom=0)
-        axes.set_ylabel("mean error (mm)", color=INK)
-    by_failures.set_xticks(np.arange(max(len(row["errors_mm"]) for row in rows)))
-    by_failures.set_xlabel("failed fibres")
+        axes.set_ylabel("mean error (mm)")
+    by_failures.set(xlabel="failed fibres", xticks=range(max(len(row["errors_mm"]) for row in rows)))
     by_length.set_xlabel("length of fibre (m)")
     add_caption(by_failures, "lines: as designed; dotted: straight fibres")
     add_caption(by_length, "dot: no failed fibres; square: most failed fibres")
     by_failures.legend(frameon=False, fontsize=8)
     add_title(figure, "Cost and localisation error of pads")
-    return figure
+    save_figure(figure, path)

@@ -131,11 +131,10 @@ def _read_request(
         inputs.append(Path(start_from))
         overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
-    contact = design_contact(spec, settings)
-    sections = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
+    sections = pad, design_contact(spec, settings), settings, rules
     origin = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
-    origin["settings"] = {name: section.model_dump(mode="json") for name, section in sections.items()}
-    return (pad, contact, settings, rules), start, origin
+    origin["settings"] = {section.section(): section.model_dump(mode="json") for section in sections}
+    return sections, start, origin
 
 
 def load_result(out: Path) -> SearchResult:

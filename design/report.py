@@ -127,14 +127,9 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
 
     Args:
         folder: folder of the pad.
-        document: its `design.json`.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is damaged.
-        InputError: the plan is not a picture.
+        document: its `design.json`; if it is damaged, any of the built-in errors is raised.
     """
-    terms, violations = document["terms"], document["violations"]
-    settings = document["provenance"]["settings"]
+    terms, violations, settings = document["terms"], document["violations"], document["provenance"]["settings"]
     enforced, search = settings["rules"]["enforce"], settings["search"]
     layout = PadSettings(**settings["pad"]).layout
     low, high = sensed_rectangle(layout)
@@ -166,7 +161,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         table(["rule", "limit", "result", "setting"], list(_rule_rows(settings["rules"], violations))),
     ]
     if violations:
-        rows = [_violation_row(violation) for violation in violations]
+        rows = list(map(_violation_row, violations))
         body.append(table(["broken rule", "fibres", "position (mm)", "measured", "limit"], rows))
     rows = [[name, value, document["descriptions"].get(name, "")] for name, value in terms.items()]
     body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], rows)]))
@@ -206,11 +201,8 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
     """Return how the simulated errors in a `contacts.json` depend on the contact model.
 
     Args:
-        folder: of the document.
-        document: as padforge writes it.
-
-    Raises:
-        KeyError, TypeError, ValueError: the document is not as padforge writes it.
+        folder: folder of the pad.
+        document: its `contacts.json`; if it is damaged, any of the built-in errors is raised.
     """
     rows, scatter = document["rows"], document["scatter"]
     levels = range(max(len(row["errors_mm"]) for row in rows))

@@ -131,10 +131,7 @@ class EditSession:
             body: the edit as JSON.
 
         Returns:
-            The new view.
-
-        Raises:
-            InputError: an invalid edit, which changes nothing.
+            The new view; InputError for an invalid edit, which changes nothing.
         """
         edit = _parse_object(body)
         with self._lock:
@@ -162,13 +159,7 @@ class EditSession:
             return self._update(fibre, selected)
 
     def save(self, body: bytes) -> Mapping[str, Any]:
-        """Write the pad to `out`, atomically.
-
-        Args:
-            body: ignored.
-
-        Returns:
-            The new view.
+        """Write the pad to `out`, atomically, and return the new view; `body` is ignored.
 
         Raises:
             InputError: the file cannot be written.
@@ -275,8 +266,7 @@ class EditSession:
         return free_presses(self._pad_settings)
 
     def _ambiguity_mm(self, pad: Morphology) -> Array:
-        noise = AMBIGUITY_NOISE
-        return pad.unit_mm * ambiguity_map(pad, self._presses, self._contact, self._max_failures, noise)
+        return pad.unit_mm * ambiguity_map(pad, self._presses, self._contact, self._max_failures, AMBIGUITY_NOISE)
 
 
 def free_name(path: Path) -> Path:
