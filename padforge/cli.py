@@ -1,4 +1,4 @@
-"""The command line: the commands of the three stages and of the studies, `design compare`, `run`, `init`, `report` and `bench`."""
+"""The command line: commands of the stages and of studies, `design compare`, `run`, `init`, `report` and `bench`."""
 
 import sys
 from functools import partial

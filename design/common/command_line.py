@@ -115,17 +115,17 @@ def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> No
     click.echo(json.dumps(document, indent=1) if as_json else "\n".join(lines))
 
 
-def text_table(rows: Sequence[Sequence[str]], left_aligned: Collection[int] = (0,)) -> list[str]:
+def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0,)) -> list[str]:
     """Format cells in aligned columns, a line per row; a short row ends in "-".
 
     Args:
         rows: cells, the header first.
-        left_aligned: indices of the columns of words; others are of numbers, and right-aligned.
+        text_columns: indices of the columns of words; others are of numbers, and right-aligned.
     """
     columns = []
     for number, column in enumerate(zip_longest(*rows, fillvalue="-")):
         width = max(map(len, column))
-        columns.append([cell.ljust(width) if number in left_aligned else cell.rjust(width) for cell in column])
+        columns.append([cell.ljust(width) if number in text_columns else cell.rjust(width) for cell in column])
     return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
