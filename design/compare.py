@@ -178,8 +178,7 @@ def comparison_lines(document: Mapping[str, Any]) -> list[str]:
     header = ["pad", "fibres", "knots", "fibre (m)", "crossings", *costs.values()]
     table = [[*header, *(f"{n} failed (mm)" for n in range(n_errors))]]
     for row in rows:
-        horizontals, verticals = row["fibres"]
-        cells = [row["name"], f"{horizontals} + {verticals}", str(row["knots"]), f"{row['length_mm'] / 1000:.2f}"]
+        cells = [row["name"], "{} + {}".format(*row["fibres"]), str(row["knots"]), f"{row['length_mm'] / 1000:.2f}"]
         cells += [str(row["crossings"]), *(f"{row[key]:.3g}" for key in costs)]
         table.append([*cells, *(f"{error:.2f}" for error in row["errors_mm"])])
         if row["errors_mm"] != row["straight_mm"]:
