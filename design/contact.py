@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
-_NONE = np.empty(0, np.int64)
+_Sparse = tuple[Ints, Ints]
+_DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 """Chains, extents and weight law of a press."""
 
@@ -64,7 +65,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
 
 
 def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
-    """Compute the relative stretch of each fibre, which is what a voltage divider measures: signal over length.
+    """Compute the relative stretch (Q, F) of each fibre, which is what a voltage divider measures: signal over length.
 
     A fibre is a strain gauge: its resistance grows with its relative stretch, so one stretch gives less on a longer
     fibre.
@@ -73,9 +74,6 @@ def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> A
         pad: the fibres.
         presses: centres; shape (Q, 2), grid units.
         contact: contact model.
-
-    Returns:
-        Relative stretch; shape (Q, F).
     """
     return signals(pad, presses, contact) / lengths(pad)
 
@@ -87,20 +85,17 @@ def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Cont
     fibres = along.shape[1]
     check_memory(len(along) * len(centres) * fibres)
     out = np.zeros(len(along) * len(centres) * fibres)
-    visited = _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _NONE, _NONE, out)
+    visited = _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _DENSE, out)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres)), visited
 
 
 def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
-    """Compute `signals` of one pad as a sparse matrix, in time and memory proportional to the fibres touched.
+    """Compute `signals` (Q, F) of one pad as a sparse matrix, in time and memory proportional to the fibres touched.
 
     Args:
         pad: the fibres.
         presses: centres; shape (Q, 2), grid units.
         contact: as in `signals`.
-
-    Returns:
-        Signals; shape (Q, F).
     """
     from scipy.sparse import csr_array
 
@@ -111,27 +106,20 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
     check_memory(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
-    _run_exact(along, across, ends, centres, shape, starts, fibre, signal)
+    _run_exact(along, across, ends, centres, shape, (starts, fibre), signal)
     matrix = csr_array((signal, fibre, starts), shape=(len(centres), len(pad.knots)))
     matrix.eliminate_zeros()
     return matrix
 
 
 def _run_exact(
-    along: Array,
-    across: Array,
-    ends: geometry.Ends,
-    presses: Array,
-    shape: PressShape,
-    starts: Ints,
-    fibre: Ints,
-    out: Array,
+    along: Array, across: Array, ends: geometry.Ends, presses: Array, shape: PressShape, sparse: _Sparse, out: Array
 ) -> int:
     """Run `exact_signals` on all cores; return the number of spans visited."""
-    slope, max_offsets = population_slopes(along, across), geometry.max_offsets(across, ends)
+    max_offsets, curves = geometry.max_offsets(across, ends), (along, across, population_slopes(along, across))
 
     def compute(begin: int, end: int) -> int:
-        return exact_signals(along, across, slope, max_offsets, ends, presses, *shape, begin, end, starts, fibre, out)
+        return exact_signals(curves, max_offsets, ends, presses, shape, begin, end, sparse, out)
 
     visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
     if profiling.is_profiling():
@@ -142,16 +130,7 @@ def _run_exact(
 def record_visits(
     along: Array, max_offsets: Array, ends: geometry.Ends, presses: Array, extents: Array, visited: int
 ) -> None:
-    """Record for the profile how many fibres and spans were visited, press by press.
-
-    Args:
-        along: knots along the axis; shape (P, F, n).
-        max_offsets: from `geometry.max_offsets`; shape (P, 2).
-        ends: positions of the fibre ends.
-        presses: centres; shape (Q, 2), grid units.
-        extents: of `press_shape`; shape (2, 5).
-        visited: number of spans visited.
-    """
+    """Record for the profile how many fibres and spans were visited; arguments as of the kernels."""
     pads, fibres, knots = along.shape
     touched = sum(int(geometry.count_touched(offsets, presses, extents, ends)[-1]) for offsets in max_offsets)
     profiling.add_count("fibres, press by press", touched, pads * len(presses) * fibres)
@@ -200,15 +179,7 @@ def grid_unit_mm(pad: Morphology | Array, layout: Layout | None = None) -> float
 
 
 def press_shape(contact: Contact, unit_mm: float) -> PressShape:
-    """Convert a contact to grid units, as the kernels take it.
-
-    Args:
-        contact: contact model.
-        unit_mm: the pad's grid unit, mm.
-
-    Returns:
-        Chains and extents in the frame of each family, and the weight law.
-    """
+    """Convert a contact to grid units of `unit_mm`: chains and extents in the frame of each family, and weight law."""
     length = _LENGTHS[contact.length]
     if contact.sensitivity_profile:
         points = contact.profile_points(unit_mm)
@@ -309,14 +280,11 @@ def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, see
 
 
 def grid_positions(rectangle: Rectangle, side: int) -> Array:
-    """Return evenly spaced positions from corner to corner of a rectangle, row by row from below.
+    """Return evenly spaced positions (side^2, 2) from corner to corner of a rectangle, row by row from below.
 
     Args:
         rectangle: low and high corner.
         side: positions per row, and rows.
-
-    Returns:
-        Positions; shape (side^2, 2), in the unit of the rectangle.
     """
     x, y = (np.linspace(low, high, side) for low, high in zip(*rectangle, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -5,7 +5,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.files import (
     atomic_files,
     check_replaceable,
@@ -15,6 +14,7 @@ from padforge.design.common.files import (
     sha256,
     write_json,
 )
+from padforge.design.common.parallel import Checkpoints
 from padforge.design.common.plotting import save_figure
 from padforge.design.common.profiling import stage
 from padforge.design.contact_comparison import design_contact

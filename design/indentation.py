@@ -64,7 +64,11 @@ class Indenter:
         object.__setattr__(self, "angle_deg", check_float("angle_deg", self.angle_deg, 0.01, 89.9))
 
     def contact_radius(self, depths: ArrayLike) -> Array:
-        """Return the contact radius at each depth; all in grid units."""
+        """Return the contact radius at each depth, grid units.
+
+        Args:
+            depths: depths of any shape, grid units.
+        """
         d = self._check_depths(depths)
         if self.shape == "sphere":
             return np.sqrt(self.radius * d)
@@ -73,14 +77,11 @@ class Indenter:
         return np.where(d > 0, self.radius, 0.0)
 
     def deflection(self, r: ArrayLike, depth: float) -> Array:
-        """Return the deflection of the surface.
+        """Return the deflection of the surface, grid units.
 
         Args:
             r: distances from the axis, of any shape; grid units.
             depth: depth of the press, grid units.
-
-        Returns:
-            Deflection of the shape of `r`, grid units.
         """
         r, depth = check_array("r", r, MAX_COORDINATE), check_float("depth", depth, 0, MAX_COORDINATE)
         a = float(self.contact_radius(depth))
@@ -96,7 +97,11 @@ class Indenter:
         return 2 * depth / np.pi * angle
 
     def force(self, depths: ArrayLike) -> Array:
-        """Return F / E* at each depth; depths in grid units, result in squared grid units."""
+        """Return F / E* at each depth, squared grid units.
+
+        Args:
+            depths: depths of any shape, grid units.
+        """
         d = self._check_depths(depths)
         if self.shape == "sphere":
             return 4 / 3 * np.sqrt(self.radius) * d**1.5
@@ -105,15 +110,12 @@ class Indenter:
         return 2 * self.radius * d
 
     def force_n(self, depths: ArrayLike, unit_mm: float, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> Array:
-        """Return the force at each depth.
+        """Return the force at each depth, N.
 
         Args:
             depths: depths of any shape, grid units.
             unit_mm: the pad's grid unit, mm.
             reduced_modulus_kpa: E*, kPa.
-
-        Returns:
-            Force of the shape of `depths`, N.
         """
         unit_mm = check_float("unit_mm", unit_mm, 0.1, 1000)
         reduced_modulus_kpa = check_float("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
@@ -166,14 +168,12 @@ def indented_signals(pad: Morphology, presses: ArrayLike, depths: ArrayLike, ind
     }[indenter.shape]
     along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
     check_memory(len(centres) * along.shape[1])
-    slope = population_slopes(along, across)[0]
+    curves = along[0], across[0], population_slopes(along, across)[0]
+    indentation = a, steepness, NEGLIGIBLE * deep * np.minimum(1, steepness), _SHAPES[indenter.shape]
     out = np.zeros((len(centres), along.shape[1]))
-    max_error = NEGLIGIBLE * deep * np.minimum(1, steepness)
-    shape = _SHAPES[indenter.shape]
 
     def compute(begin: int, end: int) -> None:
-        knots = along[0], across[0], slope, ends.horizontals
-        integrate_elongations(*knots, centres, a, steepness, max_error, shape, begin, end, out)
+        integrate_elongations(curves, ends.horizontals, centres, indentation, begin, end, out)
 
     map_chunks(compute, len(centres), min_chunk=50)
     return out

@@ -41,11 +41,11 @@ MARGIN = 1e-3
 
 
 def check_layout(n_fibres: int, layout: Layout | None = None) -> Layout:
-    """Return the layout of a number of fibres.
+    """Return the layout of `n_fibres`, for None that of a square pad of the default pitch.
 
     Args:
         n_fibres: number of fibres.
-        layout: their layout; that of a square pad of the default pitch if None.
+        layout: their layout.
 
     Raises:
         InputError: a number that is not the layout's, or without a layout no even number.
@@ -137,18 +137,16 @@ class Morphology:
         knots = check_array("knots", self.knots)
         if knots.ndim != 3 or knots.shape[2] != 2 or knots.shape[0] < 1 or knots.shape[1] < 2:
             raise InputError(f"knots have shape {knots.shape}, expected (H + V, N + 2, 2)")
-        if self.fibres is None and len(knots) % 2:
+        half, odd = divmod(len(knots), 2)
+        if self.fibres is None and odd:
             raise InputError(f"knots have shape {knots.shape}, expected (2 M, N + 2, 2), or stated fibres")
-        half = len(knots) // 2
         layout = Layout.create((half, half) if self.fibres is None else self.fibres, self.pitch_mm)
         _validate(knots, layout)
         if not layout.is_square:
             # as they will be once written and read, which differs from grid units by rounding
             knots = _to_pitches(knots, layout) * layout.spacing
         knots.setflags(write=False)
-        values = {"knots": knots, "pitch_mm": layout.pitch_mm, "fibres": layout.counts, "layout": layout}
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        self.__dict__.update(knots=knots, pitch_mm=layout.pitch_mm, fibres=layout.counts, layout=layout)
         try:
             json.dumps(dict(check_mapping("provenance", self.provenance)), allow_nan=False)
         except (TypeError, ValueError, RecursionError) as error:
@@ -219,23 +217,10 @@ class Morphology:
         """
         layout = Layout.create(fibres, pitch_mm)
         _check_knot_count(layout, knots)
-        is_rng = isinstance(seed, np.random.Generator)
-        rng = seed if is_rng else np.random.default_rng(check_int("seed", seed, 0, 2**64 - 1))
-        inner = rng.uniform(MARGIN, np.array(layout.extent) - MARGIN, (layout.fibres, knots, 2))
+        if not isinstance(seed, np.random.Generator):
+            seed = check_int("seed", seed, 0, 2**64 - 1)
+        inner = np.random.default_rng(seed).uniform(MARGIN, np.array(layout.extent) - MARGIN, (layout.fibres, knots, 2))
         return cls.from_layout(assemble_knots(inner, layout), layout)
-
-    @classmethod
-    def from_parameters(cls, parameters: ArrayLike, pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Morphology":
-        """Create a morphology from the published parameter matrix `para`.
-
-        Args:
-            parameters: x of horizontals, their y, x of verticals, their y; shape (N, 4 M), grid units.
-            pitch_mm: pitch, mm.
-
-        Raises:
-            InputError: a matrix of another shape, or not of finite numbers.
-        """
-        return cls(_knots_from_parameters(parameters), pitch_mm)
 
     def tiled(self, times: int) -> "Morphology":
         """Repeat this square pad over the surface of a pad of `times` as many fibres in both families.
@@ -271,7 +256,10 @@ class Morphology:
 
     @classmethod
     def load(cls, path: str | Path) -> "Morphology":
-        """Read a `morphology.json` or a published `.mat`.
+        """Read a morphology.
+
+        Args:
+            path: a `morphology.json` or a published `.mat`.
 
         Raises:
             InputError: the file is missing, torn, of another kind, or its knots break the rules of the class.
@@ -286,7 +274,10 @@ class Morphology:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "Morphology":
-        """Create a morphology from what `to_dict` returned.
+        """Create a morphology from a document.
+
+        Args:
+            document: what `to_dict` returned.
 
         Raises:
             InputError: a key is missing, or a value breaks the rules of the class.
@@ -321,7 +312,11 @@ class Morphology:
         return {**kind, "knots": knots.tolist(), "provenance": dict(self.provenance)}
 
     def save(self, path: str | Path) -> None:
-        """Write a `morphology.json` atomically; reading it gives the same knots to the last bit."""
+        """Write the morphology atomically; reading it gives the same knots to the last bit.
+
+        Args:
+            path: a `morphology.json`.
+        """
         write_json(as_path("path", path), self.to_dict())
 
     def to_mm(self, positions: ArrayLike) -> Array:
@@ -379,18 +374,8 @@ def _validate(knots: Array, layout: Layout) -> None:
             raise InputError(f"{name} fibre {fibre}: knots do not ascend by {MIN_SPAN:g} or more along its axis")
         has_moved = along[:, 0].any() or (along[:, -1] != layout.extent[axis]).any()
         if has_moved or (across[:, [0, -1]] != layout.levels[rows, None]).any():
-            raise InputError(
-                f"{name} fibres must run from (0, i) to ({layout.extent[axis]:g}, i) along their axis, i = 1..M, "
-                "in pitches"
-            )
-
-
-def _knots_from_parameters(parameters: ArrayLike) -> Array:
-    para = check_array("parameters", parameters)
-    if para.size == 0 or para.ndim != 2 or para.shape[1] == 0 or para.shape[1] % 4:
-        raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
-    columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
-    return assemble_knots(columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2))
+            end = f"({layout.extent[axis]:g}, i)"
+            raise InputError(f"{name} fibres must run from (0, i) to {end} along their axis, i = 1..M, in pitches")
 
 
 def _read_published_knots(path: Path) -> Array:
@@ -399,10 +384,11 @@ def _read_published_knots(path: Path) -> Array:
     Files of the square grid carry a `para` that was never used: their samples fit straight fibres and not `para`.
     """
     content = load_mat(path, ("para",))
-    try:
-        knots = _knots_from_parameters(content["para"])
-    except (ValueError, TypeError) as error:
-        raise InputError(error) from error
+    para = check_array("parameters", content["para"])
+    if para.size == 0 or para.ndim != 2 or para.shape[1] % 4:
+        raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")
+    columns = para.T.reshape(2, 2, -1, len(para))  # family, coordinate, fibre, knot
+    knots = assemble_knots(columns.transpose(0, 2, 3, 1).reshape(-1, len(para), 2))
     straight = assemble_knots(np.empty((len(knots), 0, 2)))
     try:
         return straight if _max_misfit(straight, content) < 1e-9 < _max_misfit(knots, content) else knots

@@ -42,9 +42,6 @@ class Layout:
         verticals: V, 0 to MAX_FIBRES.
         pitch_x_mm: distance of the ends of neighbouring verticals, 0.1 to 1000 mm.
         pitch_y_mm: distance of the ends of neighbouring horizontals, 0.1 to 1000 mm.
-
-    Raises:
-        InputError: no fibre, too many, or a pitch out of range.
     """
 
     horizontals: int
@@ -67,21 +64,17 @@ class Layout:
         Args:
             fibres: M, (H, V), or a layout, which is returned as it is.
             pitch_mm: one pitch, or (along x, along y), mm.
-
-        Raises:
-            InputError: anything else, or what the class refuses.
         """
         if isinstance(fibres, Layout):
             return fibres
         if not isinstance(fibres, tuple | list):
             fibres = (check_int("grid", fibres, 1, MAX_FIBRES),) * 2
-        pitches = (
-            pitch_mm if isinstance(pitch_mm, tuple | list) else (check_float("pitch_mm", pitch_mm, 0.1, 1000),) * 2
-        )
-        for name, values in (("fibres", fibres), ("pitch_mm", pitches)):
+        if not isinstance(pitch_mm, tuple | list):
+            pitch_mm = (check_float("pitch_mm", pitch_mm, 0.1, 1000),) * 2
+        for name, values in (("fibres", fibres), ("pitch_mm", pitch_mm)):
             if len(values) != 2:
                 raise InputError(f"{name} is {short_repr(values)}, expected one number or two")
-        return cls(*fibres, *pitches)
+        return cls(*fibres, *pitch_mm)
 
     @property
     def fibres(self) -> int:
@@ -115,8 +108,8 @@ class Layout:
     @cached_property
     def unit_mm(self) -> float:
         """Grid unit, mm."""
-        is_one = self.pitch_x_mm == self.pitch_y_mm  # no rounding of the root then
-        return self.pitch_x_mm if is_one else math.sqrt(self.pitch_x_mm * self.pitch_y_mm)
+        # without the rounding of a root if there is one pitch
+        return self.pitch_mm if isinstance(self.pitch_mm, float) else math.sqrt(self.pitch_x_mm * self.pitch_y_mm)
 
     @cached_property
     def spacing(self) -> Pair:
@@ -146,10 +139,9 @@ class Layout:
     @property
     def settings(self) -> Mapping[str, Any]:
         """The layout as keys of `[pad]`."""
-        counts: dict[str, Any] = {"horizontals": self.horizontals, "verticals": self.verticals}
         if self.horizontals == self.verticals:
-            counts = {"grid": self.horizontals, "horizontals": "grid", "verticals": "grid"}
-        return {**counts, "pitch_mm": self.pitch_mm}
+            return {"grid": self.horizontals, "horizontals": "grid", "verticals": "grid", "pitch_mm": self.pitch_mm}
+        return {"horizontals": self.horizontals, "verticals": self.verticals, "pitch_mm": self.pitch_mm}
 
     def __str__(self) -> str:
         """Describe the layout: `4 + 4 fibres, pitch 11.25 mm`."""
@@ -185,15 +177,12 @@ class Contact(Settings):
     are in grid units, as published; a measured press has the same width in mm on pads of any pitch.
 
     Attributes:
-        radius: circumradius K of the shape, > 0; grid units.
-        sides: number of sides D >= 3, or None for a circle ("circle" in pad.toml).
-        weight: "uniform" (1), "inverse_square" (1 / (K + d^2)) or "inverse" (1 / max(d, K / 100): the paper's 1 / d,
-            kept finite within a hundredth of the radius).
-        length: "manhattan" (|dx| + |dy|, as in the published code; default of shapes) or "euclidean" (default of a
-            profile).
-        sensitivity_profile: points (distance in mm, weight) from distance 0 to the distance from which the weight is 0,
-            interpolated by a cubic spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be
-            negative. MEASURED_PROFILE if nothing of the contact is stated.
+        sides: number of sides D; None for a circle ("circle" in pad.toml).
+        weight: "inverse" is 1 / max(d, K / 100), the paper's 1 / d kept finite within a hundredth of the radius.
+        length: "manhattan" is the default of shapes, "euclidean" that of a profile.
+        sensitivity_profile: points from distance 0 to the distance from which the weight is 0, interpolated by a cubic
+            spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be negative. MEASURED_PROFILE if
+            nothing of the contact is stated.
     """
 
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
@@ -238,24 +227,18 @@ class Contact(Settings):
         return profile
 
     def profile_points(self, unit_mm: float) -> tuple[Point, ...]:
-        """Convert the sensitivity profile to grid units.
+        """Convert the sensitivity profile to points (distance in grid units, weight).
 
         Args:
             unit_mm: grid unit of the pad, mm.
-
-        Returns:
-            Points (distance in grid units, weight).
         """
         return tuple((distance_mm / unit_mm, weight) for distance_mm, weight in self.sensitivity_profile)
 
 
 def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":
-    """Fit a cubic spline of a profile over the squared distance, which makes it smooth at the centre.
+    """Fit a cubic spline to points (distance, weight) over the squared distance, which makes it smooth at the centre.
 
-    It ends at weight 0 without a kink.
-
-    Args:
-        points: (distance, weight), the last of weight 0.
+    It ends at weight 0, that of the last point, without a kink.
     """
     import numpy as np
     from scipy.interpolate import CubicSpline
@@ -281,7 +264,6 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
 
 PUBLISHED_CONTACT = Contact(radius=0.6)
 """Contact of the paper: a polygon of 30 sides, Manhattan lengths. Default of functions that reproduce the paper."""
-
 TRACK_WIDTH_MM = 0.4
 """Default width of a track."""
 MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
@@ -289,6 +271,7 @@ MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
 
 MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
+RuleMm = Annotated[float, Field(ge=0, le=1000)]
 
 
 class RulesSettings(Settings):
@@ -303,31 +286,23 @@ class RulesSettings(Settings):
             degrees or more: they have 0.8 mm / sin(angle) in common.
     """
 
-    enforce: bool = Field(
-        default=True, description="false drops every rule: an explicit choice to design the unbuildable"
-    )
-    min_bend_radius_mm: float = Field(default=1.0, ge=0, le=1000, description="least bend radius of a fibre, mm")
-    min_gap_mm: float = Field(
-        default=0.8, ge=0, le=1000, description="least gap between centre lines of a family, or folds of a fibre, mm"
-    )
+    enforce: bool = Field(default=True, description="false drops every rule: a choice to design the unbuildable")
+    min_bend_radius_mm: RuleMm = Field(default=1.0, description="least bend radius of a fibre, mm")
+    min_gap_mm: RuleMm = Field(default=0.8, description="least gap of centre lines in a family, or folds of one, mm")
     same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
-    max_crossings: MaxCrossings = Field(
-        default=None, description='crossings of horizontals with verticals allowed (at least grid^2), or "any"'
-    )
-    min_crossing_angle_deg: float = Field(
-        default=0.0, ge=0, le=90, description="least angle at which horizontals cross verticals, degrees"
-    )
+    max_crossings: MaxCrossings = Field(default=None, description='crossings of families (at least grid^2), or "any"')
+    min_crossing_angle_deg: float = Field(default=0.0, ge=0, le=90, description="least angle of crossings, degrees")
     max_common_track_mm: MaxCommon = Field(
         default=2.0, description='length for which a horizontal may run on a vertical, within 0.4 mm, mm, or "any"'
     )
-    border_mm: float = Field(default=2.0, ge=0, le=1000, description="least distance of a fibre to the border, mm")
-    keep_out_mm: float = Field(
-        default=1.5, ge=0, le=1000, description="least distance of a fibre to a keep-out of [pad], mm"
-    )
+    border_mm: RuleMm = Field(default=2.0, description="least distance of a fibre to the border, mm")
+    keep_out_mm: RuleMm = Field(default=1.5, description="least distance of a fibre to a keep-out of [pad], mm")
     max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
 
 
 Weight = Annotated[float, Field(ge=0, le=1e6)]
+Contacts = Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)]
+Weights = Annotated[tuple[Weight, Weight, Weight], BeforeValidator(as_tuple)]
 MaxFailures = Annotated[
     Annotated[int, Field(ge=0, le=8)] | Annotated[tuple[Weight, ...], Field(min_length=1, max_length=9)],
     BeforeValidator(as_tuple),
@@ -356,12 +331,7 @@ class Scatter(NamedTuple):
     common: float = 0.0
 
     def sample_gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
-        """Sample the factor, about 1, on each response.
-
-        Args:
-            shape: (presses, fibres).
-            rng: source of random numbers.
-        """
+        """Sample the factor, about 1, on each response; the shape is (presses, fibres)."""
         individual, common = rng.standard_normal(shape), rng.standard_normal((shape[0], 1))
         return 1 + self.share * (math.sqrt(1 - self.common) * individual + math.sqrt(self.common) * common)
 
@@ -374,13 +344,7 @@ class SearchSettings(Settings):
     """`[search]`: how the fibres are optimised.
 
     Attributes:
-        max_failures: number of fibres that may fail, or the weights of 0, 1, 2, ... failed fibres.
         noise: additive scatter; this and the next two default to the scatter measured on a built pad.
-        scatter: scatter proportional to the response.
-        scatter_common: share of that scatter's variance that all fibres have in common.
-        weights: alpha, beta and gamma of the published objective.
-        presses: side of its square of presses.
-        levels: number of levels that its signals are rounded up to.
         contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
     """
 
@@ -392,9 +356,7 @@ class SearchSettings(Settings):
     steps: int = Field(default=1000, ge=1, le=1_000_000, description="steps of a start of the gradient search")
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
-    weights: Annotated[tuple[Weight, Weight, Weight], BeforeValidator(as_tuple)] = Field(
-        default=WEIGHTS, description="weights of entropy, sharpness and disorder in the genetic search"
-    )
+    weights: Weights = Field(default=WEIGHTS, description="weights of entropy, sharpness and disorder, genetic search")
     presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
     levels: int = Field(default=LEVELS, ge=1, le=MAX_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
@@ -402,21 +364,12 @@ class SearchSettings(Settings):
         default=3, description="failed fibres designed for, at half of the weight, or weights of 0, 1, ... failed"
     )
     noise: float = Field(
-        default=0.02,
-        ge=1e-9,
-        le=10,
-        description="standard deviation of a response's noise, of the full scale of straight fibres",
+        default=0.02, ge=1e-9, le=10, description="standard deviation of noise, share of straight fibres' full scale"
     )
-    scatter: float = Field(
-        default=0.18, ge=0, le=1, description="scatter of a response from press to press, share of the response"
-    )
-    scatter_common: float = Field(
-        default=0.36, ge=0, le=0.99, description="share of that scatter's variance that all fibres have in common"
-    )
+    scatter: float = Field(default=0.18, ge=0, le=1, description="scatter of a response between presses, share of it")
+    scatter_common: float = Field(default=0.36, ge=0, le=0.99, description="share of its variance common to all fibres")
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
-    contacts: Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)] = Field(
-        default=(), description="further contacts to serve as well, each a table like [contact]"
-    )
+    contacts: Contacts = Field(default=(), description="further contacts to serve as well, each a table like [contact]")
     device: Literal["cpu", "cuda"] = Field(default="cpu", description="where the expected error is computed")
 
     @property
@@ -450,18 +403,14 @@ PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
 
 def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
-    """Return the rectangle of a pad that is pressed.
+    """Return the low and the high corner of what is pressed, grid units.
 
-    Of V verticals the outermost lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
+    The outermost of V verticals lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
     is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0.
 
     Args:
         layout: positions of the fibre ends.
-        sensed_mm: "beyond" for 0.5 to V + 0.5 pitches, half a pitch beyond the outermost fibres; "fibres" for 1 to V,
-            as published; or (width, height) about the middle, mm.
-
-    Returns:
-        Low and high corner, grid units.
+        sensed_mm: "beyond" (0.5 to V + 0.5 pitches), "fibres" (1 to V, as published), or (width, height), mm.
     """
     sides = []
     for axis, count in enumerate((layout.verticals, layout.horizontals)):
@@ -488,11 +437,9 @@ def _check_sensed(value: object) -> object:
 
 def _check_pitches(value: object) -> object:
     value = as_tuple(value)
-    pitches = value if isinstance(value, tuple) else (value,)
-    if any(isinstance(pitch, int | float) and (pitch < 0.1 or pitch > 1000) for pitch in pitches):
+    pitches = value if isinstance(value, tuple) else (value, value)
+    if len(pitches) != 2 or any(isinstance(pitch, int | float) and (pitch < 0.1 or pitch > 1000) for pitch in pitches):
         raise ValueError("allowed is 0.1 to 1000, or [along x, along y] of these")
-    if isinstance(value, tuple) and len(value) != 2:
-        raise ValueError("allowed is a number or two, [along x, along y]")
     return value
 
 
@@ -500,29 +447,20 @@ class PadSettings(Settings):
     """`[pad]`: the pad, and the part of it that is pressed.
 
     Attributes:
-        horizontals: number of horizontals; `grid` if None. With 0 the pad is a strip one pitch wide, and the fibres of
-            the other family run across it, one pitch long.
-        verticals: number of verticals, in the same way.
-        pitch_mm: distance of neighbouring fibre ends, in both directions, or (along x, along y).
+        horizontals: `grid` if None; with 0 the pad is a strip one pitch wide, and the verticals run across it.
+        verticals: in the same way.
         leads: "one side" is the lower edge, for a connector; leads come down beside the pad, nested.
-        sensed_mm: (width, height), at most the pad's; "beyond", half a pitch beyond the outermost fibres; or "fibres",
-            between them, as published (`sensed_rectangle`). Designs are for presses there.
-        keep_out_mm: polygons of 3 corners or more that no fibre enters: holes, screws, a connector. Each has an area,
-            does not cross itself, and lies on the pad at least in part.
-        bent_radius_mm: radius of the cylinder it is worn on; None for a flat pad. It is cast flat in either case.
+        sensed_mm: as of `sensed_rectangle`, at most the pad's size. Designs are for presses there.
+        keep_out_mm: holes, screws, a connector. Each polygon has 3 corners or more and an area, does not cross itself,
+            and lies on the pad at least in part.
+        bent_radius_mm: None for a flat pad. It is cast flat in either case.
     """
 
     MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), where the next two do not say")
-    horizontals: Count = Field(
-        default=None,
-        description='fibres along x, or as "grid"; 0: a strip along x, its fibres run across, one pitch long',
-    )
-    verticals: Count = Field(
-        default=None,
-        description='fibres along y, or as "grid"; 0: a strip along y, its fibres run across, one pitch long',
-    )
+    horizontals: Count = Field(default=None, description='fibres along x, or as "grid"; 0: a strip of fibres across it')
+    verticals: Count = Field(default=None, description='fibres along y, or as "grid"; 0: a strip of fibres across it')
     pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_check_pitches)] = Field(
         default=DEFAULT_PITCH_MM, description="distance of neighbouring fibre ends, mm, or [along x, along y]"
     )
@@ -533,23 +471,17 @@ class PadSettings(Settings):
         default="edges", description='ends of fibres leave on all four "edges", or all of them on "one side", the lower'
     )
     sensed_mm: Annotated[Sensed, BeforeValidator(_check_sensed)] = Field(
-        default="beyond",
-        description='pressed [width, height] about the middle, mm; "beyond" the outermost fibres by half a pitch, or '
-        'between "fibres"',
+        default="beyond", description='pressed [width, height], mm; half a pitch "beyond" fibres, or between "fibres"'
     )
     keep_out_mm: Annotated[
         tuple[Annotated[Corners, BeforeValidator(_as_tuples)], ...], BeforeValidator(as_tuple), Field(max_length=64)
     ] = Field(default=(), description="polygons [[x, y], ...] from the middle, mm, that no fibre enters")
-    bent_radius_mm: BentRadius = Field(
-        default=None, description='radius of the cylinder about y that the pad is worn on, mm, or "flat"'
-    )
+    bent_radius_mm: BentRadius = Field(default=None, description='radius of a cylinder about y it is on, mm, or "flat"')
 
     @property
     def layout(self) -> Layout:
         """Positions of the fibre ends."""
-        horizontals = self.grid if self.horizontals is None else self.horizontals
-        verticals = self.grid if self.verticals is None else self.verticals
-        return Layout.create((horizontals, verticals), self.pitch_mm)
+        return _layout(dict(self))
 
     @property
     def sensed(self) -> Rectangle:
@@ -558,6 +490,9 @@ class PadSettings(Settings):
 
     def for_layout(self, layout: Layout) -> "PadSettings":
         """Return these settings for a pad of another layout.
+
+        Args:
+            layout: positions of its fibre ends.
 
         Raises:
             InputError: a setting that does not fit that pad.
@@ -577,9 +512,7 @@ class PadSettings(Settings):
         if isinstance(sensed_mm, tuple) and layout is not None:
             for name, side, limit in zip(("wide", "high"), sensed_mm, layout.size_mm, strict=True):
                 if side > limit * (1 + 1e-9):
-                    width, height = layout.size_mm
-                    size = f"{width:g} mm wide and high" if width == height else f"{limit:g} mm {name}"
-                    raise ValueError(f"the pad itself is {size}")
+                    raise ValueError(f"the pad itself is {limit:g} mm {name}")
         return sensed_mm
 
     @field_validator("keep_out_mm")
@@ -590,34 +523,35 @@ class PadSettings(Settings):
         import shapely  # takes a while, and few pads have keep-outs
 
         layout = _validated_layout(info.data)
+        width, height = layout.size_mm if layout else (2e6, 2e6)  # of a refused layout: all that coordinates reach
+        pad = shapely.box(-width / 2, -height / 2, width / 2, height / 2)
         for number, corners in enumerate(keep_out_mm, 1):
             if not 3 <= len(corners) <= 1000:
                 raise ValueError(f"polygon {number} has {len(corners)} corners, allowed are 3 to 1000")
             polygon = shapely.Polygon(corners)
             if not polygon.is_valid or polygon.area == 0:
                 raise ValueError(f"polygon {number} crosses or touches itself or has no area")
-            if layout is not None:
-                width, height = layout.size_mm
-                if not polygon.intersects(shapely.box(-width / 2, -height / 2, width / 2, height / 2)):
-                    raise ValueError(
-                        f"polygon {number} lies beside the pad, which is {width:g} by {height:g} mm about (0, 0)"
-                    )
+            if not polygon.intersects(pad):
+                size = f"{width:g} by {height:g} mm about (0, 0)"
+                raise ValueError(f"polygon {number} lies beside the pad, which is {size}")
         return keep_out_mm
 
 
+def _layout(fields: Mapping[str, Any]) -> Layout:
+    """Return the layout of the fields of `[pad]`."""
+    horizontals, verticals = (fields["grid"] if fields[x] is None else fields[x] for x in ("horizontals", "verticals"))
+    return Layout.create((horizontals, verticals), fields["pitch_mm"])
+
+
 def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:
-    """Layout of the fields of `[pad]` validated so far; None where one of them is missing because it was refused."""
-    if not {"grid", "horizontals", "verticals", "pitch_mm"} <= fields.keys():
-        return None
-    counts = [fields["grid"] if fields[name] is None else fields[name] for name in ("horizontals", "verticals")]
-    return Layout.create((counts[0], counts[1]), fields["pitch_mm"]) if any(counts) else None
+    """Return the layout of the fields validated so far; None if one of them was refused."""
+    is_complete = fields.keys() >= {"grid", "horizontals", "verticals", "pitch_mm"}
+    return _layout(fields) if is_complete and (fields["horizontals"], fields["verticals"]) != (0, 0) else None
 
 
 PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
 PUBLISHED: Mapping[str, Settings] = {
-    "pad": PUBLISHED_PAD,
-    "contact": PUBLISHED_CONTACT,
-    "search": PUBLISHED_SEARCH,
+    **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
 """Settings of the paper, by section, where they differ from the defaults."""

@@ -156,10 +156,8 @@ class ExactSignals(torch.autograd.Function):
         max_offsets, none = compute_max_offsets(v[None], ends), np.empty(0, np.int64)
         ctx.inputs = (t, v, d, max_offsets[0], ends, presses, shape)
         out = np.zeros(len(presses) * len(t))
-        begin, end = 0, len(presses)
-        visited = exact_signals(
-            t[None], v[None], d[None], max_offsets, ends, presses, *shape, begin, end, none, none, out
-        )
+        curves = t[None], v[None], d[None]
+        visited = exact_signals(curves, max_offsets, ends, presses, shape, 0, len(presses), (none, none), out)
         if profiling.is_profiling():
             record_visits(t[None], max_offsets, ends, presses, shape[1], visited)
         return torch.from_numpy(out.reshape(-1, len(t)).T)
@@ -168,9 +166,8 @@ class ExactSignals(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         """Compute the gradient with respect to along, across and slope."""
         t, v, d, max_offsets, ends, presses, shape = ctx.inputs
-        gradient = signals_gradient(
-            t, v, d, max_offsets, ends, presses, np.ascontiguousarray(upstream[0].numpy().T), *shape
-        )
+        up = np.ascontiguousarray(upstream[0].numpy().T)
+        gradient = signals_gradient(t, v, d, max_offsets, ends, presses, up, shape)
         return (*torch.from_numpy(gradient), None, None, None)
 
 
@@ -190,10 +187,10 @@ class MeasuredSignals(torch.autograd.Function):
         """Compute signals (F, Q)."""
         t, v, d = (x.detach().numpy() for x in (along, across, slope))
         (_, extents, law), spacing = shape_and_spacing
-        elements = fibre_elements(t, v, d, ends.horizontals, presses, law.radius, spacing, law.length)
+        elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacing)
         ctx.inputs = (t, v, d, elements, presses, law)
         out = np.empty((len(presses), len(t)))
-        visited = element_signals(t, v, elements, presses, law.radius, law.profile, out)
+        visited = element_signals(t, v, elements, presses, law, out)
         if profiling.is_profiling():
             record_visits(t[None], compute_max_offsets(v[None], ends), ends, presses, extents, visited)
         return torch.from_numpy(out.T)
@@ -203,5 +200,5 @@ class MeasuredSignals(torch.autograd.Function):
         """Compute the gradient with respect to along, across and slope."""
         t, v, d, elements, presses, law = ctx.inputs
         up = np.ascontiguousarray(upstream[0].numpy().T)
-        gradient = elements_gradient(t, v, d, elements, presses, up, law.radius, law.profile, law.length)
+        gradient = elements_gradient(t, v, d, elements, presses, up, law)
         return (*torch.from_numpy(gradient), None, None, None)

@@ -13,15 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common.files import read_json, write_json
-from padforge.design.common.validation import (
-    InputError,
-    check_array,
-    check_float,
-    check_int,
-    check_mapping,
-    check_type,
-    short_repr,
-)
+from padforge.design.common.validation import InputError, check_array, check_float, check_int, check_mapping, check_type
 from padforge.design.common.validation import check_path as as_path
 from padforge.design.contact import check_presses
 from padforge.design.kernels.geometry import profile_coefficients, profile_weights
@@ -50,9 +42,8 @@ def _check_fields(instance: object, **bounds: tuple[float, float]) -> None:
 def _check_pair(name: str, values: tuple[float, float]) -> tuple[float, float]:
     pair = check_array(name, values, MAX_MM)
     if pair.shape != (2,):
-        raise InputError(f"{name} is {short_repr(values)}, expected two numbers")
-    x, y = pair.tolist()
-    return x, y
+        raise InputError(f"{name} has the shape {pair.shape}, expected two numbers")
+    return float(pair[0]), float(pair[1])
 
 
 @dataclass(frozen=True)
@@ -210,7 +201,7 @@ class Twin:
         _check_fields(self, noise=(1e-9, 10))
         object.__setattr__(self, "sensed_mm", _check_pair("sensed_mm", self.sensed_mm))
         if min(self.sensed_mm) <= 0:
-            raise InputError(f"sensed_mm is {short_repr(self.sensed_mm)}, expected width and height above 0")
+            raise InputError(f"sensed_mm is {self.sensed_mm}, expected width and height above 0")
         check_int("presses", self.presses, 1, 2**53)
         check_mapping("provenance", self.provenance)
         self.contact()
@@ -284,7 +275,10 @@ class Twin:
 
     @classmethod
     def load(cls, path: str | Path) -> "Twin":
-        """Read a `twin.json`.
+        """Read a twin.
+
+        Args:
+            path: a `twin.json`.
 
         Raises:
             InputError: the file is missing, torn, of another kind, or its values do not fit together.
@@ -312,7 +306,11 @@ class Twin:
             raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | Path) -> None:
-        """Write a `twin.json` atomically."""
+        """Write the twin atomically.
+
+        Args:
+            path: a `twin.json`.
+        """
         profile = {name: getattr(self, name) for name in ("distance_mm", "weight", "angular_weight")}
         document = {
             "format": FORMAT,
@@ -336,11 +334,7 @@ def _round_rows(rows: Sequence[Array | None]) -> list[list[Any] | None]:
 
 
 def _cut(path: Array, sensitivity: Array | None) -> tuple[Array, Array, Array]:
-    """Cut a polyline (P, 2) into elements up to MAX_ELEMENT_LENGTH.
-
-    Returns:
-        Middles (n, 2), lengths times sensitivity (n,) and unit tangents (n, 2).
-    """
+    """Return the middles (n, 2), lengths times sensitivity (n,) and unit tangents (n, 2) of a path's elements."""
     step = np.diff(path, axis=0)
     size = np.hypot(*step.T)
     parts = np.maximum(np.ceil(size / MAX_ELEMENT_LENGTH), 1).astype(int)

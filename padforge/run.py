@@ -217,7 +217,7 @@ def run_stages(
     Returns:
         The exit code: 0, 1 if a rule or a check of the mould fails, or 130 if the search was interrupted.
     """
-    from padforge.design.common.checkpoints import Checkpoints
+    from padforge.design.common.parallel import Checkpoints
     from padforge.design.contact_comparison import compare_contacts
     from padforge.design.design_run import load_result, run_design, summary_lines
     from padforge.design.optimize.search import SearchOptions

@@ -58,8 +58,7 @@ def pad_folder(source: Path | None = None) -> Path:
     """Return the folder for results without `--out`: that of the pad they belong to.
 
     Args:
-        source: input of the command. A morphology.json or the folder of a recording is in the folder of its pad; any
-            other file NAME.mat gets a folder out/NAME; without an input it is out/pad.
+        source: a morphology.json or the folder of a recording, both in the folder of their pad; NAME.mat for out/NAME.
     """
     if source is None:
         return Path("out/pad")
@@ -88,10 +87,7 @@ def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def load_spec(path: Path | None) -> "Spec":
-    """Load the settings file `path`, else pad.toml in the current folder if it exists, else the defaults.
-
-    Allowed are the sections that the root command has put into its context; any without a context.
-    """
+    """Load `path`, else pad.toml of the current folder, else the defaults; the context of the root lists sections."""
     from .settings import Spec
 
     default, context = Path("pad.toml"), click.get_current_context(silent=True)
@@ -129,32 +125,31 @@ def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0
     return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as of shells."""
+INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line on the arguments of this process, errors as one line on stderr.
+    """Run a command line on the arguments of this process, errors as one line on stderr; return the exit code.
 
     Args:
         command: the root command.
         name: of the program.
         extras: optional dependencies that its commands need, by their first word; for others all of these.
-
-    Returns:
-        The exit code, with which the process has to end; it ends at once if tasks are running by then.
     """
-    _prepare_process()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # file names may be no valid text
+    for name_of_signal in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
+        number = getattr(signal, name_of_signal)
+        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
+            signal.signal(number, signal.default_int_handler)  # cleans up as Ctrl-C does
     code = _run(command, name, extras)
     atexit.register(_end_with_tasks, code)
     return code
 
 
 def _end_with_tasks(code: int) -> None:
-    """End this process if tasks are running, which can be neither stopped nor waited for.
-
-    Those in torch would crash where the interpreter ends before them.
-    """
+    """End this process if tasks are running: none can be stopped, and those in torch would crash as it ends."""
     parallel = sys.modules.get(f"{__package__}.parallel")
     if parallel is not None and parallel.active_threads:
         for stream in (sys.stdout, sys.stderr):
@@ -165,7 +160,11 @@ def _end_with_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        _check_words(sys.argv[1:])
+        for word in sys.argv[1:]:  # a Python caller can pass what no shell can, and functions of the system fail on it
+            with suppress(UnicodeEncodeError):
+                if b"\0" not in os.fsencode(word):
+                    continue
+            raise InputError(f"{word!r}: holds characters that no argument can have")
         return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
@@ -175,10 +174,8 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
         return _fail(name, f"interrupted; {message or 'what was finished is kept'}", INTERRUPTED)
     except click.ClickException as error:
         return _fail(name, error.format_message())
-    except InputError as error:
-        return _fail(name, str(error))
-    except Fault as fault:
-        return _fail(name, str(fault), fault.exit_code)
+    except (InputError, Fault) as error:
+        return _fail(name, str(error), error.exit_code)
     except OSError as error:
         return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except ModuleNotFoundError as error:
@@ -188,28 +185,6 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
         return _fail(name, message)
     except MemoryError as error:
         return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})")
-
-
-def _prepare_process() -> None:
-    """Print file names that are not valid text escaped, and let SIGTERM and SIGHUP clean up as Ctrl-C does."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-    for name in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
-        number = getattr(signal, name)
-        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
-            signal.signal(number, signal.default_int_handler)
-
-
-def _check_words(words: list[str]) -> None:
-    """Refuse arguments that no shell can pass but a Python caller can, on which functions of the system fail."""
-    for word in words:
-        try:
-            is_valid = b"\0" not in os.fsencode(word)
-        except UnicodeEncodeError:
-            is_valid = False
-        if not is_valid:
-            raise InputError(f"{word!r}: holds characters that no argument can have")
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:

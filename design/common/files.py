@@ -36,24 +36,16 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-UNFINISHED = ".unfinished-"
-"""Prefix of the names of temporary files and folders."""
-EXCHANGE = f"{UNFINISHED}exchange"
-"""Name of the folder of a committed set of files that are moving to their destinations."""
-MAX_BYTES = 2**28
-"""Size limit of a file, bytes; of what padforge writes only recordings are larger."""
-PATIENCE_S = 10.0
-"""How long to wait for another run that moves its files to their destinations, which takes milliseconds."""
+UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folders
+EXCHANGE = f"{UNFINISHED}exchange"  # folder of a committed set of files that are moving to their destinations
+MAX_BYTES = 2**28  # size limit of a file; of what padforge writes only recordings are larger
+PATIENCE_S = 10.0  # how long to wait for another run that moves its files, which takes milliseconds
 
-_NOTE = f"{UNFINISHED}note"
-"""Name of the file in `EXCHANGE` that says what it does."""
-_MAX_NOTE_BYTES = 2**20
+_NOTE, _MAX_NOTE_BYTES = f"{UNFINISHED}note", 2**20  # the file in `EXCHANGE` that says what it does
 _MAX_ATTEMPTS = 100
-_LOCK_OFFSET = 2**40
-"""Byte of a file that is locked on Windows, beyond the end of any."""
+_LOCK_OFFSET = 2**40  # byte of a file that is locked on Windows, beyond the end of any
 _PACKAGES = ("padforge", "numpy", "scipy")
-_MORPHOLOGY = "padforge-morphology/"
-"""Prefix of the format of pads: a pad derived from another one stands on its own."""
+_MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads: one derived from another stands on its own
 
 
 @contextmanager
@@ -90,15 +82,15 @@ def check_writable(folder: Path) -> None:
             raise InputError(f"{folder}: cannot be written, {existing} does not allow it; choose another folder")
 
 
-# Locks: flock on the file or folder itself, which ends with the process however that is killed, and leaves no file
-
-
 class BusyError(InputError):
     """Another process holds the lock."""
 
 
 def _try_lock(handle: int) -> bool | None:
-    """Lock an open file or folder without waiting: whether that was possible, None on a disk without locks."""
+    """Lock an open file or folder without waiting: whether that was possible, None on a disk without locks.
+
+    The lock is on the file or folder itself: it ends with the process however that is killed, and leaves no file.
+    """
     try:
         if fcntl is not None:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -125,29 +117,17 @@ def _is_at(handle: int, path: Path) -> bool:
 
 
 def lock(file: IO[Any] | int, busy: str) -> None:
-    """Lock an open file until it is closed; do nothing on a disk without locks.
-
-    Args:
-        file: the file or its descriptor.
-        busy: message of the error.
-
-    Raises:
-        BusyError: another process has locked it.
-    """
+    """Lock an open file until it is closed, or raise BusyError(busy); do nothing on a disk without locks."""
     if _try_lock(file if isinstance(file, int) else file.fileno()) is False:
         raise BusyError(busy)
 
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Lock a file or folder during the body, as `lock`; do nothing on Windows, where nothing open can be renamed.
-
-    Args:
-        path: the file or folder.
-        busy: message of the error.
+    """Lock a file or folder in the body; do nothing on Windows, where nothing open can be renamed.
 
     Raises:
-        BusyError: another process has locked it, or has removed it meanwhile.
+        BusyError: with the message `busy`: another process has locked it, or has removed it meanwhile.
         InputError: it cannot be opened.
     """
     if fcntl is None:
@@ -204,16 +184,8 @@ def _lock_file(path: Path, busy: str) -> Iterator[None]:
             path.unlink()
 
 
-# Temporary files and folders
-
-
 def remove_leftovers(folder: Path, prefix: str = UNFINISHED) -> None:
-    """Remove temporary files and folders of this user's killed runs; symbolic links are not followed.
-
-    Args:
-        folder: where they are.
-        prefix: of their names; 16 hexadecimal digits and possibly a suffix follow.
-    """
+    """Remove temporary files and folders of this user's killed runs; symbolic links are not followed."""
     if fcntl is None:  # whether their run is at work cannot be known
         return
     names = re.compile(rf"{re.escape(prefix)}[0-9a-f]{{16}}(\.[^.]+)?")
@@ -232,32 +204,14 @@ def remove_leftovers(folder: Path, prefix: str = UNFINISHED) -> None:
 
 
 def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> AbstractContextManager[Path]:
-    """Create an empty folder in `folder`, and remove it with its content at the end.
-
-    Args:
-        folder: where it is created; leftovers of killed runs with the same prefix are removed first.
-        prefix: of its name.
-
-    Returns:
-        Context manager of its path, which raises OSError if it cannot be created.
-    """
+    """Create an empty folder in `folder`, its name with `prefix`; remove it with its content at the end."""
     return _temporary(folder, prefix, "", Path.mkdir, lambda path: shutil.rmtree(path, ignore_errors=True))
 
 
 def temporary_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> AbstractContextManager[Path]:
-    """Create an empty file in `folder`, and remove it at the end unless it has been renamed.
-
-    Args:
-        folder: where it is created; leftovers of killed runs with the same prefix are removed first.
-        suffix: of its name, by which writers choose their format.
-        prefix: of its name.
-
-    Returns:
-        Context manager of its path, which raises OSError if it cannot be created.
-    """
-    return _temporary(
-        folder, prefix, suffix, partial(Path.touch, exist_ok=False), partial(Path.unlink, missing_ok=True)
-    )
+    """Create an empty file in `folder`, its name with `prefix` and `suffix`; remove it at the end unless renamed."""
+    create, remove = partial(Path.touch, exist_ok=False), partial(Path.unlink, missing_ok=True)
+    return _temporary(folder, prefix, suffix, create, remove)
 
 
 @contextmanager
@@ -284,15 +238,11 @@ def _temporary(
             return
 
 
-# Atomic writes
-
-
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path beside it, which replaces it on success.
+    """Write a file atomically: yield a temporary path beside it, with its suffix, which replaces it on success.
 
-    The temporary file exists, is empty and locked; write into it rather than replace it. Its name has the suffix of
-    `path`, by which many writers choose their format.
+    The temporary file exists, is empty and locked; write into it rather than replace it.
 
     Args:
         path: the destination; a path that is temporary itself is yielded as it is.
@@ -321,11 +271,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write `document` atomically as JSON.
-
-    Raises:
-        ValueError: it holds NaN or infinity, which JSON does not have.
-    """
+    """Write `document` atomically as JSON, which does not have NaN or infinity: these raise ValueError."""
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
@@ -341,15 +287,10 @@ def sync(path: Path) -> None:
 
 def to_disk(handle: int) -> None:
     """Synchronise an open file to the disk; on macOS out of the drive's own cache too, where `os.fsync` leaves it."""
-    full_sync = getattr(fcntl, "F_FULLFSYNC", None)
-    if fcntl is not None and full_sync is not None:
-        with suppress(OSError):  # a disk without that operation
-            fcntl.fcntl(handle, full_sync)
-            return
-    os.fsync(handle)
-
-
-# Sets of files
+    try:
+        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    except (AttributeError, OSError):  # another system, or a disk without that operation
+        os.fsync(handle)
 
 
 class _Note(NamedTuple):
@@ -400,7 +341,8 @@ def _commit(stage: Path, folder: Path, without: Collection[str]) -> None:
             if not stat.S_ISREG(mode := path.stat().st_mode):
                 kind = "a folder" if stat.S_ISDIR(mode) else "no file"
                 raise InputError(f"{path}: is {kind}, expected a file or nothing")
-            if _is_protected(path.lstat(), folder.stat()):
+            protected = folder.stat().st_mode & stat.S_ISVTX  # as /tmp, where nobody may replace files of others
+            if protected and os.geteuid() not in (0, path.lstat().st_uid, folder.stat().st_uid):
                 raise InputError(f"{path}: cannot be written, it belongs to another user")
     inodes = [folder.stat().st_ino, stage.stat().st_ino]
     note = _Note(inodes, names, sorted({*without} - {*names}))
@@ -415,11 +357,6 @@ def _commit(stage: Path, folder: Path, without: Collection[str]) -> None:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or attempt == _MAX_ATTEMPTS:
                 raise
         recover(folder)  # another run has committed meanwhile
-
-
-def _is_protected(status: os.stat_result, folder: os.stat_result) -> bool:
-    """Whether a file belongs to another user in a folder such as /tmp, where nobody may replace files of others."""
-    return bool(folder.st_mode & stat.S_ISVTX) and os.geteuid() not in (0, status.st_uid, folder.st_uid)
 
 
 def recover(folder: Path) -> None:
@@ -455,10 +392,7 @@ def recover(folder: Path) -> None:
 def resolve_exchange(path: Path) -> Path:
     """Return where the valid content of a file is: in an exchange that has not moved it yet, or at `path`.
 
-    Nothing is changed. For a file that the exchange removes, it is a path where nothing is.
-
-    Raises:
-        InputError: the exchange beside it was begun in another folder, so that files may be of two runs.
+    For a file that the exchange removes, it is a path where nothing is.
     """
     note, pending = _read_note(path.parent), path.parent / EXCHANGE / path.name
     if note is not None and (path.name in note.removed or (path.name in note.names and pending.exists())):
@@ -492,48 +426,29 @@ def _read_note(folder: Path) -> _Note | None:
     )
 
 
-# Reading
-
-
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
     """Check that `path` is a file of limited size, rather than a pipe or device that may never end.
 
-    Args:
-        path: the file.
-        max_bytes: size limit, bytes.
-
     Returns:
         Where to read it, see `resolve_exchange`.
-
-    Raises:
-        InputError: it does not exist, is not a regular file, or is larger.
     """
     try:
         valid = resolve_exchange(path)
         status = valid.stat()
+    except InputError:
+        raise
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
-    if stat.S_ISDIR(status.st_mode):
-        raise InputError(f"{path}: cannot be read (Is a directory)")
     if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path}: cannot be read (a pipe or device, expected a file)")
+        kind = "Is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or device, expected a file"
+        raise InputError(f"{path}: cannot be read ({kind})")
     if status.st_size > max_bytes:
         raise InputError(f"{path}: cannot be read (it has {status.st_size} bytes, allowed are {max_bytes})")
     return valid
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Read the content of a file.
-
-    Args:
-        path: the file.
-        max_bytes: size limit, bytes.
-
-    Raises:
-        InputError: it cannot be read, is not a regular file, or is larger.
-    """
+    """Read the content of a file of at most `max_bytes`, as `check_file`."""
     valid = check_file(path, max_bytes)
     try:
         return valid.read_bytes()
@@ -561,11 +476,7 @@ def read_json(path: Path, *formats: str) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal.
-
-    Raises:
-        InputError: it does not exist, or is neither a regular file nor a folder.
-    """
+    """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal."""
     if path.is_dir():
         lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
         return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
@@ -574,24 +485,13 @@ def sha256(path: Path) -> str:
 
 
 def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
-    """Return the names of the files directly in a folder whose content still has the digest of that name.
-
-    Args:
-        folder: the folder.
-        digests: expected digests by file name; may come from a file and hold anything.
-    """
-
-    def is_unchanged(name: str) -> bool:
-        try:
-            check_file(folder / name)
-            return Path(name).name == name and sha256(folder / name) == digests[name]
-        except (InputError, OSError):
-            return False
-
-    return set(filter(is_unchanged, digests))
-
-
-# Provenance
+    """Return the names of the files directly in a folder that still have their digest; `digests` may hold anything."""
+    unchanged = set[str]()
+    for name, digest in digests.items():
+        with suppress(InputError, OSError):
+            if Path(name).name == name and check_file(folder / name) and sha256(folder / name) == digest:
+                unchanged.add(name)
+    return unchanged
 
 
 def provenance(
@@ -615,31 +515,20 @@ def provenance(
 
 
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
-    """Return the names of the documents and recordings beside a file that were made from it, directly or not.
-
-    Args:
-        path: the file.
-        remade: names of those that are replaced together with the file.
-    """
-    # The documents of stages by name, those of recordings by the name of their folder.
-    paths = sorted([*path.parent.glob("[!.]*.json"), *path.parent.glob("[!.]*/start.json")])
-    documents = {
-        (file.name if file.parent == path.parent else file.parent.name): document
-        for file in paths
-        if file != path and not str((document := _read_object(file)).get("format")).startswith(_MORPHOLOGY)
-    }
-    sources, dependents = [path], list[str]()
+    """Return the names of what was made from a file beside it, directly or not, but for what is `remade` with it."""
+    documents = {file.name: _read_dict(file) for file in path.parent.glob("[!.]*.json") if file != path}
+    documents |= {file.parent.name: _read_dict(file) for file in path.parent.glob("[!.]*/start.json") if file != path}
+    sources, dependents = [path], set[str]()
     for source in sources:
         digest, origin = None, dict[str, Any]()
         if not source.is_dir():  # documents hold other digests of a recording
-            digest, origin = sha256(source), _provenance_of(_read_object(source))
-        for name in [
-            name for name, document in documents.items() if _is_made_from(document, source.name, digest, origin)
-        ]:
-            del documents[name]
-            dependents.append(name)
-            sources.append(path.parent / name)
-    return sorted({*dependents} - {*remade})
+            digest, origin = sha256(source), _as_dict(_read_dict(source).get("provenance"))
+        for name, document in documents.items():
+            is_pad = str(document.get("format")).startswith(_MORPHOLOGY)
+            if name not in dependents and not is_pad and _is_made_from(document, source.name, digest, origin):
+                dependents.add(name)
+                sources.append(path.parent / name)
+    return sorted(dependents - {*remade})
 
 
 def check_replaceable(
@@ -661,7 +550,7 @@ def check_replaceable(
     if isinstance(by, Path):
         is_same = sha256(by) == sha256(path)
     else:
-        before = _provenance_of(_read_object(path))
+        before = _as_dict(_read_dict(path).get("provenance"))
         is_same = all(before.get(key) == value for key, value in json.loads(json.dumps(by)).items())
     if not is_same and (dependents := find_dependents(path, remade)):
         *names, last = dependents
@@ -669,24 +558,21 @@ def check_replaceable(
         raise InputError(f"{path}: {listed} made from it; choose another --out, or replace it with --force")
 
 
-def _read_object(path: Path) -> dict[str, Any]:
+def _as_dict(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _read_dict(path: Path) -> dict[str, Any]:
     """Read a JSON object; an empty one from any other file, since a folder may hold whatever a user puts there."""
     try:
-        document = json.loads(read_bytes(path))
+        return _as_dict(json.loads(read_bytes(path)))
     except (InputError, ValueError, RecursionError):
         return {}
-    return document if isinstance(document, dict) else {}
-
-
-def _provenance_of(document: Mapping[str, Any]) -> dict[str, Any]:
-    origin = document.get("provenance")
-    return origin if isinstance(origin, dict) else {}
 
 
 def _is_made_from(document: Mapping[str, Any], name: str, digest: str | None, origin: Mapping[str, Any]) -> bool:
     """Whether a document names as its input a file of this digest, or a model of this provenance."""
-    inputs = _provenance_of(document).get("inputs")
-    inputs = inputs if isinstance(inputs, dict) else {}
+    inputs = _as_dict(_as_dict(document.get("provenance")).get("inputs"))
     if digest is None:
         return name in inputs
     if name == "morphology.json" and document.get("morphology_sha256") == digest:

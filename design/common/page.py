@@ -29,17 +29,10 @@ def read_resource(package: str, name: str) -> str:
 
 TEMPLATES = "padforge.design.common.templates"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
-
-_MAX_PICTURE_BYTES = 2**25
-"""Size limit of a picture, which a page contains as it is."""
-_NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")
-"""Cells that are right-aligned in a table."""
-_SHORT = 16
-"""Columns whose cells have at most this number of characters are not wrapped."""
-_LONG = 30
-"""Words of more characters are broken."""
-_RESULTS = ("pass", "warn", "fail")
-"""Cells of these words are coloured."""
+_MAX_PICTURE_BYTES = 2**25  # of a picture, which a page contains as it is
+_NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")  # right-aligned in a table
+_SHORT, _LONG = 16, 30  # characters: columns of cells up to the one are not wrapped, words beyond the other broken
+_RESULTS = ("pass", "warn", "fail")  # cells of these words are coloured
 
 
 @dataclass(frozen=True)
@@ -65,38 +58,30 @@ class PageSection:
 
 
 def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
-    """Return an HTML document: title, contents, key figures, sections.
+    """Return an HTML document: title, first paragraph, contents, key figures, sections.
 
     Its content security policy forbids content from elsewhere, and scripts other than its own.
-
-    Args:
-        title: of the page.
-        lead: first paragraph.
-        sections: in their order.
     """
     scripts = [read_resource(TEMPLATES, "page.js"), *(section.script for section in sections if section.script)]
-    content = {
-        "title": title,
-        "lead": lead,
-        "sections": sections,
-        "key_figures": [figure for section in sections for figure in section.figures],
-        "style": read_resource(TEMPLATES, "page.css"),
-        "scripts": scripts,
-        "digests": [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts],
-    }
-    return _templates().get_template("page.html").render(content)
+    return (
+        _templates()
+        .get_template("page.html")
+        .render(
+            title=title,
+            lead=lead,
+            sections=sections,
+            key_figures=[figure for section in sections for figure in section.figures],
+            style=read_resource(TEMPLATES, "page.css"),
+            scripts=scripts,
+            digests=[base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts],
+        )
+    )
 
 
 @cache
 def _templates() -> Environment:
-    return Environment(
-        loader=PackageLoader(TEMPLATES, ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    lines = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    return Environment(loader=PackageLoader(TEMPLATES, ""), autoescape=True, undefined=StrictUndefined, **lines)
 
 
 def _element(kind: str, *content: object) -> str:
@@ -116,14 +101,7 @@ def paragraph(text: str) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table.
-
-    Cells of the words pass, warn and fail are coloured, and columns of numbers are right-aligned.
-
-    Args:
-        header: titles of the columns.
-        rows: values of the cells.
-    """
+    """Return a table; cells of the words pass, warn and fail are coloured, columns of numbers right-aligned."""
     cells = [[_text(value) for value in row] for row in rows]
     kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
@@ -143,26 +121,15 @@ def collapsible(summary: str, body: Sequence[str]) -> str:
 
 
 def figures(pictures: Sequence[tuple[Path, str]]) -> str:
-    """Return pictures side by side with their captions.
-
-    Args:
-        pictures: paths of .png and .svg files, and captions; missing files are skipped.
-
-    Raises:
-        InputError: a file is no such picture, or torn.
-    """
+    """Return .png and .svg pictures side by side with their captions; skip missing files."""
     embedded = [_embed_picture(path, caption) for path, caption in pictures if path.is_file()]
     return _element("figures", embedded) if embedded else ""
 
 
 def render_markdown(text: str) -> Iterator[str]:
-    """Convert Markdown: paragraphs, lists, tables, headings, **bold** and `code`; anything else, HTML too, is text.
+    """Convert Markdown to HTML elements, without its title (level 1).
 
-    Args:
-        text: Markdown; its title (level 1) is skipped.
-
-    Yields:
-        HTML elements.
+    Understood are paragraphs, lists, tables, headings, **bold** and `code`; anything else, HTML too, is text.
     """
     reader = MarkdownIt("zero", {"html": False}).enable(["heading", "list", "table", "emphasis", "backticks"])
     for block in SyntaxTreeNode(reader.parse(text)).children:

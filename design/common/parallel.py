@@ -1,10 +1,13 @@
-"""Parallel tasks on the cores of this machine or on a cluster, and the cache of compiled kernels.
+"""Parallel tasks on the cores of this machine or on a cluster, and the checkpoints from which they resume.
 
 Threads serve on one machine, since torch and the kernels release the interpreter lock while they compute: nothing is
 copied, and compiled code is shared.
 """
 
+import io
+import json
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
@@ -15,19 +18,23 @@ from threading import Lock, Thread
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from padforge.design.common.validation import Fault, InputError
+from padforge.design.common import files
+from padforge.design.common.validation import Fault, InputError, short_repr
 
+State = dict[str, NDArray[Any]]
 Key = TypeVar("Key")
 Result = TypeVar("Result")
 
-SCHEDULER_S = 10.0
-"""Time limit for a cluster's scheduler to answer."""
-POLL_S = 0.1
-"""Interval at which Ctrl-C is noticed on systems where it does not wake a waiting thread."""
+FORMAT = "padforge-search/1"
+SCHEDULER_S = 10.0  # time limit for a cluster's scheduler to answer
+POLL_S = 0.1  # interval at which Ctrl-C is noticed on systems where it does not wake a waiting thread
 
-active_threads: set[Thread] = set()
-"""Those of `DaemonThreads` that have not ended."""
+_STATE_FILE = re.compile(r"start_([0-9]{4,})\.npz")
+_DIGEST = "seal"  # name of the array that holds the digest of the others
+
+active_threads = set[Thread]()  # those of `_DaemonThreads` that have not ended
 
 
 def run_tasks(
@@ -40,22 +47,17 @@ def run_tasks(
 ) -> Iterator[tuple[Key, Result]]:
     """Run tasks in parallel, and yield their results as they complete, each with the key of its task.
 
-    Searches, studies and trainings share this loop: the caller keeps each result and reports the progress. Tasks start
-    only while the caller iterates. An exception or Ctrl-C in the caller starts no further task, and running ones are
-    not waited for; an exception in a task is raised here at once. Tasks may share torch under `one_torch_thread`.
+    Tasks start only while the caller iterates. An exception or Ctrl-C in the caller starts no further task, and running
+    ones are not waited for; an exception in a task is raised here at once.
 
     Args:
-        tasks: functions by key, in the order in which they start; drawn one by one as there is room. For other
-            processes, such as those of a cluster, they must be picklable: `functools.partial` of a module's function.
+        tasks: functions by key, in the order in which they start; for a cluster picklable, as `functools.partial` is.
         executor: of the `concurrent.futures` kind; daemon threads of this machine if None.
         max_parallel: limit of running tasks; by default the number of cores, or none with an executor.
         follow_up: returns the next task of the same key, once the caller has used a result; None if there is none.
         is_abandoned: whether to leave running tasks behind, as where an executor hangs.
-
-    Yields:
-        Key and result.
     """
-    pool = executor or DaemonThreads()
+    pool = executor or _DaemonThreads()
     limit = max_parallel or (None if executor else os.cpu_count() or 1)
     waiting, running = iter(tasks), dict[Future[Result], Key]()
     try:
@@ -74,7 +76,7 @@ def run_tasks(
             future.cancel()
 
 
-class DaemonThreads(Executor):
+class _DaemonThreads(Executor):
     """A thread for each task, which, unlike those of `ThreadPoolExecutor`, does not delay the end of the program."""
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **keywords: Any) -> Future[Any]:
@@ -101,7 +103,6 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
     """Connect to the Dask cluster at `address` as an executor; None stands for this machine.
 
     Raises:
-        InputError: Dask is not installed, or no scheduler answers there.
         Fault: in the body, when the scheduler is lost, or a task has ended one worker after another.
     """
     if address is None:
@@ -126,16 +127,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
 
 
 def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -> list[Result]:
-    """Apply work(begin, end) to chunks that partition range(count), one thread a core.
-
-    Args:
-        work: function of the bounds of a chunk.
-        count: number of items.
-        min_chunk: items below which a chunk is not worth a thread.
-
-    Returns:
-        Results in the order of the chunks.
-    """
+    """Return work(begin, end) for chunks of at least `min_chunk` that partition range(count), one thread a core."""
     n_chunks = max(1, min(os.cpu_count() or 1, count // min_chunk))
     if n_chunks == 1:
         return [work(0, count)]
@@ -144,48 +136,119 @@ def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -
         return list(pool.map(lambda bounds: work(*bounds), pairwise(edges)))
 
 
-class _TorchThreads:
-    """Bodies of `one_torch_thread` that run, and the number of threads before the first: torch has one for all."""
-
-    lock, n_bodies, n_before = Lock(), 0, 1
+_threads_before, _torch_lock = list[int](), Lock()  # torch has one number of threads for all
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
     """Limit torch to one thread in the body; from any thread, in parallel or nested, until the last body ends.
 
-    Small matrices gain little from more threads, these slow each other down where another program uses the cores, and
-    sums in another order would give another result.
+    More threads gain little on small matrices, slow down where another program runs, and sum in another order.
     """
     import torch
 
-    with _TorchThreads.lock:
-        if not _TorchThreads.n_bodies:
-            _TorchThreads.n_before = torch.get_num_threads()
-        _TorchThreads.n_bodies += 1
+    with _torch_lock:
+        _threads_before.append(torch.get_num_threads())
         torch.set_num_threads(1)
     try:
         yield
     finally:
-        with _TorchThreads.lock:
-            _TorchThreads.n_bodies -= 1
-            if not _TorchThreads.n_bodies:
-                torch.set_num_threads(_TorchThreads.n_before)
+        with _torch_lock:
+            n_before = _threads_before.pop()
+            if not _threads_before:
+                torch.set_num_threads(n_before)
 
 
 def clear_stale_kernels(package: Path) -> None:
     """Delete the compiled kernels of a package if any of its sources has changed since the last call.
 
-    Numba compares the source of a kernel alone, not of those that it inlines. A folder that cannot be written is left
-    as it is: no kernels are cached there.
+    Numba compares the source of a kernel alone, not of those that it inlines.
     """
     cache = package / "__pycache__"
-    with suppress(OSError):
+    with suppress(OSError):  # a folder that cannot be written: no kernels are cached there
         cache.mkdir(exist_ok=True)
         digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
         stamp = cache / "kernels.sha256"
-        if stamp.exists() and stamp.read_bytes() == digest:
-            return
-        for compiled in package.rglob("__pycache__/*.nb[ic]"):
-            compiled.unlink(missing_ok=True)
-        stamp.write_bytes(digest)
+        if not stamp.exists() or stamp.read_bytes() != digest:
+            for compiled in package.rglob("__pycache__/*.nb[ic]"):
+                compiled.unlink(missing_ok=True)
+            stamp.write_bytes(digest)
+
+
+class Checkpoints:
+    """The states of the tasks of a search, each in a small file of arrays, from which they resume after a kill.
+
+    Attributes:
+        folder: created with the first state.
+        settings: what the search depends on, JSON by section and key; states of other settings are refused.
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        self.folder, self.settings = folder, json.loads(json.dumps(settings))
+        self._file = folder / "search.json"
+
+    def begin(self, resume: bool) -> dict[int, State]:
+        """Return the states of an earlier run by number to resume from, or remove them.
+
+        Raises:
+            InputError: the states belong to other settings, or cannot be read.
+        """
+        if not (resume and self._file.exists()):
+            self.clear()
+            return {}
+        stored: Any = files.read_json(self._file, FORMAT).get("settings")
+        with files.reraise_as_input_error(self._file):
+            for section, values in self.settings.items():
+                for key, value in values.items():
+                    if (before := stored.get(section, {}).get(key)) != value:
+                        change = f"begun with {section} {key} {short_repr(before)}, now {short_repr(value)}"
+                        raise InputError(f"{self.folder}: {change}; allowed to resume are the same settings")
+        paths = {int(name[1]): path for path in self.folder.iterdir() if (name := _STATE_FILE.fullmatch(path.name))}
+        return {number: self._read(paths[number], number) for number in sorted(paths)}
+
+    def save(self, number: int, state: State) -> None:
+        """Write a state atomically in place of the last one of that number."""
+        if not self._file.exists():
+            files.write_json(self._file, {"format": FORMAT, "settings": self.settings})
+        with files.atomic_file(self.folder / f"start_{number:04d}.npz") as temporary:
+            np.savez(temporary, allow_pickle=False, **state, **{_DIGEST: np.array(self._digest(number, state))})
+
+    def clear(self) -> None:
+        """Remove all states, and the folder if nothing else is in it.
+
+        Raises:
+            InputError: its search.json is not that of a search.
+        """
+        if self._file.exists():
+            try:
+                files.read_json(self._file, FORMAT)
+            except InputError as error:
+                raise InputError(f"{error}; remove it, or choose another folder") from error
+            for file in list(self.folder.iterdir()):
+                if _STATE_FILE.fullmatch(file.name) and file.is_file() and not file.is_symlink():
+                    file.unlink()
+            self._file.unlink()
+        files.remove_leftovers(self.folder)
+        with suppress(OSError):  # it does not exist, or is not empty
+            self.folder.rmdir()
+
+    def _read(self, path: Path, number: int) -> State:
+        try:
+            with np.load(io.BytesIO(files.read_bytes(path)), allow_pickle=False) as arrays:
+                if sum(entry.file_size for entry in arrays.zip.infolist()) > files.MAX_BYTES:
+                    raise ValueError(f"it unpacks to more than {files.MAX_BYTES} bytes")
+                state = {name: arrays[name] for name in arrays.files}
+            if str(state.pop(_DIGEST, "")) != self._digest(number, state):
+                raise ValueError("it is not as it was written")
+        except InputError:
+            raise
+        except Exception as error:  # NumPy and zipfile raise many kinds on torn files
+            raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error
+        return state
+
+    def _digest(self, number: int, state: State) -> str:
+        """Compute the digest of a state and of what it belongs to, which makes further checks unnecessary."""
+        digest = sha256(json.dumps([self.settings, number], sort_keys=True).encode())
+        for name, array in sorted(state.items()):
+            digest.update(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes())
+        return digest.hexdigest()

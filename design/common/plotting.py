@@ -11,8 +11,7 @@ if TYPE_CHECKING:
 
 HORIZONTAL, VERTICAL = "#0b6e99", "#d9730d"
 ALARM, INK, FAINT, PAPER = "#c4161c", "#37352f", "#d3d1cb", "#f7f6f3"
-CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")
-"""Colours of the curves of a figure, in their order."""
+CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")  # of a figure, in order
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
@@ -20,8 +19,7 @@ def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
 
     Args:
         figure: the figure.
-        path: with the suffix .png or .svg. A PNG has a palette of 256 colours: a third of the size, and no visible
-            difference.
+        path: .svg or .png; a PNG has a palette of 256 colours, a third of the size without visible difference.
         dpi: resolution of a PNG.
     """
     import matplotlib as mpl
@@ -43,12 +41,7 @@ def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
 
 
 def new_figure(width_in: float, height_in: float) -> "tuple[Figure, Any]":
-    """Create a figure with one pair of axes in the common style.
-
-    Args:
-        width_in: width, inches.
-        height_in: height, inches.
-    """
+    """Create a figure of a size in inches with one pair of axes in the common style."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")

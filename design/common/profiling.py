@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.abc import MetaPathFinder
@@ -19,55 +20,34 @@ _OTHER = "elsewhere"
 
 
 class Profile:
-    """Times and counts.
-
-    Attributes:
-        seconds: wall time of the main thread by stage, without the stages within it.
-        counts: by name, [evaluated, total].
-    """
+    """Wall time of the main thread by stage, without the stages within it, and counts."""
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.counts: dict[str, list[int]] = {}
-        self.lock = threading.Lock()
-        self._stages = [_OTHER]
-        self._since = time.perf_counter()
+        self.seconds = defaultdict[str, float](float)
+        self.counts = defaultdict[str, list[int]](lambda: [0, 0])  # [evaluated, total]
+        self.lock, self.stages, self._since = threading.Lock(), [_OTHER], time.perf_counter()
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Attribute the time of the body to `name`."""
-        self._attribute_time()
-        self._stages.append(name)
-        try:
-            yield
-        finally:
-            self._attribute_time()
-            self._stages.pop()
-
-    def _attribute_time(self) -> None:
+    def attribute_time(self) -> None:
+        """Add the time since the last call to the innermost stage."""
         now = time.perf_counter()
-        self.seconds[self._stages[-1]] = self.seconds.get(self._stages[-1], 0.0) + now - self._since
+        self.seconds[self.stages[-1]] += now - self._since
         self._since = now
 
     def lines(self) -> list[str]:
         """Format the profile as text."""
-        self._attribute_time()
+        self.attribute_time()
         total_s = sum(self.seconds.values())
-        stages = sorted(self.seconds.items(), key=lambda item: (item[0] == _OTHER, -item[1]))
-        loaded = [name for name in HEAVY if name in sys.modules]
+        lines = [f"where {total_s:.2f} s went"]
+        for name, spent in sorted(self.seconds.items(), key=lambda item: (item[0] == _OTHER, -item[1])):
+            lines.append(f"  {name:<24} {spent:8.2f} s {spent / total_s:6.1%}")
+        lines.append("what was skipped")
+        for name, (evaluated, total) in self.counts.items():
+            n = total - evaluated
+            lines.append(f"  {name:<24} {n} of {total}" + (f" ({n / total:.1%})" if total >= 1000 else ""))
+        loaded = ", ".join(name for name in HEAVY if name in sys.modules)
         skipped = [name for name in HEAVY if name not in sys.modules]
-        counts = {name: (total - evaluated, total) for name, (evaluated, total) in self.counts.items()}
-        return [
-            f"where {total_s:.2f} s went",
-            *(f"  {name:<24} {spent:8.2f} s {spent / total_s:6.1%}" for name, spent in stages),
-            "what was skipped",
-            *(
-                f"  {name:<24} {n} of {total}" + (f" ({n / total:.1%})" if total >= 1000 else "")
-                for name, (n, total) in counts.items()
-            ),
-            f"  {'imports':<24} {len(skipped)} of {len(HEAVY)}: {', '.join(skipped) or 'none'}"
-            + (f" (not {', '.join(loaded)})" if loaded else ""),
-        ]
+        imports = f"  {'imports':<24} {len(skipped)} of {len(HEAVY)}: {', '.join(skipped) or 'none'}"
+        return [*lines, imports + (f" (not {loaded})" if loaded else "")]
 
 
 _active: Profile | None = None
@@ -89,20 +69,25 @@ def profiled() -> Iterator[Profile]:
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Attribute the time of the body to `name` if it runs in the main thread of a profiled command."""
-    if _active is None or threading.current_thread() is not threading.main_thread():
+    profile = _active
+    if profile is None or threading.current_thread() is not threading.main_thread():
         yield
         return
-    with _active.stage(name):
+    profile.attribute_time()
+    profile.stages.append(name)
+    try:
         yield
+    finally:
+        profile.attribute_time()
+        profile.stages.pop()
 
 
 def add_count(name: str, evaluated: int, total: int) -> None:
     """Count how many of `total` items were evaluated, the others skipped; from any thread."""
     if _active is not None:
         with _active.lock:
-            count = _active.counts.setdefault(name, [0, 0])
-            count[0] += evaluated
-            count[1] += total
+            _active.counts[name][0] += evaluated
+            _active.counts[name][1] += total
 
 
 def is_profiling() -> bool:

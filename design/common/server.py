@@ -10,6 +10,7 @@ import errno
 import hashlib
 import hmac
 import json
+import math
 import os
 import secrets
 import socket
@@ -17,11 +18,11 @@ import socketserver
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 from padforge.design.common.page import TEMPLATES, read_resource
@@ -29,78 +30,106 @@ from padforge.design.common.validation import InputError
 
 HOST = "127.0.0.1"
 """The loopback interface; other addresses are served only with a token."""
-MIN_TOKEN, MAX_TOKEN = 16, 256
-"""Length of a token, characters."""
-POLL_S = 0.05
-"""Interval at which a server checks whether it is to end."""
-MAX_CONNECTIONS = 64
-"""At once; far fewer than the files that a process may open."""
-ADMIT_S = 10.0
-"""Time limit for a connection to send a valid request, however slowly it sends."""
-END_S = 1.0
-"""Time limit for sending the last message at the end."""
-HTTP_PORT = 80
-"""The port that browsers omit from the Host header."""
-MIN_INTERVAL_S = 0.04
-"""Between two messages to a browser."""
-KEEP_ALIVE_S = 5.0
-"""After this time without a message an empty one is sent, which fails if the browser has gone."""
-RETRY_MS = 1000
-"""After this time a browser that lost its connection tries again."""
-_MAX_DISCARDED = 2**20
-"""Bytes of a request that is too long that are read before it is refused, since a sender reads no answer."""
+MIN_TOKEN, MAX_TOKEN = 16, 256  # characters
+MAX_CONNECTIONS = 64  # at once; far fewer than the files that a process may open
+POLL_S = 0.05  # interval at which a server checks whether it is to end
+ADMIT_S = 10.0  # time limit for a connection to send a valid request, however slowly it sends
+END_S = 1.0  # time limit for sending the last message at the end
+MIN_INTERVAL_S = 0.04  # between two messages to a browser
+KEEP_ALIVE_S = 5.0  # after this time without a message an empty one is sent, which fails if the browser has gone
+RETRY_MS = 1000  # after this time a browser that lost its connection tries again
+HTTP_PORT = 80  # which browsers omit from the Host header
+_MAX_DISCARDED = 2**20  # bytes of a too long request that are read before it is refused: a sender reads no answer
 
-Server = TypeVar("Server", bound=socketserver.BaseServer)
 Handler = Callable[[bytes], Mapping[str, Any] | None]
 """Takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use."""
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):
-    """A TCP server with a thread for each connection; their number, and the time to authenticate, are limited."""
+    """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate."""
 
     daemon_threads = True
     # On Windows the flag would let two programs share a port; elsewhere it frees a port that was used a minute ago.
     allow_reuse_address = os.name == "posix"
 
-    def __init__(self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler]) -> None:
-        self._lock = threading.Lock()
-        self._connections: dict[socket.socket, float] = {}  # when they are cut off unless admitted
-        super().__init__(address, handler)
+    def __init__(
+        self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler], token: str, option: str
+    ) -> None:
+        """Bind the port.
+
+        Args:
+            address: host and port to listen on; port 0 for any that is free.
+            handler: of a connection.
+            token: what a client must know; "" for none.
+            option: of the command line, by which another port is chosen.
+
+        Raises:
+            InputError: the address cannot be used, or other machines can connect without a token of some length.
+        """
+        host, port = address
+        if token and not (MIN_TOKEN <= len(token) <= MAX_TOKEN and token.isascii() and token.isprintable()):
+            limits = f"{MIN_TOKEN} to {MAX_TOKEN}, those of plain text"
+            raise InputError(f"token has {len(token)} characters, allowed are {limits}")
+        if host not in (HOST, "localhost") and not token:
+            example = f"--token {secrets.token_urlsafe(MIN_TOKEN)}"
+            raise InputError(f"host is {host!r}, which other machines reach: state a token, such as {example}")
+        self.token = token
+        self._connections = dict[Any, float]()  # when they are cut off unless admitted
+        reasons = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "this user may not use it"}
+        try:
+            super().__init__(address, handler)
+        except (OSError, UnicodeError) as error:
+            number = getattr(error, "errno", None)
+            if reason := reasons.get(number):
+                choice = f"choose another with {option}, or 0 for any"
+                raise InputError(f"port {port} of {host}: {reason}; {choice}") from error
+            if number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
+                raise InputError(f"host is {host!r}, expected an address of this machine ({error})") from error
+            raise
+
+    def __enter__(self) -> Self:
+        threading.Thread(target=self.serve_forever, args=(POLL_S,), name=type(self).__name__, daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.shutdown()
+        self.end(END_S)
+        self.server_close()
+
+    def end(self, timeout_s: float) -> None:
+        """Send no more, and wait until every client has got the last message, `timeout_s` at most."""
+        raise NotImplementedError
 
     def admit(self, request: Any) -> None:
         """Lift the time limit of a connection, which has authenticated itself."""
-        with self._lock:
-            self._connections[request] = float("inf")
+        self._connections[request] = math.inf
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Refuse connections beyond MAX_CONNECTIONS."""
-        with self._lock:
-            return len(self._connections) < MAX_CONNECTIONS
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Register a connection, and start its thread."""
-        with self._lock:
+        """Register a connection, or refuse it beyond MAX_CONNECTIONS."""
+        if is_accepted := len(self._connections) < MAX_CONNECTIONS:
             self._connections[request] = time.monotonic() + ADMIT_S
-        super().process_request(request, client_address)
+        return is_accepted
 
     def close_request(self, request: Any) -> None:
         """Unregister and close a connection."""
-        with self._lock:
-            self._connections.pop(request, None)
+        self._connections.pop(request, None)
         super().close_request(request)
 
     def service_actions(self) -> None:
         """Cut off connections that have not authenticated themselves in time; called every POLL_S."""
-        with self._lock:
-            late = [request for request, deadline_s in self._connections.items() if time.monotonic() > deadline_s]
-        _shut_down(late)
+        self._cut_off(time.monotonic())
 
     def server_close(self) -> None:
         """Stop listening, and cut off all connections."""
         super().server_close()
-        with self._lock:
-            remaining = list(self._connections)
-        _shut_down(remaining)
+        self._cut_off(math.inf)
+
+    def _cut_off(self, time_s: float) -> None:
+        """End connections, such that what was sent still arrives, and threads that wait for them wake up."""
+        for connection, deadline_s in self._connections.copy().items():  # a copy: threads add and remove others
+            if deadline_s <= time_s:
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report errors other than those of a connection that was closed by its client."""
@@ -108,70 +137,14 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
             super().handle_error(request, client_address)
 
 
-def _shut_down(connections: Iterable[socket.socket]) -> None:
-    """End connections so that what was sent still arrives, and threads that wait for them wake up."""
-    for connection in connections:
-        with suppress(OSError):
-            connection.shutdown(socket.SHUT_RDWR)
-
-
-def check_exposure(host: str, token: str) -> None:
-    """Check that a server that other machines can reach requires a token that cannot be guessed.
-
-    Args:
-        host: address that it listens on.
-        token: what a client must know; "" for none.
-
-    Raises:
-        InputError: there is no token, or it is too short, too long or not plain text.
-    """
-    if token and not (MIN_TOKEN <= len(token) <= MAX_TOKEN and token.isascii() and token.isprintable()):
-        raise InputError(
-            f"token has {len(token)} characters, allowed are {MIN_TOKEN} to {MAX_TOKEN}, those of plain text"
-        )
-    if host not in (HOST, "localhost") and not token:
-        raise InputError(
-            f"host is {host!r}, which other machines reach: whoever knows a token may listen, and nobody else; "
-            f"give one, such as --token {secrets.token_urlsafe(MIN_TOKEN)}"
-        )
-
-
-def bind_server(create: Callable[[], Server], host: str, port: int, option: str) -> Server:
-    """Create a server, with errors of its address in one line.
-
-    Args:
-        create: returns the server.
-        host: address that it listens on.
-        port: that it listens on.
-        option: of the command line, by which another port is chosen.
-
-    Raises:
-        InputError: the port is in use or not allowed, or the host is no address of this machine.
-    """
-    try:
-        return create()
-    except (OSError, UnicodeError) as error:
-        number = error.errno if isinstance(error, OSError) else None
-        if number in (errno.EADDRINUSE, errno.EACCES):
-            reason = "another program uses it" if number == errno.EADDRINUSE else "this user may not use it"
-            raise InputError(f"port {port} of {host}: {reason}; choose another with {option}, or 0 for any") from error
-        if number == errno.EADDRNOTAVAIL or isinstance(error, (socket.gaierror, UnicodeError)):
-            raise InputError(f"host is {host!r}, expected an address of this machine ({error})") from error
-        raise
-
-
-class LocalPage:
-    """A page that is served in the `with` block.
-
-    Attributes:
-        url: address of the page, with the token.
-    """
+class LocalPage(ConnectionServer):
+    """A page that is served in the `with` block, and its latest message to every browser that waits for it."""
 
     def __init__(
         self,
         port: int,
         page: str,
-        handlers: Mapping[str, Handler] | None = None,
+        handlers: Mapping[str, Handler],
         max_post_bytes: int = 4096,
         *,
         host: str = HOST,
@@ -185,73 +158,30 @@ class LocalPage:
             handlers: what takes the posts of the page, by address; called from several threads at once.
             max_post_bytes: size limit of a post.
             host: address to listen on.
-            token: what a client must know, see `check_exposure`.
-
-        Raises:
-            InputError: the port is in use or not allowed, or other machines could connect without a token.
+            token: required from clients, see `ConnectionServer`.
         """
-        check_exposure(host, token)
-        self._server = bind_server(
-            lambda: _PageServer((host, port), token, page, handlers or {}, max_post_bytes), host, port, "--port"
-        )
-        query = f"?{urlencode({'token': token})}" if token else ""
-        self.url = f"http://{host}:{self._server.server_address[1]}/{query}"
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(POLL_S,), name="server of the page", daemon=True
-        )
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._server.shutdown()
-        self._server.end(END_S)
-        self._server.server_close()
-
-    def show(self, view: Mapping[str, Any]) -> None:
-        """Show `view`, a JSON object, from now on.
-
-        Raises:
-            ValueError: it holds what JSON does not have, such as NaN.
-        """
-        self._server.publish(json.dumps(view, allow_nan=False))
-
-
-def page_text(package: str, name: str, *parts: str) -> str:
-    """Read a page that a package ships, and insert the style and script that all local pages share.
-
-    Args:
-        package: that ships the page.
-        name: file of the page.
-        parts: further files of the package; each stands in the page as a line `/* its name */`.
-    """
-    text = read_resource(package, name)
-    for owner, part in [(TEMPLATES, "local_page.css"), (TEMPLATES, "local_page.js"), *((package, p) for p in parts)]:
-        text = text.replace(f"/* {part} */\n", read_resource(owner, part))
-    return text
-
-
-class _PageServer(ConnectionServer):
-    """Serves a page, and its latest message to every browser that waits for it."""
-
-    def __init__(
-        self, address: tuple[str, int], token: str, page: str, handlers: Mapping[str, Handler], max_post_bytes: int
-    ) -> None:
-        self.token, self.handlers, self.max_post_bytes = token, handlers, max_post_bytes
-        self.page, self.policy = page.encode(), _content_security_policy(page)
+        self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
+        self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"
+        for tag in ("script", "style"):  # the page's own only
+            digest = hashlib.sha256(page.split(f"<{tag}>")[1].split(f"</{tag}>")[0].encode()).digest()
+            self.policy += f"; {tag}-src 'sha256-{base64.b64encode(digest).decode()}'"
+        self.policy += "; frame-ancestors 'none'"
         self._changed = threading.Condition()
         self._message, self._number, self._n_readers, self._has_ended = "", 0, 0, False
-        super().__init__(address, _PageHandler)
+        super().__init__((host, port), _PageHandler, token, "--port")
+        query = f"?{urlencode({'token': token})}" if token else ""
+        # The address of the page, with the token.
+        self.url = f"http://{host}:{self.server_address[1]}/{query}"
 
-    def publish(self, message: str) -> None:
-        """Replace the latest message."""
+    def show(self, view: Mapping[str, Any]) -> None:
+        """Show `view`, a JSON object without NaN, from now on."""
+        message = json.dumps(view, allow_nan=False)
         with self._changed:
             self._message, self._number = message, self._number + 1
             self._changed.notify_all()
 
     def end(self, timeout_s: float) -> None:
-        """Publish no more, and wait until every browser has got the latest message, `timeout_s` at most."""
+        """Show no more, and wait until every browser has got the latest message, `timeout_s` at most."""
         with self._changed:
             self._has_ended = True
             self._changed.notify_all()
@@ -278,20 +208,23 @@ class _PageServer(ConnectionServer):
                 self._changed.notify_all()
 
 
-class _PageHandler(BaseHTTPRequestHandler):
-    server: _PageServer  # pyright: ignore[reportIncompatibleVariableOverride]
-    timeout = 10  # of a browser that neither sends nor receives
+def page_text(package: str, name: str, *parts: str) -> str:
+    """Read a page that a package ships, and insert the style and script that all local pages share.
 
-    def parse_request(self) -> bool:
-        """Refuse a malformed address, too."""
-        if not super().parse_request():
-            return False
-        try:
-            self._url = urlsplit(self.path)
-        except ValueError:
-            self.send_error(HTTPStatus.BAD_REQUEST)
-            return False
-        return True
+    Args:
+        package: that ships the page.
+        name: file of the page.
+        parts: further files of the package; each stands in the page as a line `/* its name */`.
+    """
+    text = read_resource(package, name)
+    for owner, part in [(TEMPLATES, "local_page.css"), (TEMPLATES, "local_page.js"), *((package, p) for p in parts)]:
+        text = text.replace(f"/* {part} */\n", read_resource(owner, part))
+    return text
+
+
+class _PageHandler(BaseHTTPRequestHandler):
+    server: LocalPage  # pyright: ignore[reportIncompatibleVariableOverride]
+    timeout = 10  # of a browser that neither sends nor receives
 
     def do_GET(self) -> None:
         if not self._is_authorised():
@@ -300,10 +233,7 @@ class _PageHandler(BaseHTTPRequestHandler):
             page, policy = self.server.page, self.server.policy
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", page, Content_Security_Policy=policy)
         elif self._url.path == "/events":
-            self.send_response(HTTPStatus.OK)
-            self.send_header("Content-Type", "text/event-stream")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
+            self._send(HTTPStatus.OK, "text/event-stream")
             self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
             self.server.send_messages(self.wfile.write)
         else:
@@ -338,43 +268,31 @@ class _PageHandler(BaseHTTPRequestHandler):
 
         Otherwise a page from elsewhere could reach the server by a host name that resolves to it (DNS rebinding).
         """
+        try:
+            self._url = urlsplit(self.path)
+        except ValueError:  # a malformed address
+            return False
         if self.server.token:
             token = parse_qs(self._url.query).get("token", [""])[0]
             token = token or self.headers.get("Authorization", "").removeprefix("Bearer ")
             is_authorised = hmac.compare_digest(token.encode(), self.server.token.encode())
         else:
-            port = self.server.server_address[1]
-            suffixes = (f":{port}", "") if port == HTTP_PORT else (f":{port}",)
-            is_authorised = self.headers.get("Host") in {f"{host}{s}" for host in (HOST, "localhost") for s in suffixes}
+            host, _, port = self.headers.get("Host", "").partition(":")
+            served = str(self.server.server_address[1])
+            is_authorised = host in (HOST, "localhost") and (port or str(HTTP_PORT)) == served
         if is_authorised:
             self.server.admit(self.request)
         return is_authorised
 
     def _send(self, status: HTTPStatus, content_type: str = "", body: bytes = b"", **headers: str) -> None:
         self.send_response(status)
-        if content_type:
-            headers |= {"Content_Type": content_type, "Content_Length": str(len(body))}
-        headers |= {
-            "Cache_Control": "no-store",
-            "X_Content_Type_Options": "nosniff",
-            "Referrer_Policy": "no-referrer",
-        }
+        headers |= {"Cache_Control": "no-store", "X_Content_Type_Options": "nosniff", "Referrer_Policy": "no-referrer"}
+        headers |= {"Content_Type": content_type, "Content_Length": str(len(body) or "")}  # "" of a stream
         for name, value in headers.items():
-            self.send_header(name.replace("_", "-"), value)
+            if value:
+                self.send_header(name.replace("_", "-"), value)
         self.end_headers()
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log nothing: the terminal shows the progress of the command."""
-
-
-def _content_security_policy(page: str) -> str:
-    """Allow the page's own script and style only, and requests to this server only."""
-    hashes = {}
-    for tag in ("script", "style"):
-        digest = hashlib.sha256(page.split(f"<{tag}>")[1].split(f"</{tag}>")[0].encode()).digest()
-        hashes[tag] = f"'sha256-{base64.b64encode(digest).decode()}'"
-    return (
-        f"default-src 'none'; connect-src 'self'; img-src data:; script-src {hashes['script']}; "
-        f"style-src {hashes['style']}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )

@@ -1,5 +1,6 @@
 """Reading, validating and writing of `pad.toml`; the packages that own its sections define their models."""
 
+import json
 import math
 import sys
 import tomllib
@@ -12,14 +13,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError, check_mapping, check_path, check_type, short_repr
 
-MAX_BYTES = 2**18
-"""Size limit of a settings file."""
-MAX_DOTS = 200
-"""In a line: the time to parse a dotted key grows with the square of its parts."""
-MAX_DEPTH = 6
-"""Of nested lists and tables; more than any setting has, while a list may contain itself."""
-MAX_ITEMS = 2**17
-"""Size limit of an array: a broadcast one may not fit into memory as a list."""
+MAX_BYTES = 2**18  # of a settings file
+MAX_DOTS = 200  # in a line: the time to parse a dotted key grows with the square of its parts
+MAX_DEPTH = 6  # of nested lists and tables; more than any setting has, while a list may contain itself
+MAX_ITEMS = 2**17  # of an array: a broadcast one may not fit into memory as a list
 
 
 class Settings(BaseModel):
@@ -54,15 +51,7 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
-    """Replace NumPy scalars and arrays by Python numbers and lists.
-
-    Args:
-        value: of a key, or a table.
-        depth: levels of lists and tables within which they are replaced.
-
-    Returns:
-        The value; an array of more than MAX_ITEMS items unchanged, which no model accepts.
-    """
+    """Replace NumPy scalars and arrays by Python numbers and lists, but no array that is too large for a model."""
     numpy = sys.modules.get("numpy")  # without importing it: a caller who has such values has done so
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
         # an axis of length 0 counts as 1, since lists are made for the others all the same
@@ -115,15 +104,11 @@ class Spec:
             raise InputError(f"sections are {short_repr(sections)}, expected names") from error
         if not all(isinstance(name, str) for name in allowed):
             raise InputError(f"sections are {short_repr(sections)}, expected names")
-        unknown = [name for name in tables if name not in allowed]
-        if unknown:
+        if unknown := [name for name in tables if name not in allowed]:
             raise InputError(f"{source}: unknown section [{unknown[0]}], allowed are {', '.join(allowed)}")
         for name, table in tables.items():
-            if not isinstance(table, Mapping):
-                raise InputError(f"{source}: {name} is {short_repr(table)}, expected a section [{name}]")
             check_mapping(f"{source}: [{name}]", table)
-        self.source = source
-        self._tables = tables
+        self.source, self._tables = source, tables
 
     @classmethod
     def load(cls, path: Path | None, sections: Collection[str] | None = None) -> "Spec":
@@ -162,13 +147,21 @@ class Spec:
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]")
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
-        """Return these settings with the values of `tables`, by section, in place of their own."""
+        """Return these settings with other values in place of theirs.
+
+        Args:
+            tables: the values, by section and key.
+        """
         Spec(tables, self.source)
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
 
     def stated(self, model: type[Settings]) -> Mapping[str, Any]:
-        """Return what the file states of the section of `model`, without defaults and not validated."""
+        """Return what the file states of a section, without defaults and not validated.
+
+        Args:
+            model: of the section.
+        """
         if not (isinstance(model, type) and issubclass(model, Settings)):
             raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
         return self._tables.get(model.section(), {})
@@ -177,17 +170,7 @@ class Spec:
 def or_default(
     name: str, value: AnySettings | None, model: type[AnySettings], default: AnySettings | None = None
 ) -> AnySettings:
-    """Return an argument that is a section of the settings.
-
-    Args:
-        name: of the argument.
-        value: the section; None for its default.
-        model: of the section.
-        default: in place of the model's own default.
-
-    Raises:
-        InputError: `value` is of another type.
-    """
+    """Return an argument that is a section of the settings; `default`, else that of the model, if it is None."""
     return (default or model()) if value is None else check_type(name, value, model)
 
 
@@ -213,27 +196,13 @@ def _to_input_error(error: ValidationError, model: type[Settings], where: str) -
 
 
 def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:
-    """Write a `pad.toml` that states every key, with the descriptions as comments.
-
-    Args:
-        models: of the sections, by name.
-        preset: sections that replace the defaults.
-    """
+    """Write a `pad.toml` that states every key of `models`, by section, with the descriptions as comments."""
     head = "# padforge settings. Every key is optional; what stands here is the default"
     lines = [f"{head}, or of the preset." if preset else f"{head}."]
     for name, model in models.items():
         lines += ["", f"[{name}]"]
         values = ((preset or {}).get(name) or model()).model_dump()
         for key, field in model.model_fields.items():
-            lines.append(f"{key} = {_toml_value(values[key])} ".ljust(36) + f"# {field.description}")
+            value = json.dumps(values[key], ensure_ascii=False)  # which TOML writes alike
+            lines.append(f"{key} = {value} ".ljust(36) + f"# {field.description}")
     return "\n".join(lines) + "\n"
-
-
-def _toml_value(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
-    return repr(value)

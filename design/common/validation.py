@@ -14,10 +14,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-MAX_VALUES = 2**28
-"""Size limit of an array that a public function takes or makes: 2 GiB of float64."""
-MAX_PATH = 4096
-"""Length limit of a path, characters, as of the system."""
+MAX_VALUES = 2**28  # size limit of an array that a public function takes or makes: 2 GiB of float64
+MAX_PATH = 4096  # characters, as of the system
 
 Kind = TypeVar("Kind")
 
@@ -25,9 +23,11 @@ Kind = TypeVar("Kind")
 class InputError(ValueError):
     """An error of the user: a file, setting or argument that cannot be used.
 
-    The message is one line that names the thing, the value and what is allowed. The command line prints it without a
-    traceback and exits with 2.
+    Args:
+        message: one line that names the thing, the value and what is allowed.
     """
+
+    exit_code = 2  # of the command line, which prints the message without a traceback
 
     def __init__(self, message: object = "") -> None:
         super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may hold line ends
@@ -43,33 +43,27 @@ class Fault(Exception):  # noqa: N818  of things outside the program, not an err
     exit_code = 1
 
 
-_DISTRIBUTIONS = {
-    **{"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"},
-    **dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde"),
-}
-"""Distributions by the module they bring, where the names differ."""
+# distributions by the module they bring, where the names differ
+_DISTRIBUTIONS = {"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"}
+_DISTRIBUTIONS |= dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde")
 
 
 def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
-    """Say how to install a missing library, from the metadata of the installed padforge.
+    """Say in one line how to install a missing library; None if no extra of padforge brings it.
 
     Args:
         error: of its import.
         wanted: extras, separated by commas, that the command needs in any case.
-
-    Returns:
-        One line; None if no extra of padforge brings the library.
     """
     from importlib.metadata import PackageNotFoundError, requires
 
     module = (error.name or "").partition(".")[0]
     library = _DISTRIBUTIONS.get(module, module)
+    requirement = re.compile(rf"""{library}\b(?![-\w]).*extra == ['"](?!(?:all|test|figures)\b)([\w-]+)""")
     try:
-        requirements = [line for line in requires("padforge") or () if re.match(rf"{library}\b(?![-\w])", line)]
+        extras = [match[1] for line in requires("padforge") or () if (match := requirement.match(line))]
     except PackageNotFoundError:
         return None
-    extras = [match[1] for line in requirements if (match := re.search(r"""extra == ['"]([\w-]+)""", line))]
-    extras = [extra for extra in extras if extra not in ("all", "test", "figures")]
     if not extras:
         return None
     extra = wanted if {*wanted.split(",")} & {*extras} else extras[0]
@@ -110,16 +104,7 @@ def check_float(name: str, value: object, minimum: float, maximum: float) -> flo
 
 
 def check_array(name: str, values: "ArrayLike", max_abs: float = math.inf) -> "NDArray[np.float64]":
-    """Return finite real numbers of any shape as an array of float64.
-
-    Args:
-        name: of the argument.
-        values: the numbers.
-        max_abs: limit of their absolute value.
-
-    Raises:
-        InputError: rows of different length, anything but finite real numbers, or more than MAX_VALUES of them.
-    """
+    """Return finite real numbers of any shape, at most `max_abs`, as an array of float64, else raise InputError."""
     import numpy as np
 
     try:

@@ -33,15 +33,9 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 @njit(cache=True, error_model="numpy")
 def differentiate_cubic(s: float, h: float, d0: float, d1: float, d_point: Any, d_tangent: Any) -> None:
-    """Compute dp/dx and its derivative by s for x = t0, t1, v0, v1, d0, d1.
+    """Compute dp/dx and its derivative by s for x = t0, t1, v0, v1, d0, d1, into two arrays (6, 2).
 
-    Args:
-        s: parameter on the span, 0..1.
-        h: length of the span along its axis.
-        d0: slope at its first knot.
-        d1: slope at its last knot.
-        d_point: dp/dx; shape (6, 2), overwritten.
-        d_tangent: derivative of dp/dx by s; shape (6, 2), overwritten.
+    The span has the length h along its axis and the slopes d0 and d1 at its knots; s is 0..1.
     """
     d_point[:] = 0.0
     d_tangent[:] = 0.0
@@ -149,20 +143,7 @@ def _add_inner_term(
 def _differentiate_span(
     t: Any, v: Any, d: Any, j: int, ct: float, cv: float, shape: Any, scratch: Any, work: Any, change: Any
 ) -> None:
-    """Set change (6,) to the derivatives of the signal of span j for a press at (ct, cv).
-
-    Args:
-        t: knots along the axis; shape (n,).
-        v: knots across it; shape (n,).
-        d: slopes; shape (n,).
-        j: index of the span.
-        ct: press coordinate along the axis.
-        cv: press coordinate across it.
-        shape: from `select_frame`.
-        scratch: from `make_scratch`.
-        work: the span (6,), d_point and d_tangent (6, 2), overwritten.
-        change: derivatives; shape (6,).
-    """
+    """Set `change` (6,) to the derivatives of the signal of span j for a press at (ct, cv); `work` is overwritten."""
     span, tolerance = work[0], 4 * EPS * (abs(cv) + shape[2].radius)
     s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
@@ -176,43 +157,21 @@ def _differentiate_span(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def signals_gradient(
-    along: Any,
-    across: Any,
-    slope: Any,
-    max_offsets: Any,
-    ends: Any,
-    presses: Any,
-    upstream: Any,
-    chains: tuple[Any, Any],
-    extents: Any,
-    law: Any,
+    along: Any, across: Any, slope: Any, max_offsets: Any, ends: Any, presses: Any, upstream: Any, shape: Any
 ) -> Any:
-    """Compute the gradient of sum(upstream * signals) with respect to knots and slopes of one pad.
+    """Compute the gradient (3, F, n) of sum(upstream * signals) by along, across and slope of one pad.
 
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots, held independent; shape (F, n).
-        max_offsets: from the function of that name, for this pad; shape (2,).
-        ends: `Ends`.
-        presses: x and y; shape (Q, 2).
-        upstream: gradient with respect to the signals; shape (Q, F).
-        chains: shape in the frame of each family, two of (3, B).
-        extents: extents in the frame of each family; shape (2, 5).
-        law: `WeightLaw` of any weight but PROFILE, which `measured_signals` differentiates.
-
-    Returns:
-        Gradient with respect to along, across and slope; shape (3, F, n).
+    Slopes are held independent of knots. `upstream` is (Q, F), `max_offsets` (2,); the law has any weight but PROFILE,
+    which `measured_signals` differentiates.
     """
-    fibres, n = along.shape
-    out = np.zeros((3, fibres, n))
-    change = np.empty(6)
+    (fibres, n), (chains, extents, law) = along.shape, shape
+    out, change = np.zeros((3, fibres, n)), np.empty(6)
     work = np.empty(6), np.empty((6, 2)), np.empty((6, 2))
     scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     for q in range(len(presses)):
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = select_frame((chains, extents, law), family)
+            framed = select_frame(shape, family)
             tolerance = 4 * EPS * (abs(cv) + law.radius)
             low, high = cv + extents[family, 2] - tolerance, cv + extents[family, 3] + tolerance
             first, last = find_touched_range(cv, extents[family], max_offsets[family], ends, family)
@@ -221,7 +180,7 @@ def signals_gradient(
                 j = piece_of(ct + extents[family, 0], t, n)
                 while j < n - 1 and t[j] < ct + extents[family, 1]:
                     if min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:
-                        _differentiate_span(t, v, d, j, ct, cv, shape, scratch, work, change)
+                        _differentiate_span(t, v, d, j, ct, cv, framed, scratch, work, change)
                         for x in range(6):
                             out[x // 2, f, j + x % 2] += upstream[q, f] * change[x]
                     j += 1

@@ -79,20 +79,10 @@ def _density(span: Any, s: float, law: Any) -> float:
 
 @njit(cache=True, error_model="numpy")
 def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
-    """Integrate over [a, b] by the 15-point Kronrod rule and estimate the error by the 7-point Gauss rule.
+    """Integrate over [a, b] by the 15-point Kronrod rule and estimate the relative error by the 7-point Gauss rule.
 
-    The estimate is relative to the integral. For a profile, whose weights may cancel, it is relative to the integral at
-    weight 1, and the plain difference: QUADPACK's sharpening (200 d)^1.5 holds for smooth functions only, and splines
-    bend at their knots.
-
-    Args:
-        span: r, h, e0..e3; shape (6,).
-        a: start of the interval.
-        b: end of the interval.
-        law: a `WeightLaw`.
-
-    Returns:
-        Integral and error estimate.
+    For a profile, whose weights may cancel, the estimate is relative to the integral at weight 1, and the plain
+    difference: QUADPACK's sharpening (200 d)^1.5 holds for smooth functions only, and splines bend at their knots.
     """
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
     centre = _density(span, middle, law)
@@ -118,16 +108,8 @@ def is_precise(error: float, pieces: int, law: Any) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
-    """Integrate the density over a stretch [a, b]: in closed form, or by adaptive Gauss-Kronrod.
-
-    Args:
-        span: r, h, e0..e3; shape (6,).
-        a: start of the stretch.
-        b: end of the stretch.
-        law: a `WeightLaw`.
-        stack: intervals to do; shape (MAX_HALVINGS + 2, 2), overwritten.
-    """
+def _integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
+    """Integrate the density over [a, b] in closed form, or by adaptive Gauss-Kronrod on a stack of intervals."""
     if law.weight == UNIFORM and law.length == MANHATTAN:
         mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
         return (b - a) * (span[1] + abs(mean_rise))
@@ -255,18 +237,9 @@ def _find_between_lines(
 
 @njit(cache=True, error_model="numpy")
 def find_stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float, scratch: Any) -> Any:
-    """Find the stretches of [a, b] on which the span lies inside the press into the last array of `scratch`.
+    """Find the stretches of [a, b] inside a press, into the last array of `scratch`; return their number.
 
-    Args:
-        span: r, h, e0..e3; shape (6,).
-        a: start of the interval.
-        b: end of the interval.
-        shape: from `select_frame`; chains are (3, B) breakpoints t, upper v, lower v of a polygon, B = 0 for a circle.
-        tolerance: distance outside that still counts as on the boundary.
-        scratch: from `make_scratch`.
-
-    Returns:
-        Number of stretches.
+    What is outside by up to `tolerance` counts as on the boundary. The chains of a circle have no breakpoints.
     """
     stretches = scratch[4]
     (chains, extents, law), r, h = shape, span[0], span[1]
@@ -320,31 +293,20 @@ def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: An
     """Return the signal of a stretch inside the press, split at the kink of the 1/d weight."""
     roots, work, p, stack, _ = scratch
     if law.weight != INVERSE:
-        return integrate_stretch(span, a, b, law, stack)
+        return _integrate_stretch(span, a, b, law, stack)
     count = find_circle_roots(span, a, b, law.radius / 100, roots, np.int64(0), work, p)
     total, begin = 0.0, a
     for i in range(count):
-        total += integrate_stretch(span, begin, roots[i], law, stack)
+        total += _integrate_stretch(span, begin, roots[i], law, stack)
         begin = roots[i]
-    return total + integrate_stretch(span, begin, b, law, stack)
+    return total + _integrate_stretch(span, begin, b, law, stack)
 
 
 @njit(cache=True, error_model="numpy")
 def centre_cubic(
     t0: float, t1: float, v0: float, v1: float, d0: float, d1: float, ct: float, cv: float, out: Any
 ) -> float:
-    """Expand the span between two knots about its point abreast of the press centre.
-
-    Args:
-        t0: first knot along the axis.
-        t1: last knot along the axis.
-        v0: first knot across it.
-        v1: last knot across it.
-        d0: slope at the first knot.
-        d1: slope at the last knot.
-        ct: press coordinate along the axis.
-        cv: press coordinate across it.
-        out: r, h, e0..e3; shape (6,), overwritten.
+    """Expand the span between two knots about its point abreast of the press centre, into `out` (6,).
 
     Returns:
         Share s0 of the span before that point; s runs from -s0 to 1 - s0.
@@ -362,24 +324,10 @@ def centre_cubic(
 
 
 @njit(cache=True, error_model="numpy")
-def compute_fibre_signal(
+def _compute_fibre_signal(
     t: Any, v: Any, d: Any, ct: float, cv: float, shape: Any, span: Any, scratch: Any
 ) -> tuple[float, int]:
-    """Compute the signal of one fibre for the press at (ct, cv).
-
-    Args:
-        t: knots along the axis; shape (n,).
-        v: knots across it; shape (n,).
-        d: slopes; shape (n,).
-        ct: press coordinate along the axis.
-        cv: press coordinate across it.
-        shape: from `select_frame`; its extents (5,) are min and max t, min and max v, radius of the inscribed circle.
-        span: work array; shape (6,).
-        scratch: from `make_scratch`.
-
-    Returns:
-        Signal, and number of spans visited.
-    """
+    """Return the signal of one fibre for the press at (ct, cv), and the number of spans visited."""
     _, extents, law = shape
     n, begin, end = len(t), ct + extents[0], ct + extents[1]
     if end <= t[0] or begin >= t[n - 1]:
@@ -407,42 +355,17 @@ def make_scratch(breaks: int) -> Any:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def exact_signals(
-    along: Any,
-    across: Any,
-    slope: Any,
-    max_offsets: Any,
-    ends: Any,
-    presses: Any,
-    chains: tuple[Any, Any],
-    extents: Any,
-    law: Any,
-    begin: int,
-    end: int,
-    starts: Any,
-    fibre: Any,
-    signal: Any,
+    curves: Any, max_offsets: Any, ends: Any, presses: Any, shape: Any, begin: int, end: int, sparse: Any, signal: Any
 ) -> int:
-    """Compute signals of pads, only for fibres that a press can touch.
+    """Compute signals of pads, only for fibres that a press can touch, for presses `begin` to `end` of all P Q.
 
-    Args:
-        along: knots along the axis; shape (P, F, n).
-        across: knots across it; shape (P, F, n).
-        slope: slopes at the knots; shape (P, F, n).
-        max_offsets: from the function of that name; shape (P, 2).
-        ends: `Ends`.
-        presses: x and y; shape (Q, 2).
-        chains: shape in the frame of each family, two of (3, B).
-        extents: extents in the frame of each family; shape (2, 5).
-        law: a `WeightLaw`.
-        begin: first press to do, counted through the population, 0..P Q.
-        end: press to stop before.
-        starts: from `count_touched` for one pad, shape (Q + 1,), for sparse signals; empty for dense ones.
-        fibre: fibre indices of sparse signals.
-        signal: sparse signals, or dense ones (P Q F,), zeros before.
+    They go into `signal` (P Q F,), zeros before. Or, for one pad, as a sparse matrix into the fibre indices of `sparse`
+    and into `signal`, if the former's starts (Q + 1,), from `count_touched`, are not empty.
 
     Returns:
         Number of spans visited.
     """
+    (along, across, slope), (starts, fibre), (chains, extents, _) = curves, sparse, shape
     fibres = along.shape[1]
     span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     visited = 0
@@ -451,11 +374,11 @@ def exact_signals(
         slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            shape = select_frame((chains, extents, law), family)
+            framed = select_frame(shape, family)
             first, last = find_touched_range(cv, extents[family], max_offsets[p, family], ends, family)
             for f in range(first, last):
                 t, v, d = along[p, f], across[p, f], slope[p, f]
-                value, spans = compute_fibre_signal(t, v, d, ct, cv, shape, span, scratch)
+                value, spans = _compute_fibre_signal(t, v, d, ct, cv, framed, span, scratch)
                 visited += spans
                 if len(starts):
                     fibre[slot], signal[slot] = f, value

@@ -71,19 +71,12 @@ def weigh(square: float, law: Any) -> float:
 def profile_coefficients(points: tuple[tuple[float, float], ...]) -> Array:
     """Return the `WeightLaw.profile` (B, 5) through points (distance, weight), by their `profile_spline`."""
     spline = profile_spline(points)
-    return np.ascontiguousarray(
-        np.column_stack([spline.x[:-1], spline.c[::-1].T])
-    )  # one memory order, so that kernels are compiled once
+    # one memory order, so that kernels are compiled once
+    return np.ascontiguousarray(np.column_stack([spline.x[:-1], spline.c[::-1].T]))
 
 
 def profile_weights(profile: Array, end: float, distance: Array) -> Array:
-    """Evaluate a profile.
-
-    Args:
-        profile: from `profile_coefficients`.
-        end: distance from which it is 0.
-        distance: distances of any shape.
-    """
+    """Evaluate a profile of `profile_coefficients` at distances of any shape; it is 0 from `end` on."""
     square = distance**2
     piece = np.searchsorted(profile[:, 0], square, side="right") - 1
     x, c0, c1, c2, c3 = profile[piece].T
@@ -93,14 +86,10 @@ def profile_weights(profile: Array, end: float, distance: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
-    """Return the shape of a press in the frame of each family.
+    """Return a polygon of `sides` in a circle of `radius`, or the circle if None, in the frame of each family.
 
     A circle has no breakpoints. At t a polygon extends up to the lowest of its upper edges' lines and down to the
     highest of its lower ones.
-
-    Args:
-        radius: circumradius.
-        sides: number of sides; None for a circle.
 
     Returns:
         Chains, two of (3, B) breakpoints t, upper v and lower v; and extents (2, 5): min and max t, min and max v,
@@ -134,20 +123,12 @@ def select_frame(shape: Any, family: int) -> Any:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def max_offsets(across: Any, ends: Any) -> Any:
-    """Compute the largest offset of the fibres of each family from their own level.
-
-    Args:
-        across: knots across the axis; shape (P, F, n).
-        ends: `Ends`.
-
-    Returns:
-        Offsets; shape (P, 2).
-    """
+    """Compute the largest offset (P, 2) of the fibres of each family from their own level."""
     population, fibres, _ = across.shape
     out = np.zeros((population, 2))
     for p in range(population):
         for f in range(fibres):
-            family, first, _, spacing = family_of(f, ends)
+            family, first, _, spacing = _family_of(f, ends)
             level = (f - first + 1) * spacing
             for at in across[p, f]:
                 out[p, family] = max(out[p, family], abs(at - level))
@@ -155,7 +136,7 @@ def max_offsets(across: Any, ends: Any) -> Any:
 
 
 @njit(cache=True, error_model="numpy")
-def family_of(fibre: int, ends: Any) -> tuple[int, int, int, float]:
+def _family_of(fibre: int, ends: Any) -> tuple[int, int, int, float]:
     """Return a fibre's family, 0 or 1, its first fibre and the one after its last, and the spacing of their ends."""
     if fibre < ends.horizontals:
         return 0, 0, ends.horizontals, ends.spacing_y
@@ -164,17 +145,9 @@ def family_of(fibre: int, ends: Any) -> tuple[int, int, int, float]:
 
 @njit(cache=True, error_model="numpy")
 def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, family: int) -> tuple[int, int]:
-    """Find the fibres of a family that a press can touch: those whose level plus offset is within its extents.
+    """Find the first fibre that a press at `cv` can touch, of all fibres, and the one to stop before.
 
-    Args:
-        cv: press coordinate across the family's axis.
-        extents: extents of the press in the family's frame; shape (5,).
-        max_offset: from `max_offsets`, of the family.
-        ends: `Ends`.
-        family: 0 or 1.
-
-    Returns:
-        First fibre and the one to stop before, as indices among all fibres.
+    They are those of the family whose level plus offset is within the extents (5,) of the press.
     """
     before = 0 if family == 0 else ends.horizontals
     count, spacing = (ends.horizontals, ends.spacing_y) if family == 0 else (ends.verticals, ends.spacing_x)
@@ -186,17 +159,7 @@ def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, fa
 
 @njit(cache=True, error_model="numpy")
 def count_touched(max_offsets: Any, presses: Any, extents: Any, ends: Any) -> Any:
-    """Count the fibres that presses can touch on one pad.
-
-    Args:
-        max_offsets: from the function of that name, for the pad; shape (2,).
-        presses: x and y; shape (Q, 2).
-        extents: extents in the frame of each family; shape (2, 5).
-        ends: `Ends`.
-
-    Returns:
-        Cumulative counts, starting with 0; shape (Q + 1,).
-    """
+    """Return the cumulative counts (Q + 1,), from 0, of fibres that presses can touch on one pad; offsets (2,)."""
     starts = np.zeros(len(presses) + 1, np.int64)
     for q in range(len(presses)):
         starts[q + 1] = starts[q]
@@ -287,7 +250,7 @@ def _cumulate_lengths(points: Any, first: Any) -> Any:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, width: float) -> Any:
-    """Find the intervals of polylines that are near segments of other polylines.
+    """Find the intervals of polylines that are nearer than `width` to segments of other polylines.
 
     Args:
         points: vertices of all polylines, one after the other; shape (n, 2).
@@ -304,11 +267,11 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
     arcs = _cumulate_lengths(points, first)
     intervals, count = np.empty((64, 4)), 0
     for box in range(len(sides)):
-        left, low, right, high = sides[box]
+        x_min, y_min, x_max, y_max = sides[box]
         for beside in range(len(other_sides)):
-            if other_sides[beside, 0] > right or other_sides[beside, 2] < left:
+            if other_sides[beside, 0] > x_max or other_sides[beside, 2] < x_min:
                 continue
-            if other_sides[beside, 1] > high or other_sides[beside, 3] < low:
+            if other_sides[beside, 1] > y_max or other_sides[beside, 3] < y_min:
                 continue
             for i in range(segments[box, 0], segments[box, 1]):
                 x, y, length = points[i, 0], points[i, 1], arcs[i + 1] - arcs[i]
@@ -333,9 +296,9 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
     return intervals[:count]
 
 
-DEPTH = 60
-MAX_DEGREE = 6
-SCRATCH = (DEPTH + 2, MAX_DEGREE + 3)
+_DEPTH = 60
+_MAX_DEGREE = 6
+SCRATCH = (_DEPTH + 2, _MAX_DEGREE + 3)
 """Shape of the work array of `find_unit_roots`."""
 
 
@@ -379,24 +342,14 @@ def _refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> 
 
 @njit(cache=True, error_model="numpy")
 def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
-    """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:] by Bernstein subdivision.
+    """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
 
-    Coefficients in Bernstein form without a change of sign exclude a root, with one change they isolate one (Descartes'
-    rule); else the interval is halved by de Casteljau's algorithm. A polynomial whose coefficients are all within
-    `tolerance` of 0 only touches zero: no sign change.
-
-    Args:
-        p: power coefficients; shape (degree + 1,).
-        degree: at most MAX_DEGREE; an int64, no literal, for each of which the kernel would be compiled.
-        tolerance: coefficient that counts as 0.
-        out: roots.
-        count: number of roots in `out`.
-        work: stack of [coefficients ..., low, high]; shape SCRATCH, overwritten.
-
-    Returns:
-        New number of roots.
+    Bernstein subdivision: coefficients without a change of sign exclude a root, with one change they isolate one
+    (Descartes' rule); else the interval is halved by de Casteljau's algorithm. A polynomial whose coefficients are all
+    within `tolerance` of 0 only touches zero. The degree, at most `_MAX_DEGREE`, is an int64: kernels are compiled anew
+    for each literal. `work` is a stack of [coefficients ..., low, high] of the shape SCRATCH.
     """
-    lo, hi = MAX_DEGREE + 1, MAX_DEGREE + 2
+    lo, hi = _MAX_DEGREE + 1, _MAX_DEGREE + 2
     for j in range(degree + 1):  # power to Bernstein form: b_j = sum_i C(j, i) / C(n, i) p_i
         ratio, total = 1.0, 0.0
         for i in range(j + 1):
@@ -419,17 +372,17 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
             out[count] = _refine_root(p, degree, b[lo], b[hi], b[0] < 0)
             count += 1
             top -= 1
-        elif top >= DEPTH:
+        elif top >= _DEPTH:
             top -= 1
-        else:  # de Casteljau at the middle; the left half goes on top of the stack, so roots come in order
-            left = work[top + 1]
+        else:  # de Casteljau at the middle; the lower half goes on top of the stack, so roots come in order
+            lower = work[top + 1]
             for j in range(degree + 1):
-                left[j] = b[0]
+                lower[j] = b[0]
                 for i in range(degree - j):
                     b[i] = 0.5 * (b[i] + b[i + 1])
-            # after the sweep b holds the last diagonal reversed: the right half
+            # after the sweep b holds the last diagonal reversed: the upper half
             middle = 0.5 * (b[lo] + b[hi])
-            left[lo], left[hi] = b[lo], middle
+            lower[lo], lower[hi] = b[lo], middle
             b[lo] = middle
             top += 1
     return count
@@ -437,33 +390,21 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sum_overlaps(
-    samples: Any,
-    slope: Any,
-    arc: Any,
-    fibres: Any,
-    neighbours: Any,
-    middles: Any,
-    half: float,
-    width: float,
-    gradient: Any,
+    samples: Any, slope: Any, arc: Any, pairs: Any, middles: Any, half: float, width: float, gradient: Any
 ) -> float:
-    """Sum how much nearer than `width` points of fibres are to the tangent of a fibre of the other family.
+    """Sum how much nearer than `width`, relative to it, points of fibres are to the tangent of one of the other family.
 
     Args:
         samples: samples of the fibres, along and across their axis; shape (F, P, 2).
         slope: slopes at the samples; shape (F, P).
         arc: arc lengths at the samples; shape (F, P).
-        fibres: fibre of each middle; shape (K,).
-        neighbours: fibre of the other family that each middle is near; shape (K,).
+        pairs: fibre of each middle, and the one of the other family that it is near; two of shape (K,).
         middles: arc length of each middle; shape (K,).
         half: arc length from a middle to the two points before and after it.
         width: distance at which a point has no overlap.
-        gradient: derivative of the sum by `samples` is added to it, for points at fixed arc lengths; shape (F, P, 2).
-
-    Returns:
-        Sum of overlaps, relative to `width`.
+        gradient: derivative of the sum by `samples`, for points at fixed arc lengths, is added; shape (F, P, 2).
     """
-    total, n_samples = 0.0, samples.shape[1]
+    (fibres, neighbours), n_samples, total = pairs, samples.shape[1], 0.0
     for k in range(len(fibres)):
         f, g = fibres[k], neighbours[k]
         for side in (-half, half):

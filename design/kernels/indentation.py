@@ -25,7 +25,7 @@ from padforge.design.kernels.exact_signals import (
 
 SPHERE, CONE, FLAT = 0, 1, 2
 PRECISION = 1e-6
-"""Estimated relative error at which a piece is is_accepted."""
+"""Estimated relative error at which a piece is accepted."""
 MAX_PIECE_LENGTH = 4.0
 """Length of a piece above which it is halved at once, relative to its distance plus the contact radius."""
 NOTCH_WIDTH = 2e-5
@@ -67,14 +67,6 @@ def _is_long(span: Any, s0: float, s1: float, from_edge: bool, a: float, shape: 
 
     If a fibre passes the tip of a cone or the edge of a flat punch at a small distance, it does not rise or fall over
     just as short a length: a notch in the density that quadrature would miss.
-
-    Args:
-        span: r, h, e0..e3; shape (6,).
-        s0: start of the piece.
-        s1: end of the piece.
-        from_edge: whether the piece starts at the edge of the contact.
-        a: contact radius.
-        shape: SPHERE, CONE or FLAT.
     """
     t0, t1 = span[0] + span[1] * s0, span[0] + span[1] * s1
     v0, v1 = evaluate_cubic(span, s0), evaluate_cubic(span, s1)
@@ -90,42 +82,20 @@ def _is_long(span: Any, s0: float, s1: float, from_edge: bool, a: float, shape: 
 
 
 @njit(cache=True, error_model="numpy")
-def _integrate_piece(
-    span: Any,
-    start: float,
-    end: float,
-    is_quadratic: bool,
-    a: float,
-    steepness: float,
-    max_error: float,
-    shape: int,
-    stack: Any,
-) -> float:
+def _integrate_piece(span: Any, start: float, end: float, is_quadratic: bool, press: Any, stack: Any) -> float:
     """Integrate the elongation between s = start and s = end, in either order, by adaptive Gauss-Kronrod.
 
-    Args:
-        span: r, h, e0..e3; shape (6,).
-        start: first end.
-        end: second end.
-        is_quadratic: whether s - start ~ u^2, for a start at the edge of the contact; else s - start ~ u.
-        a: contact radius.
-        steepness: as in `integrate_elongations`.
-        max_error: absolute error that is negligible.
-        shape: SPHERE, CONE or FLAT.
-        stack: intervals to do, overwritten.
+    If `is_quadratic`, for a start at the edge of the contact, then s - start ~ u^2; else s - start ~ u.
     """
-    width = end - start
-    total = 0.0
+    a, steepness, max_error, shape = press
+    width, total = end - start, 0.0
     stack[0, 0], stack[0, 1] = 0.0, 1.0
     top = 0
     while top >= 0:
         low, high = stack[top]
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        s0, s1 = (
-            (start + width * low * low, start + width * high * high)
-            if is_quadratic
-            else (start + width * low, start + width * high)
-        )
+        s0 = start + width * low * (low if is_quadratic else 1.0)
+        s1 = start + width * high * (high if is_quadratic else 1.0)
         is_accepted = top >= MAX_HALVINGS or not _is_long(span, s0, s1, is_quadratic and low == 0, a, shape)
         if is_accepted:
             fine, coarse = 0.0, 0.0
@@ -151,11 +121,9 @@ def _integrate_piece(
 
 
 @njit(cache=True, error_model="numpy")
-def _integrate_span(
-    span: Any, low: float, high: float, a: float, steepness: float, max_error: float, shape: int, scratch: Any
-) -> float:
-    """Integrate the elongation of a span from s = low to s = high."""
-    roots, work, p, stack, _ = scratch
+def _integrate_span(span: Any, low: float, high: float, press: Any, scratch: Any) -> float:
+    """Integrate the elongation of a span from s = low to s = high by a press (a, steepness, max_error, shape)."""
+    (a, _, _, shape), (roots, work, p, stack, _) = press, scratch
     t0, t1 = span[0] + span[1] * low, span[0] + span[1] * high
     v0, v1 = evaluate_cubic(span, low), evaluate_cubic(span, high)
     near_t, near_v = max(t0, -t1, 0.0), max(min(v0, v1), -max(v0, v1), 0.0)
@@ -170,60 +138,39 @@ def _integrate_span(
         t, v = span[0] + span[1] * middle, evaluate_cubic(span, middle)
         if t * t + v * v <= a * a:
             if shape != FLAT:
-                total += _integrate_piece(span, begin, end, False, a, steepness, max_error, shape, stack)
+                total += _integrate_piece(span, begin, end, False, press, stack)
         elif 0 < i < count:
-            total += _integrate_piece(span, begin, middle, True, a, steepness, max_error, shape, stack)
-            total += _integrate_piece(span, end, middle, True, a, steepness, max_error, shape, stack)
+            total += _integrate_piece(span, begin, middle, True, press, stack)
+            total += _integrate_piece(span, end, middle, True, press, stack)
         elif i < count:
-            total += _integrate_piece(span, end, begin, True, a, steepness, max_error, shape, stack)
+            total += _integrate_piece(span, end, begin, True, press, stack)
         else:
-            total += _integrate_piece(span, begin, end, i > 0, a, steepness, max_error, shape, stack)
+            total += _integrate_piece(span, begin, end, i > 0, press, stack)
         begin = end
     return total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def integrate_elongations(
-    along: Any,
-    across: Any,
-    slope: Any,
-    horizontals: int,
-    presses: Any,
-    contact_radius: Any,
-    steepness: Any,
-    max_error: Any,
-    shape: int,
-    begin: int,
-    end: int,
-    out: Any,
+    curves: Any, horizontals: int, presses: Any, indentation: Any, begin: int, end: int, out: Any
 ) -> None:
-    """Compute the elongation of every fibre of one pad for presses begin..end.
+    """Compute the elongation of every fibre of one pad for presses `begin` to `end`, into `out` (Q, F), zeros before.
 
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots; shape (F, n).
-        horizontals: number of fibres, the first ones, that run along x.
-        presses: x and y; shape (Q, 2).
-        contact_radius: a, 0 for no press; shape (Q,).
-        steepness: scale of dw/dr: slope at the edge a / R of a sphere, slope of the flank of a cone, 2 d / (pi a) of a
-            flat punch; shape (Q,).
-        max_error: negligible error of a piece; shape (Q,).
-        shape: SPHERE, CONE or FLAT.
-        begin: first press.
-        end: press to stop before.
-        out: elongations, zeros before; shape (Q, F).
+    `curves` are along, across and slope. `indentation` is the contact radius a of each press, 0 for no press; the scale
+    of dw/dr, `steepness`: slope at the edge a / R of a sphere, slope of the flank of a cone, 2 d / (pi a) of a flat
+    punch; the negligible error of a piece; all (Q,); and SPHERE, CONE or FLAT.
     """
+    (along, across, slope), (radii, steepness, max_error, shape) = curves, indentation
     fibres, knots = along.shape
     span, scratch = np.empty(6), make_scratch(0)
     for q in range(begin, end):
-        a = contact_radius[q]
-        if a == 0:
+        if radii[q] == 0:
             continue
+        press = radii[q], steepness[q], max_error[q], shape
         for f in range(fibres):
             family = 0 if f < horizontals else 1
             ct, cv = presses[q, family], presses[q, 1 - family]
             t, v, d = along[f], across[f], slope[f]
             for j in range(knots - 1):
                 s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
-                out[q, f] += _integrate_span(span, -s0, 1 - s0, a, steepness[q], max_error[q], shape, scratch)
+                out[q, f] += _integrate_span(span, -s0, 1 - s0, press, scratch)

@@ -57,9 +57,6 @@ def element_spacing(points: tuple[tuple[float, float], ...]) -> float:
 
     Args:
         points: profile as (distance in grid units, weight).
-
-    Returns:
-        Spacing, grid units.
     """
     profile, end = profile_coefficients(points), points[-1][0]
     distances, shifts = end * np.arange(32)[:, None, None] / 32, np.arange(16)[:, None] / 16
@@ -85,32 +82,21 @@ def element_spacing(points: tuple[tuple[float, float], ...]) -> float:
 @njit(cache=True, error_model="numpy")
 def _count_pieces(h: float, rise: float, d0: float, d1: float, spacing: float) -> int:
     """Return the number of equal pieces of a span whose elements are at most `spacing` apart on average."""
-    # the d_tangent at which a span rises is a quadratic, which keeps within its Bezier points
+    # the slope at which a span rises is a quadratic, which keeps within its Bezier points
     steepest = max(abs(h * d0), abs(h * d1), abs(3 * rise - h * (d0 + d1)))
     return math.ceil(min(math.hypot(h, steepest) / (len(_NODES) * spacing), 1.0 * MAX_PIECES))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def fibre_elements(
-    along: Any, across: Any, slope: Any, horizontals: int, presses: Any, end: float, spacing: float, length: int
+    along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacing: float
 ) -> Any:
-    """Cut one pad's spans into `Elements`, except spans beyond the profile of every press.
-
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots; shape (F, n).
-        horizontals: number of fibres, the first ones, that run along x.
-        presses: x and y, at least one press; shape (Q, 2).
-        end: distance from which the profile is 0.
-        spacing: from `element_spacing`.
-        length: MANHATTAN or EUCLIDEAN.
-    """
+    """Cut one pad's spans into `Elements` `spacing` apart, except spans beyond the profile of every press."""
     fibres, n = along.shape
     low, high = np.empty(2), np.empty(2)
     for axis in range(2):
         least, largest = extremes(presses[:, axis])
-        low[axis], high[axis] = least - end, largest + end
+        low[axis], high[axis] = least - law.radius, largest + law.radius
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
     total = 0
     for f in range(fibres):
@@ -134,7 +120,7 @@ def fibre_elements(
                 for i in range(len(_NODES)):
                     s, weight = (piece + _NODES[i]) / pieces[f, j], _WEIGHTS[i] / pieces[f, j]
                     speed = abs(a1 + s * (2 * a2 + 3 * a3 * s))
-                    speed = h + speed if length == MANHATTAN else math.hypot(h, speed)
+                    speed = h + speed if law.length == MANHATTAN else math.hypot(h, speed)
                     out[0, k], out[1, k] = along[f, j] + h * s, v0 + s * (a1 + s * (a2 + s * a3))
                     out[2, k], out[3, k], out[4, k] = weight * speed, s, weight
                     k += 1
@@ -159,22 +145,9 @@ def _find_piece(square: float, profile: Any, piece: Any) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def element_signals(along: Any, across: Any, elements: Any, presses: Any, end: float, profile: Any, out: Any) -> int:
-    """Compute signals of one pad from its elements.
-
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        elements: from `fibre_elements`.
-        presses: x and y; shape (Q, 2).
-        end: distance from which the profile is 0.
-        profile: from `profile_coefficients`.
-        out: signals; shape (Q, F).
-
-    Returns:
-        Number of spans visited.
-    """
-    fibres, n = along.shape
+def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, out: Any) -> int:
+    """Compute signals of one pad from its elements into `out` (Q, F); return the number of spans visited."""
+    (fibres, n), (end, _, _, profile) = along.shape, law
     visited, piece = 0, np.int64(0)
     for f in range(fibres):
         t, v, first, axis = along[f], across[f], elements.starts[f], 0 if f < elements.horizontals else 1
@@ -199,11 +172,10 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, end: f
 
 @njit(cache=True, error_model="numpy")
 def _differentiate_elements(
-    along: Any, across: Any, elements: Any, presses: Any, upstream: Any, end: float, profile: Any, out: Any
+    along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, out: Any
 ) -> None:
     """Add the derivatives of sum(upstream * signals) by each element's along, across and length to out (3, E)."""
-    fibres, n = along.shape
-    piece = np.int64(0)
+    (fibres, n), (end, _, _, profile), piece = along.shape, law, np.int64(0)
     for f in range(fibres):
         t, v, first, axis = along[f], across[f], elements.starts[f], 0 if f < elements.horizontals else 1
         bottom, top = extremes(v)
@@ -226,36 +198,14 @@ def _differentiate_elements(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def elements_gradient(
-    along: Any,
-    across: Any,
-    slope: Any,
-    elements: Any,
-    presses: Any,
-    upstream: Any,
-    end: float,
-    profile: Any,
-    length: int,
-) -> Any:
-    """Compute the gradient of sum(upstream * signals) with respect to knots and slopes of one pad.
+def elements_gradient(along: Any, across: Any, slope: Any, elements: Any, presses: Any, upstream: Any, law: Any) -> Any:
+    """Compute the gradient (3, F, n) of sum(upstream (Q, F) * signals) by along, across and slope of one pad.
 
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots, held independent; shape (F, n).
-        elements: from `fibre_elements` of the same arguments.
-        presses: x and y; shape (Q, 2).
-        upstream: gradient with respect to the signals; shape (Q, F).
-        end: distance from which the profile is 0.
-        profile: from `profile_coefficients`.
-        length: MANHATTAN or EUCLIDEAN.
-
-    Returns:
-        Gradient with respect to along, across and slope; shape (3, F, n).
+    Slopes are held independent of knots; the elements are from `fibre_elements` of the same arguments.
     """
     fibres, n = along.shape
     out, element_gradient = np.zeros((3, fibres, n)), np.zeros((3, len(elements.length)))
-    _differentiate_elements(along, across, elements, presses, upstream, end, profile, element_gradient)
+    _differentiate_elements(along, across, elements, presses, upstream, law, element_gradient)
     d_point, d_tangent = np.empty((6, 2)), np.empty((6, 2))
     for f in range(fibres):
         for j in range(n - 1):
@@ -264,9 +214,10 @@ def elements_gradient(
             for k in range(elements.starts[f, j], elements.starts[f, j + 1]):
                 s = elements.share[k]
                 dv_ds = h * (d0 + s * (2 * (3 * m - 2 * d0 - d1) + 3 * s * (d0 + d1 - 2 * m)))
-                speed = h + abs(dv_ds) if length == MANHATTAN else math.hypot(h, dv_ds)
-                speed_t = 1.0 if length == MANHATTAN else h / speed
-                speed_v = math.copysign(1.0, dv_ds) if length == MANHATTAN else dv_ds / speed
+                is_manhattan = law.length == MANHATTAN
+                speed = h + abs(dv_ds) if is_manhattan else math.hypot(h, dv_ds)
+                speed_t = 1.0 if is_manhattan else h / speed
+                speed_v = math.copysign(1.0, dv_ds) if is_manhattan else dv_ds / speed
                 longer = element_gradient[2, k] * elements.weight[k]
                 differentiate_cubic(s, h, d0, d1, d_point, d_tangent)
                 for x in range(6):

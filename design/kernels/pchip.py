@@ -9,13 +9,7 @@ from numba import njit
 
 @njit(cache=True, error_model="numpy")
 def piece_of(at: float, edges: Any, pieces: int) -> int:
-    """Return the index of the piece that contains `at` by bisection; the first one if none does.
-
-    Args:
-        at: coordinate.
-        edges: ascending starts of the pieces; `pieces` or more.
-        pieces: number of pieces.
-    """
+    """Return the index of the piece that contains `at` by bisection of ascending `edges`; the first if none does."""
     low, high = 0, pieces
     while high - low > 1:
         middle = (low + high) // 2
@@ -48,13 +42,7 @@ def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def pchip_slopes(t: Any, v: Any, d: Any) -> None:
-    """Compute the slopes of the PCHIP interpolant (Fritsch and Butland 1984).
-
-    Args:
-        t: ascending coordinates; shape (n,).
-        v: values; shape (n,).
-        d: slopes; shape (n,), overwritten.
-    """
+    """Compute the slopes d of the PCHIP interpolant of (t, v) at its knots (Fritsch and Butland 1984)."""
     n = len(t)
     if n == 2:
         d[0] = d[1] = (v[1] - v[0]) / (t[1] - t[0])
@@ -75,14 +63,7 @@ def pchip_slopes(t: Any, v: Any, d: Any) -> None:
 
 @njit(cache=True, error_model="numpy")
 def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
-    """Sample the PCHIP interpolant of (t, v) at 0, step, 2 step, ...; the last sample is the last knot.
-
-    Args:
-        t: ascending coordinates; shape (n,).
-        v: values; shape (n,).
-        step: distance of samples.
-        out: samples; shape (samples,), overwritten.
-    """
+    """Sample the PCHIP interpolant of (t, v) at 0, step, 2 step, ... into `out`; the last sample is the last knot."""
     d = np.empty(len(t))
     pchip_slopes(t, v, d)
     i = 0
@@ -99,38 +80,8 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_curves(knots: Any, horizontals: int, samples: int) -> Any:
-    """Sample fibres uniformly along their axis.
-
-    Args:
-        knots: shape (P, F, N + 2, 2).
-        horizontals: number of fibres, the first ones, that run along x.
-        samples: samples per fibre.
-
-    Returns:
-        Coordinates across the axis; shape (P, F, samples).
-    """
-    population, fibres = knots.shape[:2]
-    out = np.empty((population, fibres, samples))
-    for index in range(population * fibres):
-        p, f = index // fibres, index % fibres
-        along = 0 if f < horizontals else 1
-        t = knots[p, f, :, along].copy()
-        pchip_sample(t, knots[p, f, :, 1 - along].copy(), t[-1] / (samples - 1), out[p, f])
-    return out
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def population_slopes(along: Any, across: Any) -> Any:
-    """Compute the slopes of the PCHIP curves of a population.
-
-    Args:
-        along: knots along the axis; shape (P, F, n).
-        across: knots across it; shape (P, F, n).
-
-    Returns:
-        Slopes; shape (P, F, n).
-    """
+    """Compute the slopes (P, F, n) of the PCHIP curves of a population."""
     out = np.empty_like(across)
     for p in range(len(along)):
         for f in range(along.shape[1]):

@@ -43,31 +43,11 @@ def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
 def _sum_uniform(
-    curve: Any,
-    segment_lengths: Any,
-    low: int,
-    high: int,
-    step: float,
-    ct: float,
-    cv: float,
-    chains: Any,
-    outer: float,
-    inner: float,
+    curve: Any, segment_lengths: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any
 ) -> float:
-    """Compute `_sum_stretch` for weight 1: the inscribed circle without a branch, the ring around it sample by sample.
-
-    Args:
-        curve: samples of the fibre.
-        segment_lengths: lengths of its segments.
-        low: first sample.
-        high: sample to stop before.
-        step: distance of samples along the axis.
-        ct: press coordinate along the axis.
-        cv: press coordinate across it.
-        chains: polygon as (3, B) breakpoints, upper and lower.
-        outer: squared radius of the circumscribed circle.
-        inner: squared radius of the inscribed circle.
-    """
+    """Compute `_sum_stretch` for weight 1: the inscribed circle without branches, the ring around it by samples."""
+    chains, extents, law = shape
+    outer, inner = law.radius * law.radius, extents[4] * extents[4]
     values, weights, start = curve[low:high], segment_lengths[low:high], low * step - ct
     total, ring = 0.0, 0
     for i in range(len(values)):
@@ -101,9 +81,9 @@ def _sum_stretch(
 ) -> float:
     """Sum the segments of samples [low, high) that start inside the press at (ct, cv)."""
     chains, extents, law = shape
-    outer, inner = law.radius * law.radius, extents[4] * extents[4]
     if law.weight == UNIFORM:
-        return _sum_uniform(curve, segment_lengths, low, high, step, ct, cv, chains, outer, inner)
+        return _sum_uniform(curve, segment_lengths, low, high, step, ct, cv, shape)
+    outer, inner = law.radius * law.radius, extents[4] * extents[4]
     total = 0.0
     for i in range(low, high):
         dt, dv = i * step - ct, curve[i] - cv
@@ -114,26 +94,13 @@ def _sum_stretch(
 
 
 @njit(cache=True, error_model="numpy")
-def sample_fibre_signals(
+def _sample_fibre_signals(
     t: Any, v: Any, curve: Any, step: float, presses: Any, family: int, shape: Any, out: Any
 ) -> int:
-    """Compute the signals of one sampled fibre.
+    """Compute the signals (Q,) of one fibre sampled at 0, step, ...; return the number of samples visited.
 
     Fibres are monotone between knots, so the samples that a press can touch are index ranges: by its extent along the
     axis, then by bisection across it.
-
-    Args:
-        t: knots along the axis; shape (n,).
-        v: knots across it; shape (n,).
-        curve: samples of the fibre at 0, step, ...
-        step: distance of samples along the axis.
-        presses: x and y; shape (Q, 2).
-        family: 0 of a horizontal, 1 of a vertical.
-        shape: from `select_frame`; its extents (5,) are min and max t, min and max v, radius of the inscribed circle.
-        out: signals; shape (Q,), overwritten.
-
-    Returns:
-        Number of samples visited.
     """
     extents, length = shape[1], shape[2].length
     n, segments = len(t), len(curve) - 1
@@ -177,21 +144,9 @@ def sample_fibre_signals(
 def quantized_signals(
     along: Any, across: Any, horizontals: int, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
 ) -> int:
-    """Compute signals by the published rule: the sum over sampled segments that start inside the press.
+    """Compute signals (P, Q, F) of fibres `begin` to `end` of all P F: sums of sampled segments that start inside.
 
-    Args:
-        along: knots along the axis; shape (P, F, n).
-        across: knots across it; shape (P, F, n).
-        horizontals: number of fibres, the first ones, that run along x.
-        presses: x and y; shape (Q, 2).
-        shape: as `select_frame` takes it.
-        samples: points per fibre, uniform along its axis.
-        begin: first fibre to do, counted through the population, 0..F P.
-        end: fibre to stop before.
-        out: signals; shape (P, Q, F), overwritten.
-
-    Returns:
-        Number of samples visited.
+    The shape is (chains, extents, law), `samples` the points per fibre. Returns the number of samples visited.
     """
     fibres = along.shape[1]
     curve, column = np.empty(samples), np.empty(len(presses))
@@ -202,7 +157,7 @@ def quantized_signals(
         t, v = along[p, f], across[p, f]
         step = t[-1] / (samples - 1)
         pchip_sample(t, v, step, curve)
-        visited += sample_fibre_signals(t, v, curve, step, presses, family, select_frame(shape, family), column)
+        visited += _sample_fibre_signals(t, v, curve, step, presses, family, select_frame(shape, family), column)
         for q in range(len(presses)):
             out[p, q, f] = column[q]
     return visited
@@ -222,16 +177,7 @@ def quantize(signals: Any, levels: int, out: Any) -> None:
 
 @njit(cache=True, error_model="numpy")
 def compute_row_entropy(rows: Any, first: Any, end: int) -> float:
-    """Compute the joint entropy of the rows of a matrix by counting equal rows with sorted hashes (FNV-1a).
-
-    Args:
-        rows: whole numbers; shape (Q, C).
-        first: first column.
-        end: column to stop before.
-
-    Returns:
-        Entropy, bits.
-    """
+    """Compute the joint entropy, bits, of rows in columns first..end by counting equal sorted hashes (FNV-1a)."""
     count = len(rows)
     if count == 0:
         return 0.0
@@ -263,13 +209,8 @@ def sum_second_differences(levels: Any) -> float:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
-def sum_disorder(curves: Any, horizontals: int) -> float:
-    """Sum the negative parts of curve_j - curve_i over pairs i < j of each family.
-
-    Args:
-        curves: samples; shape (F, samples).
-        horizontals: number of fibres in the first family.
-    """
+def _sum_disorder(curves: Any, horizontals: int) -> float:
+    """Sum the negative parts of curve_j - curve_i over pairs i < j of each family; curves are (F, samples)."""
     total = 0.0
     for i in range(len(curves)):
         for j in range(i + 1, horizontals if i < horizontals else len(curves)):
@@ -293,20 +234,7 @@ def published_terms(
     end: int,
     out: Any,
 ) -> None:
-    """Compute entropy (summed over families), sharpness and disorder of pads begin..end.
-
-    Args:
-        along: knots along the axis; shape (P, F, n).
-        across: knots across it; shape (P, F, n).
-        horizontals: number of fibres, the first ones, that run along x.
-        presses: x and y; shape (Q, 2).
-        shape: as `select_frame` takes it.
-        samples: points per fibre.
-        levels: levels of the converter.
-        begin: first pad.
-        end: pad to stop before.
-        out: terms; shape (P, 3).
-    """
+    """Compute entropy (summed over families), sharpness and disorder of pads `begin` to `end`, into `out` (P, 3)."""
     fibres = along.shape[1]
     curves = np.empty((fibres, samples))
     signals, column = np.empty((len(presses), fibres)), np.empty(len(presses))
@@ -317,7 +245,7 @@ def published_terms(
             t, v, framed = along[p, f], across[p, f], select_frame(shape, family)
             step = t[-1] / (samples - 1)
             pchip_sample(t, v, step, curves[f])
-            sample_fibre_signals(t, v, curves[f], step, presses, family, framed, column)  # for a column, compiled anew
+            _sample_fibre_signals(t, v, curves[f], step, presses, family, framed, column)  # for a column, compiled anew
             for q in range(len(presses)):  # an assignment to a slice takes two seconds to compile
                 signals[q, f] = column[q]
         quantize(signals, levels, scaled)
@@ -325,7 +253,7 @@ def published_terms(
             scaled, horizontals, fibres
         )
         out[p, 1] = sum_second_differences(scaled)
-        out[p, 2] = sum_disorder(curves, horizontals)
+        out[p, 2] = _sum_disorder(curves, horizontals)
 
 
 @njit(cache=True, error_model="numpy")
@@ -371,14 +299,7 @@ def _integrate_area_above(t: Any, v: Any, d: Any, other_t: Any, other_v: Any, ot
 
 @njit(cache=True, error_model="numpy")
 def integrate_disorder(along: Any, across: Any, slope: Any, horizontals: int) -> float:
-    """Sum `_integrate_area_above` over pairs i < j of each family.
-
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots; shape (F, n).
-        horizontals: number of fibres in the first family.
-    """
+    """Sum `_integrate_area_above` over pairs i < j of each family."""
     total = 0.0
     for i in range(len(along)):
         for j in range(i + 1, horizontals if i < horizontals else len(along)):

@@ -146,9 +146,9 @@ def _fast_signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
     slope = population_slopes(along, across)[0]
     law = press_shape(contact, pad.unit_mm)[2]
     spacing = element_spacing(contact.profile_points(pad.unit_mm))
-    elements = fibre_elements(along[0], across[0], slope, ends.horizontals, presses, law.radius, spacing, law.length)
+    elements = fibre_elements(along[0], across[0], slope, ends.horizontals, presses, law, spacing)
     out = np.empty((len(presses), len(slope)))
-    element_signals(along[0], across[0], elements, presses, law.radius, law.profile, out)
+    element_signals(along[0], across[0], elements, presses, law, out)
     return out
 
 

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from padforge.design.common.validation import InputError
 from padforge.design.kernels.geometry import sum_overlaps
-from padforge.design.paths.bends import FOLD
-from padforge.design.paths.curves import common_stretches
+from padforge.design.paths.curves import FOLD, common_stretches
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 from padforge.design.torch_signals import pchip_sample, span_samples
@@ -272,7 +271,7 @@ def _common_tracks(fibres: FibreSamples) -> Tensor | None:
         long = stretches.length > limit
         middle = (stretches.begin[long] + stretches.end[long]) / 2
         pairs = one.start + stretches.line[long], other.start + stretches.other[long]
-        total += sum_overlaps(points, slope, arc, *pairs, middle, limit / 2, width, gradient)
+        total += sum_overlaps(points, slope, arc, pairs, middle, limit / 2, width, gradient)
     weight = COMMON_WEIGHT * limit / 4 / len(arc) / fibres.mean_run.item()  # the mean of two points, along either fibre
     value = weight * (total - (gradient * points).sum())
     return (torch.from_numpy(weight * gradient) * fibres.points).sum() + value

@@ -13,16 +13,21 @@ import shapely
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.bends import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, trace_curve
 from padforge.design.paths.curves import (
+    UNFOLDED,
     Crossing,
+    bend_radius,
     beziers,
     common_stretches,
     crossing_angles,
     crossings,
+    extreme_headings,
     flatten,
+    fold_gap,
     lengths,
+    rolled_turns,
     slope_beziers,
+    trace_curve,
 )
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings

@@ -12,7 +12,7 @@ from pymoo.core.repair import Repair
 from pymoo.core.termination import NoTermination
 from pymoo.operators.sampling.rnd import FloatRandomSampling
 
-from padforge.design.common.checkpoints import State
+from padforge.design.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.objectives.published import published_presses, published_terms
 from padforge.design.optimize.problem import SearchProblem

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padforge.design.common.checkpoints import State
+from padforge.design.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
 from padforge.design.objectives.expected_error import (
     SEARCH_SIDE,

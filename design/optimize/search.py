@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from padforge.design.common import profiling
-from padforge.design.common.checkpoints import Checkpoints, State
-from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_float, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology

@@ -71,27 +71,13 @@ class DrawnPlan:
     _points: int = 0
 
     def count_part(self) -> None:
-        """Count an element.
-
-        Raises:
-            InputError: there are more than MAX_PARTS.
-        """
+        """Count an element, and refuse more than MAX_PARTS."""
         self._parts += 1
         if self._parts > MAX_PARTS:
             raise InputError(f"more than {MAX_PARTS} elements, which is more than a drawing of fibres has")
 
     def add(self, name: str, points: Array, groups: Sequence[str] = (), closed: bool = False) -> None:
-        """Add a curve, unless it is a single point.
-
-        Args:
-            name: name of the curve.
-            points: vertices; shape (n, 2), in units of the drawing.
-            groups: names of groups that contain it.
-            closed: whether it ends where it begins.
-
-        Raises:
-            InputError: coordinates not finite or beyond MAX_COORDINATE, or too many points.
-        """
+        """Add a `DrawnCurve` unless it is a single point; refuse coordinates beyond MAX_COORDINATE, too many points."""
         self._points += len(points)
         if self._points > MAX_POINTS:
             raise InputError(f"more than {MAX_POINTS} points, which is more than a drawing of fibres has")
@@ -111,10 +97,7 @@ class DrawnPlan:
 
     @property
     def fibres(self) -> list[DrawnCurve]:
-        """Curves that are fibres, joined where one ends at another.
-
-        They are those named so (fibre, horizontal, vertical), or all open curves if none is.
-        """
+        """Curves named fibre, horizontal or vertical, or else all open ones, joined where one ends at another."""
         named = [curve for curve in self.curves if any(map(_FIBRES.match, curve.groups))]
         for curve in named:
             if curve.closed:
@@ -195,11 +178,7 @@ _MAX_USES = 8
 
 
 def read_svg(path: Path) -> DrawnPlan:
-    """Read the curves of an SVG. Lengths without a unit are pixels of 1/96 inch.
-
-    Raises:
-        InputError: the file cannot be read, or holds what no drawing of fibres does.
-    """
+    """Read the curves of an SVG; lengths without a unit are pixels of 1/96 inch."""
     content = read_bytes(path, MAX_BYTES)
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False, remove_comments=True, remove_pis=True
@@ -255,9 +234,8 @@ def _iterate_shapes(
 
 def _draw_shape(drawing: DrawnPlan, element: Any, matrix: Array, groups: tuple[str, ...]) -> None:
     """Add the curves of an element, none if it is no curve."""
-    kind = _kind(element)
+    kind, lines = _kind(element), list[tuple[Array, bool]]()
     name = next((group for group in reversed(groups) if group), f"{kind} {len(drawing.curves) + 1}")
-    lines: list[tuple[Array, bool]] = []
     if kind == "path":
         lines = _parse_path(element.get("d", ""), name)
     elif kind == "line":
@@ -334,20 +312,19 @@ def _viewport(element: Any, nested: bool = False) -> Array:
     if len(box) != 4:
         return unit @ origin
     if not (box[2] > 0 and box[3] > 0):
-        raise InputError(
-            f"{name}: viewBox is {short_repr(element.get('viewBox'))}, expected x, y, width, height above 0"
-        )
+        text = short_repr(element.get("viewBox"))
+        raise InputError(f"{name}: viewBox is {text}, expected x, y, width, height above 0")
     sides = [
         inner if element.get(side, "100%").strip().endswith("%") else _lengths(element, name, side)[0]
         for side, inner in zip(("width", "height"), box[2:], strict=True)
     ]
-    scale = [outer / inner for outer, inner in zip(sides, box[2:], strict=True)]
+    scale = np.divide(sides, box[2:])
     if element.get("preserveAspectRatio", "").strip() != "none":
-        scale = [min(scale)] * 2
+        scale[:] = scale.min()
     if not nested:  # the drawing's own origin is the one that was drawn from
         return unit @ np.diag([*scale, 1.0])
-    margins = [outer - inner * factor for outer, inner, factor in zip(sides, box[2:], scale, strict=True)]
-    return origin @ _shift(margins[0] / 2, margins[1] / 2) @ np.diag([*scale, 1.0]) @ _shift(-box[0], -box[1])
+    x, y = (sides - box[2:] * scale) / 2
+    return origin @ _shift(x, y) @ np.diag([*scale, 1.0]) @ _shift(-box[0], -box[1])
 
 
 def _transform(element: Any, name: str) -> Array:
@@ -388,11 +365,7 @@ _MAX_DEGREE = 9
 
 
 def read_dxf(path: Path) -> DrawnPlan:
-    """Read the curves of a DXF's modelspace, in units of $INSUNITS, mm without; blocks, hatches and text are ignored.
-
-    Raises:
-        InputError: the file cannot be read, or holds what no drawing of fibres does.
-    """
+    """Read the curves of a DXF's modelspace, in $INSUNITS or mm; blocks, hatches and text are ignored."""
     import ezdxf
     from ezdxf import path as paths
     from ezdxf import units

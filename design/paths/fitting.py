@@ -22,28 +22,22 @@ _LEVEL_TOLERANCE = 1e-9
 
 
 def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
-    """Give all fibres the same number of knots by adding spare ones that do not change the curve.
+    """Give all fibres the same number of knots (F, n, 2) by adding spare ones that do not change the curve.
 
     Args:
         paths: knots of each fibre, as in a morphology; shape (n, 2), grid units.
         layout: layout of the fibres.
-
-    Returns:
-        Knots; shape (F, n, 2), n that of the fibre with the most.
     """
     n_knots = max(map(len, paths))
     return np.stack([_add_spares(path, layout.family(i), n_knots - len(path)) for i, path in enumerate(paths)])
 
 
 def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
-    """Return the knots of each fibre without spare ones.
+    """Return the knots (n, 2) of each fibre without spare ones.
 
     Args:
         knots: shape (F, n, 2), grid units.
         layout: layout of the fibres.
-
-    Returns:
-        Knots of each fibre; shape (n, 2).
     """
     paths = []
     for fibre, line in enumerate(knots):
@@ -118,15 +112,12 @@ _MIN_SPAN = 2e-3
 
 
 def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
-    """Fit a PCHIP curve to a polyline; misfits are measured along the normal.
+    """Fit the knots (n, 2) of a PCHIP curve to a polyline; misfits are measured along the normal.
 
     Args:
         points: coordinates along, strictly ascending, and across; shape (m, 2).
         tolerance: largest misfit, in the unit of the points.
         max_inner: largest number of inner knots; with that many the tolerance may be exceeded.
-
-    Returns:
-        Knots from the first to the last point; shape (n, 2).
     """
     samples, weight = _sample(points)
     knots = samples[_find_turns(samples, tolerance)]
@@ -157,8 +148,7 @@ def _find_turns(samples: Array, tolerance: float) -> Ints:
 
     A PCHIP curve turns only at knots.
     """
-    across, turns, direction = samples[:, 1], [0], 0
-    extreme = 0
+    across, turns, direction, extreme = samples[:, 1], [0], 0, 0
     for k, value in enumerate(across):
         further = value - across[extreme]
         if direction == 0 and abs(value - across[0]) > tolerance:
@@ -196,8 +186,7 @@ def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float,
         inside = np.flatnonzero(span == k)[1:]
         if len(inside) and misfit[inside].max() > tolerance:
             worst.append(int(inside[np.argmax(misfit[inside])]))
-    worst.sort(key=lambda at: -misfit[at])
-    new = samples[worst[:limit]]
+    new = samples[sorted(worst, key=lambda at: -misfit[at])[:limit]]
     if not len(new):  # spans shorter than the distance of samples
         longest = int(np.argmax(np.diff(knots[:, 0])))
         new = knots[longest : longest + 2].mean(axis=0, keepdims=True)

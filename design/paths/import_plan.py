@@ -19,6 +19,7 @@ MAX_KNOTS = 64
 """Inner knots of a fibre, as of `[search] knots`."""
 MAX_CURVES_PER_FIBRE = 8
 """Beyond, messages on single curves would not help."""
+_FAMILIES = "horizontal", "vertical"
 _MAX_BACKTRACK_MM = 2e-4
 """Largest step backwards along the axis: files are rounded."""
 _MARGIN_MM = 1.0
@@ -63,19 +64,12 @@ class ImportedPlan:
 
 @dataclass(frozen=True)
 class _FibrePath:
-    """A curve on the pad.
-
-    Attributes:
-        name: name in the drawing.
-        fibre: index of the fibre whose ends are nearest.
-        points: coordinates along and across the fibre's axis, from border to border; shape (n, 2), mm from the middle.
-        error_mm: largest distance of its ends to the fibre's.
-    """
+    """A curve on the pad."""
 
     name: str
-    fibre: int
-    points: Array
-    error_mm: float
+    fibre: int  # the one whose ends are nearest
+    points: Array  # along and across the fibre's axis, from border to border; shape (n, 2), mm from the middle
+    error_mm: float  # largest distance of its ends to the fibre's
 
 
 def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan:
@@ -103,10 +97,8 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
         if not curves:
             raise InputError("there is no open curve in it")
         if len(curves) > MAX_CURVES_PER_FIBRE * layout.fibres:
-            raise InputError(
-                f"it has {len(curves)} open curves, expected {layout.fibres}, one a fibre; put these into a layer or"
-                " group whose name begins with fibre"
-            )
+            hint = "put these into a layer or group whose name begins with fibre"
+            raise InputError(f"it has {len(curves)} open curves, expected {layout.fibres}, one a fibre; {hint}")
         candidates, placement = _place_curves(drawing, curves, layout)
         fibre_paths = _match_fibres(candidates, layout, tolerance_mm)
         pad = Morphology.from_layout(_fit_paths(fibre_paths, layout, tolerance_mm), layout)
@@ -120,14 +112,12 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
 def _place_curves(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layout) -> tuple[list[_FibrePath], str]:
     """Return the curves on the pad, and a description of how the drawing was positioned."""
     size = np.array(layout.size_mm)
-    border = drawing.border
-    if border is not None:
+    if (border := drawing.border) is not None:
+        width, height = border[1] - border[0]
         ratio = (border[1] - border[0]) / size
         if not (ratio > 0).all() or abs(ratio[0] / ratio[1] - 1) > _ASPECT_TOLERANCE:
-            width, height = border[1] - border[0]
-            raise InputError(
-                f"pad is drawn {width:g} by {height:g}, expected the shape of {size[0]:g} by {size[1]:g} mm"
-            )
+            shape = f"{size[0]:g} by {size[1]:g} mm"
+            raise InputError(f"pad is drawn {width:g} by {height:g}, expected the shape of {shape}")
         lines = [(curve.points - border.mean(axis=0)) / ratio for curve in curves]
         return _assign_curves(curves, lines, layout), "the border is that named pad"
     lines = [curve.points * drawing.unit_mm for curve in curves]
@@ -189,10 +179,8 @@ def _assign_to_family(name: str, line: Array, family: int, layout: Layout) -> _F
     if backtrack.max() > _MAX_BACKTRACK_MM:
         at = int(np.argmax(backtrack > _MAX_BACKTRACK_MM))
         position = _format_position(np.array([t[at], v[at]]), family)
-        raise InputError(
-            f"{name}: turns back at {position}, expected a curve that goes on along {'xy'[family]} as a "
-            f"{('horizontal', 'vertical')[family]} fibre does"
-        )
+        expected = f"a curve that goes on along {'xy'[family]} as a {_FAMILIES[family]} fibre does"
+        raise InputError(f"{name}: turns back at {position}, expected {expected}")
     is_ascending = np.append(True, t[1:] > np.maximum.accumulate(t)[:-1] + 1e-7)
     t, v = t[is_ascending], v[is_ascending]
     # 3. from border to border
@@ -215,13 +203,12 @@ def _match_fibres(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: flo
         name = _fibre_name(path.fibre, layout)
         if path.error_mm > tolerance_mm:
             begin, end = (_format_position(path.points[at], family) for at in (0, -1))
-            raise InputError(
-                f"{path.name}: runs from {begin} to {end}, {path.error_mm:.3g} mm from where {name} ends; allowed"
-                f" is {tolerance_mm:g} mm (--tolerance-mm) on a pad of {layout}"
-            )
+            allowed = f"{tolerance_mm:g} mm (--tolerance-mm) on a pad of {layout}"
+            error = f"{path.error_mm:.3g} mm from where {name} ends; allowed is {allowed}"
+            raise InputError(f"{path.name}: runs from {begin} to {end}, {error}")
         if path.fibre in by_fibre:
-            other = by_fibre[path.fibre].name
-            raise InputError(f"{other} and {path.name}: both are {name}, expected one curve a fibre")
+            both = f"{by_fibre[path.fibre].name} and {path.name}"
+            raise InputError(f"{both}: both are {name}, expected one curve a fibre")
         offset = np.abs(path.points[:, 1])
         if offset.max() > layout.size_mm[1 - family] / 2 + tolerance_mm:
             position = _format_position(path.points[int(np.argmax(offset))], family)
@@ -248,11 +235,7 @@ def _fit_paths(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: float)
 
 
 def _check_fit(line: Array, path: _FibrePath, layout: Layout, tolerance_mm: float) -> ImportedFibre:
-    """Compare a fibre (n, 2), grid units, with its path.
-
-    Raises:
-        InputError: they differ by more than the tolerance.
-    """
+    """Compare a fibre (n, 2), grid units, with its path, and refuse a difference beyond the tolerance."""
     family = layout.family(path.fibre)
     fitted = (line - np.array(layout.extent) / 2) * layout.unit_mm
     drawn = path.points if family == 0 else path.points[:, ::-1]
@@ -261,16 +244,14 @@ def _check_fit(line: Array, path: _FibrePath, layout: Layout, tolerance_mm: floa
     error_mm = float(max(to_fitted.max(), to_drawn.max()))
     if error_mm > max(tolerance_mm, path.error_mm) * 1.05:
         position = _format_position(fitted[int(np.argmax(to_drawn))], 0)
-        raise InputError(
-            f"{path.name}: {MAX_KNOTS} knots keep within {error_mm:.3g} mm of it, at {position}; allowed is"
-            f" {tolerance_mm:g} mm (--tolerance-mm)"
-        )
+        error = f"{MAX_KNOTS} knots keep within {error_mm:.3g} mm of it, at {position}"
+        raise InputError(f"{path.name}: {error}; allowed is {tolerance_mm:g} mm (--tolerance-mm)")
     return ImportedFibre(path.name, path.error_mm, error_mm)
 
 
 def _fibre_name(fibre: int, layout: Layout) -> str:
     family = layout.family(fibre)
-    return f"{('horizontal', 'vertical')[family]} {fibre - layout.families[family].start + 1}"
+    return f"{_FAMILIES[family]} {fibre - layout.families[family].start + 1}"
 
 
 def _format_position(point: Array, family: int) -> str:

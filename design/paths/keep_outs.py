@@ -40,39 +40,26 @@ def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
                 end = (along, level) if family == 0 else (level, along)
                 distance_mm = polygon.distance(shapely.Point(end)) * layout.unit_mm
                 if distance_mm < rules.keep_out_mm or distance_mm == 0:
-                    x, y = ((a - size / 2) * layout.unit_mm for a, size in zip(end, layout.extent, strict=True))
-                    raise InputError(
-                        f"[pad] keep_out_mm: polygon {number} is {distance_mm:.3g} mm from an end of fibre "
-                        f"{fibre + 1}, at ({x:.4g}, {y:.4g}) mm, allowed is {rules.keep_out_mm:g} or more "
-                        "([rules] keep_out_mm)"
-                    )
+                    x, y = (np.array(end) - np.array(layout.extent) / 2) * layout.unit_mm
+                    end_name = f"an end of fibre {fibre + 1}, at ({x:.4g}, {y:.4g}) mm"
+                    allowed = f"{rules.keep_out_mm:g} or more ([rules] keep_out_mm)"
+                    error = f"polygon {number} is {distance_mm:.3g} mm from {end_name}, allowed is {allowed}"
+                    raise InputError(f"[pad] keep_out_mm: {error}")
 
 
 def is_outside(positions: NDArray[np.float64], pad: PadSettings) -> NDArray[np.bool_]:
-    """Whether positions lie outside all keep-outs.
+    """Whether positions (Q,) lie outside all keep-outs.
 
     Args:
         positions: shape (Q, 2), grid units.
         pad: the pad and its keep-outs.
-
-    Returns:
-        Mask; shape (Q,).
     """
-    free = np.ones(len(positions), bool)
-    for polygon in keep_outs(pad):
-        free &= ~shapely.intersects_xy(polygon, positions)
-    return free
+    polygons = np.array(keep_outs(pad), dtype=object)
+    return ~shapely.intersects_xy(polygons[:, None], *positions.T).any(axis=0)
 
 
 class _Passage:
-    """How one family passes one keep-out: lanes beside it that fibres enter and leave smoothly.
-
-    Args:
-        box: low and high corner of the keep-out; shape (2, 2), grid units.
-        family: 0 of horizontals, 1 of verticals.
-        pad: the pad.
-        rules: distances and bend radius to keep.
-    """
+    """How one family passes one keep-out, a box (2, 2): lanes beside it that fibres enter and leave smoothly."""
 
     def __init__(self, box: Array, family: int, pad: PadSettings, rules: RulesSettings) -> None:
         layout = pad.layout
@@ -126,9 +113,6 @@ def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Arra
         knots: shape (F, N + 2, 2), grid units.
         pad: the pad and its keep-outs.
         rules: distances and bend radius to keep.
-
-    Returns:
-        Knots; shape (F, N + 2, 2), grid units.
     """
     shifted = knots.copy()
     for family, rows in enumerate(pad.layout.families):
@@ -140,15 +124,12 @@ def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Arra
 
 
 def straight_paths(pad: PadSettings, rules: RulesSettings, count: int) -> Array:
-    """Return the knots of straight fibres that bow around keep-outs where the rules are enforced.
+    """Return the knots (F, count + 2, 2) of straight fibres that bow around keep-outs if the rules are enforced.
 
     Args:
         pad: the pad and its keep-outs.
         rules: distances and bend radius to keep.
         count: inner knots per fibre.
-
-    Returns:
-        Knots; shape (F, count + 2, 2), grid units.
     """
     layout = pad.layout
     marks = []

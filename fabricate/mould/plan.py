@@ -18,8 +18,16 @@ from shapely.geometry.base import BaseGeometry
 
 from padforge.design.common.validation import InputError, check_type
 from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.bends import trace_curve
-from padforge.design.paths.curves import Crossing, beziers, common_stretches, crossings, flatten, lengths, slope_beziers
+from padforge.design.paths.curves import (
+    Crossing,
+    beziers,
+    common_stretches,
+    crossings,
+    flatten,
+    lengths,
+    slope_beziers,
+    trace_curve,
+)
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import Layout
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings

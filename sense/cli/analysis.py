@@ -79,8 +79,8 @@ def fibre_loss(
     worst set of each size, and without those fibres that --failed names. Retrained networks that are done are
     kept when it is broken off, and the same command goes on from them.
     """
-    from padforge.design.common.checkpoints import Checkpoints
     from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.design.common.parallel import Checkpoints
     from padforge.sense.localizer.calibration.fibre_loss_study import fibre_loss_lines, fibre_loss_study
     from padforge.sense.localizer.localizer import Localizer
     from padforge.sense.recordings.import_export import open_recording

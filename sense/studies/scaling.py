@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.checkpoints import State
+from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals

@@ -12,9 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.checkpoints import Checkpoints, State
 from padforge.design.common.files import provenance, write_json, write_text
-from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:

@@ -116,7 +116,7 @@ def test_press_visits_only_spans_below_it():
 def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
     settings = SearchSettings(knots=1, starts=2, steps=2, max_failures=0)
     asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
-    monkeypatch.setattr("padforge.design.common.checkpoints.Checkpoints.clear", lambda self: None)
+    monkeypatch.setattr("padforge.design.common.parallel.Checkpoints.clear", lambda self: None)
     with profiling.profiled() as profile:
         first = search(*asked, run=SearchOptions(keep_in=tmp_path / "search"))
     assert profile.counts["starts"] == [2, 2]

@@ -15,8 +15,8 @@ from safetensors.numpy import load_file
 
 import padforge.design.design_run
 import padforge.sense.report.calibration_results
-from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.files import sha256
+from padforge.design.common.parallel import Checkpoints
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
 

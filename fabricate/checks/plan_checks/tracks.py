@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from shapely import ops
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.paths.bends import bend_radius, trace_curve
-from padforge.design.paths.curves import beziers, flatten, slope_beziers
+from padforge.design.paths.curves import bend_radius, beziers, flatten, slope_beziers, trace_curve
 from padforge.fabricate.checks.findings import Finding, Status, as_places, graded, verdict
 from padforge.fabricate.mould.plan import COVER_MM, INTO_WALL_MM, Plan, areas, overlap, without
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
-from padforge.design.common.server import END_S, POLL_S, ConnectionServer, bind_server, check_exposure
+from padforge.design.common.server import ConnectionServer
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
@@ -54,8 +54,7 @@ class Lines:
         Raises:
             InputError: the port is taken, or not for this user, or others could listen without a token.
         """
-        check_exposure(host, token)
-        self._server = bind_server(lambda: _LineServer((host, port), token), host, port, "--tcp")
+        self._server = _LineServer((host, port), token)
         self.address: tuple[str, int] = self._server.server_address[:2]  # type: ignore[assignment]
         self._number = 0
 
@@ -66,23 +65,19 @@ class Lines:
         self._server.tell(line, kept=message.topic == HEALTH)
 
     def __enter__(self) -> Self:
-        name = "server of lines"
-        threading.Thread(target=self._server.serve_forever, args=(POLL_S,), name=name, daemon=True).start()
+        self._server.__enter__()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._server.shutdown()
-        self._server.end(END_S)
-        self._server.server_close()
+        self._server.__exit__()
 
 
 class _LineServer(ConnectionServer):
     def __init__(self, address: tuple[str, int], token: str) -> None:
-        self.token = token.encode()
         self._clients: set[_Client] = set()
         self._kept: bytes | None = None
         self._changed = threading.Condition()
-        super().__init__(address, _Client)
+        super().__init__(address, _Client, token, "--tcp")
 
     def tell(self, line: bytes, kept: bool = False) -> None:
         """Give a line to all who listen, and if it is `kept` to those who come later."""
@@ -91,12 +86,12 @@ class _LineServer(ConnectionServer):
             for client in self._clients:
                 client.take(line)
 
-    def end(self, wait_s: float) -> None:
-        """There will be no more; waits until all who listen have been sent all, for `wait_s` at most."""
+    def end(self, timeout_s: float) -> None:
+        """There will be no more; waits until all who listen have been sent all, for `timeout_s` at most."""
         with self._changed:
             for client in self._clients:
                 client.take(None)
-            self._changed.wait_for(lambda: not self._clients, wait_s)
+            self._changed.wait_for(lambda: not self._clients, timeout_s)
 
     def join(self, client: "_Client") -> bool:
         with self._changed:
@@ -129,7 +124,7 @@ class _Client(socketserver.StreamRequestHandler):
             self._behind = True
 
     def handle(self) -> None:
-        token = self.server.token
+        token = self.server.token.encode()
         if token and not hmac.compare_digest(self.rfile.readline(len(token) + 2).rstrip(b"\r\n"), token):
             return
         self.server.admit(self.request)

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.checkpoints import Checkpoints, State
 from padforge.design.common.files import provenance
-from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_int, check_path, check_type, short_repr
 from padforge.design.objectives.fibre_loss import failure_subsets

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.checkpoints import State
+from padforge.design.common.parallel import State
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology

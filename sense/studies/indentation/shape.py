@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.checkpoints import State
+from padforge.design.common.parallel import State
 from padforge.design.common.plotting import INK, add_title, draw_confusions
 from padforge.design.contact import signals
 from padforge.design.indentation import Indenter, indented_signals

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.checkpoints import Checkpoints
+from padforge.design.common.parallel import Checkpoints
 from padforge.design.common.validation import InputError
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
@@ -58,7 +58,7 @@ def test_checkpoints_limit_the_unpacked_size_and_clear_only_states(
         for name, each in content.items():
             packed.writestr(name, each)
     assert path.stat().st_size < 2000
-    monkeypatch.setattr("padforge.design.common.checkpoints.MAX_BYTES", 50_000)
+    monkeypatch.setattr("padforge.design.common.files.MAX_BYTES", 50_000)
     with pytest.raises(InputError, match=r"start_0000\.npz: .*unpacks to more than 50000 bytes"):
         kept.begin(resume=True)
     kept = Checkpoints(tmp_path / "search", {"search": {}})

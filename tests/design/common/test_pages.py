@@ -101,7 +101,7 @@ def test_token_is_required_under_any_host_name() -> None:
         assert asked("/", Authorization="Bearer another") == 403
     for host, token in (("0.0.0.0", ""), ("::", ""), ("", ""), ("0.0.0.0", "short")):
         with pytest.raises(InputError, match="token"):
-            LocalPage(0, PAGE, host=host, token=token)
+            LocalPage(0, PAGE, {}, host=host, token=token)
 
 
 def test_incomplete_posts_and_malformed_addresses_are_refused_silently(
@@ -111,7 +111,7 @@ def test_incomplete_posts_and_malformed_addresses_are_refused_silently(
     for asked in (b"GET http://[ HTTP/1.0", b"POST http://[x]y/double HTTP/1.0"):
         with socket.create_connection((HOST, port_of(page)), timeout=10) as stranger:
             stranger.sendall(asked + b"\r\n\r\n")
-            assert stranger.recv(100).split()[1] == b"400"
+            assert stranger.recv(100).split()[1] == b"403"
     assert posted(page, b"1").status == 200
     assert capfd.readouterr().err == ""
     asked = f"POST /double HTTP/1.0\r\nHost: {HOST}:{port_of(page)}\r\nOrigin: http://{HOST}:{port_of(page)}\r\n"

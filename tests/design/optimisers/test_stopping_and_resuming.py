@@ -17,8 +17,8 @@ import pytest
 from padforge.cli import cli
 from padforge.design import InputError, PadSettings, RulesSettings, SearchOptions, SearchSettings, search
 from padforge.design.common import parallel as computing
-from padforge.design.common.checkpoints import Checkpoints
 from padforge.design.common.command_line import run_to_end
+from padforge.design.common.parallel import Checkpoints
 from padforge.design.optimize import search as stopping
 
 PAD = PadSettings(grid=1)

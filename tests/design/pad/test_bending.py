@@ -7,8 +7,16 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, flatten
-from padforge.design.paths.bends import FOLD, UNFOLDED, bend_radius, extreme_headings, fold_gap, trace_curve
-from padforge.design.paths.curves import beziers, slope_beziers
+from padforge.design.paths.curves import (
+    FOLD,
+    UNFOLDED,
+    bend_radius,
+    beziers,
+    extreme_headings,
+    fold_gap,
+    slope_beziers,
+    trace_curve,
+)
 from tests.design.pad.wild_pads import SEEDS, wild_pads
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])

@@ -11,7 +11,7 @@ from padforge.design.contact import fibre_axes
 from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
-from padforge.design.paths.bends import bend_radius, rolled_turns
+from padforge.design.paths.curves import bend_radius, rolled_turns
 from padforge.design.paths.keep_outs import check_fibre_ends, is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 

@@ -78,7 +78,6 @@ REFUSED = [
     *((lambda x=x: Morphology.from_layout(PAD.knots, x), r"layout is .*, expected a Layout") for x in ODD),
     (lambda: Morphology(PAD.knots, provenance={"noise": np.nan}), "provenance is .*, expected JSON"),
     (lambda: Morphology(PAD.knots, provenance=[1]), "provenance is .*, expected a table"),  # pyright: ignore
-    *((lambda x=x: Morphology.from_parameters(x), "parameters") for x in (np.empty((0, 0)), np.ones((2, 8)) * 1j)),
 ]
 
 

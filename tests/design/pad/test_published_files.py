@@ -141,8 +141,8 @@ def boasting(file: h5py.File) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (external, "para has its values in other files"),
-        (virtual, "para has its values in other files"),
+        (external, "has no variable para"),
+        (virtual, "has no variable para"),
         (linked, "has no variable para"),
         (boasting, "para claims 536870912 bytes of float64 in 0 of the file"),
     ],
@@ -196,9 +196,9 @@ BOMBS = {
         packed(variable(6, (MUCH, MUCH), element(9, bytes(8)))),
         f"voltage claims {MUCH**2} values in 8 bytes",
     ),
-    "dimensions": (packed(variable(6, (MUCH,) * 2**17, element(9, bytes(8)))), "voltage has 131072 dimensions"),
+    "dimensions": (packed(variable(6, (MUCH,) * 2**17, element(9, bytes(8)))), "voltage has shape"),
     "a long element": (struct.pack("<II", 14, 2**31), "it ends early"),
-    "zeros": (zeros(2**28), "it unpacks to more than 67108864 bytes"),
+    "zeros": (zeros(2**28), "unpacks to more than 67108864 bytes"),
     "bytes that are numbers": (zeros(2**25), "it holds more than 8388608 values"),
 }
 

@@ -148,7 +148,7 @@ def test_the_client_of_the_docs_prints_places(tmp_path: Path) -> None:
 
 
 def test_without_the_token_nothing_is_heard() -> None:
-    with pytest.raises(InputError, match="whoever knows a token may listen"):
+    with pytest.raises(InputError, match="state a token"):
         Lines("0.0.0.0", 0)
     with Lines("127.0.0.1", 0, TOKEN) as lines:
         lines.tell(STATES)

@@ -1,0 +1,72 @@
+"""Docstrings of design as mkdocstrings reads them: complete for what is exported, never half complete elsewhere."""
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import griffe
+
+ROOT = Path(__file__).parents[2]
+
+
+@cache
+def design() -> Any:
+    return griffe.load("padforge.design", search_paths=[ROOT / "typings"], docstring_parser="google")
+
+
+def public_functions(parent: Any) -> Iterator[Any]:
+    """Functions and methods below `parent` with public names; constructors of classes that define one."""
+    for name, member in parent.members.items():
+        if member.is_alias or (name.startswith("_") and name != "__init__"):
+            continue
+        if member.is_function:
+            yield member
+        elif member.is_module or member.is_class:
+            yield from public_functions(member)
+
+
+def parameters(function: Any) -> set[str]:
+    return {parameter.name for parameter in function.parameters} - {"self", "cls"}
+
+
+def stated_parameters(function: Any) -> set[str] | None:
+    """Names that the docstring states, of a constructor also those of its class; None without such a section."""
+    owners = [function, *([function.parent] if function.name == "__init__" else [])]
+    sections = [section for owner in owners if owner.docstring for section in owner.docstring.parsed]
+    kinds = griffe.DocstringSectionKind.parameters, griffe.DocstringSectionKind.attributes
+    stated = [section.value for section in sections if section.kind in kinds]
+    return {item.name.lstrip("*") for items in stated for item in items} if stated else None
+
+
+def exported() -> Iterator[Any]:
+    """What `padforge.design` exports, as it is defined."""
+    for node in ast.parse((ROOT / "design" / "__init__.pyi").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom):
+            for name in node.names:
+                member = design()
+                for part in f"{node.module}.{name.name}".split("."):
+                    member = member.members[part]
+                yield member
+
+
+def test_docstrings_of_exported_functions_state_every_parameter() -> None:
+    missing = {
+        function.path: parameters(function) - (stated_parameters(function) or set())
+        for member in exported()
+        for function in ([member] if member.is_function else public_functions(member) if member.is_class else [])
+        if not (function.name == "__init__" and "dataclass" in member.labels)
+    }
+    assert len(missing) > 30
+    assert {path: names for path, names in missing.items() if names} == {}
+
+
+def test_docstrings_that_state_parameters_state_all_of_them_and_no_other() -> None:
+    partial = {
+        function.path: parameters(function) ^ stated
+        for function in public_functions(design())
+        if (stated := stated_parameters(function)) is not None and function.name != "__init__"
+    }
+    assert len(partial) > 100
+    assert {path: names for path, names in partial.items() if names} == {}
