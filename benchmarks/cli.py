@@ -35,8 +35,7 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
     from dataclasses import asdict
     from pkgutil import resolve_name
 
-    from padforge.benchmarks.harness import run_benches
-    from padforge.benchmarks.results import bench_lines, comparison_lines, read_earlier, summary_lines
+    from padforge.benchmarks.harness import bench_lines, comparison_lines, read_earlier, run_benches, summary_lines
 
     earlier = read_earlier(against) if against else {}
     names = tuple(dict.fromkeys(names)) or tuple(name for name in BENCHES if not earlier or name in earlier)

@@ -1,7 +1,8 @@
 """Error of filters on a simulated fibre against run time, and how near robust filters come to the optimum."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -36,25 +37,20 @@ def trials() -> Iterator[BenchTrial]:
     clean, noisy = fibre(READINGS, np.random.default_rng(0))
     minimum = cache(lambda: objective(noisy, linear_program(noisy, PUBLISHED), PUBLISHED))
 
-    def evaluate(filtered: Array) -> Mapping[str, float | None]:
+    def evaluate(solves: bool, filtered: Array) -> Mapping[str, float | None]:
         error = np.sqrt(((filtered - clean) ** 2).mean() / ((noisy - clean) ** 2).mean())
-        return {"error": float(error), "excess": None}
+        excess = objective(noisy, filtered, PUBLISHED) / minimum() - 1 if solves else None
+        return {"error": float(error), "excess": excess}
 
-    def evaluate_solver(filtered: Array) -> Mapping[str, float | None]:
-        excess = objective(noisy, filtered, PUBLISHED) / minimum() - 1
-        return {**evaluate(filtered), "excess": excess}
+    def trial(way: str, size: float, work: Callable[..., Array], *options: Any) -> BenchTrial:
+        solves = way in ("LP (HiGHS)", "iterative") or (way, size) == ("robust", PUBLISHED)
+        return BenchTrial(f"{READINGS} readings", way, size, partial(work, noisy, *options), partial(evaluate, solves))
 
-    case = f"{READINGS} readings"
-    for lam in LAMS:
-        evaluation = evaluate_solver if lam == PUBLISHED else evaluate
-        yield BenchTrial(case, "robust", lam, partial(total_variation, noisy, lam), evaluation)
-    for lam in LAMS_V:
-        yield BenchTrial(case, "squares", lam, partial(total_variation, noisy, lam, "squares"), evaluate)
-    for width in WIDTHS:
-        yield BenchTrial(case, "median", width, partial(running_median, noisy, width), evaluate)
-    yield BenchTrial(case, "LP (HiGHS)", PUBLISHED, partial(linear_program, noisy, PUBLISHED), evaluate_solver)
-    for steps in STEPS:
-        yield BenchTrial(case, "iterative", steps, partial(admm, noisy, PUBLISHED, steps), evaluate_solver)
+    yield from (trial("robust", lam, total_variation, lam) for lam in LAMS)
+    yield from (trial("squares", lam, total_variation, lam, "squares") for lam in LAMS_V)
+    yield from (trial("median", width, running_median, width) for width in WIDTHS)
+    yield trial("LP (HiGHS)", PUBLISHED, linear_program, PUBLISHED)
+    yield from (trial("iterative", steps, admm, PUBLISHED, steps) for steps in STEPS)
     for count in LONG:
         readings = fibre(count, np.random.default_rng(0))[1]
         for way, size, work in (
@@ -76,8 +72,7 @@ def fibre(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         count: number of readings.
         rng: draws presses and noise.
     """
-    presses = -(-count // PERIOD)
-    phase = np.arange(PERIOD // 2)
+    presses, phase = -(-count // PERIOD), np.arange(PERIOD // 2)
     height = rng.uniform(0.01, 0.1, presses) * (rng.random(presses) < 0.5)
     pressed = 1 - 0.2 * (1 - np.exp(-phase / 8))
     released = -0.1 * np.exp(-phase / 5)

@@ -35,7 +35,6 @@ FEATURES = ("published", "full")
 MARQUARDT = ("published",)
 """Features for Levenberg-Marquardt: with F times as many, each step takes F^2 to F^3 as long."""
 BATCH, ADAM_RATE = 128, 3e-3
-
 Predict = Callable[[Array], Array]
 
 
@@ -45,8 +44,7 @@ def trials() -> Iterator[BenchTrial]:
         for features in FEATURES:
             yield from _trainings(features)
         # the time of a prediction does not depend on the training
-        _, table, inputs, targets = _scaled(FEATURES[0])
-        press = inputs[:1].reshape(1, -1).astype(np.float64)
+        press = _scaled(FEATURES[0])[2][:1].reshape(1, -1).astype(np.float64)
         rng = np.random.default_rng(0)
         published = _PublishedNetwork(rng.standard_normal((10, press.size)), rng.standard_normal((10, 2)))
         yield BenchTrial("one press", "published", 0, partial(published, press))

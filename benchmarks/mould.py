@@ -52,16 +52,12 @@ def trials() -> Iterator[BenchTrial]:
                         f"N={knots}", way, 1000 * tolerance_mm, partial(work, plan), partial(evaluate, plan)
                     )
         plan = partial(_plan, pad)
-        work, evaluate = partial(_curved_solid, plan), partial(_evaluate_solid, plan)
-        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FITS_MM[0], work, evaluate)
+        work = partial(lambda plan: mould_model(plan(), "mould").shape, plan)
+        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FITS_MM[0], work, partial(_evaluate_solid, plan))
 
 
 def _plan(pad: Morphology, tolerance_mm: float = DEFAULTS.mould.tolerance_mm) -> Plan:
     return Plan(pad, replace(DEFAULTS, mould=MouldSettings(tolerance_mm=tolerance_mm, number_mm=0)))
-
-
-def _curved_solid(new_plan: Callable[[], Plan]) -> Any:
-    return mould_model(new_plan(), "mould").shape
 
 
 def _evaluate_mesh(new_plan: Callable[[], Plan], mesh: Any) -> Mapping[str, float]:

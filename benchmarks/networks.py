@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.benchmarks import harness
+from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
@@ -31,7 +31,7 @@ FAILED, SETS = 2, 14
 MAX_DAMPING = 1e10
 
 
-def trials() -> Iterator[harness.BenchTrial]:
+def trials() -> Iterator[BenchTrial]:
     """Yield the networks for SETS sets of failed fibres of two 4 x 4 pads by both ways.
 
     Both ways train on the same samples and are tested on the same fresh presses; the plain way uses as many threads as
@@ -41,12 +41,9 @@ def trials() -> Iterator[harness.BenchTrial]:
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
             presses = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
             failures = failure_subsets(len(pad.knots), FAILED, SETS)
-            evaluate = partial(_evaluate, presses, failures)
-            for way, work in (
-                ("batched", partial(presses.fit, failures, HIDDEN)),
-                ("plain numpy", partial(_fit_all_plain, presses, failures)),
-            ):
-                yield harness.BenchTrial(case, way, 0, work, evaluate, items=SETS)
+            batched, plain = partial(presses.fit, failures, HIDDEN), partial(_fit_all_plain, presses, failures)
+            for way, work in (("batched", batched), ("plain numpy", plain)):
+                yield BenchTrial(case, way, 0, work, partial(_evaluate, presses, failures), items=SETS)
 
 
 def _evaluate(
@@ -123,7 +120,7 @@ def _jacobian(x: Array, neurons: Array, output: Array) -> Array:
     return np.stack(blocks, axis=1).reshape(samples * outputs, -1)
 
 
-BENCH = harness.Bench(
+BENCH = Bench(
     "networks",
     trials,
     "mean error (grid units)",

@@ -11,14 +11,7 @@ from padforge.benchmarks.contact import KNOTS, PUBLISHED, SAMPLES, plain_signals
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
-from padforge.design.objectives.published import (
-    disorder_area,
-    joint_entropy,
-    published_objective,
-    published_presses,
-    published_sharpness,
-    quantize,
-)
+from padforge.design.objectives import published
 from padforge.design.settings import PUBLISHED_CONTACT
 
 BETA, GAMMA = 1e-7, 5e-6
@@ -37,22 +30,22 @@ def trials() -> Iterator[BenchTrial]:
         for samples in SAMPLES:
             gamma = GAMMA * (PUBLISHED - 1) / (samples - 1)  # disorder is a sum over samples
             yield BenchTrial(case, "plain", samples, partial(plain_objective, pad, samples, gamma), evaluate)
-            compiled = partial(published_objective, pad, samples=samples, weights=(1.0, BETA, gamma))
+            compiled = partial(published.published_objective, pad, samples=samples, weights=(1.0, BETA, gamma))
             yield BenchTrial(case, "compiled", samples, compiled, evaluate)
         yield BenchTrial(case, "exact", 0, partial(exact_objective, pad))  # the reference of the errors
 
 
 def exact_objective(pad: Morphology) -> float:
     """Compute the published objective from exact signals and the exact area of disorder."""
-    levels = quantize(signals(pad, published_presses(pad.grid), PUBLISHED_CONTACT))
-    entropy = joint_entropy(levels[:, : pad.grid]) + joint_entropy(levels[:, pad.grid :])
-    disorder = disorder_area(pad) * (PUBLISHED - 1) / (pad.grid + 1)
-    return 1 / (1 + entropy) + BETA * published_sharpness(levels) + GAMMA * disorder
+    levels = published.quantize(signals(pad, published.published_presses(pad.grid), PUBLISHED_CONTACT))
+    entropy = published.joint_entropy(levels[:, : pad.grid]) + published.joint_entropy(levels[:, pad.grid :])
+    disorder = published.disorder_area(pad) * (PUBLISHED - 1) / (pad.grid + 1)
+    return 1 / (1 + entropy) + BETA * published.published_sharpness(levels) + GAMMA * disorder
 
 
 def plain_objective(pad: Morphology, samples: int = PUBLISHED, gamma: float = GAMMA) -> float:
     """Compute the published objective from `plain_signals` by NumPy alone."""
-    responses = plain_signals(pad, published_presses(pad.grid), PUBLISHED_CONTACT, samples)
+    responses = plain_signals(pad, published.published_presses(pad.grid), PUBLISHED_CONTACT, samples)
     span = np.ptp(responses, axis=0)
     levels = np.ceil((responses - responses.min(axis=0)) / np.where(span > 0, span, 1) * 4096)
     entropy = disorder = 0.0

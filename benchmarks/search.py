@@ -36,12 +36,10 @@ def trials() -> Iterator[BenchTrial]:
     as the genetic search does, and with them.
     """
     unconstrained = RulesSettings(enforce=False)
-    ways: list[tuple[str, int, dict[str, Any], RulesSettings]] = [
-        ("genetic", n, {"method": "genetic", "generations": n}, unconstrained) for n in GENERATIONS
-    ]
-    for steps in STEPS:
-        ways.append(("descent", steps, {"starts": 1, "steps": steps}, unconstrained))
-        ways.append(("with rules", steps, {"starts": 1, "steps": steps}, RulesSettings()))
+    ways = [("genetic", n, {"method": "genetic", "generations": n}, unconstrained) for n in GENERATIONS]
+    for n in STEPS:
+        for way, rules in (("descent", unconstrained), ("with rules", RulesSettings())):
+            ways.append((way, n, {"starts": 1, "steps": n}, rules))
     for knots in KNOTS:
         for way, size, changes, rules in ways:
             for seed in SEEDS:
@@ -54,9 +52,8 @@ def trials() -> Iterator[BenchTrial]:
 def evaluate_pad(result: SearchResult) -> Mapping[str, float]:
     """Return the localisation errors with up to three failed fibres, their mean, and the number of broken rules."""
     errors = [level.mean for level in localisation_error(result.morphology, subsets=SUBSETS)]
-    violations = len(check_rules(result.morphology, RulesSettings()))
-    by_failures = {f"failed_{number}": error for number, error in enumerate(errors)}
-    return {"error": sum(errors) / len(errors), "violations": violations, **by_failures}
+    row = {"error": sum(errors) / len(errors), "violations": len(check_rules(result.morphology, RulesSettings()))}
+    return row | {f"failed_{number}": error for number, error in enumerate(errors)}
 
 
 BENCH = Bench(

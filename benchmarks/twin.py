@@ -5,6 +5,7 @@ the plan as designed, with the true wiring and pose, and a smooth function of po
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -27,7 +28,7 @@ from padforge.sense.twin.responses import responses
 PRESSES = (150, 300, 600, 1500, 3000)
 TEST = 400
 GRID, KNOTS = 4, 5
-WORLDS: Mapping[str, tuple[str, float, int]] = {
+WORLDS = {
     "gaussian, 0.5 mm, 1 dead": ("gaussian", 0.5, 1),
     "disc, 1 mm, 2 dead": ("disc", 1.0, 2),
     "skirted, 2 mm, 3 dead": ("skirted", 2.0, 3),
@@ -36,7 +37,6 @@ WORLDS: Mapping[str, tuple[str, float, int]] = {
 PLAN_CONTACT = Contact(radius=0.6)
 """Contact of the baseline that believes the plan."""
 
-PROFILES = ("gaussian", "disc", "skirted")
 WIDTH = 0.55
 """Standard deviation of the Gaussian profile, grid units; the others are about as wide."""
 GAIN_V, GAIN_SD = -0.5, 0.2
@@ -56,8 +56,8 @@ def trials() -> Iterator[BenchTrial]:
                 yield BenchTrial(world, way, presses, partial(fit, world, presses), partial(_evaluate, world))
 
 
-def sensitivity_profile(kind: str) -> tuple[Array, Array]:
-    """Return distances in grid units and weights of one of PROFILES; shape (n,) each."""
+def _sensitivity_profile(kind: str) -> tuple[Array, Array]:
+    """Return distances in grid units and weights of a profile: "gaussian", "disc" or "skirted"."""
     distance = np.linspace(0, 3.2 * WIDTH, 17)
     if kind == "disc":
         weight = np.clip((1.0 - distance) / 0.2 + 0.5, 0, 1)
@@ -72,7 +72,6 @@ def sensitivity_profile(kind: str) -> tuple[Array, Array]:
 def printed_pad(
     plan: Morphology,
     rng: np.random.Generator,
-    *,
     profile: str = "gaussian",
     lateral_offset_mm: float = 0.5,
     n_dead: int = 1,
@@ -83,13 +82,13 @@ def printed_pad(
     Args:
         plan: the designed pad.
         rng: draws pose, wiring, gains and offsets.
-        profile: one of PROFILES.
+        profile: sensitivity profile: "gaussian", "disc" or "skirted".
         lateral_offset_mm: standard deviation of the distance of fibres from their planned paths, mm.
         n_dead: channels that read nothing.
         noise: standard deviation of a response, share of full scale.
     """
     fibres, unit_mm = len(plan.knots), plan.unit_mm
-    distance, weight = sensitivity_profile(profile)
+    distance, weight = _sensitivity_profile(profile)
     turn, shift = rng.choice([-3.0, 3.0]), rng.uniform(2, 3, 2) * rng.choice([-1, 1], 2)
     wiring, dead = rng.permutation(fibres), set(rng.choice(fibres, n_dead, replace=False).tolist())
     gains_v = GAIN_V * np.exp(GAIN_SD * rng.standard_normal(fibres))
@@ -98,23 +97,17 @@ def printed_pad(
     low, high = np.array(sensed_rectangle(plan.layout))
     width, height = (unit_mm * (high - low)).tolist()
 
-    def twin(noise_v: float) -> Twin:
-        channels = [
-            TwinChannel(
-                channel, fibre, 0.0 if fibre is None else float(gains_v[channel]), noise_v, float(fibre is not None)
-            )
-            for channel, fibre in enumerate(channel_fibres)
-        ]
-        paths = tuple(path if fibre in channel_fibres else None for fibre, path in enumerate(as_built_mm))
-        pose = PlanTransform(True, float(turn), (float(shift[0]), float(shift[1])))
-        return Twin(plan, tuple(channels), pose, distance * unit_mm, weight, paths, noise, (width, height), presses=1)
-
-    noiseless = twin(0.0)
-    stretch = noiseless.as_built_stretch(rng.uniform(-0.5, 0.5, (400, 2)) * (width, height))
-    full_scale_v = [
-        abs(gains_v[c]) * stretch[:, fibre].max() for c, fibre in enumerate(channel_fibres) if fibre is not None
-    ]
-    return twin(noise * float(np.mean(full_scale_v)))
+    channels = tuple(
+        TwinChannel(c, fibre, 0.0 if fibre is None else float(gains_v[c]), 0.0, float(fibre is not None))
+        for c, fibre in enumerate(channel_fibres)
+    )
+    paths = tuple(path if fibre in channel_fibres else None for fibre, path in enumerate(as_built_mm))
+    pose = PlanTransform(True, float(turn), (float(shift[0]), float(shift[1])))
+    twin = Twin(plan, channels, pose, distance * unit_mm, weight, paths, noise, (width, height), presses=1)
+    stretch = twin.as_built_stretch(rng.uniform(-0.5, 0.5, (400, 2)) * (width, height))
+    full_scale_v = [abs(gains_v[c.channel]) * stretch[:, c.fibre].max() for c in channels if c.fibre is not None]
+    noise_v = noise * float(np.mean(full_scale_v))
+    return replace(twin, channels=tuple(replace(channel, noise_v=noise_v) for channel in channels))
 
 
 def _offset_paths(plan: Plan, std: float, rng: np.random.Generator) -> list[Array]:
@@ -134,10 +127,7 @@ def _offset_paths(plan: Plan, std: float, rng: np.random.Generator) -> list[Arra
 @cache
 def printed(world: str) -> Twin:
     """Simulate the printed pad of a world."""
-    profile, lateral_offset_mm, n_dead = WORLDS[world]
-    plan = Morphology.random(GRID, knots=KNOTS, seed=0)
-    rng = np.random.default_rng(0)
-    return printed_pad(plan, rng, profile=profile, lateral_offset_mm=lateral_offset_mm, n_dead=n_dead)
+    return printed_pad(Morphology.random(GRID, knots=KNOTS, seed=0), np.random.default_rng(0), *WORLDS[world])
 
 
 @cache

@@ -18,7 +18,7 @@ from .optimize.search import SearchResult as SearchResult
 from .optimize.search import search as search
 from .paths.curves import crossings as crossings
 from .paths.curves import flatten as flatten
-from .plan_drawing import draw_plan as draw_plan
+from .report import draw_plan as draw_plan
 from .settings import Contact as Contact
 from .settings import PadSettings as PadSettings
 from .settings import RulesSettings as RulesSettings

@@ -1,34 +1,20 @@
-"""`padforge design`: optimise, draw, import, check, score and compare pads."""
+"""`padforge design`: optimise, draw, import, check, score and edit pads."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import (
-    INTERRUPTED,
-    force_option,
-    json_option,
-    load_spec,
-    out_option,
-    pad_folder,
-    profile_option,
-    progress,
-    scheduler_option,
-    seed_option,
-    show_result,
-    spec_option,
-)
+from padforge.design.common import command_line as common
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from padforge.design.common.settings import Spec
-    from padforge.design.compare import MakePad
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import Violation
     from padforge.design.optimize.search import OnProgress
@@ -39,7 +25,6 @@ POLL_S = 0.2
 """Period of checking for Ctrl-C where the system does not wake a waiting thread, s."""
 MIN_SHOWN_MM = 5e-4
 """Smallest shift of a fibre's ends that `import` prints, mm."""
-
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 twin_option = click.option(
     "--twin",
@@ -48,12 +33,17 @@ twin_option = click.option(
 )
 
 
+def time_budget_option(text: str) -> Callable[..., Any]:
+    """Make the option `--time-budget` with a help text."""
+    return click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help=text)
+
+
 @contextmanager
 def search_progress() -> "Iterator[OnProgress]":
     """Show a progress bar for every start of a search on stderr."""
     tasks: dict[str, TaskID] = {}
     best: dict[str, float] = {}
-    with progress() as bar:
+    with common.progress() as bar:
 
         def report(run: str, done: int, total: int, objective: float) -> None:
             if run not in tasks:
@@ -66,40 +56,34 @@ def search_progress() -> "Iterator[OnProgress]":
 
 
 @click.group(invoke_without_command=True)
-@spec_option
+@common.spec_option
 @click.option("--method", type=click.Choice(["descent", "genetic"]), help="As [search] method.")
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
 @click.option("--start-from", metavar="random|straight|FILE", help="Initial fibres (default: random).")
 @twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Device that evaluates the objective.")
-@click.option(
-    "--time-budget", type=click.FloatRange(min=0), metavar="S", help="Stop with the best pad after S seconds."
-)
+@time_budget_option("Stop with the best pad after S seconds.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted search into the same folder.")
-@scheduler_option
-@seed_option
-@out_option("out/pad")
-@force_option
-@json_option
-@profile_option
+@common.scheduler_option
+@common.seed_option
+@common.out_option("out/pad")
+@common.force_option
+@common.json_option
+@common.profile_option
 @click.pass_context
 def design(
     context: click.Context,
     spec: Path | None,
-    method: str | None,
-    knots: int | None,
-    starts: int | None,
     start_from: str | None,
     twin: Path | None,
-    device: str | None,
     time_budget: float | None,
     resume: bool,
     scheduler: str | None,
-    seed: int | None,
     out: Path,
     force: bool,
     as_json: bool,
+    **overrides: Any,
 ) -> None:
     """Optimise the paths of the fibres, or evaluate a finished morphology.
 
@@ -124,20 +108,19 @@ def design(
     from padforge.design.optimize.search import SearchOptions
     from padforge.design.twin import Twin
 
-    overrides = {"method": method, "knots": knots, "starts": starts, "seed": seed, "device": device}
     with locked_folder(out), cluster(scheduler) as executor, search_progress() as on_progress:
         options = SearchOptions(on_progress, resume=resume, time_budget=time_budget, executor=executor)
-        document, result = run_design(load_spec(spec), out, overrides, start_from, options, twin, force=force)
+        document, result = run_design(common.load_spec(spec), out, overrides, start_from, options, twin, force=force)
     if twin is not None and (omitted := Twin.load(twin).ignored_effects()):
         click.echo(f"{twin}: {omitted}", err=True)
-    show_result(document, summary_lines(result, out), as_json)
-    context.exit(INTERRUPTED if result.stopped == "interrupted" else int(bool(result.violations)))
+    common.show_result(document, summary_lines(result, out), as_json)
+    context.exit(common.INTERRUPTED if result.stopped == "interrupted" else int(bool(result.violations)))
 
 
 @design.command()
 @morphology_argument
-@spec_option
-@out_option(what="Picture to write, .svg or .png", file=True)
+@common.spec_option
+@common.out_option(what="Picture to write, .svg or .png", file=True)
 def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     """Draw the plan: fibres, crossings, broken rules and the contact, to scale.
 
@@ -147,10 +130,10 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     """
     from padforge.design.common.plotting import save_figure
     from padforge.design.common.validation import InputError
-    from padforge.design.plan_drawing import draw_plan
+    from padforge.design.report import draw_plan
     from padforge.design.settings import Contact
 
-    path = out or pad_folder(morphology) / "plan.svg"
+    path = out or common.pad_folder(morphology) / "plan.svg"
     if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec)
@@ -160,8 +143,8 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
 
 @design.command()
 @morphology_argument
-@spec_option
-@json_option
+@common.spec_option
+@common.json_option
 @click.pass_context
 def check(context: click.Context, morphology: Path, spec: Path | None, as_json: bool) -> None:
     """Check every design rule on the exact curves; exit code 1 if one is broken.
@@ -171,13 +154,13 @@ def check(context: click.Context, morphology: Path, spec: Path | None, as_json: 
     """
     violations = _load_and_check(morphology, spec)[-1]
     lines = [str(violation) for violation in violations] or ["all rules hold"]
-    show_result({"violations": list(map(asdict, violations))}, lines, as_json)
+    common.show_result({"violations": list(map(asdict, violations))}, lines, as_json)
     context.exit(int(bool(violations)))
 
 
 @design.command()
 @morphology_argument
-@spec_option
+@common.spec_option
 @twin_option
 def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     """Print every term of the objective as JSON.
@@ -197,7 +180,7 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     terms = score_terms(
         pad, contact, search.max_failures, rules=rules, size=pad_settings, scatter=search.response_scatter
     )
-    show_result({"terms": terms, "violations": list(map(asdict, violations))}, [], as_json=True)
+    common.show_result({"terms": terms, "violations": list(map(asdict, violations))}, [], as_json=True)
 
 
 def _load_and_check(
@@ -208,7 +191,7 @@ def _load_and_check(
     from padforge.design.objectives.rules import check_rules
     from padforge.design.settings import PadSettings, RulesSettings
 
-    pad, settings = Morphology.load(morphology), load_spec(spec)
+    pad, settings = Morphology.load(morphology), common.load_spec(spec)
     if twin is not None:
         from padforge.design.optimize.search import settings_for_twin
 
@@ -219,11 +202,11 @@ def _load_and_check(
 
 @design.command()
 @click.argument("pad", required=False, type=click.Path(path_type=Path))
-@spec_option
-@out_option(what="Morphology to save to", file=True)
-@force_option
+@common.spec_option
+@common.out_option(what="Morphology to save to", file=True)
+@common.force_option
 @click.option(
-    "--port", type=click.IntRange(0, 65_535), default=EDIT_PORT, show_default=True, help="Port of the page; 0: any."
+    "--port", type=click.IntRange(0, 65535), default=EDIT_PORT, show_default=True, help="Port of the page; 0: any."
 )
 def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, port: int) -> None:
     """Edit the paths of fibres in a browser on this machine, with broken rules and ambiguity at every step.
@@ -239,26 +222,15 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     from padforge.design.common.files import check_writable
     from padforge.design.common.server import LocalPage, page_text
     from padforge.design.common.validation import InputError
-    from padforge.design.morphology import Morphology
-    from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-    from .editor.edits import PathEvaluator
     from .editor.session import EditSession, free_name
 
-    out = out or free_name(pad_folder(pad) / ("edited.json" if pad is None else f"{pad.stem}-edited.json"))
+    out = out or free_name(common.pad_folder(pad) / ("edited.json" if pad is None else f"{pad.stem}-edited.json"))
     if out.suffix.lower() != ".json":
         raise InputError(f"--out is {out}, allowed is a name that ends in .json")
     check_writable(out.parent)
-    settings = load_spec(spec)
-    layout = settings.section(PadSettings).layout if pad is None else Morphology.load(pad).layout
-    evaluator = PathEvaluator(
-        settings.section(PadSettings, **layout.settings),
-        settings.section(RulesSettings),
-        settings.section(Contact),
-        settings.section(SearchSettings),
-    )
     text = page_text("padforge.design.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
-    session = EditSession(evaluator, pad, out, lambda view: page.show(view), force)
+    session = EditSession(common.load_spec(spec), pad, out, lambda view: page.show(view), force)
     with LocalPage(port, text, {"/edit": session.edit, "/save": session.save}) as page:
         replaces = " in place of its content" * out.exists()
         click.echo(f"page: {page.url} (Ctrl-C ends), saves to {out}{replaces}", err=True)
@@ -274,7 +246,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
 
 @design.command("import")
 @click.argument("plan", type=click.Path(dir_okay=False, path_type=Path))
-@spec_option
+@common.spec_option
 @click.option(
     "--tolerance-mm",
     type=click.FloatRange(1e-3, 10),
@@ -282,9 +254,9 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     show_default=True,
     help="Largest distance of fibres and their ends from the drawing.",
 )
-@out_option()
-@force_option
-@json_option
+@common.out_option()
+@common.force_option
+@common.json_option
 @click.pass_context
 def import_(
     context: click.Context,
@@ -310,72 +282,23 @@ def import_(
     from padforge.design.paths.import_plan import import_plan
     from padforge.design.settings import PadSettings, RulesSettings
 
-    settings = load_spec(spec)
+    settings = common.load_spec(spec)
     pad_settings, rules = settings.section(PadSettings), settings.section(RulesSettings)
     result = import_plan(plan, pad_settings.layout, tolerance_mm)
     origin = provenance("padforge design import", None, [plan], packages=("ezdxf", "lxml", "fonttools"))
     origin["settings"] = {"pad": pad_settings.model_dump(mode="json"), "tolerance_mm": tolerance_mm}
-    path = (out or pad_folder(plan)) / "morphology.json"
+    path = (out or common.pad_folder(plan)) / "morphology.json"
     with atomic_files(path.parent) as folder:
         Morphology.from_layout(result.pad.knots, pad_settings.layout, origin).save(folder / path.name)
         check_replaceable(path, folder / path.name, force=force)
-    violations = check_rules(result.pad, rules, pad_settings)
-    knots = result.pad.knots.shape[1] - 2
+    violations, knots = check_rules(result.pad, rules, pad_settings), result.pad.knots.shape[1] - 2
     lines = [f"import: {len(result.fibres)} fibres of {knots} knots -> {path}", f"  {result.placement}"]
     for number, fibre in enumerate(result.fibres, 1):
         moved = f", ends moved by {fibre.end_shift_mm:.3f} mm" if fibre.end_shift_mm >= MIN_SHOWN_MM else ""
         lines.append(f"  fibre {number}: {fibre.name}, within {fibre.max_error_mm:.3f} mm{moved}")
     lines += [f"  broken: {violation}" for violation in violations] or ["  all rules hold"]
-    document = {
-        "fibres": [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)],
-        "knots": knots,
-        "placement": result.placement,
-        "violations": list(map(asdict, violations)),
-    }
-    show_result(document, lines, as_json)
+    fibres = [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)]
+    document = {"fibres": fibres, "knots": knots, "placement": result.placement}
+    document["violations"] = list(map(asdict, violations))
+    common.show_result(document, lines, as_json)
     context.exit(int(bool(violations)))
-
-
-def compare_command(make_pad: "MakePad") -> click.Command:
-    """Return the command `padforge design compare`.
-
-    Args:
-        make_pad: makes the mould of a pad and returns its costs; a function of the next stage, which `design` must not
-            import.
-    """
-
-    @click.command("compare")
-    @click.argument("sources", metavar="[SPEC|MORPHOLOGY]...", nargs=-1, type=click.Path(exists=True, path_type=Path))
-    @click.option("--vary", metavar="KEY=V,V", multiple=True, help="Values of a setting, such as pad.grid=3,4.")
-    @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Seconds for each search.")
-    @seed_option
-    @out_option("out/comparison")
-    @json_option
-    @profile_option
-    def command(
-        sources: tuple[Path, ...],
-        vary: tuple[str, ...],
-        time_budget: float | None,
-        seed: int | None,
-        out: Path,
-        as_json: bool,
-    ) -> None:
-        """Compare pads in a table and a figure: fibres, length, mould, and error with failed fibres.
-
-        \b
-        padforge design compare --vary pad.grid=3,4,5 --vary search.knots=6,21
-        padforge design compare small.toml large.toml
-        padforge design compare out/pad/morphology.json published.mat
-
-        Every variant of the settings is designed in its own folder, with its mould; morphologies are not changed.
-        """
-        from padforge.design.common.files import locked_folder
-        from padforge.design.compare import compare, comparison_lines, read_variants
-        from padforge.design.optimize.search import SearchOptions
-
-        variants = read_variants(sources, vary, load_spec)
-        with locked_folder(out), search_progress() as on_progress:
-            document = compare(variants, out, SearchOptions(on_progress, time_budget=time_budget), seed, make_pad)
-        show_result(document, [*comparison_lines(document), f"comparison -> {out / 'comparison.json'}"], as_json)
-
-    return command

@@ -5,23 +5,12 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
+from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance, write_json
-from padforge.design.common.plotting import (
-    CURVES,
-    FAINT,
-    INK,
-    add_caption,
-    add_title,
-    new_figure,
-    save_figure,
-    style_axes,
-)
+from padforge.design.common.plotting import CURVES, FAINT, add_caption, add_title, new_figure, save_figure, style_axes
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError, short_repr
@@ -31,9 +20,6 @@ from padforge.design.morphology import Morphology
 from padforge.design.optimize.search import SearchOptions
 from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
@@ -147,10 +133,11 @@ def compare(
     for variant in variants:
         folder, pad = out / variant.folder, variant.pad
         if pad is None:
-            on_progress = partial(_report_variant, options.on_progress, variant.name)
-            result = run_design(
-                variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=on_progress)
-            )[1]
+
+            def report(run: str, *step: Any, name: str = variant.name) -> None:
+                options.on_progress(f"{name}, {run}", *step)
+
+            _, result = run_design(variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=report))
             if result.stopped == "interrupted":
                 raise KeyboardInterrupt  # ends the comparison, not only this search
             pad = result.morphology
@@ -158,12 +145,8 @@ def compare(
     origin = provenance("padforge design compare", seed or 0, packages=("torch",))
     document = {"format": FORMAT, "rows": rows, "provenance": origin}
     write_json(out / NAME, document)
-    save_figure(_draw_comparison(rows), out / "comparison.png")
+    _draw_comparison(rows, out / "comparison.png")
     return document
-
-
-def _report_variant(on_progress: Callable[..., None], name: str, run: str, *step: Any) -> None:
-    on_progress(f"{name}, {run}", *step)
 
 
 def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
@@ -195,24 +178,16 @@ def comparison_lines(document: Mapping[str, Any]) -> list[str]:
     header = ["pad", "fibres", "knots", "fibre (m)", "crossings", *costs.values()]
     table = [[*header, *(f"{n} failed (mm)" for n in range(n_errors))]]
     for row in rows:
-        horizontals, verticals = row["fibres"]
-        cells = [row["name"], f"{horizontals} + {verticals}", str(row["knots"]), f"{row['length_mm'] / 1000:.2f}"]
+        cells = [row["name"], "{} + {}".format(*row["fibres"]), str(row["knots"]), f"{row['length_mm'] / 1000:.2f}"]
         cells += [str(row["crossings"]), *(f"{row[key]:.3g}" for key in costs)]
         table.append([*cells, *(f"{error:.2f}" for error in row["errors_mm"])])
         if row["errors_mm"] != row["straight_mm"]:
-            table.append(
-                ["  straight fibres", *[""] * (len(header) - 1), *(f"{error:.2f}" for error in row["straight_mm"])]
-            )
-    columns = list(itertools.zip_longest(*table, fillvalue="-"))
-    widths = [max(map(len, column)) for column in columns]
-    cells = [
-        [cell.rjust(width) if number else cell.ljust(width) for cell in column]
-        for number, (column, width) in enumerate(zip(columns, widths, strict=True))
-    ]
-    return ["  ".join(row) for row in zip(*cells, strict=True)]
+            errors = [f"{error:.2f}" for error in row["straight_mm"]]
+            table.append(["  straight fibres", *[""] * (len(header) - 1), *errors])
+    return text_table(table)
 
 
-def _draw_comparison(rows: Sequence[Mapping[str, Any]]) -> "Figure":
+def _draw_comparison(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw the errors by failed fibres, and those with none and most failed by length of fibre."""
     figure, _ = new_figure(9.6, 4.2)
     figure.clear()
@@ -228,12 +203,11 @@ def _draw_comparison(rows: Sequence[Mapping[str, Any]]) -> "Figure":
         style_axes(axes)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         axes.set_ylim(bottom=0)
-        axes.set_ylabel("mean error (mm)", color=INK)
-    by_failures.set_xticks(np.arange(max(len(row["errors_mm"]) for row in rows)))
-    by_failures.set_xlabel("failed fibres")
+        axes.set_ylabel("mean error (mm)")
+    by_failures.set(xlabel="failed fibres", xticks=range(max(len(row["errors_mm"]) for row in rows)))
     by_length.set_xlabel("length of fibre (m)")
     add_caption(by_failures, "lines: as designed; dotted: straight fibres")
     add_caption(by_length, "dot: no failed fibres; square: most failed fibres")
     by_failures.legend(frameon=False, fontsize=8)
     add_title(figure, "Cost and localisation error of pads")
-    return figure
+    save_figure(figure, path)

@@ -1,7 +1,7 @@
 """Run a search on the settings of a `pad.toml`, and write morphology.json, design.json and the plan of the pad."""
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from padforge.design.optimize.search import (
     settings_for_twin,
     state_folders,
 )
-from padforge.design.plan_drawing import draw_plan
+from padforge.design.report import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 if TYPE_CHECKING:
@@ -73,16 +73,15 @@ def run_design(
     Raises:
         InputError: invalid settings, or the pad in `out` is in use; the checkpoints stay.
     """
-    request, regenerated = _read_request(spec, overrides, start_from, twin), {"design.json", *regenerated}
-    path, checkpoints = out / "morphology.json", out / "search"
-    check_replaceable(path, request.provenance, regenerated, force)
+    settings, start, origin = _read_request(spec, overrides, start_from, twin)
+    path, checkpoints, regenerated = out / "morphology.json", out / "search", {"design.json", *regenerated}
+    check_replaceable(path, origin, regenerated, force)
     options = replace(options or SearchOptions(), keep_in=checkpoints)
-    settings = request.pad, request.contact, request.search, request.rules
     if twin is None:
-        result = search(*settings, origin=request.start, run=options)
+        result = search(*settings, origin=start, run=options)
     else:
         nominal = spec.section(SearchSettings, **overrides)
-        result = search_for_twin(*settings, nominal, origin=request.start, run=options)
+        result = search_for_twin(*settings, nominal, origin=start, run=options)
     document = {
         "format": FORMAT,
         "terms": result.terms,
@@ -93,16 +92,17 @@ def run_design(
         "history": result.history,
         "seconds": round(result.seconds, 3),
         "stopped": result.stopped,
-        "provenance": request.provenance,
+        "provenance": origin,
     }
     with stage("figures"), atomic_files(out) as folder:
-        Morphology.from_layout(result.morphology.knots, request.pad.layout, request.provenance).save(folder / path.name)
+        pad, contact = settings[:2]
+        Morphology.from_layout(result.morphology.knots, pad.layout, origin).save(folder / path.name)
         # checked again: an interrupted search with the same settings may end with another pad
         check_replaceable(path, folder / path.name, regenerated, force)
         document["morphology_sha256"] = sha256(folder / path.name)
-        figure = draw_plan(result.morphology, request.contact, result.violations, request.pad.keep_out_mm)
-        save_figure(figure, folder / "design.svg")
-        save_figure(figure, folder / "design.png")
+        figure = draw_plan(result.morphology, contact, result.violations, pad.keep_out_mm)
+        for name in ("design.svg", "design.png"):
+            save_figure(figure, folder / name)
         write_json(folder / "design.json", document)
     on_written(result)
     if not result.stopped:
@@ -119,26 +119,13 @@ def check_design(
     Raises:
         InputError: invalid settings, or the pad in `out` is in use.
     """
-    request = _read_request(spec, overrides)
-    check_replaceable(out / "morphology.json", request.provenance, {"design.json", *regenerated}, force)
-
-
-@dataclass(frozen=True)
-class _DesignRequest:
-    """The settings of a search, the pad it starts from, and the provenance of its result."""
-
-    pad: PadSettings
-    contact: Contact
-    search: SearchSettings
-    rules: RulesSettings
-    start: Morphology | None
-    provenance: dict[str, Any]
+    check_replaceable(out / "morphology.json", _read_request(spec, overrides)[-1], {"design.json", *regenerated}, force)
 
 
 def _read_request(
     spec: "Spec", overrides: Mapping[str, Any], start_from: str | None = None, twin: Path | None = None
-) -> _DesignRequest:
-    """Read the settings and files that `run_design` takes."""
+) -> tuple[tuple[PadSettings, Contact, SearchSettings, RulesSettings], Morphology | None, dict[str, Any]]:
+    """Return the settings of a search, the pad it starts from, and the provenance of its result."""
     inputs: list[Path] = []
     if twin is not None:
         spec, inputs = settings_for_twin(spec, twin), [twin]
@@ -150,33 +137,20 @@ def _read_request(
         inputs.append(Path(start_from))
         overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
-    contact = design_contact(spec, settings)
-    sections = {"pad": pad, "contact": contact, "search": settings, "rules": rules}
+    sections = pad, design_contact(spec, settings), settings, rules
     origin = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
-    origin["settings"] = {name: section.model_dump(mode="json") for name, section in sections.items()}
-    return _DesignRequest(pad, contact, settings, rules, start, origin)
+    origin["settings"] = {section.section(): section.model_dump(mode="json") for section in sections}
+    return sections, start, origin
 
 
-def load_result(out: Path) -> SearchResult | None:
-    """Load the result of a search from the folder of a pad.
-
-    Returns:
-        The result, or None where there is none or the morphology there is another one.
-
-    Raises:
-        InputError: a file is damaged.
-    """
-    path, morphology = out / "design.json", out / "morphology.json"
-    if not (path.exists() and morphology.exists()):
-        return None
-    document = read_json(path, FORMAT)
-    with reraise_as_input_error(path):
-        if document["morphology_sha256"] != sha256(morphology):
-            return None
+def load_result(out: Path) -> SearchResult:
+    """Load the result of a search from the folder of a pad; InputError if a file is damaged."""
+    document = read_json(out / "design.json", FORMAT)
+    with reraise_as_input_error(out / "design.json"):
         violations = [Violation(**violation) for violation in document["violations"]]
         list(map(str, violations))  # fails on values of the wrong type
         return SearchResult(
-            Morphology.load(morphology),
+            Morphology.load(out / "morphology.json"),
             {name: float(value) for name, value in document["terms"].items()},
             violations,
             str(document["candidate"]),
@@ -213,17 +187,17 @@ def _error_lines(result: SearchResult) -> list[str]:
         for terms in (result.terms, result.straight)
     )
     lines = [
-        f"  expected error {format_errors(designed)} mm with {format_errors(range(len(designed)))} failed fibres",
-        f"  straight fibres {format_errors(straight)} mm",
+        f"  expected error  {_format_errors(designed)} mm with {_format_errors(range(len(designed)))} failed fibres",
+        f"  straight fibres {_format_errors(straight)} mm",
     ]
-    if result.candidate == "straight fibres":
-        return [*lines, "  the search found no better pad than straight fibres; try more steps or time"]
     similar = [n for n, (a, b) in enumerate(zip(designed, straight, strict=True)) if a > (1 - SIGNIFICANT) * b]
-    if similar:
-        lines.append(f"  not significantly better than straight fibres with {format_errors(similar)} failed fibres")
+    if result.candidate == "straight fibres":
+        lines.append("  the search found no better pad than straight fibres; try more steps or time")
+    elif similar:
+        lines.append(f"  not significantly better than straight fibres with {_format_errors(similar)} failed fibres")
     return lines
 
 
-def format_errors(errors: Collection[float]) -> str:
+def _format_errors(errors: Collection[float]) -> str:
     """Join errors by slashes, to the hundredth, or counts: "0.21 / 0.24"."""
     return " / ".join(f"{error:.2f}" if isinstance(error, float) else str(error) for error in errors)

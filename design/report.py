@@ -1,16 +1,125 @@
-"""Write the sections of a report on the design of a pad and on the provenance of all results."""
+"""Draw the plan of a pad, and write the sections of a report on its design and its contact."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.files import find_unchanged, read_json, reraise_as_input_error
+import numpy as np
+
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
-from padforge.design.settings import PadSettings, RulesSettings, sensed_rectangle
+from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
+from padforge.design.common.validation import InputError, check_array, check_type
+from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings, sensed_rectangle
 
-PAD = "morphology.json"
-Stage = tuple[str, Path, Callable[[Path, Mapping[str, Any]], list[PageSection]]]
-"""Name of a stage, its document, and the function that writes the sections on it."""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Polygon
+
+    from padforge.design.morphology import Morphology
+    from padforge.design.objectives.rules import Violation
+
+TOLERANCE = 1e-3
+"""Deviation of drawn curves from exact ones, grid units."""
+
+
+def draw_plan(
+    pad: "Morphology", contact: Contact, violations: "Sequence[Violation]" = (), keep_out_mm: Sequence[Corners] = ()
+) -> "Figure":
+    """Draw the plan of a pad.
+
+    Crossings within a family are ringed, broken rules marked with a red cross, keep-outs hatched; the contact is drawn
+    at the centre. Fibres are numbered from 1 at their ends, and named in an SVG so that it can be imported again.
+
+    Args:
+        pad: the pad.
+        contact: the contact.
+        violations: broken rules, as `check_rules` returns them.
+        keep_out_mm: polygons that fibres must avoid, mm from the centre of the pad.
+
+    Returns:
+        A matplotlib figure with axes in mm from the centre of the pad.
+
+    Raises:
+        InputError: an argument of the wrong type, or a polygon of the wrong shape.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Polygon, Rectangle
+
+    from padforge.design.morphology import Morphology
+    from padforge.design.objectives.rules import Violation
+    from padforge.design.paths.curves import crossings, flatten
+
+    check_type("pad", pad, Morphology)
+    check_type("contact", contact, Contact)
+    for violation in check_type("violations", violations, Sequence):
+        check_type("violations", violation, Violation)
+    polygons = [check_array("keep_out_mm", corners) for corners in check_type("keep_out_mm", keep_out_mm, Sequence)]
+    for polygon in polygons:
+        if polygon.ndim != 2 or polygon.shape[1] != 2 or not len(polygon):
+            raise InputError(f"keep_out_mm has a polygon of shape {polygon.shape}, expected (n, 2)")
+
+    width, height = (side / 2 for side in pad.layout.size_mm)
+    half, scale = max(width, height), 6.4 / max(width, height)
+    figure = Figure(figsize=(max(scale * width, 4.8), max(scale * height, 2.4)), layout="constrained")
+    axes = figure.add_subplot(aspect="equal")
+    axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT, gid="pad"))
+    for polygon in polygons:
+        axes.add_patch(Polygon(polygon, facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
+    for fibre, points in enumerate(flatten(pad, TOLERANCE)):
+        family = pad.layout.family(fibre)
+        x, y = pad.to_mm(points).T
+        color, name = ((HORIZONTAL, "horizontal"), (VERTICAL, "vertical"))[family]
+        gid = f"{name}-{fibre + 1 - pad.layout.families[family].start}"  # import_plan reads these names
+        (line,) = axes.plot(x, y, color=color, linewidth=1.6, solid_capstyle="round", gid=gid)
+        line.get_path().should_simplify = False
+        ha, va, dx, dy = (("left", "center", 0.02, 0), ("center", "bottom", 0, 0.02))[family]
+        axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
+
+    markers = [
+        (pad.to_mm(c.position), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)
+    ]
+    for same, size, color in ((False, 10, INK), (True, 40, ALARM)):
+        points = np.array([position for position, is_same in markers if is_same == same]).reshape(-1, 2)
+        axes.scatter(*points.T, s=size, facecolor="none" if same else color, edgecolor=color, linewidth=0.8, zorder=3)
+    axes.add_patch(_contact_patch(contact, pad.unit_mm))
+    points = np.array([v.place_mm for v in violations if v.place_mm is not None]).reshape(-1, 2)
+    axes.scatter(*points.T, marker="x", s=50, color=ALARM, linewidth=1.8, zorder=4)
+
+    x_limit, y_limit = width + 0.08 * half, height + 0.08 * half
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", xlim=(-x_limit, x_limit), ylim=(-y_limit, y_limit))
+    axes.spines[["top", "right"]].set_visible(False)
+    n_same = sum(same for _, same in markers)
+    axes.set_title(
+        f"{pad.layout}, {len(markers)} crossings"
+        + (f", {n_same} within a family" if n_same else "")
+        + (f", {len(violations)} rules broken" if violations else ""),
+        fontsize=10,
+        color=ALARM if violations else INK,
+    )
+    return figure
+
+
+def _contact_patch(contact: Contact, unit_mm: float) -> "Circle | Polygon":
+    """Return the outline of a contact, or the circle at half of the largest weight of a measured profile."""
+    from matplotlib.patches import Circle, Polygon
+
+    style = {"color": INK, "alpha": 0.15, "linewidth": 0}
+    if contact.sensitivity_profile:
+        return Circle((0, 0), _half_width_mm(contact.sensitivity_profile), **style)
+    radius = contact.radius * unit_mm
+    if contact.sides is None:
+        return Circle((0, 0), radius, **style)
+    angle = 2 * np.pi * np.arange(contact.sides) / contact.sides
+    return Polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]), **style)
+
+
+def _half_width_mm(profile: Sequence[tuple[float, float]]) -> float:
+    """Return the largest distance at which a profile is half of its maximum, by linear interpolation, mm."""
+    distance, weight = np.abs(np.array(profile)).T
+    half = weight.max() / 2
+    last = int(np.flatnonzero(weight >= half)[-1])  # never the last point, whose weight is 0
+    share = (weight[last] - half) / (weight[last] - weight[last + 1])
+    return float(distance[last] + share * (distance[last + 1] - distance[last]))
 
 
 def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -18,14 +127,9 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
 
     Args:
         folder: folder of the pad.
-        document: its `design.json`.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is damaged.
-        InputError: the plan is not a picture.
+        document: its `design.json`; if it is damaged, any of the built-in errors is raised.
     """
-    terms, violations = document["terms"], document["violations"]
-    settings = document["provenance"]["settings"]
+    terms, violations, settings = document["terms"], document["violations"], document["provenance"]["settings"]
     enforced, search = settings["rules"]["enforce"], settings["search"]
     layout = PadSettings(**settings["pad"]).layout
     low, high = sensed_rectangle(layout)
@@ -57,7 +161,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         table(["rule", "limit", "result", "setting"], list(_rule_rows(settings["rules"], violations))),
     ]
     if violations:
-        rows = [_violation_row(violation) for violation in violations]
+        rows = list(map(_violation_row, violations))
         body.append(table(["broken rule", "fibres", "position (mm)", "measured", "limit"], rows))
     rows = [[name, value, document["descriptions"].get(name, "")] for name, value in terms.items()]
     body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], rows)]))
@@ -84,88 +188,6 @@ def _violation_row(violation: Mapping[str, Any]) -> list[object]:
     return [violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]]
 
 
-def stage_sections(
-    folder: Path, stages: Sequence[Stage], recording: Callable[[], str | None] = lambda: None
-) -> tuple[list[PageSection], list[list[object]], list[str]]:
-    """Write the sections on all stages that have a document in a folder.
-
-    Args:
-        folder: folder of the pad.
-        stages: stages in the order of the report.
-        recording: returns the digest of the recording in the folder, None if there is none; called only if needed.
-
-    Returns:
-        Sections, rows of their provenance, and results that are of another pad or recording; these are listed in a
-        section of their own, the first.
-
-    Raises:
-        InputError: a document is damaged.
-    """
-    sections: list[PageSection] = []
-    rows: list[list[object]] = []
-    mismatches: list[str] = []
-    for name, path, write_sections in stages:
-        if path.exists():
-            document = read_json(path, f"padforge-{name}/{2 if name == 'design' else 1}")
-            with reraise_as_input_error(path):
-                mismatches += _find_mismatches(folder, name, document, recording)
-                sections += write_sections(folder, document)
-                rows.append(provenance_row(folder, name, document))
-    if mismatches:
-        advice = "This folder has files of two pads. Run these stages again, or use a folder for each pad."
-        sections.insert(0, PageSection("Files of different pads", list(map(paragraph, [advice, *mismatches]))))
-    return sections, rows, mismatches
-
-
-def _find_mismatches(
-    folder: Path, stage: str, document: Mapping[str, Any], recording: Callable[[], str | None]
-) -> Iterator[str]:
-    """Yield whether a result is of another pad than the morphology.json in the folder, or of another recording."""
-    origin = document["provenance"]
-    inputs, name = origin.get("inputs", {}), f"{stage} ({origin.get('command')})"
-    pad = document.get("morphology_sha256") if stage == "design" else inputs.get(PAD)
-    if isinstance(pad, str) and (folder / PAD).is_file() and not find_unchanged(folder, {PAD: pad}):
-        yield f"{name} is of another pad than the {PAD} here"
-    if isinstance(inputs.get("recording"), str) and recording() not in (None, inputs["recording"]):
-        yield f"{name} is of another recording than the one here"
-
-
-def provenance_row(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
-    """Return the row of `provenance_section` on a document.
-
-    Args:
-        folder: folder of the report; inputs in it are compared with those that were used.
-        stage: name of the stage.
-        document: its document.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the document is damaged.
-    """
-    origin = document["provenance"]
-    versions = ", ".join(f"{package} {version}" for package, version in origin.get("versions", {}).items())
-    inputs = "; ".join(_describe_inputs(folder, origin.get("inputs", {})))
-    return [stage, origin.get("command"), origin.get("seed"), versions or "-", inputs or "-"]
-
-
-def _describe_inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
-    for name, digest in inputs.items():
-        if not isinstance(digest, str):  # the provenance of an input that was computed
-            yield f"{name}: {digest['command']}" if digest else name
-        elif Path(name).name == name and (folder / name).is_file():  # never opens a file in another folder
-            match = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
-            yield f"{name} {digest} ({match})"
-        else:
-            yield f"{name} {digest}"
-
-
-def provenance_section(rows: Sequence[Sequence[object]]) -> PageSection:
-    """Write the section on the provenance of all results, from the rows that `provenance_row` returns."""
-    header = ["stage", "command", "seed", "versions", "inputs (sha256)"]
-    return PageSection(
-        "Provenance", [collapsible("Commands, seeds, versions and inputs of all stages", [table(header, rows)])]
-    )
-
-
 def contact_line(document: Mapping[str, Any]) -> str:
     """Summarise a `contacts.json`: errors with all fibres under the assumed contact, and their range under others."""
     parts = []
@@ -179,11 +201,8 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
     """Return how the simulated errors in a `contacts.json` depend on the contact model.
 
     Args:
-        folder: of the document.
-        document: as padforge writes it.
-
-    Raises:
-        KeyError, TypeError, ValueError: the document is not as padforge writes it.
+        folder: folder of the pad.
+        document: its `contacts.json`; if it is damaged, any of the built-in errors is raised.
     """
     rows, scatter = document["rows"], document["scatter"]
     levels = range(max(len(row["errors_mm"]) for row in rows))

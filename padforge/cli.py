@@ -1,27 +1,21 @@
-"""The command line: the commands of the three stages and of the studies, `run`, `init`, `report` and `bench`."""
+"""The command line: commands of the stages and of studies, `design compare`, `run`, `init`, `report` and `bench`."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 import click
 
-from padforge.design.cli import compare_command, search_progress
 from padforge.design.cli import design as design_group
-from padforge.design.common.command_line import (
-    INTERRUPTED,
-    force_option,
-    load_spec,
-    out_option,
-    profile_option,
-    run_to_end,
-    seed_option,
-    spec_option,
-)
+from padforge.design.cli import search_progress, time_budget_option
+from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs, split_formats
 from padforge.sense.cli.main import sense as sense_group
+from padforge.sense.cli.options import reported
 from padforge.sense.studies.cli import study as study_group
 
 from .report import write_report
@@ -62,7 +56,41 @@ def cli(context: click.Context) -> None:
 
 for command in (design_group, fabricate_group, sense_group, study_group, bench):
     cli.add_command(command)
-design_group.add_command(compare_command(mould_costs))
+
+
+@design_group.command("compare")
+@click.argument("sources", metavar="[SPEC|MORPHOLOGY]...", nargs=-1, type=click.Path(exists=True, path_type=Path))
+@click.option("--vary", metavar="KEY=V,V", multiple=True, help="Values of a setting, such as pad.grid=3,4.")
+@time_budget_option("Seconds for each search.")
+@common.seed_option
+@common.out_option("out/comparison")
+@common.json_option
+@common.profile_option
+def _compare(
+    sources: tuple[Path, ...],
+    vary: tuple[str, ...],
+    time_budget: float | None,
+    seed: int | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Compare pads in a table and a figure: fibres, length, mould, and error with failed fibres.
+
+    \b
+    padforge design compare --vary pad.grid=3,4,5 --vary search.knots=6,21
+    padforge design compare small.toml large.toml
+    padforge design compare out/pad/morphology.json published.mat
+
+    Every variant of the settings is designed in its own folder, with its mould; morphologies are not changed.
+    """
+    from padforge.design.common.files import locked_folder
+    from padforge.design.compare import compare, comparison_lines, read_variants
+    from padforge.design.optimize.search import SearchOptions
+
+    variants = read_variants(sources, vary, common.load_spec)
+    with locked_folder(out), search_progress() as on_progress:
+        document = compare(variants, out, SearchOptions(on_progress, time_budget=time_budget), seed, mould_costs)
+    common.show_result(document, [*comparison_lines(document), f"comparison -> {out / 'comparison.json'}"], as_json)
 
 
 @cli.command("init")
@@ -85,25 +113,16 @@ def _init(path: Path, preset: str | None) -> None:
 
 
 @cli.command("run")
-@spec_option
+@common.spec_option
 @formats_option
-@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Seconds for all stages together.")
+@time_budget_option("Seconds for all stages together.")
 @click.option("--resume", is_flag=True, help="Reuse the finished stages of an earlier run into the same folder.")
-@seed_option
-@out_option("out/pad")
-@force_option
-@profile_option
+@common.seed_option
+@common.out_option("out/pad")
+@common.force_option
+@common.profile_option
 @click.pass_context
-def _run(
-    context: click.Context,
-    spec: Path | None,
-    formats: str,
-    time_budget: float | None,
-    resume: bool,
-    seed: int | None,
-    out: Path,
-    force: bool,
-) -> None:
+def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **options: Any) -> None:
     """Run all stages: optimise, mould, record presses on the simulated rig, calibrate, report.
 
     \b
@@ -122,11 +141,12 @@ def _run(
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
-    run = Run(load_spec(spec), out, seed, split_formats(formats), resume, time_budget, force)
+    run = Run(common.load_spec(spec), out, formats=split_formats(formats), **options)
     check_run(run)
     with locked_folder(out):
-        code = run_stages(run, click.echo, lambda message: click.echo(message, err=True), search_progress)
-        if code != INTERRUPTED:
+        warn, training_progress = partial(click.echo, err=True), partial(reported, "training")
+        code = run_stages(run, click.echo, warn, search_progress, training_progress)
+        if code != common.INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")
     context.exit(code)
@@ -145,4 +165,4 @@ def _report(folder: Path) -> None:
 
 def main() -> None:
     """Run the command line."""
-    sys.exit(run_to_end(cli, "padforge", EXTRAS))
+    sys.exit(common.run_to_end(cli, "padforge", EXTRAS))

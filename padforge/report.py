@@ -1,10 +1,14 @@
 """Write one HTML page on all results in the folder of a pad."""
 
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
-from padforge.design.common.validation import Fault, InputError
-from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.files import find_unchanged, read_json, recover, reraise_as_input_error, write_text
+from padforge.design.common.validation import Fault, InputError, check_path
+
+PAD = "morphology.json"
 
 
 def write_report(folder: Path) -> Path:
@@ -20,43 +24,82 @@ def write_report(folder: Path) -> Path:
         InputError: there are no results, or a file is damaged.
         Fault: some results are of another pad or recording; the first section of the page lists them.
     """
-    from padforge.design.common.files import recover, reraise_as_input_error, write_text
-    from padforge.design.common.page import PageSection, page
-    from padforge.design.report import (
-        contact_sections,
-        design_sections,
-        provenance_row,
-        provenance_section,
-        stage_sections,
-    )
+    from padforge.design.common.page import PageSection, collapsible, page, paragraph, table
+    from padforge.design.report import contact_sections, design_sections
     from padforge.fabricate.report.sections import fabrication_sections
     from padforge.sense.report import sections as sense
     from padforge.sense.report.identification_results import identification_sections
 
-    folder = as_path("folder", folder)
+    folder = check_path("folder", folder)
     recover(folder)
-    stages = (
-        ("design", folder / "design.json", design_sections),
-        ("fabrication", folder / "fabrication.json", fabrication_sections),
-        ("recording", folder / "recording" / "start.json", sense.recording_sections),
-        ("identification", folder / "identification.json", identification_sections),
-        ("calibration", folder / "calibration.json", sense.calibration_sections),
-        ("fibre-loss", folder / "fibre_loss.json", sense.fibre_loss_sections),
-        ("contacts", folder / "contacts.json", contact_sections),
-    )
-    sections, provenance, mismatches = stage_sections(folder, stages, cache(lambda: sense.recording_digest(folder)))
+    recording = cache(lambda: sense.recording_digest(folder))
+    sections: list[PageSection] = []
+    provenance: list[list[object]] = []
+    mismatches: list[str] = []
+    for name, file, write_sections in (
+        ("design", "design.json", design_sections),
+        ("fabrication", "fabrication.json", fabrication_sections),
+        ("recording", "recording/start.json", sense.recording_sections),
+        ("identification", "identification.json", identification_sections),
+        ("calibration", "calibration.json", sense.calibration_sections),
+        ("fibre-loss", "fibre_loss.json", sense.fibre_loss_sections),
+        ("contacts", "contacts.json", contact_sections),
+    ):
+        if (path := folder / file).exists():
+            document = read_json(path, f"padforge-{name}/{2 if name == 'design' else 1}")
+            with reraise_as_input_error(path):
+                mismatches += _find_mismatches(folder, name, document, recording)
+                sections += write_sections(folder, document)
+                provenance.append(_provenance_row(folder, name, document))
+    if mismatches:
+        advice = "This folder has files of two pads. Run these stages again, or use a folder for each pad."
+        sections.insert(0, PageSection("Files of different pads", list(map(paragraph, [advice, *mismatches]))))
     studies: list[str] = []
     for path, document in sense.find_studies(folder):
         with reraise_as_input_error(path):
             studies += sense.study_pieces(path, document)
-            provenance.append(provenance_row(folder, f"study {path.stem}", document))
+            provenance.append(_provenance_row(folder, f"study {path.stem}", document))
     if not provenance:
         raise InputError(f"{folder}: no design.json, fabrication.json, calibration.json or study to report on")
     if studies:
         sections.append(PageSection("Studies", studies))
+    rows = table(["stage", "command", "seed", "versions", "inputs (sha256)"], provenance)
+    summary = "Commands, seeds, versions and inputs of all stages"
+    sections.append(PageSection("Provenance", [collapsible(summary, [rows])]))
     lead = "Fibres, mould and calibration of one soft strain-sensor pad."
-    title = f"Pad report: {folder.resolve().name}"
-    write_text(folder / "report.html", page(title, lead, [*sections, provenance_section(provenance)]))
+    write_text(folder / "report.html", page(f"Pad report: {folder.resolve().name}", lead, sections))
     if mismatches:
         raise Fault(f"{folder / 'report.html'}: {'; '.join(mismatches)}")
     return folder / "report.html"
+
+
+def _find_mismatches(
+    folder: Path, stage: str, document: Mapping[str, Any], recording: Callable[[], str | None]
+) -> Iterator[str]:
+    """Yield whether a result is of another pad than the morphology.json in the folder, or of another recording."""
+    origin = document["provenance"]
+    inputs, name = origin.get("inputs", {}), f"{stage} ({origin.get('command')})"
+    pad = document.get("morphology_sha256") if stage == "design" else inputs.get(PAD)
+    if isinstance(pad, str) and (folder / PAD).is_file() and not find_unchanged(folder, {PAD: pad}):
+        yield f"{name} is of another pad than the {PAD} here"
+    if isinstance(inputs.get("recording"), str) and recording() not in (None, inputs["recording"]):
+        yield f"{name} is of another recording than the one here"
+
+
+def _provenance_row(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
+    """Return stage, command, seed, versions and inputs, each compared with the file of that name in the folder."""
+    origin = document["provenance"]
+    versions = ", ".join(f"{package} {version}" for package, version in origin.get("versions", {}).items())
+    inputs = "; ".join(_describe_inputs(folder, origin.get("inputs", {})))
+    return [stage, origin.get("command"), origin.get("seed"), versions or "-", inputs or "-"]
+
+
+def _describe_inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
+    for name, digest in inputs.items():
+        if not isinstance(digest, str):  # the provenance of an input that was computed
+            yield f"{name}: {digest['command']}" if digest else name
+        elif Path(name).name == name and (folder / name).is_file():  # never opens a file in another folder
+            match = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
+            yield f"{name} {digest} ({match})"
+        else:
+            yield f"{name} {digest}"

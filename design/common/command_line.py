@@ -6,9 +6,10 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +109,20 @@ def progress() -> Iterator["Progress"]:
 def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> None:
     """Print the machine-readable result or its summary for people, both on stdout."""
     click.echo(json.dumps(document, indent=1) if as_json else "\n".join(lines))
+
+
+def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0,)) -> list[str]:
+    """Format cells in aligned columns, a line per row; a short row ends in "-".
+
+    Args:
+        rows: cells, the header first.
+        text_columns: indices of the columns of words; others are of numbers, and right-aligned.
+    """
+    columns = []
+    for number, column in enumerate(zip_longest(*rows, fillvalue="-")):
+        width = max(map(len, column))
+        columns.append([cell.ljust(width) if number in text_columns else cell.rjust(width) for cell in column])
+    return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as of shells

@@ -1,8 +1,8 @@
 """`padforge sense calibrate` and `evaluate`: learning places, and how well it went."""
 
-from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -10,16 +10,14 @@ from padforge.design.common import command_line as common
 
 from .options import FEATURES, METHODS, lost_option, model_option, read_recording, recording_argument, reported
 
-if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
-    from padforge.sense.recordings.recording import Recording
-
 
 @click.command()
 @recording_argument
 @click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
 @click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
-@click.option("--test-split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test.")
+@click.option(
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test."
+)
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
@@ -29,15 +27,12 @@ if TYPE_CHECKING:
 @common.profile_option
 def calibrate(
     recording: Path,
-    method: str | None,
-    features: str | None,
-    test_split: str | None,
     time_budget: float | None,
-    seed: int | None,
     spec: Path | None,
     out: Path | None,
     force: bool,
     as_json: bool,
+    **overrides: Any,
 ) -> None:
     """Learn places from RECORDING and test on presses held back.
 
@@ -49,40 +44,24 @@ def calibrate(
     error_map.png and error_by_loss.png.
     """
     from padforge.design.common.files import locked_folder
-    from padforge.sense.report.calibration_results import calibration_lines
-
-    overrides = {"method": method, "features": features, "split": test_split, "seed": seed}
-    folder = out or common.pad_folder(recording)
-    with locked_folder(folder):
-        document = run_calibration(
-            common.load_spec(spec), read_recording(recording), folder, overrides, time_budget, force
-        )
-    common.show_result(document, calibration_lines(document), as_json)
-
-
-def run_calibration(
-    spec: "Spec",
-    recording: "Recording",
-    out: Path,
-    overrides: Mapping[str, Any],
-    time_budget: float | None = None,
-    force: bool = False,
-) -> dict[str, Any]:
-    """Calibrate into `out` with the settings of `spec`, and say on stderr how far it is; returns `calibration.json`."""
-    from padforge.sense.report.calibration_results import calibrate_into
+    from padforge.sense.report.calibration_results import calibrate_into, calibration_lines
     from padforge.sense.settings import LocalizerSettings
 
-    options = spec.section(LocalizerSettings, **overrides)
-    with reported("training") as report:
-        return calibrate_into(
-            recording,
-            out,
-            options,
-            time_budget=time_budget,
-            progress=report,
-            warn=lambda line: click.echo(line, err=True),
-            force=force,
-        )
+    folder = out or common.pad_folder(recording)
+    with locked_folder(folder):
+        options = common.load_spec(spec).section(LocalizerSettings, **overrides)
+        presses = read_recording(recording)
+        with reported("training") as report:
+            document = calibrate_into(
+                presses,
+                folder,
+                options,
+                time_budget=time_budget,
+                progress=report,
+                warn=partial(click.echo, err=True),
+                force=force,
+            )
+    common.show_result(document, calibration_lines(document), as_json)
 
 
 @click.command()

@@ -5,9 +5,18 @@ import json
 
 import pytest
 
-from padforge.benchmarks import harness, results
-from padforge.benchmarks.harness import Bench, BenchRounds, BenchTrial, measure_round, run_benches
-from padforge.benchmarks.results import bench_lines, comparison_lines, find_worsenings, read_earlier
+from padforge.benchmarks import harness
+from padforge.benchmarks.harness import (
+    Bench,
+    BenchRounds,
+    BenchTrial,
+    bench_lines,
+    comparison_lines,
+    find_worsenings,
+    measure_round,
+    read_earlier,
+    run_benches,
+)
 from padforge.design.common.validation import InputError
 
 
@@ -99,7 +108,7 @@ def test_worse_trials_are_reported(before, now, what):
 
 
 def test_slower_and_less_accurate_work_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(results, "save_figure", lambda figure, path: None)
+    monkeypatch.setattr(harness, "save_figure", lambda figure, path: None)
 
     def work(times):
         return lambda: sum(i * i for i in range(times * 5000))

@@ -55,7 +55,7 @@ def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
     assert document["candidate"] == result.candidate == "straight fibres"
     assert summary_lines(result, Path("out/pad"))[1:] == printed[1:]
     first, second = straight_mm[:2]
-    assert printed[1].startswith(f"  expected error {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
+    assert printed[1].startswith(f"  expected error  {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
     assert (printed[3].startswith("  the search found no better pad"), printed[4:]) == (True, ["  all rules hold"])
     similar = summary_lines(replace(result, candidate="start 1"), Path("out/pad"))
     assert similar[3].startswith("  not significantly better than straight fibres")

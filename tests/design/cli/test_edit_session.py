@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, check_rules
+from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, Spec, check_rules
 from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
-from padforge.design.editor.edits import PathEvaluator
 from padforge.design.editor.session import EditSession
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 
@@ -19,9 +18,8 @@ def session(tmp_path, pad=None, **size):
     if pad is not None:
         source = tmp_path / "pad.json"
         pad.save(source)
-        size = dict(pad.layout.settings)
-    evaluator = PathEvaluator(PadSettings(**size), RulesSettings(), Contact(), SearchSettings(max_failures=1))
-    editor = EditSession(evaluator, source, tmp_path / "out.json", views.append)
+    spec = Spec({"pad": size, "search": {"max_failures": 1}})
+    editor = EditSession(spec, source, tmp_path / "out.json", views.append, False)
     editor.begin()
     return editor, views
 

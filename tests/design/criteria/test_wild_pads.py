@@ -11,7 +11,7 @@ from padforge.design.objectives.published import disorder_area, published_terms
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import Parametrization
-from padforge.design.plan_drawing import draw_plan
+from padforge.design.report import draw_plan
 from padforge.design.settings import PadSettings, RulesSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")

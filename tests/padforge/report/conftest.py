@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design.common.files import provenance
 from padforge.design.common.plotting import save_figure
-from padforge.design.plan_drawing import draw_plan
+from padforge.design.report import draw_plan
 from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report

@@ -11,9 +11,10 @@ import pytest
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.settings import Spec
-from padforge.sense.cli.calibration import run_calibration
 from padforge.sense.health import fibre_prediction
+from padforge.sense.report.calibration_results import calibrate_into
 from padforge.sense.rig.operation import record_simulated
+from padforge.sense.settings import LocalizerSettings
 from tests.helpers.once import Once
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
@@ -43,7 +44,7 @@ def made(folder: Path, presses: int) -> Path:
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
     with mock.patch.object(fibre_prediction, "MOST_STEPS", 80):
-        run_calibration(spec, recording, folder / "model", {})
+        calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 
 
