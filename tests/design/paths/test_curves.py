@@ -11,7 +11,7 @@ from padforge.design import Morphology, crossings, flatten
 from padforge.design.kernels.pchip import pchip_sample as sample_curve
 from padforge.design.paths.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
 from padforge.design.torch_signals import pchip_sample
-from tests.design.pad.wild_pads import SEEDS, longest_signals, wild_pads
+from tests.design.wild_pads import SEEDS, longest_signals, wild_pads
 
 pads = st.builds(Morphology.random, st.integers(1, 3), st.integers(0, 10), SEEDS)
 

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from padforge.design import InputError, Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
-from tests.design.pad.wild_pads import SEEDS, mirrored, transposed, wild_pads, wild_presses
+from tests.design.wild_pads import SEEDS, mirrored, transposed, wild_pads, wild_presses
 
 INDENTERS = [Indenter("sphere", 0.7), Indenter("cone", angle_deg=30), Indenter("flat", 0.45)]
 

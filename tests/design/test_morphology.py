@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from padforge.design import InputError, Morphology, signals
 from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT
-from tests.design.pad.damage import damages, read_damaged
-from tests.design.pad.wild_pads import SEEDS, wild_pads
+from tests.design.common.damage import damages, read_damaged
+from tests.design.wild_pads import SEEDS, wild_pads
 
 
 @given(grid=st.integers(1, 5), knots=st.integers(0, 6), seed=SEEDS)

@@ -17,7 +17,7 @@ from padforge.design.paths.curves import (
     slope_beziers,
     trace_curve,
 )
-from tests.design.pad.wild_pads import SEEDS, wild_pads
+from tests.design.wild_pads import SEEDS, wild_pads
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 

@@ -18,7 +18,7 @@ from padforge.design.kernels.measured_signals import PRECISION
 from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
-from tests.design.pad.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
+from tests.design.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
 
 PROFILES = {
     "broad": ((0.0, 1.0), (0.3, 0.9), (0.6, 0.5), (0.9, 0.15), (1.2, -0.04), (1.6, 0.0)),

@@ -19,7 +19,7 @@ from padforge.design.paths.import_plan import import_plan
 from padforge.design.settings import Layout
 from padforge.fabricate import Plan
 from padforge.fabricate.report.track_drawings import tracks_dxf
-from tests.design.pad.damage import damages, read_damaged
+from tests.design.common.damage import damages, read_damaged
 
 LAYOUT = Layout.create((2, 3), (10.0, 12.0))
 """40 by 36 mm: ends of horizontals at y = -6 and 6, of verticals at x = -10, 0 and 10."""

@@ -12,7 +12,7 @@ from padforge.design import Contact, Morphology, signals, signals_quantized, sig
 from padforge.design.contact import serpentine_presses
 from padforge.design.objectives.published import published_terms
 from padforge.design.settings import PUBLISHED_CONTACT
-from tests.design.pad.wild_pads import SEEDS, contacts
+from tests.design.wild_pads import SEEDS, contacts
 
 SETS = [
     ("1para", PUBLISHED_CONTACT),

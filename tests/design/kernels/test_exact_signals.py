@@ -15,7 +15,7 @@ from padforge.design import Contact, InputError, Morphology, signals, signals_qu
 from padforge.design.contact import fibre_axes, signals_and_spans
 from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
-from tests.design.pad import wild_pads as wild
+from tests.design import wild_pads as wild
 
 
 def root(function, low, high):

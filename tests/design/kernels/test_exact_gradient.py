@@ -10,7 +10,7 @@ from padforge.design.contact import fibre_axes
 from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 from padforge.design.torch_signals import pchip_slopes, press_signals
-from tests.design.pad.wild_pads import SEEDS, wild_contacts, wild_pads
+from tests.design.wild_pads import SEEDS, wild_contacts, wild_pads
 
 PROFILE = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))
 CONTACTS = [

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from padforge.design import InputError, Morphology
 from padforge.design.common.mat_files import load_mat
 from padforge.sense import import_mat
-from tests.design.pad.damage import damages, read_damaged
+from tests.design.common.damage import damages, read_damaged
 
 
 def newer(path: Path, content: dict[str, Any]) -> Path:
