@@ -43,11 +43,21 @@ def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
 def _sum_uniform(
-    curve: Any, segment_lengths: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any
+    curve: Any,
+    segment_lengths: Any,
+    low: int,
+    high: int,
+    step: float,
+    ct: float,
+    cv: float,
+    chains: Any,
+    outer: float,
+    inner: float,
 ) -> float:
-    """Compute `_sum_stretch` for weight 1: the inscribed circle without branches, the ring around it by samples."""
-    chains, extents, law = shape
-    outer, inner = law.radius * law.radius, extents[4] * extents[4]
+    """Compute `_sum_stretch` for weight 1: the inscribed circle without branches, the ring around it by samples.
+
+    The squared radii are arguments: taken from the shape in here, the loop is no longer vectorised.
+    """
     values, weights, start = curve[low:high], segment_lengths[low:high], low * step - ct
     total, ring = 0.0, 0
     for i in range(len(values)):
@@ -81,9 +91,9 @@ def _sum_stretch(
 ) -> float:
     """Sum the segments of samples [low, high) that start inside the press at (ct, cv)."""
     chains, extents, law = shape
-    if law.weight == UNIFORM:
-        return _sum_uniform(curve, segment_lengths, low, high, step, ct, cv, shape)
     outer, inner = law.radius * law.radius, extents[4] * extents[4]
+    if law.weight == UNIFORM:
+        return _sum_uniform(curve, segment_lengths, low, high, step, ct, cv, chains, outer, inner)
     total = 0.0
     for i in range(low, high):
         dt, dv = i * step - ct, curve[i] - cv
