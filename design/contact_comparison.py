@@ -19,14 +19,22 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import SimulatedPresses
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Contact, PadSettings, Scatter, SearchSettings
+from padforge.design.settings import (
+    MEASURED_PROFILE,
+    MEASURED_STD_MM,
+    PUBLISHED_CONTACT,
+    Contact,
+    PadSettings,
+    Scatter,
+    SearchSettings,
+)
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
-PROFILE_STD_MM = (5.0, 6.2, 7.9)
-"""Standard deviations of the sensitivity profiles, about Gaussian, that are tried; that of MEASURED_PROFILE second."""
+PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)
+"""Standard deviations of the sensitivity profiles, about Gaussian, that are tried."""
 SIDE, N_TEST, HIDDEN = 32, 500, 20
 """Training presses a side, test presses, and neurons: the 50 published ones overfit the scatter, and err a tenth more
 in more time."""
@@ -47,7 +55,7 @@ def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
     """Return the assumed contact, first, and others that a pad may really meet, by name; none twice."""
     others = {
         f"profile of {std:g} mm": Contact(
-            sensitivity_profile=tuple((std / PROFILE_STD_MM[1] * d, weight) for d, weight in MEASURED_PROFILE)
+            sensitivity_profile=tuple((std / MEASURED_STD_MM * d, weight) for d, weight in MEASURED_PROFILE)
         )
         for std in PROFILE_STD_MM
     }

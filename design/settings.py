@@ -153,7 +153,9 @@ MEASURED_PROFILE = (
     *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
     *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
 )
-"""Profile measured on the built pad: a Gaussian of standard deviation 6.2 mm, with a smooth end instead of tails."""
+"""Profile measured on the built pad: a Gaussian with a smooth end instead of tails."""
+MEASURED_STD_MM = 6.2
+"""Standard deviation of that Gaussian."""
 MAX_OVERSHOOT = 0.15
 """Largest excursion of a spline from the range of the two points it connects, as a share of the largest weight. Smooth
 profiles stay far below; beyond it a signal would depend on weights that nobody measured."""

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.design.common.parallel import map_chunks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_array, check_int, check_type
+from padforge.design.common.validation import InputError, check_array, check_int, check_type, short_repr
 from padforge.design.contact import (
     check_presses,
     check_samples,
@@ -165,16 +165,16 @@ def published_terms(
         layout: of a population's fibres; as many horizontals as verticals, the default pitch apart, if None.
         levels: whole levels that signals are rounded up to, 1 to 2^24.
     """
-    factors = check_array("weights", weights, 1e12)
-    if factors.shape != (3,):
-        raise InputError(f"weights have shape {factors.shape}, expected three numbers: alpha, beta, gamma")
-    alpha, beta, gamma = factors.tolist()
+    if weights is not WEIGHTS and check_array("weights", weights, 1e12).shape != (3,):
+        raise InputError(f"weights are {short_repr(weights)}, expected three numbers: alpha, beta, gamma")
+    alpha, beta, gamma = weights
     along, across, ends, _ = fibre_axes(pads, layout)
     samples, levels = check_samples(samples, along.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)
     if presses is None:  # a copy, for a read-only array has kernels compiled anew
         layout = pads.layout if isinstance(pads, Morphology) else layout
-        presses = published_presses(layout or ends.horizontals).copy()
-    positions = check_presses(presses)[0]
+        positions = published_presses(layout or ends.horizontals).copy()
+    else:
+        positions = check_presses(presses)[0]
     shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT), grid_unit_mm(pads, layout))
     terms = np.zeros((len(along), 3))
 

@@ -2,7 +2,7 @@
 
 To add a term, write a function of a `ScoredPad` and add a row to TERMS; `score`, design.json and the report then have
 it. For a search to minimise it as well, name in the row the key of `[search]` that holds its weight (added to
-`SearchSettings`, 0 by default) and its differentiable form `loss`, a function of the signals.
+`SearchSettings`, 0 by default) and its differentiable form `loss`, a function of a `SearchedPad`.
 
 To add a rule, see `padforge.design.objectives.rules`.
 """
@@ -76,8 +76,15 @@ class ScoredPad:
         return formula.published_terms(self.pad, self.published_contact)[0]
 
 
-ComputeSignals = Callable[[Array], Tensor]
-"""Signals (F, Q) of presses (Q, 2), with gradient by the knots."""
+@dataclass(frozen=True)
+class SearchedPad:
+    """A pad at a step of a search, with gradients by its knots; grid units."""
+
+    signals: Callable[[Array], Tensor]  # signals (F, Q) of presses (Q, 2)
+    along: Tensor  # knots (F, n) along the fibres
+    across: Tensor  # and across them
+    length: Tensor  # of the fibres (F, 1)
+    size: PadSettings  # says what is pressed
 
 
 @dataclass(frozen=True)
@@ -88,7 +95,7 @@ class Term:
     description: str  # for people; `{}` stands for the end of the name
     compute: Callable[[ScoredPad], float | Mapping[object, float]]  # its value, or several by the end of their name
     weight: str | None = None  # key of `[search]` by which a search weighs it; None if it does not
-    loss: Callable[[ComputeSignals, PadSettings], Tensor] | None = None  # its differentiable form
+    loss: Callable[[SearchedPad], Tensor] | None = None  # its differentiable form
 
 
 def sharpness(signals: Tensor) -> Tensor:
@@ -129,7 +136,7 @@ TERMS = (
         "mean second difference of the signals along a serpentine, grid units",
         lambda s: sharpness(torch.tensor(s.serpentine_signals.T)).item(),
         weight="sharpness",
-        loss=lambda compute, size: sharpness(compute(serpentine_presses(size.sensed, SEARCH_SIDE))),
+        loss=lambda pad: sharpness(pad.signals(serpentine_presses(pad.size.sensed, SEARCH_SIDE))),
     ),
     Term("penalty", "penalty of {} in the gradient search", _penalties),
     Term(

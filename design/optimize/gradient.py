@@ -18,7 +18,7 @@ from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.objectives import expected_error as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.score import weighted_terms
+from padforge.design.objectives.score import SearchedPad, weighted_terms
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
@@ -318,5 +318,6 @@ class GradientSearch:
             for weight, term in weighted_terms(search):
                 if term.loss is not None:
                     on_device = lambda x, compute=compute_signals: compute(x).float().to(search.device)  # noqa: E731
-                    total = total + weight * term.loss(on_device, pad)
+                    searched = SearchedPad(on_device, along, across, length, pad)
+                    total = total + weight * term.loss(searched).to(search.device)
         return total.cpu() / len(self.problem.contacts)
