@@ -29,13 +29,12 @@ from padforge.design.optimize.search import (
     settings_for_twin,
     state_folders,
 )
-from padforge.design.report import draw_plan
+from padforge.design.report import FORMAT, draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
-FORMAT = "padforge-design/2"
 SIGNIFICANT = 0.05
 """Relative difference of expected errors from which trained networks agree which pad is better."""
 MAX_VIOLATIONS = 10

@@ -187,6 +187,8 @@ class Contact(Settings):
             nothing of the contact is stated.
     """
 
+    MOVED: ClassVar[Mapping[str, str]] = {"reach": "sensitivity_profile"}
+
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
     sides: Sides = Field(default=30, description='sides D of the object, or "circle", of a shape')
     weight: Literal["uniform", "inverse_square", "inverse"] = Field(
@@ -349,6 +351,8 @@ class SearchSettings(Settings):
         noise: additive scatter; this and the next two default to the scatter measured on a built pad.
         contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
     """
+
+    MOVED: ClassVar[Mapping[str, str]] = {"lost": "max_failures"}
 
     method: Literal["descent", "genetic"] = Field(
         default="descent", description="gradients of the expected error, or the genetic search as published"

@@ -23,7 +23,9 @@ from .run import SECTIONS, Run, check_run, run_stages, section_models
 
 try:
     from padforge.benchmarks.cli import bench
-except ModuleNotFoundError:  # an installed wheel
+except ModuleNotFoundError as error:
+    if not (error.name or "").startswith("padforge.benchmarks"):  # else an installed wheel, which has none
+        raise
 
     @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
     def bench() -> None:

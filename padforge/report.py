@@ -25,6 +25,7 @@ def write_report(folder: Path) -> Path:
         Fault: some results are of another pad or recording; the first section of the page lists them.
     """
     from padforge.design.common.page import PageSection, collapsible, page, paragraph, table
+    from padforge.design.report import FORMAT as DESIGN_FORMAT
     from padforge.design.report import contact_sections, design_sections
     from padforge.fabricate.report.sections import fabrication_sections
     from padforge.sense.report import sections as sense
@@ -36,17 +37,17 @@ def write_report(folder: Path) -> Path:
     sections: list[PageSection] = []
     provenance: list[list[object]] = []
     mismatches: list[str] = []
-    for name, file, write_sections in (
-        ("design", "design.json", design_sections),
-        ("fabrication", "fabrication.json", fabrication_sections),
-        ("recording", "recording/start.json", sense.recording_sections),
-        ("identification", "identification.json", identification_sections),
-        ("calibration", "calibration.json", sense.calibration_sections),
-        ("fibre-loss", "fibre_loss.json", sense.fibre_loss_sections),
-        ("contacts", "contacts.json", contact_sections),
+    for format_, file, write_sections in (
+        (DESIGN_FORMAT, "design.json", design_sections),
+        ("padforge-fabrication/1", "fabrication.json", fabrication_sections),
+        ("padforge-recording/1", "recording/start.json", sense.recording_sections),
+        ("padforge-identification/1", "identification.json", identification_sections),
+        ("padforge-calibration/1", "calibration.json", sense.calibration_sections),
+        ("padforge-fibre-loss/1", "fibre_loss.json", sense.fibre_loss_sections),
+        ("padforge-contacts/1", "contacts.json", contact_sections),
     ):
         if (path := folder / file).exists():
-            document = read_json(path, f"padforge-{name}/{2 if name == 'design' else 1}")
+            document, name = read_json(path, format_), format_.removeprefix("padforge-").partition("/")[0]
             with reraise_as_input_error(path):
                 mismatches += _find_mismatches(folder, name, document, recording)
                 sections += write_sections(folder, document)

@@ -37,6 +37,8 @@ REFUSED = [
     *((PadSettings, {"grid": grid}, "grid: got ") for grid in (np.float64(4), np.int64(0), np.array([4]))),
     *((PadSettings, {"grid": grid}, "grid: got ") for grid in (np.bool_(True), np.datetime64("2026-01-01"))),
     (PadSettings, {"gird": 4}, r"gird: no such key, allowed are grid"),
+    (Contact, {"reach": []}, "reach: no such key, it is sensitivity_profile now"),
+    (SearchSettings, {"lost": 2}, "lost: no such key, it is max_failures now"),
     (PadSettings, {"fibre_diameter_mm": 0.3}, r"fibre_diameter_mm: no such key, it is \[fibre\] diameter_mm now"),
     (PadSettings, {"horizontals": 0, "verticals": 0}, "horizontals and verticals are both 0, allowed is one fibre or"),
     (PadSettings, {"verticals": 257}, "verticals: got 257"),

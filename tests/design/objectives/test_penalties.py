@@ -12,6 +12,7 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths, refine
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.design.torch_signals import span_samples
+from tests.design.objectives.pads import bent
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NONE = RulesSettings(
@@ -32,15 +33,6 @@ def axes(pad):
 def found(pad, rules, margin=1.0):
     terms = penalties(*axes(pad), PadSettings(grid=pad.grid), rules, margin)
     return {rule: value.item() for rule, value in terms.items()}
-
-
-def bent(cross, travel=2.5, fibre=0):
-    """A 4 x 4 grid with one knot of one fibre moved."""
-    knots = Morphology.straight(4).knots
-    middle = knots.mean(axis=1, keepdims=True)
-    knots = np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1)
-    knots[fibre, 1] = (travel, cross) if fibre < 4 else (cross, travel)
-    return Morphology(knots)
 
 
 def slanting(shift):

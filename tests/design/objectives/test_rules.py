@@ -8,6 +8,7 @@ from padforge.design import InputError, Morphology, Spec, crossings
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import common_stretches, crossing_angles, flatten, slopes
 from padforge.design.settings import PUBLISHED, RulesSettings
+from tests.design.objectives.pads import bent
 
 NONE = RulesSettings(
     min_bend_radius_mm=0,
@@ -44,15 +45,6 @@ def test_no_limit_is_written_and_read_as_a_word(key, refused):
     assert PUBLISHED["rules"] == RulesSettings(max_common_track_mm=None)
     with pytest.raises(InputError, match=rf"\[rules\] {key}: got {refused!r}"):
         Spec({"rules": {key: refused}}).section(RulesSettings)
-
-
-def bent(cross, travel=2.5, fibre=0):
-    """A 4 x 4 grid with one knot of one fibre moved."""
-    knots = Morphology.straight(4).knots
-    middle = knots.mean(axis=1, keepdims=True)
-    knots = np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1)
-    knots[fibre, 1] = (travel, cross) if fibre < 4 else (cross, travel)
-    return Morphology(knots)
 
 
 @pytest.mark.parametrize("seed", range(3))
