@@ -1,11 +1,11 @@
-from .checks.findings import Finding as Finding
+from .cad.model import build_mould as build_mould
+from .checks import Finding as Finding
 from .checks.mesh_checks import check_mesh as check_mesh
 from .checks.plan_checks import check as check
 from .export import build as build
 from .materials import FibreSettings as FibreSettings
 from .materials import SiliconeSettings as SiliconeSettings
-from .mould.cad.model import build_mould as build_mould
-from .mould.plan import Plan as Plan
+from .plan import Plan as Plan
 from .settings import DispenserSettings as DispenserSettings
 from .settings import FabricationSettings as FabricationSettings
 from .settings import MouldSettings as MouldSettings

@@ -77,8 +77,8 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     """
     from padforge.design.common.files import locked_folder
     from padforge.design.morphology import Morphology
+    from padforge.fabricate.export import build as build_files
 
-    from .export import build as build_files
     from .settings import FabricationSettings
 
     settings = FabricationSettings.from_spec(load_spec(spec))
@@ -123,7 +123,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     """
     from padforge.design.common.files import atomic_file
     from padforge.fabricate.checks.plan_checks import inspect_file
-    from padforge.fabricate.report.pictures import draw_findings
+    from padforge.fabricate.outputs.pictures import draw_findings
 
     from .settings import FabricationSettings
 
@@ -147,7 +147,8 @@ def _line(finding: dict[str, Any]) -> str:
 
 def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
     """What the mould of a pad takes, with its fabrication.json and .stl written to `folder`: ml, and failed checks."""
-    from .export import build as build_files
+    from padforge.fabricate.export import build as build_files
+
     from .settings import FabricationSettings
 
     settings = FabricationSettings.from_spec(spec)

@@ -4,7 +4,8 @@ The same inputs give the same bytes. Everything is built and checked before the 
 appear together or not at all.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,12 +27,16 @@ from padforge.design.common.files import (
 )
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology
-from padforge.fabricate.checks.findings import Finding, verdict
+from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.checks.mesh_checks import SOUND, sound
 from padforge.fabricate.checks.plan_checks import inspect
-from padforge.fabricate.dispensing.files import LANGUAGES, dispensing
+from padforge.fabricate.fibre_placement.gcode import gcode
+from padforge.fabricate.fibre_placement.toolpath import check_course, instructions, laying_steps, summary_lines
+from padforge.fabricate.fibre_placement.urscript import urscript
 from padforge.fabricate.materials import PLASTICS
-from padforge.fabricate.mould.assembly import (
+from padforge.fabricate.mesh import write_3mf, write_stl, write_utf8
+from padforge.fabricate.mould import (
+    Body,
     bed_frame,
     conductive_body,
     conductive_plan,
@@ -41,17 +46,45 @@ from padforge.fabricate.mould.assembly import (
     mould_body,
     sizes,
 )
-from padforge.fabricate.mould.plan import Plan
-from padforge.fabricate.mould.prisms import Body
-from padforge.fabricate.report.laying import guide, orientation
-from padforge.fabricate.report.pictures import draw_mould, draw_tracks
-from padforge.fabricate.report.track_drawings import tracks_dxf, tracks_svg
-
-from .mesh_files import write_3mf, write_stl, write_utf8
-from .settings import DEFAULTS, FabricationSettings
+from padforge.fabricate.outputs.drawings import ORIENTATION_FILE as ORIENTATION_FILE
+from padforge.fabricate.outputs.drawings import orientation_svg, toolpath_svg, tracks_dxf, tracks_svg
+from padforge.fabricate.outputs.laying_page import laying_document as laying_document
+from padforge.fabricate.outputs.laying_page import laying_page
+from padforge.fabricate.outputs.laying_page import pad_document as pad_document
+from padforge.fabricate.outputs.pictures import draw_mould, draw_tracks
+from padforge.fabricate.plan import Plan
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
+
+LANGUAGES = {"gcode": ("laying.gcode", gcode), "urscript": ("laying.script", urscript)}
+"""The file of each language, and what writes it."""
+
+
+@dataclass(frozen=True)
+class FibrePlacement:
+    """Texts by the names of their files, programs first, and findings; both empty where no language is asked for."""
+
+    texts: dict[str, str]
+    findings: list[Finding]
+
+
+def place_fibres(plan: Plan, languages: Collection[str]) -> FibrePlacement:
+    """The programs in the `LANGUAGES` wanted, with a picture of the ways; other names are for others to read."""
+    wanted = [name for name in LANGUAGES if name in languages]
+    if not wanted:
+        return FibrePlacement({}, [])
+    fibre = plan.settings.fibre.material
+    steps = laying_steps(plan, fibre.diameter_mm, fibre.largest_stretch or math.inf)
+    work, summary, dispenser = (
+        list(instructions(plan, steps)),
+        list(summary_lines(plan, steps)),
+        plan.settings.dispenser,
+    )
+    texts = {name: write(work, summary, dispenser) for name, write in map(LANGUAGES.__getitem__, wanted)}
+    return FibrePlacement(texts | {"dispensing.svg": toolpath_svg(plan, steps)}, check_course(plan, steps))
+
 
 FORMAT = "padforge-fabrication/1"
 FORMATS = ("stl", "3mf", "step", "svg", "dxf", "png", *LANGUAGES)
@@ -116,7 +149,7 @@ def build(
         printed = [_meshed(name, body) for name, body in _bodies(plan)]
     with profiling.stage("checks"):
         findings = _checked(plan, printed)
-    by_machine = dispensing(plan, formats)
+    by_machine = place_fibres(plan, formats)
     findings += by_machine.findings
     cad = []
     if "step" in formats:
@@ -132,8 +165,8 @@ def build(
     ]
     document = _document(plan, printed, findings, [name for name, _ in writes], formats, made_by)
     writes += [
-        (orientation.FILE, partial(write_utf8, text=orientation.orientation_svg(plan))),
-        ("laying.md", partial(write_utf8, text=guide.laying_page(document))),
+        (ORIENTATION_FILE, partial(write_utf8, text=orientation_svg(plan))),
+        ("laying.md", partial(write_utf8, text=laying_page(document))),
     ]
     _put_in_place(out, writes, document, warn)
     return document
@@ -194,10 +227,10 @@ def _bodies(plan: Plan) -> list[tuple[str, Body]]:
 
 
 def _meshed(name: str, body: Body) -> Printed:
-    from padforge.fabricate.mould.mesh import arrays, mesh
+    from padforge.fabricate.mesh import build_mesh, mesh_arrays
 
-    solid = mesh(body)
-    return Printed(name, solid, *arrays(solid))
+    solid = build_mesh(body)
+    return Printed(name, solid, *mesh_arrays(solid))
 
 
 def _checked(plan: Plan, printed: Sequence[Printed]) -> list[Finding]:
@@ -234,8 +267,8 @@ def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
     Raises:
         InputError: a CAD solid is not valid, or not of its mesh.
     """
-    from padforge.fabricate.mould.cad.model import assembly, models
-    from padforge.fabricate.mould.cad.step_file import write_step
+    from padforge.fabricate.cad.model import assembly, models
+    from padforge.fabricate.cad.step_file import write_step
 
     made = models(plan, dict(_bodies(plan)))
     apart = [model.apart(body.mesh) for model, body in zip(made, printed, strict=True)]
@@ -249,7 +282,7 @@ def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
     message = f"volume and surface are within {100 * volume:.3f} % and {100 * surface:.3f} % of the mesh's"
     message += f", curves within {1000 * max(model.fit_mm for model in made):g} µm"
     measured = [round(volume, 6), round(surface, 6)]
-    found = verdict("cad_solid", True, measured, [round(most_volume, 6), round(most_surface, 6)], message)
+    found = check_result("cad_solid", True, measured, [round(most_volume, 6), round(most_surface, 6)], message)
     return ("mould.step", partial(write_step, shape=assembly(made, plan.enlarged))), found
 
 
@@ -277,7 +310,7 @@ def _document(
     size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
     rim = settings.mould.floor_mm + plan.enlarged.silicone_mm
     pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
-    bench = guide.document(plan, printed[0].mesh.volume() - pins)
+    bench = laying_document(plan, printed[0].mesh.volume() - pins)
     return {
         "format": FORMAT,
         "files": list(files),
@@ -292,7 +325,7 @@ def _document(
             "pitch_mm": plan.pad.pitch_mm,
             "mould": settings.mould.model_dump(),
             "printer": settings.printer.model_dump(),
-            "pad": guide.pad_settings(plan),
+            "pad": pad_document(plan),
             "rules": settings.rules.model_dump(include={"min_bend_radius_mm"}),
             "silicone": settings.silicone.model_dump(mode="json"),
             "fibre": settings.fibre.model_dump(),

@@ -27,7 +27,7 @@ def write_report(folder: Path) -> Path:
     from padforge.design.common.page import PageSection, collapsible, page, paragraph, table
     from padforge.design.report import FORMAT as DESIGN_FORMAT
     from padforge.design.report import contact_sections, design_sections
-    from padforge.fabricate.report.sections import fabrication_sections
+    from padforge.fabricate.outputs.report import fabrication_sections
     from padforge.sense.report import sections as sense
     from padforge.sense.report.identification_results import identification_sections
 

@@ -18,10 +18,10 @@ from padforge.design.common.files import sha256
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import export
+from padforge.fabricate.cad import model
 from padforge.fabricate.export import FORMATS, build
-from padforge.fabricate.mesh_files import COLOURS
-from padforge.fabricate.mould.cad import model
-from padforge.fabricate.mould.prisms import Body, Prism
+from padforge.fabricate.mesh import COLOURS
+from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
 

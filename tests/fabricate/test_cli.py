@@ -119,7 +119,7 @@ def test_imports_and_a_build_without_step_and_png_stay_light(morphology, tmp_pat
         ("import padforge.fabricate", [*always, "trimesh", "manifold3d", "shapely", "pydantic"]),
         ("import padforge.fabricate.cli", [*always, "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
         ("import padforge.fabricate.settings", [*always, "trimesh", "manifold3d", "shapely", "numpy"]),
-        ("import padforge.fabricate.export, padforge.design", [*always, "trimesh", "manifold3d"]),
+        ("import padforge.fabricate.build, padforge.design", [*always, "trimesh", "manifold3d"]),
         (
             f"padforge.fabricate.build(padforge.design.Morphology.load({str(morphology)!r}), "
             f"{str(tmp_path)!r}, ['stl', 'svg'])",

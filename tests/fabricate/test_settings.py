@@ -17,7 +17,7 @@ from padforge.fabricate.materials import (
     SiliconeSettings,
     divider_ohm,
 )
-from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import with_settings
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.fabricate.mesh_files import read_mesh
+from padforge.fabricate.mesh import read_mesh
 from tests.helpers.door import call
 
 CHEAP = """

@@ -18,7 +18,7 @@ from padforge.design.common.plotting import save_figure
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.settings import Layout
 from padforge.fabricate import Plan
-from padforge.fabricate.report.track_drawings import tracks_dxf
+from padforge.fabricate.outputs.drawings import tracks_dxf
 from tests.design.common.damage import damages, read_damaged
 
 LAYOUT = Layout.create((2, 3), (10.0, 12.0))

@@ -10,12 +10,10 @@ import shapely
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import beziers, cubic
 from padforge.design.settings import RulesSettings
-from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import SOUND
-from padforge.fabricate.checks.plan_checks import check, check_plan
-from padforge.fabricate.checks.plan_checks.fibre_strain import strains
-from padforge.fabricate.checks.plan_checks.tracks import thinner
-from padforge.fabricate.mould.plan import Plan
+from padforge.fabricate.checks.plan_checks import check, check_plan, strains, thinner
+from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from padforge.fabricate.checks.self_intersections import penetrating, places
+from padforge.fabricate.checks.surface import find_self_intersections, intersection_points
 
 CUBE = np.asarray(trimesh.creation.box((10, 10, 10)).triangles)
 
@@ -18,7 +18,7 @@ def moved(triangles: np.ndarray, *away: float) -> np.ndarray:
 
 
 def found(*parts: np.ndarray) -> int:
-    return len(penetrating(np.concatenate(parts)))
+    return len(find_self_intersections(np.concatenate(parts)))
 
 
 def interiors_meet(first: np.ndarray, second: np.ndarray) -> bool:
@@ -38,10 +38,10 @@ def test_two_triangles_against_linear_programming(corners):
     pair = np.array(corners, dtype=float).reshape(2, 3, 3) * 10  # none penetrates by less than the limit then
     areas = np.linalg.norm(np.cross(pair[:, 1] - pair[:, 0], pair[:, 2] - pair[:, 0]), axis=1)
     expected = bool((areas > 0).all()) and interiors_meet(*pair)
-    pairs = penetrating(pair)
+    pairs = find_self_intersections(pair)
     assert len(pairs) == expected
     if expected:
-        (place,) = places(pair, pairs)
+        (place,) = intersection_points(pair, pairs)
         low, high = pair.min(axis=1)[:, :2].max(axis=0), pair.max(axis=1)[:, :2].min(axis=0)
         assert (place >= low - 1e-6).all()
         assert (place <= high + 1e-6).all()
@@ -68,15 +68,15 @@ def test_bodies_that_reach_into_each_other(depth, counts):
     assert bool(found(CUBE, other)) == counts
     if depth > 1:
         corners = np.concatenate([CUBE, other])
-        middles = places(corners, penetrating(corners))
+        middles = intersection_points(corners, find_self_intersections(corners))
         assert (np.abs(middles - [5 - depth / 2, 0.5]) <= [depth / 2 + 1e-9, 4.5 + 1e-9]).all()
 
 
 def test_one_shell_through_itself():
     torus = trimesh.creation.torus(2, 3)
-    pairs = penetrating(np.asarray(torus.triangles))
+    pairs = find_self_intersections(np.asarray(torus.triangles))
     assert len(pairs) > 10
-    assert np.hypot(*places(np.asarray(torus.triangles), pairs).T).max() < 1.5
+    assert np.hypot(*intersection_points(np.asarray(torus.triangles), pairs).T).max() < 1.5
     assert not found(np.asarray(trimesh.creation.torus(3, 2).triangles))
 
 

@@ -7,9 +7,9 @@ import trimesh
 from manifold3d import CrossSection, Manifold, OpType
 from shapely.geometry.base import BaseGeometry
 
-from padforge.fabricate.checks.findings import Finding
+from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import inspect_mesh
-from padforge.fabricate.mould.plan import polygon_rings
+from padforge.fabricate.plan import polygon_rings
 
 FLOOR, DEPTH, WALL, SIZE = 2.0, 6.0, 2.0, 20.0
 """Floor, depth and walls of the trays here, and the width of what they hold, mm."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from padforge.fabricate.report.mould_view import Packed, packed
+from padforge.fabricate.outputs.report import Packed, packed
 from padforge.report import write_report
 from tests.helpers.chromium import SOFTWARE_GL, Chromium
 
@@ -53,7 +53,7 @@ def test_oversized_mesh_is_simplified_or_omitted(made: Path, pad: Path, monkeypa
     assert coarse.nbytes <= whole.nbytes * 4 // 5
     assert volume(coarse) == pytest.approx(volume(whole), rel=0.01)
     assert packed(made / "mould.stl", most_bytes=1000) is None
-    monkeypatch.setattr("padforge.fabricate.report.sections.packed", lambda path: None)
+    monkeypatch.setattr("padforge.fabricate.outputs.report.packed", lambda path: None)
     text = write_report(pad).read_text()
     assert "mould.stl is too large to be turned" in text
     assert "<canvas" not in text

@@ -1,0 +1,1 @@
+"""CAD model of the mould: exact curves, named and coloured solids, STEP."""

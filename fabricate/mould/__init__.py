@@ -1,1 +1,0 @@
-"""The mould, from the plan to solids and meshes."""

@@ -1,1 +1,0 @@
-"""The mould as a CAD model: true curves, named and coloured parts."""

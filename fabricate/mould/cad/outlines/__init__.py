@@ -1,1 +1,0 @@
-"""Outlines drawn finely, and the true curves and cells that come of them."""

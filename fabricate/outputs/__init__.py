@@ -1,0 +1,1 @@
+"""Drawings, pictures, laying page and report of a mould."""

@@ -1,1 +1,0 @@
-"""The mould on paper: drawings, laying guide, pictures, and its part of the report."""

@@ -1,1 +1,0 @@
-"""The page for the bench: what to print, mix, cast and lay."""

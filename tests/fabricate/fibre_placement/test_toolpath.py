@@ -1,0 +1,158 @@
+"""How fast a needle goes along fibres, and whether it has room and fits its tracks."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.interpolate import PchipInterpolator
+
+from padforge.design.morphology import Morphology, assemble_knots
+from padforge.fabricate.fibre_placement.toolpath import Stroke, check_course, laying_steps
+from padforge.fabricate.outputs.laying_page import laying_document
+from padforge.fabricate.plan import Plan
+from tests.fabricate.planted import with_settings
+
+
+def strokes(plan: Plan, stretch: float = math.inf) -> list[Stroke]:
+    return [stroke for step in laying_steps(plan, 0.3, stretch) for stroke in step.strokes]
+
+
+def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
+    """The plain way: the heading every 2 um by scipy's PCHIP, what turns within a window, the most in each piece."""
+    family = plan.family(stroke.fibre)
+    knots = plan.pad.to_mm(plan.pad.knots[stroke.fibre])
+    travel, cross = knots[:, family], knots[:, 1 - family]
+    t = np.linspace(travel[0] - window_mm, travel[-1] + window_mm, 40_000)
+    inside = (t >= travel[0]) & (t <= travel[-1])
+    slope = np.where(inside, PchipInterpolator(travel, cross)(t, 1), 0.0)
+    arc = np.concatenate([[0], np.cumsum(np.hypot(1, (slope[1:] + slope[:-1]) / 2) * np.diff(t))])
+    turned = np.concatenate([[0], np.cumsum(np.abs(np.diff(np.arctan(slope))))])
+    radius = window_mm / np.maximum(
+        np.interp(arc + window_mm / 2, arc, turned) - np.interp(arc - window_mm / 2, arc, turned), 1e-9
+    )
+    along = stroke.places_mm[:, family] * (-1 if family == 0 else 1)
+    return np.array([radius[(t >= a) & (t <= b)].min(initial=1e9) for a, b in pairwise(along)])
+
+
+@pytest.mark.parametrize("stretch", [math.inf, 0.3])
+def test_no_bend_is_taken_faster_than_machine_and_fibre_can(stretch):
+    plan = Plan(
+        Morphology.random(2, 3, seed=6), with_settings(dispenser={"acceleration_mm_s2": 60.0, "feed_mm_s": 12.0})
+    )
+    slow = 0
+    for stroke in strokes(plan, stretch):
+        radius = least_radii(plan, stroke, 0.3)
+        allowed = np.minimum(np.sqrt(60 * radius), 12 * (1 - 0.3 / (2 * radius * stretch)))
+        assert (stroke.feeds_mm_s <= np.clip(1.1 * allowed, 1.2, 12) + 1e-9).all()
+        slow += (stroke.feeds_mm_s < 6).sum()
+        assert np.allclose(stroke.feeds_mm_s / 1.2, np.round(stroke.feeds_mm_s / 1.2))
+    assert slow
+
+
+@pytest.mark.parametrize(
+    ("radius_mm", "acceleration", "stretch", "feed"),
+    [
+        (4.0, 9.5, math.inf, 6.0),  # sqrt(9.5 * 4) = 6.16 mm/s
+        (4.0, 26.0, math.inf, 10.0),
+        (2.0, 9.5, math.inf, 4.0),  # sqrt(9.5 * 2) = 4.36 mm/s
+        (4.0, 26.0, 0.07, 4.0),  # 1 - 0.3 / (2 * 4 * 0.07) = 0.464 of the feed
+        (4.0, 9.5, 0.11, 6.0),  # the fibre bears 6.59 mm/s
+    ],
+)
+def test_the_feed_in_a_bend_is_what_its_radius_allows(radius_mm, acceleration, stretch, feed):
+    """Leads to one side turn by quarters of a circle, of the least radius of the rules; all else here is straight."""
+    settings = with_settings(
+        pad={"leads": "one side"},
+        rules={"min_bend_radius_mm": radius_mm},
+        dispenser={"acceleration_mm_s2": acceleration, "feed_mm_s": 10.0},
+    )
+    (horizontal,) = (each for each in strokes(Plan(Morphology.straight(2), settings), stretch) if each.fibre == 0)
+    assert (horizontal.feeds_mm_s.min(), horizontal.feeds_mm_s.max()) == (feed, 10.0)
+    slow_mm = horizontal.steps_mm[horizontal.feeds_mm_s == feed].sum()
+    ends_mm = 4 * 2 * 0.3  # of both quarters: beside them the needle has half a diameter to get slower in
+    assert slow_mm == pytest.approx(math.pi * radius_mm if feed < 10 else horizontal.steps_mm.sum(), abs=ends_mm)
+
+
+def test_bends_only_where_they_are_slow_a_fibre_down():
+    """A corner in mid-way: beyond a millimetre of it the needle is as fast as it may be, on the leads as well."""
+    inner = np.zeros((2, 3, 2))
+    inner[0] = [(0.6, 1.0), (1.0, 1.0), (1.02, 1.2)]
+    inner[1] = [(1, 0.5), (1, 1.0), (1, 1.5)]
+    bent, straight = strokes(Plan(Morphology(assemble_knots(inner), 10.0)))
+    assert straight.feeds_mm_s.tolist() == [10.0]
+    assert len(straight.places_mm) == 2
+    at_most = bent.feeds_mm_s == 10
+    assert 0 < bent.steps_mm[~at_most].sum() < 6
+    assert at_most[[0, -1]].all()
+    assert bent.feeds_mm_s.min() < 6
+
+
+def test_a_fibre_that_bears_less_is_laid_more_slowly_never_at_rest():
+    plan = Plan(Morphology.random(2, 4, seed=1))
+    feeds = [np.concatenate([stroke.feeds_mm_s for stroke in strokes(plan, each)]) for each in (1e-6, 0.2, 5.0)]
+    least, most = [each.min() for each in feeds], [each.max() for each in feeds]
+    assert least[0] == 1.0
+    assert most == sorted(most)
+    lengths = [sum((s.steps_mm / s.feeds_mm_s).sum() for s in strokes(plan, each)) for each in (1e-6, 0.2, 5.0)]
+    assert lengths == sorted(lengths, reverse=True)
+
+
+def test_as_long_as_the_laying_page_has_it_cut():
+    plan = Plan(Morphology.random(2, 5, seed=3))
+    cut = [fibre["cut_mm"] for fibre in laying_document(plan, 1.0)["fibres"]]
+    for stroke in strokes(plan):
+        assert stroke.steps_mm.sum() == pytest.approx(cut[stroke.fibre], abs=0.02)
+
+
+PAD = Morphology.straight(2)  # 33.75 mm, with leads 97.75 mm
+
+
+EDGE = 33.75 / 2 + 2 + 30
+
+
+def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object):
+    plan = Plan(pad, with_settings(mould, dispenser=dispenser))
+    return {finding.name: finding for finding in check_course(plan, laying_steps(plan, 0.3))}
+
+
+@pytest.mark.parametrize(
+    ("keys", "room", "places"),
+    [
+        ({"origin_mm": [EDGE, EDGE]}, 0.0, None),
+        ({"origin_mm": [EDGE - 0.5, 110.0]}, -0.5, [(EDGE, -5.625), (EDGE, 5.625)]),
+        ({"box_mm": [0.0, 220.0, 0.0, 110 + EDGE - 2, -5.0, 9.0]}, -2.0, [(-5.625, EDGE), (5.625, EDGE)]),
+        ({"box_mm": [0.0, 220.0, 0.0, 220.0, -0.5, 9.0]}, -0.4, [(-EDGE, -5.625), (-EDGE, 5.625)]),
+        ({"travel_height_mm": 10.0, "box_mm": [0.0, 220.0, 0.0, 220.0, -5.0, 9.0]}, -1.0, None),
+    ],
+)
+def test_the_box_holds_all_ways_or_it_is_told_where_not(keys, room, places):
+    found = findings(**keys)["dispenser_box"]
+    assert found.measured == pytest.approx(room, abs=1e-9)
+    assert found.status == ("pass" if room == 0 else "fail")
+    if places is not None:
+        assert np.array(sorted(found.places_mm)) == pytest.approx(np.array(places))
+    else:
+        assert len(found.places_mm) == (4 if room else 0)
+
+
+@pytest.mark.parametrize(
+    ("tip", "mould", "status"),
+    [
+        (0.37, {}, "pass"),
+        (0.41, {}, "fail"),
+        (0.64, {"ridge_width_mm": 0.7}, "pass"),
+        (0.71, {"ridge_width_mm": 0.7}, "fail"),
+    ],
+)
+def test_a_needle_wider_than_a_track_would_cut_the_silicone(tip, mould, status):
+    found = findings(mould, tip_mm=tip)["dispenser_tip"]
+    assert (found.status, found.measured) == (status, tip)
+    assert bool(found.places_mm) == (status == "fail")
+    assert all(max(map(abs, place)) < EDGE - 29 for place in found.places_mm)  # leads lie outside
+
+
+def test_by_default_the_needle_can_go_its_way():
+    found = findings(pad=Morphology.random(3, 5, seed=4))
+    assert {finding.status for finding in found.values()} == {"pass"}
+    assert 0.38 < float(str(found["dispenser_tip"].limit)) <= 0.4

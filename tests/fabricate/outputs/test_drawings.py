@@ -1,0 +1,202 @@
+# pyright: reportPrivateImportUsage=false
+# ezdxf does not mark what its own manual imports as exported.
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import ezdxf
+import numpy as np
+import pytest
+import shapely
+from ezdxf.document import Drawing
+from ezdxf.entities import LWPolyline
+from scipy.interpolate import PchipInterpolator
+
+from padforge.design.morphology import Morphology
+from padforge.fabricate.outputs.drawings import orientation_sentence, tracks_dxf, tracks_svg
+from padforge.fabricate.plan import Plan, fibre_layers
+from tests.fabricate.planted import level_pad, with_settings
+
+PAD = Morphology.random(3, 3, seed=7)
+SVG = "{http://www.w3.org/2000/svg}"
+INKSCAPE = "{http://www.inkscape.org/namespaces/inkscape}"
+TONGUES = [{"exit_mm": 0.0}, {}, {"border_mm": 2.0}]
+
+
+def numbers_in(text: str) -> np.ndarray:
+    """The coordinates of an SVG path, (n, 2), y upwards."""
+    return np.array(re.findall(r"-?\d+(?:\.\d+)?", text), dtype=float).reshape(-1, 2) * (1, -1)
+
+
+def svg_groups(plan: Plan) -> dict[str, ElementTree.Element]:
+    return {group.get("id", ""): group for group in ElementTree.fromstring(tracks_svg(plan)).findall(f"{SVG}g")}
+
+
+def bezier_points(control: np.ndarray) -> np.ndarray:
+    """(n, 2) points of Bezier segments (s, 4, 2)."""
+    u = np.linspace(0, 1, 25)[:, None, None]
+    a, b, c, d = np.moveaxis(control, 1, 0)
+    return ((1 - u) ** 3 * a + 3 * (1 - u) ** 2 * u * b + 3 * (1 - u) * u**2 * c + u**3 * d).reshape(-1, 2)
+
+
+def assert_on_curve(plan: Plan, fibre: int, places_mm: np.ndarray) -> None:
+    """Places (n, 2) mm lie within 0.1 µm of the fibre as scipy has it, and cover it from end to end."""
+    axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
+    curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
+    travel = np.clip(places_mm[:, axis], knots[0, axis], knots[-1, axis])
+    off = np.abs(places_mm[:, 1 - axis] - curve(travel)) / np.hypot(1, curve(travel, 1))
+    assert off.max() < 1e-4
+    assert np.ptp(travel) == pytest.approx(plan.pad.layout.size_mm[0])
+
+
+def assert_ends(plan: Plan, fibre: int, ends_mm: np.ndarray) -> None:
+    """The fibre begins and ends at the edge of the silicone, level with its own ends."""
+    axis, mould = plan.family(fibre), plan.settings.mould
+    edge = plan.pad.layout.size_mm[0] / 2 + mould.border_mm + mould.exit_mm
+    assert ends_mm[:, axis] == pytest.approx([-edge, edge], abs=1e-4)
+    level = plan.pad.to_mm(plan.pad.knots[fibre])[[0, -1], 1 - axis]
+    assert ends_mm[:, 1 - axis] == pytest.approx(level, abs=1e-4)
+
+
+@pytest.mark.parametrize("mould", TONGUES)
+def test_svg_holds_the_exact_curves(mould):
+    plan = Plan(PAD, with_settings(mould))
+    paths = {path.get("id"): path for group in svg_groups(plan).values() for path in group.findall(f"{SVG}path")}
+    for fibre in range(6):
+        path = paths[f"{('horizontal', 'vertical')[fibre // 3]}-{fibre % 3 + 1}"].get("d", "")
+        assert re.sub(r"[^A-Z]", "", path) == "MLCCCCL"
+        points = numbers_in(path)
+        assert_ends(plan, fibre, points[[0, -1]])
+        assert_on_curve(plan, fibre, bezier_points(np.stack([points[1 + 3 * i : 5 + 3 * i] for i in range(4)])))
+
+
+def test_svg_has_a_layer_for_every_depth_in_laying_order():
+    groups = svg_groups(Plan(Morphology.straight(4)))
+    assert list(groups) == ["silicone", "horizontal-1.2", "vertical-0.4", "numbers", "scale"]
+    assert {group.get(f"{INKSCAPE}groupmode") for group in groups.values()} == {"layer"}
+    assert groups["horizontal-1.2"].get(f"{INKSCAPE}label") == "horizontal, 1.2 mm deep"
+    assert [path.get("id") for path in groups["vertical-0.4"]] == [f"vertical-{n}" for n in (1, 2, 3, 4)]
+    deep = svg_groups(Plan(Morphology.straight(4), with_settings(pad={"deep_family": "vertical"})))
+    assert list(deep)[1:3] == ["vertical-1.2", "horizontal-0.4"]
+
+
+def test_fibres_of_one_family_that_cross_are_on_layers_of_their_own():
+    groups = svg_groups(Plan(level_pad(1.8, 1.2)))
+    assert [name for name in groups if name.startswith("horizontal")] == ["horizontal-2", "horizontal-1.2"]
+    strokes = {groups[name].get("stroke") for name in ("horizontal-2", "horizontal-1.2", "vertical-0.4")}
+    assert len(strokes) == 3
+
+
+def test_svg_is_of_true_size_and_nothing_is_cut_off():
+    plan = Plan(PAD)
+    root = ElementTree.fromstring(tracks_svg(plan))
+    left, top, width, height = map(float, root.get("viewBox", "").split())
+    assert (root.get("width"), root.get("height")) == (f"{width:g}mm", f"{height:g}mm")
+    frame = shapely.box(left, -top - height, left + width, -top)
+    groups = svg_groups(plan)
+    edge = shapely.Polygon(numbers_in(groups["silicone"][0].get("d", "")))
+    assert edge.symmetric_difference(plan.silicone).area < 1e-3
+    assert edge.within(frame)
+    bar = shapely.MultiPoint(numbers_in(groups["scale"][0].get("d", "")))
+    assert bar.within(frame)
+    assert not bar.intersects(edge)
+    assert bar.bounds[2] - bar.bounds[0] == pytest.approx(10)
+    assert groups["scale"][1].text == "10 mm"
+
+
+def test_svg_numbers_stand_beside_the_starts_outside_the_silicone():
+    plan = Plan(PAD)
+    texts = svg_groups(plan)["numbers"]
+    assert [text.text for text in texts] == list("123456")
+    for text, line in zip(texts, plan.lines, strict=True):
+        place = shapely.Point(float(text.get("x", "")), -float(text.get("y", "")))
+        assert not place.intersects(plan.silicone)
+        assert place.distance(shapely.Point(line.coords[0])) < 3
+    root = ElementTree.fromstring(tracks_svg(plan))
+    assert "as it lies in the tray" in (root.findtext(f"{SVG}title") or "")
+    assert orientation_sentence((4, 4), "edges") in (root.findtext(f"{SVG}desc") or "")
+
+
+@pytest.mark.parametrize("pad", [Morphology.straight(1, pitch_mm=4.0), PAD, Morphology.straight(10)])
+def test_both_drawings_say_which_way_round_and_have_room_for_it(pad, tmp_path):
+    plan = Plan(pad)
+    beside, *texts = svg_groups(plan)["scale"].findall(f"{SVG}text")[1:]
+    assert " ".join(text.text or "" for text in texts) == orientation_sentence((4, 4), "edges")
+    notes = read_dxf(tracks_dxf(plan), tmp_path).modelspace().query('TEXT[layer=="scale"]')
+    assert [note.dxf.text for note in notes][2:] == [text.text for text in texts]
+    left, top, width, height = map(float, ElementTree.fromstring(tracks_svg(plan)).get("viewBox", "").split())
+    for text in (beside, *texts):
+        size = min(2.5, 0.6 * pad.pitch_mm)
+        assert float(text.get("x", "")) + 0.58 * size * len(text.text or "") < left + width  # DejaVu Sans is wide
+    lines = [float(text.get("y", "")) for text in texts]
+    assert max(lines) + 1 < top + height
+    assert min(lines) - 1 > -plan.silicone.bounds[1]
+    assert (np.diff(lines) > 0.6 * min(2.5, 0.6 * pad.pitch_mm)).all()
+
+
+def read_dxf(text: str, folder: Path) -> Drawing:
+    path = folder / "tracks.dxf"
+    path.write_text(text, encoding="utf-8")
+    return ezdxf.readfile(path)
+
+
+@pytest.mark.parametrize("mould", TONGUES)
+def test_dxf_splines_are_the_exact_curves(mould, tmp_path):
+    plan = Plan(PAD, with_settings(mould))
+    document = read_dxf(tracks_dxf(plan), tmp_path)
+    drawn = [list(document.modelspace().query(f'SPLINE[layer=="{layer.name}"]')) for layer in fibre_layers(plan)]
+    for layer, splines in zip(fibre_layers(plan), drawn, strict=True):
+        for fibre, spline in zip(layer.fibres, splines, strict=True):
+            curve = spline.construction_tool()
+            assert curve.degree == 3
+            knots, counts = np.unique(curve.knots(), return_counts=True)
+            assert counts.tolist() == [4, *[3] * (len(knots) - 2), 4]
+            points = np.array([tuple(p)[:2] for p in curve.points(np.linspace(knots[0], knots[-1], 400).tolist())])
+            assert_ends(plan, fibre, points[[0, -1]])
+            inside = np.abs(points[:, layer.family]) <= plan.pad.layout.size_mm[0] / 2
+            control = np.array([tuple(p)[:2] for p in curve.control_points])
+            first = 3 * bool(plan.settings.mould.border_mm + plan.settings.mould.exit_mm)
+            ends = control[[first, len(control) - 1 - first]]
+            assert_on_curve(plan, fibre, np.vstack([ends, points[inside]]))
+
+
+def test_dxf_is_sound_and_complete(tmp_path):
+    plan = Plan(level_pad(1.8, 1.2))
+    document = read_dxf(tracks_dxf(plan), tmp_path)
+    audit = document.audit()
+    assert not audit.errors
+    assert not audit.fixes
+    assert document.dxfversion >= "AC1024"
+    assert document.header["$INSUNITS"] == 4
+    names = {"silicone", "numbers", "scale", "horizontal-2", "horizontal-1.2", "vertical-0.4"}
+    assert {layer.dxf.name for layer in document.layers} - {"0", "Defpoints"} == names
+    colours = [document.layers.get(name).rgb for name in ("horizontal-2", "horizontal-1.2", "vertical-0.4")]
+    assert len({tuple(colour) for colour in colours if colour}) == 3
+    space = document.modelspace()
+    (edge,) = space.query("LWPOLYLINE")
+    assert isinstance(edge, LWPolyline)
+    assert edge.closed
+    assert shapely.Polygon(edge.get_points("xy")).symmetric_difference(plan.silicone).area < 1e-3
+    assert [text.dxf.text for text in space.query('TEXT[layer=="numbers"]')] == list("1234")
+    spans = np.array([[line.dxf.start.x, line.dxf.end.x] for line in space.query("LINE")])
+    assert np.ptp(spans) == pytest.approx(10)
+
+
+@pytest.mark.slow
+def test_dxf_is_the_same_in_every_process():
+    script = (
+        "import sys; from padforge.design.morphology import Morphology; from padforge.fabricate.plan import Plan;"
+        " from padforge.fabricate.outputs import drawings; assert 'ezdxf' not in sys.modules;"
+        " sys.stdout.write(drawings.tracks_dxf(Plan(Morphology.random(3, 3, seed=7))))"
+    )
+    folder, before = Path(__file__).resolve().parents[3], ezdxf.options.write_fixed_meta_data_for_testing
+    here = tracks_dxf(Plan(PAD))
+    assert ezdxf.options.write_fixed_meta_data_for_testing == before
+    environment = {**os.environ, "PYTHONHASHSEED": "1"}  # sets of strings have an order of their own with each
+    command = [sys.executable, "-c", script]
+    there = subprocess.run(command, check=True, cwd=folder, env=environment, capture_output=True, text=True)
+    assert there.stdout == here

@@ -1,0 +1,100 @@
+"""Wild pads, and settings at the ends of what each key allows: a closed mould, or one line that says why not."""
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology, assemble_knots
+from padforge.fabricate.checks.mesh_checks import sound
+from padforge.fabricate.checks.plan_checks import check
+from padforge.fabricate.mesh import build_mesh, mesh_arrays
+from padforge.fabricate.mould import mould_body
+from padforge.fabricate.plan import Plan
+from tests.fabricate.planted import with_settings
+
+ENDS = {
+    "floor_mm": [0.4, 50.0],
+    "wall_mm": [0.8, 50.0],
+    "wall_draft_deg": [0.0, 30.0],
+    "silicone_mm": [1e-3, 1.3, 100.0],
+    "border_mm": [1e-9, 1e-5, 100.0],
+    "ridge_width_mm": [0.1, 3.0, 20.0],
+    "ridge_draft_deg": [1e-9, 20.0],
+    "deep_ridge_height_mm": [1e-9, 0.5, 5.99],
+    "shallow_ridge_height_mm": [1e-300, 1e-6, 1.19, 1.1999999999],
+    "exit_mm": [0.0, 1e-9, 1e-4, 50.0],
+    "exit_width_mm": [0.4000001, 11.0],
+    "number_mm": [0.0, 1e-9, 0.01, 20.0],
+    "lead_mm": [0.0, 1000.0],
+    "tolerance_mm": [1e-3, 0.0999],
+}
+
+
+def wild(kind: str, grid: int = 2, count: int = 4) -> Morphology:
+    """A pad whose fibres have steps and needles, run along the border, on each other or through others' knots."""
+    rng = np.random.default_rng(3)
+    inner = rng.uniform(0, grid + 1, (2 * grid, count, 2))
+    if kind == "steps":  # knots of one travel coordinate are put next to each other
+        inner[:grid, :, 0], inner[grid:, :, 1] = 0.7, 2.2
+    elif kind == "lattice":
+        inner = np.round(2 * inner) / 2
+    elif kind == "border":
+        inner[:grid, :, 1] = rng.choice([0, grid + 1.0], (grid, count))
+        inner[grid:, :, 0] = rng.choice([0, grid + 1.0], (grid, count))
+    elif kind == "alike":
+        inner[:grid], inner[grid:] = inner[0], inner[grid]
+    elif kind == "edge":
+        inner = rng.choice([0.0, 1e-9, grid + 1.0], inner.shape)
+    elif kind == "needles":
+        inner[:grid, :, 0] = inner[grid:, :, 1] = 1.3 + 1e-9 * np.arange(count)
+    elif kind == "level":
+        inner[:grid, :, 1] = np.arange(1, grid + 1)[:, None] + rng.normal(0, 1e-12, (grid, count))
+    return Morphology(assemble_knots(inner))
+
+
+KINDS = ["steps", "lattice", "border", "alike", "edge", "needles", "level"]
+
+
+def require_one_line(error: InputError) -> None:
+    assert len(str(error).splitlines()) == 1
+
+
+def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
+    try:
+        plan = Plan(pad, with_settings(dict(mould)))
+        vertices, triangles = mesh_arrays(build_mesh(mould_body(plan)))
+    except InputError as error:
+        require_one_line(error)
+        return
+    broken = [finding.message for finding in sound(vertices, triangles) if finding.status == "fail"]
+    assert not broken
+    size = np.ptp(vertices.astype(float), axis=0)
+    assert min(size[:2]) > pad.layout.size_mm[0] + 2 * plan.settings.mould.border_mm
+    assert size[2] > plan.settings.mould.floor_mm
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wild_pad_has_a_closed_mould(kind):
+    require_closed(wild(kind), {"border_mm": 1.0})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", [*KINDS, *ENDS])
+def test_whatever_can_be_planned_is_judged_in_plain_words(key):
+    for value in ENDS.get(key, [None]):
+        pad = wild(key) if value is None else Morphology.random(1, 3, seed=1)
+        try:
+            findings = check(pad, with_settings(None if value is None else {key: value}))
+        except InputError as error:
+            require_one_line(error)
+            continue
+        json.dumps([finding.document() for finding in findings], allow_nan=False)
+
+
+@pytest.mark.parametrize("key", ENDS)
+def test_settings_at_their_ends_give_a_closed_mould_or_one_line(key):
+    for value in ENDS[key]:
+        require_closed(Morphology.random(1, 1, seed=1), {key: value})

@@ -1,0 +1,216 @@
+"""Files of meshes: there and back, damaged, or made to be awkward; each is read and judged, or refused in one line."""
+
+import json
+import zipfile
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+import trimesh.exchange.stl
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from padforge.design.common.validation import InputError
+from padforge.fabricate.checks import Finding
+from padforge.fabricate.checks.mesh_checks import check_mesh, inspect_mesh, sound
+from padforge.fabricate.mesh import read_mesh, write_3mf, write_stl
+
+BOX = trimesh.creation.box((10, 20, 5))
+VERTICES, TRIANGLES = np.asarray(BOX.vertices), np.asarray(BOX.faces)
+CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+
+
+def written(path: Path, vertices: np.ndarray = VERTICES, triangles: np.ndarray = TRIANGLES, title: str = "box") -> Path:
+    if path.suffix == ".stl":
+        write_stl(path, vertices, triangles)
+    else:
+        write_3mf(path, vertices, triangles, name="mould", title=title, material=title)
+    return path
+
+
+def require_plain(findings: list[Finding]) -> None:
+    """See that JSON can hold what is said, and that each says it in one line."""
+    json.dumps([finding.document() for finding in findings], allow_nan=False)
+    assert all(len(finding.message.splitlines()) == 1 for finding in findings)
+
+
+def require_line(error: BaseException, name: str = "") -> None:
+    assert name in str(error)
+    assert len(str(error).splitlines()) == 1
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".3mf"])
+def test_a_mesh_comes_back_as_it_was_written(tmp_path, suffix):
+    moved = VERTICES + np.array([0.1, -123.456, 7])
+    vertices, triangles = read_mesh(written(tmp_path / f"box{suffix}", moved))
+    assert vertices[triangles] == pytest.approx(moved[TRIANGLES].astype("f4"))
+    assert {finding.status for finding in check_mesh(tmp_path / f"box{suffix}")} == {"pass"}
+
+
+def test_words_of_a_3mf_are_text_and_its_unit_is_heeded(tmp_path):
+    path, hostile = tmp_path / "odd.3mf", '<a href="&amp;">"\''
+    written(path, title=hostile)
+    with zipfile.ZipFile(path) as archive:
+        content = archive.read("3D/3dmodel.model").decode()
+    model = ElementTree.fromstring(content)
+    assert model.findtext(f"{{{CORE}}}metadata[@name='Title']") == hostile
+    assert [base.get("name") for base in model.iter(f"{{{CORE}}}base")] == [hostile]
+    packed(path, content.replace('unit="millimeter"', 'unit="inch"'))
+    assert np.ptp(read_mesh(path)[0], axis=0) == pytest.approx([254, 508, 127])
+
+
+def test_an_stl_of_text_and_a_3mf_may_have_several_bodies(tmp_path):
+    far = BOX.copy().apply_translation((30, 0, 0))
+    text = "\n".join(trimesh.exchange.stl.export_stl_ascii(mesh) for mesh in (BOX, far))
+    (tmp_path / "two.stl").write_text(text)
+    trimesh.Scene([BOX, BOX.copy().apply_translation((5, 4, 0))]).export(tmp_path / "two.3mf")
+    apart, across = (
+        {finding.name: finding for finding in check_mesh(tmp_path / name)} for name in ("two.stl", "two.3mf")
+    )
+    assert (apart["bodies"].status, apart["bodies"].measured) == ("fail", 2)
+    assert apart["self_intersection"].status == "pass"
+    assert across["bodies"].status == across["self_intersection"].status == "fail"
+
+
+def packed(path: Path, model: str) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("3D/3dmodel.model", model)
+    return path
+
+
+def model(objects: str, items: str) -> str:
+    return f'<model unit="millimeter" xmlns="{CORE}"><resources>{objects}</resources><build>{items}</build></model>'
+
+
+TRIANGLE = (
+    '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/></vertices>'
+    '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>'
+)
+BEYOND, HUGE = TRIANGLE.replace('v3="2"', 'v3="9"'), TRIANGLE.replace('x="1"', 'x="1e999"')
+
+
+def doubled(levels: int, copies: int) -> str:
+    """Objects each made of so many of the one before."""
+    parts = [f'<object id="0" type="model">{TRIANGLE}</object>']
+    for n in range(1, levels + 1):
+        part = f'<component objectid="{n - 1}"/>'
+        parts.append(f'<object id="{n}" type="model"><components>{part * copies}</components></object>')
+    return model("".join(parts), f'<item objectid="{levels}"/>')
+
+
+RING = "".join(
+    f'<object id="{a}"><components><component objectid="{b}"/></components></object>' for a, b in ((1, 2), (2, 1))
+)
+MODELS = {
+    "bomb": (doubled(12, 2), "it is built of 8191 objects, allowed are 1000"),
+    "wide": (doubled(5, 30), "objects, allowed are 1000"),
+    "deep": (doubled(3000, 1), "made of others more than 16 deep"),
+    "ring": (model(RING, '<item objectid="1"/>'), "or of themselves"),
+    "missing": (model("", '<item objectid="1"/>'), "model.3mf"),
+    "none": (model("", ""), "model.3mf"),
+    "beyond": (model(f'<object id="1">{BEYOND}</object>', '<item objectid="1"/>'), "model.3mf"),
+    "huge": (model(f'<object id="1">{HUGE}</object>', '<item objectid="1"/>'), "model.3mf"),
+    "outside": ('<!DOCTYPE x [<!ENTITY a SYSTEM "file:///dev/zero">]><model>&a;</model>', "model.3mf"),
+    "swollen": (model(" " * 2**27, ""), r"it unpacks to 1342\d+ bytes, allowed are 134217728"),
+    "text": ("no model at all", "model.3mf"),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_models_made_to_be_awkward_are_refused_in_one_line(tmp_path, name):
+    content, said = MODELS[name]
+    with pytest.raises(InputError, match=said) as refusal:
+        read_mesh(packed(tmp_path / "model.3mf", content))
+    require_line(refusal.value, "model.3mf")
+
+
+@pytest.mark.parametrize("name", ["torn.stl", "torn.3mf"])
+@pytest.mark.parametrize("content", [None, b"", b"solid\n", b"\0" * 84, b"\0" * 90, b"\xff" * 500, b"PK"])
+def test_what_is_no_mesh_is_refused_in_one_line(tmp_path, name, content):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as refusal:
+        check_mesh(tmp_path / name)
+    require_line(refusal.value, name)
+
+
+@pytest.mark.parametrize("odd", [np.nan, np.inf, 3e38])
+def test_a_corner_that_is_no_place_is_refused_not_dropped(tmp_path, odd):
+    changed = np.array(VERTICES)
+    changed[3, 1] = odd
+    with np.errstate(invalid="ignore", over="ignore"):
+        written(tmp_path / "box.stl", changed)
+    with pytest.raises(InputError, match="vertices hold NaN, infinity or more than"):
+        read_mesh(tmp_path / "box.stl")
+
+
+@settings(max_examples=25)
+@given(
+    st.sampled_from([".stl", ".3mf"]),
+    st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.integers(0, 16)), max_size=3),
+    st.none() | st.floats(0, 1),
+)
+def test_damaged_files_are_judged_or_refused_in_one_line(tmp_path_factory, suffix, changes, end):
+    path = written(tmp_path_factory.getbasetemp() / f"damaged{suffix}")
+    content = bytearray(path.read_bytes())
+    for share, piece, gone in changes:
+        at = int(share * len(content))
+        content[at : at + gone] = piece
+    path.write_bytes(content if end is None else content[: int(end * len(content))])
+    try:
+        vertices, triangles = read_mesh(path)
+    except InputError as error:
+        require_line(error, path.name)
+        return
+    require_plain(inspect_mesh(vertices, triangles))
+
+
+RNG = np.random.default_rng(0)
+BROKEN = {
+    "none": (VERTICES, TRIANGLES[:0]),
+    "one": (VERTICES, TRIANGLES[:1]),
+    "open": (VERTICES, TRIANGLES[1:]),
+    "inside out": (VERTICES, TRIANGLES[:, ::-1]),
+    "doubled": (VERTICES, np.concatenate([TRIANGLES, TRIANGLES])),
+    "flat": (VERTICES * [1, 1, 0], TRIANGLES),
+    "a point": (0 * VERTICES, TRIANGLES),
+    "soup": (RNG.normal(size=(300, 3)), RNG.integers(0, 300, (200, 3))),
+}
+SOUND = {
+    "single": (VERTICES.astype(np.float32), TRIANGLES.astype(np.uint32)),
+    "fortran": (np.asfortranarray(VERTICES), np.asfortranarray(TRIANGLES)),
+    "shuffled": (VERTICES, RNG.permutation(TRIANGLES)),
+    "shaken": (VERTICES + RNG.normal(0, 1e-7, VERTICES.shape), TRIANGLES),
+}
+
+
+@pytest.mark.parametrize("name", [*BROKEN, *SOUND])
+def test_broken_meshes_of_any_size_have_findings_that_say_so(name):
+    vertices, triangles = (BROKEN | SOUND)[name]
+    for size in (1e-9, 1.0, 1e4):
+        found = inspect_mesh(vertices * size, triangles)
+        require_plain(found)
+        statuses = {finding.name: finding.status for finding in found}
+        if name in BROKEN:
+            assert "fail" in statuses.values()
+        elif size == 1:
+            assert statuses["watertight"] == statuses["volume"] == statuses["bodies"] == "pass"
+
+
+@pytest.mark.parametrize("change", [np.nan, np.inf, 1e300])
+def test_vertices_and_triangles_that_cannot_be_are_refused(change):
+    changed = np.array(VERTICES)
+    changed[0] = change
+    for vertices, triangles in ((changed, TRIANGLES), (VERTICES, TRIANGLES + 3), (VERTICES, TRIANGLES - 1)):
+        with pytest.raises(InputError) as refusal:
+            inspect_mesh(vertices, triangles)
+        require_line(refusal.value)
+
+
+def test_a_heap_of_triangles_is_told_from_its_first_pairs():
+    found = sound(np.random.default_rng(0).normal(size=(30_000, 3)), np.arange(30_000).reshape(-1, 3))
+    failed = {finding.name: finding for finding in found if finding.status == "fail"}
+    assert {"watertight", "self_intersection"} <= failed.keys()
+    assert failed["self_intersection"].message.endswith("pairs of triangles and more cut through each other")

@@ -1,0 +1,237 @@
+import math
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from shapely import affinity
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.fabricate.cad.model import body_solid
+from padforge.fabricate.checks.plan_checks import check_plan
+from padforge.fabricate.mesh import build_mesh, mesh_arrays
+from padforge.fabricate.mould import (
+    Body,
+    Prism,
+    bed_frame,
+    conductive_body,
+    conductive_plan,
+    holder_body,
+    lid_body,
+    mould_body,
+    sizes,
+)
+from padforge.fabricate.plan import Plan
+from padforge.fabricate.settings import WELL_MM
+from tests.fabricate.planted import with_settings
+
+EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}
+
+
+def as_read(body: Body) -> trimesh.Trimesh:
+    """The mesh as whoever reads its STL finds it: single precision, equal vertices joined."""
+    return trimesh.Trimesh(*mesh_arrays(build_mesh(body)))
+
+
+def assert_one_closed_body(read: trimesh.Trimesh, genus: int = 0) -> None:
+    assert read.is_watertight
+    assert read.is_winding_consistent
+    assert read.body_count == 1
+    assert read.euler_number == 2 - 2 * genus
+
+
+def assert_both_ways_agree(body: Body) -> None:
+    """The CAD kernel's own Boolean operations on the same prisms are the oracle for the mesh."""
+    oracle = body_solid(body)
+    assert oracle.volume == pytest.approx(build_mesh(body).volume(), rel=1e-5)  # circles are polygons in the mesh
+    box = np.array([[*oracle.bounding_box().min], [*oracle.bounding_box().max]])
+    assert box == pytest.approx(as_read(body).bounds, abs=1e-4)
+
+
+def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
+    """z of the mould's surface seen from above."""
+    corners = solid.triangles
+    a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
+    area = np.cross(b - a, c - a)
+    up = area > 1e-12
+    w = np.stack([np.cross(c - b, (x, y) - b), np.cross(a - c, (x, y) - c), np.cross(b - a, (x, y) - a)])[:, up]
+    w = w / area[up]
+    inside = (w >= -1e-9).all(axis=0)
+    return float((w[:, inside] * corners[up][inside][:, :, 2].T).sum(axis=0).max())
+
+
+@pytest.mark.parametrize(
+    "pad",
+    [
+        *((1, 1, 0), (2, 10, 2), (1, 30, 1032)),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "5para_dis", "20para")),
+    ],
+)
+def test_random_and_published_moulds_are_closed(request, pad):
+    if isinstance(pad, str):
+        pad = Morphology.load(request.getfixturevalue("published") / f"{pad}.mat")
+    else:
+        pad = Morphology.random(*pad)
+    assert_one_closed_body(as_read(mould_body(Plan(pad))))
+
+
+@pytest.mark.parametrize(
+    ("make", "pad", "mould", "line"),
+    [
+        (lid_body, (1, 3.5), {"lid": True, "spout": True}, "spout: got true for a pad 7 mm wide, allowed from 19"),
+        (mould_body, (2,), {"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}, r"pins.*1 mm wide"),
+        (conductive_plan, (2, 5.0), {}, "exit_width_mm"),
+    ],
+)
+def test_what_has_no_room_is_refused(make, pad, mould, line):
+    with pytest.raises(InputError, match=line):
+        make(Plan(Morphology.straight(*pad), with_settings(mould)))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param(
+            with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
+            marks=pytest.mark.slow,
+        ),
+        with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
+        pytest.param(  # the oracle's pins are round
+            with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_both_ways_to_the_mould_agree(settings):
+    tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
+    plan = Plan(Morphology.straight(1) if tapered else Morphology.random(1, 3, seed=5), settings)
+    body = mould_body(plan)
+    assert_both_ways_agree(body)
+    assert_one_closed_body(as_read(body))
+    if settings.mould.conductive:
+        assert_both_ways_agree(conductive_body(conductive_plan(plan)))
+
+
+@pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0, "border_mm": 1.5}, {"floor_mm": 1.2, "wall_mm": 0.8}])
+def test_the_holder_takes_the_pad_with_its_leads(mould):
+    plan = Plan(Morphology.random(3, 2, seed=4), with_settings(mould))
+    read, frame = as_read(holder_body(plan)), bed_frame(plan)
+    assert_one_closed_body(read)
+    floor, wall, out = plan.settings.mould.floor_mm, frame["walls_mm"], plan.tray.bounds[2]
+    assert read.bounds == pytest.approx(np.array([[-out, -out, 0], [out, out, wall]]), abs=1e-4)
+    over = affinity.scale(plan.silicone, xfact=-1, origin=(0, 0))  # its rim, the wider side, is below
+    rim = shapely.segmentize(over.buffer(plan.flare_mm + 0.1, join_style="mitre").exterior, 1.3)
+    leads = [(-end[0], end[1]) for line in plan.lines for end in (line.coords[0], line.coords[-1])]
+    beyond = [(x * 50, y) if abs(x) > abs(y) else (x, y * 50) for x, y in leads]
+    ways = [
+        shapely.LineString([end, away]).intersection(plan.tray).coords[-1]
+        for end, away in zip(leads, beyond, strict=True)
+    ]
+    for x, y in [*rim.coords, *leads, *(0.999 * np.array(ways))]:
+        assert height_at(read, x, y) == pytest.approx(floor)
+    inside = out - 0.2
+    assert [
+        height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (-inside, -inside))
+    ] == pytest.approx([wall] * 3)
+    with pytest.raises(ValueError, match="zero-size array"):
+        height_at(read, inside, -inside)  # where fibres 1 and 4 start, as the pad lies
+
+
+def test_the_frame_on_the_bed_is_that_of_the_mould():
+    plan = Plan(Morphology.straight(2), with_settings({"border_mm": 1.0}, printer={"bed_mm": [300.0, 200.0, 100.0]}))
+    frame = bed_frame(plan)
+    assert (frame["centre_mm"], frame["angle_deg"], frame["mirrored"]) == ([150.0, 100.0], 0.0, True)
+    assert frame["pad_mm"] == sizes(plan)["pad_mm"]
+    assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
+
+
+def test_tracks_run_out_of_the_pad_through_its_tongues():
+    plan = Plan(Morphology.straight(1, pitch_mm=10.0), with_settings({"number_mm": 0.0, "border_mm": 1.0}))
+    read = as_read(mould_body(plan))
+    edge = 10 + 1.0
+    for place, z in (
+        ((edge + 1.9, 0.1), 2 + 1.2),  # the ridge, to the end of its slot
+        ((edge + 1.9, 1.4), 2.0),  # the floor of the slot beside it
+        ((edge + 1.9, 1.8), 8.0),  # the wall beside the slot
+        ((edge + 2.4, 0.1), 8.0),  # and behind it
+        ((0.1, -edge - 1.9), 2 + 0.4),
+    ):
+        assert height_at(read, *place) == pytest.approx(z, abs=1e-4), place
+    assert {round(2 * side, 6) for side in plan.tray.bounds[2:]} == {round(2 * (edge + 2 + 2 + plan.flare_mm), 6)}
+
+
+def test_walls_and_ridges_lean_as_set():
+    plan = Plan(
+        Morphology.straight(1, pitch_mm=20.0),
+        with_settings({"number_mm": 0.0, "exit_mm": 0.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 10.0}),
+    )
+    read = as_read(mould_body(plan))
+    slope = math.tan(math.radians(10))
+    for z in (3.0, 5.0, 7.5):  # on a wall clear of ridges
+        assert height_at(read, 7.0, 20 + slope * (z - 2)) == pytest.approx(z, abs=1e-3)
+    section = read.section(plane_origin=[0, 0, 2.05], plane_normal=[0, 0, 1])
+    assert section is not None
+    across = np.abs(section.vertices[(np.abs(section.vertices[:, 0]) < 15) & (np.abs(section.vertices[:, 1]) < 2)])
+    foot = 0.2 + 1.1 * slope  # the lowest terrace, one layer high, is as wide as the taper at its top
+    assert across[:, 1].max() == pytest.approx(foot, abs=0.011)
+    assert sizes(plan)["ridge_foot_mm"] == pytest.approx(0.4 + 2 * 1.2 * slope)
+
+
+def test_lid_has_the_holes_that_fit_the_pins():
+    plan = Plan(Morphology.straight(2), with_settings({"lid": True, "pins": True}))
+    pin = sizes(plan)["pin_mm"]
+    assert pin == 2.0
+    assert_one_closed_body(as_read(lid_body(plan)), genus=4 + 3)
+    read = as_read(mould_body(plan))
+    assert read.bounds[1, 2] == pytest.approx(8 + pin)
+    assert_one_closed_body(read)
+    spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
+    assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
+    lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))  # just room enough
+
+
+@pytest.mark.parametrize(
+    ("tapered", "knots", "layer_mm"),
+    [(5.0, 1, 0.3), (17.0, 2, 0.3), *(pytest.param(draft, 4, 0.1, marks=pytest.mark.slow) for draft in (5.0, 17.0))],
+)
+def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
+    tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})
+    plan = Plan(Morphology.random(1, knots, seed=3), tapers)
+    for body in (mould_body(plan), conductive_body(conductive_plan(plan))):
+        assert_one_closed_body(as_read(body))
+
+
+def test_the_second_mould_has_a_well_at_every_ridge_end():
+    plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
+    read = as_read(conductive_body(plan))
+    assert_one_closed_body(read)
+    edge = 1.5 * 15
+    for x in (-edge - 2.5, edge + 2.5):
+        for offset in (0.0, 0.9 * WELL_MM / 2):
+            assert height_at(read, x, -7.5 + offset + 0.01) == pytest.approx(2 + 1.2, abs=1e-4)
+        assert height_at(read, x, -7.5 + 1.1 * WELL_MM / 2) == pytest.approx(2.0, abs=1e-4)
+
+
+def test_corners_that_meet_by_chance_are_drawn_apart():
+    """Two blocks that share one upright line: joined there, the line would have four faces."""
+    touching = Body((Prism(shapely.box(0, 0, 1, 1), 0, 1), Prism(shapely.box(1, 1, 2, 2), 0, 1)))
+    vertices, triangles = mesh_arrays(build_mesh(touching))
+    assert len(np.unique(vertices, axis=0)) == len(vertices)
+    assert trimesh.Trimesh(vertices, triangles).is_watertight
+    assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(2, abs=2e-3)
+
+
+@pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])
+def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
+    """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
+    plan = Plan(Morphology.random(2, knots, seed))
+    read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm
+    floors = []
+    for line in plan.lines:
+        places = shapely.line_interpolate_point(line, np.linspace(3, line.length - 3, 40))
+        # Deeper tracks that cross are seen too: the least is the fibre's own.
+        floors.append(min(height_at(read, *place) for place in shapely.get_coordinates(places)))
+    (stated,) = [f.measured for f in check_plan(plan) if f.name == "crossing_gap"]
+    assert isinstance(stated, float)
+    for c in plan.crossings:
+        assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4

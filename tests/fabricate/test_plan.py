@@ -1,0 +1,201 @@
+"""Plans of moulds: ridges along the exact fibres, levels for those that cross, numbers beside them."""
+
+import itertools
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.design.paths.curves import Crossing
+from padforge.fabricate.mould import mould_body
+from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, fibre_levels, number_strokes
+from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.settings import RigSettings
+from tests.fabricate.planted import exact_fibre, level_pad, with_settings
+
+
+@pytest.mark.parametrize("tolerance_mm", [0.05, pytest.param(0.002, marks=pytest.mark.slow)])
+def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
+    pad = Morphology.random(3, 5, seed=1)
+    plan = Plan(pad, with_settings({"tolerance_mm": tolerance_mm}))
+    exact = [exact_fibre(pad, fibre, 0.02) for fibre in range(len(pad.knots))]
+    for line, curve in zip(plan.lines, exact, strict=True):
+        assert shapely.distance(shapely.points(curve), line).max() < tolerance_mm / 4
+    for level, ridge in enumerate(plan.ridges):
+        own = [shapely.LineString(curve) for curve, at in zip(exact, plan.levels, strict=True) if at == level]
+        curves, inside = shapely.union_all(own), plan.cavity.buffer(-0.5)  # clear of the ends, which go on straight
+        assert ridge.intersection(inside).within(curves.buffer(0.2 + tolerance_mm, quad_segs=16))
+        assert curves.buffer(0.2 - tolerance_mm, quad_segs=16).intersection(inside).within(ridge)
+
+
+@pytest.mark.slow
+def test_published_curves_within_the_tolerance(published):
+    pad = Morphology.load(published / "20para.mat")
+    for fibre, line in enumerate(Plan(pad).lines):
+        assert shapely.distance(shapely.points(exact_fibre(pad, fibre, 0.02)), line).max() < 0.0025
+
+
+@pytest.mark.parametrize("border_mm", [0.0, 3.0])
+def test_ridges_run_into_the_walls_at_both_ends(border_mm):
+    plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": border_mm}))
+    side = plan.pad.layout.size_mm[0] / 2 + border_mm
+    assert plan.cavity.bounds == pytest.approx((-side, -side, side, side))
+    ends = np.array([line.coords[0] for line in plan.lines[:3]])
+    assert ends[:, 0] == pytest.approx(-side - plan.settings.mould.exit_mm - INTO_WALL_MM)
+    assert ends[:, 1] == pytest.approx(plan.pad.to_mm([[0, 1], [0, 2], [0, 3]])[:, 1])
+    for line in plan.lines:
+        assert shapely.within(line, plan.tray)
+
+
+def test_a_mould_shrunk_is_the_pad():
+    plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": 1.0}, silicone={"shrinkage": 0.03}))
+    mould = plan.enlarged
+    assert mould.cavity.bounds[2] * 0.97 == pytest.approx(plan.cavity.bounds[2], rel=1e-12)
+    for larger, slot in zip(mould.exits, plan.exits, strict=True):
+        assert np.array(larger.bounds) * 0.97 == pytest.approx(slot.bounds, rel=1e-12)
+    for fibre, larger in enumerate(mould.lines):
+        shrunk = shapely.transform(larger, lambda places: 0.97 * places)
+        assert shapely.distance(shapely.points(exact_fibre(plan.pad, fibre, 0.02)), shrunk).max() < 0.0025
+    assert mould.heights_mm[:2] == (0.4, 1.2)  # 0.412 and 1.237 mm in whole layers
+    assert plan.depths_mm == pytest.approx([0.97 * height for height in mould.heights_mm], rel=1e-8)
+    assert plan.thickness_mm == pytest.approx(0.97 * mould.silicone_mm) == pytest.approx(0.97 * 6.2)
+    assert mould.enlarged is mould
+    assert (mould.depths_mm, mould.thickness_mm) == (mould.heights_mm, mould.silicone_mm)
+
+
+def test_a_pad_that_does_not_shrink_is_its_own_mould():
+    plan = Plan(Morphology.straight(2), with_settings(silicone={"name": "EcoFlex 00-20", "shrinkage": 0.0}))
+    assert plan.enlarged is plan
+    assert Plan(Morphology.straight(2)).enlarged.pad.pitch_mm == 11.25
+
+
+@settings(max_examples=50)
+@given(st.integers(1, 6), st.data())
+def test_fibres_that_cross_never_share_a_level(grid, data):
+    fibres = [*itertools.combinations(range(grid), 2), *itertools.combinations(range(grid, 2 * grid), 2)]
+    pairs = data.draw(st.lists(st.sampled_from(fibres), max_size=12)) if fibres else []
+    deep = data.draw(st.booleans())
+    levels = fibre_levels((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
+    assert all(levels[i] != levels[j] for i, j in pairs)
+    horizontal, vertical = levels[:grid], levels[grid:]
+    assert min(horizontal if deep else vertical) > max(vertical if deep else horizontal)
+    assert set(levels) == set(range(max(levels) + 1))
+
+
+def test_a_star_of_crossings_needs_one_level_more():
+    star = [Crossing(0, other, (0.0, 0.0)) for other in range(1, 5)]
+    assert max(fibre_levels((5, 5), star, deep_horizontal=True)) == 2
+
+
+def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
+    plan = Plan(Morphology.random(3, 3, seed=3))
+    levels = plan.levels
+    assert max(levels) >= 2
+    crossing = {tuple(sorted((c.first, c.second), key=lambda fibre: levels[fibre])) for c in plan.crossings}
+    assert any(levels[deep] - levels[shallow] > 1 for shallow, deep in crossing)
+    assert {(each.shallow, each.deep) for each in plan.common_tracks} >= crossing
+
+
+def test_crossing_fibres_of_a_family_lie_a_step_apart_and_the_pad_is_thickened_for_them():
+    plan = Plan(level_pad(1.8, 1.2))
+    assert plan.heights_mm == (0.4, 1.2, 2.0)
+    assert plan.levels[0] != plan.levels[1]
+    assert plan.silicone_mm == 6.0
+    assert Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5})).silicone_mm == 2.0 + COVER_MM
+    assert Plan(Morphology.straight(2), with_settings({"silicone_mm": 1.5})).silicone_mm == 1.5
+    assert Plan(Morphology.straight(2)).levels == (1, 1, 0, 0)
+    assert Plan(Morphology.straight(2), with_settings(pad={"deep_family": "vertical"})).levels == (0, 0, 1, 1)
+
+
+def test_two_levels_only_refuse_a_family_that_crosses_itself():
+    settings = with_settings({"levels": "two"})
+    plan = Plan(level_pad(1.8, 1.2), settings)
+    with pytest.raises(
+        InputError, match=r'levels: got "two".*2 crossings: fibres 1 x 2 at \(-\d+\.\d, -?0\.0\)'
+    ) as refusal:
+        plan.require_levels()
+    assert "\n" not in str(refusal.value)
+    assert plan.heights_mm == (0.4, 1.2)
+    Plan(Morphology.straight(3), settings).require_levels()
+
+
+def test_published_pads_take_as_many_levels_as_their_crossings_need(published):
+    for name, least in (("1para", 2), ("5para_dis", 3), ("20para", 8)):
+        plan = Plan(Morphology.load(published / f"{name}.mat"))
+        assert len(plan.heights_mm) >= least
+        assert all(plan.levels[c.first] != plan.levels[c.second] for c in plan.crossings)
+        assert np.diff(plan.heights_mm) == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1.5, 0.2), (2.5, 0.4), (5.0, 0.8)])
+def test_strokes_and_gaps_are_as_wide_as_ridges(height, width):
+    for number in (8, 23, 96):
+        outline = number_strokes(number, height, width)
+        digits = shapely.get_parts(outline)
+        assert len(digits) == len(str(number))
+        assert len(digits) == 1 or digits[0].distance(digits[1]) == pytest.approx(max(width, 0.25 * height))
+        assert outline.buffer(-0.49 * width).buffer(0.49 * width, join_style="mitre").area == pytest.approx(
+            outline.area, rel=0.02
+        )
+        left, low, right, high = outline.bounds
+        assert high - low == pytest.approx(height + width)
+        assert (left + right, low + high) == pytest.approx((0, 0), abs=1e-9)
+
+
+@pytest.mark.parametrize("pad", [Morphology.straight(4), Morphology.random(4, 5, seed=3), Morphology.straight(1)])
+def test_numbers_keep_clear_of_ridges_walls_and_each_other(pad):
+    plan = Plan(pad, with_settings({"min_silicone_mm": 0.6}))
+    placed = [number for number in plan.numbers if number is not None]
+    assert len(placed) >= len(plan.numbers) - 1
+    ridges = shapely.union_all(plan.ridges)
+    for i, number in enumerate(placed):
+        assert number.distance(ridges) > 0.6 - 0.01
+        assert number.within(plan.cavity)
+        assert all(number.distance(other) > 0.6 for other in placed[:i])
+
+
+def test_a_number_stands_beside_its_own_start():
+    plan = Plan(Morphology.straight(4))
+    starts = np.array([line.coords[0] for line in plan.lines])
+    for fibre, number in enumerate(plan.numbers):
+        assert number is not None
+        middle = np.array(number.centroid.coords[0])
+        assert int(np.argmin(np.linalg.norm(starts - middle, axis=1))) == fibre
+
+
+def test_numbers_can_be_left_out_and_crowded_out():
+    assert Plan(Morphology.straight(2), with_settings({"number_mm": 0.0})).numbers == []
+    crowded = Plan(Morphology.straight(2, pitch_mm=4.0), with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
+    assert crowded.numbers == [None] * 4
+
+
+DIGITS = """
+### ..# ### ### #.# ### ### ### ### ###
+#.# ..# ..# ..# #.# #.. #.. ..# #.# #.#
+#.# ..# ### ### ### ### ### ..# ### ###
+#.# ..# #.. ..# ..# ..# #.# ..# #.# ..#
+### ..# ### ### ..# ### ### ..# ### ###
+"""
+
+
+@pytest.mark.parametrize("pad", [Morphology.straight(5), Morphology.random(5, 3, seed=2)])
+def test_numbers_in_the_mould_read_right_on_the_pad_as_it_is_used(pad):
+    """The heights of the mould's floor, which the tracks' side of the pad is cast from, seen as an arm sees the pad."""
+    plan, mould = Plan(pad), with_settings({}).mould
+    floor = shapely.union_all([prism.area for prism in mould_body(plan).adds if prism.top_mm > mould.floor_mm])
+    lying = Frame.of(RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, mirrored=True))
+    rows = [row.split() for row in DIGITS.split("\n") if row]
+    for number, outline in enumerate(plan.numbers, 1):
+        assert outline is not None
+        x, y, *_ = lying.pose(np.array(shapely.box(*outline.bounds).centroid.coords[0]), 0.0)
+        half, height = (outline.bounds[2] - outline.bounds[0] - mould.ridge_width_mm) / 2, mould.number_mm
+        digit = number % 10  # the last one, on the right of who reads
+        for down, row in enumerate(rows):
+            for across, cell in enumerate(row[digit]):
+                seen = x + half + (across / 4 - 0.5) * height, y + height * (0.5 - down / 4), 0.0
+                (place,), _ = lying.tip(np.array([seen]))
+                assert floor.covers(shapely.Point(place)) == (cell == "#"), (number, down, across)

@@ -1,0 +1,211 @@
+"""Pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import settings as effort
+from hypothesis import strategies as st
+
+from padforge.design.morphology import Morphology
+from padforge.design.settings import PadSettings
+from padforge.fabricate.checks.plan_checks import check_plan, meshed
+from padforge.fabricate.export import build
+from padforge.fabricate.fibre_placement.toolpath import laying_steps, turned_over
+from padforge.fabricate.mesh import build_mesh, mould_mesh
+from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
+from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
+from padforge.fabricate.outputs.pictures import WALL, mould_relief
+from padforge.fabricate.plan import Plan
+from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, FibreSettings, MouldSettings
+
+PAD = Morphology.straight((3, 6), (8.0, 15.0))
+
+
+HOLE = ((-2.5, 3.0), (2.5, 3.0), (2.5, 11.0), (-2.5, 11.0))
+"""Between fibres of `PAD`."""
+
+
+def settings(pad: Morphology, mould: dict | None = None, **more) -> FabricationSettings:
+    own = PadSettings(**{**pad.layout.settings, **more})
+    return replace(DEFAULTS, mould=MouldSettings(**{"number_mm": 0.0, **(mould or {})}), pad=own)
+
+
+def test_the_tray_is_as_wide_and_high_as_the_pad():
+    plan = Plan(PAD, settings(PAD))
+    assert sizes(plan)["pad_mm"] == [56.0, 60.0]
+    left, low, right, high = plan.tray.bounds
+    assert (right - left) - (high - low) == pytest.approx(56 - 60)
+    starts = np.array([lead.beyond(0) for lead in plan.ends(0)])
+    assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
+    assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
+
+
+def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
+    with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
+    found = {finding.name: finding for finding in meshed(with_hole)[-1]}
+    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
+    more = mould_mesh(with_hole).volume() - mould_mesh(without).volume()
+    assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
+    rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
+    section = [shapely.Polygon(ring) for ring in mould_mesh(with_hole).slice(rim - 1e-3).to_polygons()]
+    assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
+
+
+def test_a_keep_out_at_the_edge_joins_the_wall():
+    notch = ((20.0, 20.0), (28.0, 20.0), (28.0, 30.0), (20.0, 30.0))
+    plan = Plan(Morphology.straight((1, 1), (28.0, 30.0)), settings(PAD, keep_out_mm=(notch,)))
+    rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
+    free = [ring for ring in mould_mesh(plan).slice(rim - 1e-3).to_polygons() if len(ring)]
+    assert len(free) == 2  # the walls' outside and inside: no film between pillar and wall
+
+
+@pytest.mark.parametrize(
+    ("hole", "name", "status"),
+    [
+        (((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)), "keep_out", "fail"),
+        (((0.0, 3.0), (0.6, 3.0), (0.6, 9.0), (0.0, 9.0)), "pillars", "warn"),
+        (((0.0, 3.0), (0.3, 3.0), (0.3, 9.0), (0.0, 9.0)), "pillars", "fail"),
+        (((-1.0, -40.0), (1.0, -40.0), (1.0, 40.0), (-1.0, 40.0)), "one_piece", "fail"),
+    ],
+)
+def test_keep_outs_that_do_harm_are_found(hole, name, status):
+    found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=(hole,))))}
+    assert found[name].status == status
+    assert found[name].places_mm
+
+
+def test_the_lids_bores_keep_off_pillars():
+    hole = ((-6.0, -5.0), (6.0, -5.0), (6.0, 5.0), (-6.0, 5.0))
+    plan = Plan(PAD, settings(PAD, {"lid": True, "spout": True}, keep_out_mm=(hole,)))
+    for prism in lid_body(plan).cuts:
+        assert not prism.area.intersects(plan.pillars)
+
+
+@pytest.mark.parametrize("fibres", [(0, 3), (2, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize("leads", ["edges", "one side"])
+def test_few_fibres_have_a_mould_as_any_other(fibres, leads):
+    pad = Morphology.straight(fibres, (9.0, 12.0))
+    found = {finding.name: finding for finding in meshed(Plan(pad, settings(pad, leads=leads)))[-1]}
+    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
+
+
+@effort(max_examples=20)
+@given(
+    st.tuples(st.integers(0, 8), st.integers(0, 8)).filter(any),
+    st.tuples(st.floats(4, 25), st.floats(4, 25)),
+    st.floats(0, 4),
+)
+def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches, border):
+    pad = Morphology.straight(fibres, pitches)
+    plan = Plan(pad, settings(pad, {"border_mm": border}, leads="one side"))
+    room = plan.settings.lead_room(plan.heights_mm[-1], plan.flare_mm)
+    apart = min(room.apart_mm, *pitches)
+    ways = []
+    for fibre, pair in enumerate(plan.leads.pairs):
+        for lead in pair:
+            assert lead.beyond(0)[1] == pytest.approx(plan.cavity.bounds[1])
+            way = np.vstack([lead.end_mm, lead.bends(1e-4), lead.beyond(0)])
+            assert lead.length_mm == pytest.approx(shapely.LineString(way).length, rel=1e-4)
+            ways.append((fibre, shapely.LineString(way)))
+    for fibre, way in ways:
+        assert way.within(plan.cavity.buffer(1e-6))
+        for other, its in ways:
+            if other != fibre:
+                assert way.distance(its) > apart - 1e-3
+    exits = sorted(lead.beyond(0)[0] for pair in plan.leads.pairs for lead in pair)
+    assert np.diff(exits).min() > apart - 1e-6
+
+
+def test_leads_of_a_shrinking_silicone_come_out_as_planned():
+    plan = Plan(
+        PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))
+    )
+    large = plan.enlarged
+    assert np.array(large.cavity.bounds) * 0.99 == pytest.approx(plan.cavity.bounds)
+    assert large.lengths_mm * 0.99 == pytest.approx(plan.lengths_mm)
+
+
+def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
+    pad = Morphology.straight((1, 3), (9.0, 12.0))
+    plan = Plan(pad, settings(pad, {"holder": True}, leads="one side"))
+    walls = build_mesh(holder_body(plan)).slice(DEFAULTS.mould.floor_mm + 0.5)
+    solid = shapely.Polygon()
+    for ring in walls.to_polygons():
+        solid = solid.symmetric_difference(shapely.Polygon(ring))
+    for lead in (lead for pair in plan.leads.pairs for lead in pair):
+        x, y = lead.beyond(DEFAULTS.mould.exit_mm + 1)
+        assert solid.distance(shapely.Point(-x, y)) > 1
+    low, high = plan.tray.bounds[1], plan.tray.bounds[3]
+    assert bed_frame(plan)["centre_mm"] == pytest.approx([110.0, 110.0 - (low + high) / 2])
+
+
+@pytest.mark.parametrize(
+    ("fibres", "leads", "says"),
+    [
+        ((2, 3), "edges", "horizontal fibres count from near to far and start on the right, vertical ones"),
+        ((0, 3), "edges", "all fibres are vertical: they count from right to left and start at the near side."),
+        ((2, 0), "edges", "all fibres are horizontal: they count from near to far and start on the right."),
+        ((2, 3), "one side", "all leads leave at the near side: horizontal fibres"),
+    ],
+)
+def test_one_sentence_says_which_way_round(fibres, leads, says):
+    pad = Morphology.straight(fibres, (8.0, 15.0))
+    assert says in orientation_sentence(fibres, leads)
+    assert says in re.sub(r"\s+", " ", orientation_svg(Plan(pad, settings(pad, leads=leads))))
+
+
+def test_the_page_and_drawings_have_holes_bending_exits_and_lengths(tmp_path):
+    pad, hole = Morphology.straight((2, 3), (8.0, 15.0)), ((-7.0, -5.0), (-1.0, -5.0), (-1.0, 5.0), (-7.0, 5.0))
+    own = settings(pad, leads="one side", keep_out_mm=(hole,), bent_radius_mm=30.0)
+    own = replace(own, fibre=FibreSettings(ohm_per_mm=10.0))
+    document = build(pad, tmp_path, [], own)
+    page = (tmp_path / "laying.md").read_text(encoding="utf-8")
+    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 5." in page
+    assert "around every pillar" in page
+    assert "bent to 30 mm, fibres are stretched by up to" in page
+    assert "from left to right as the pad lies for laying, these fibres end: 5, 2, 1, 5, 4, 3, 1, 2, 3, 4." in page
+    assert document["settings"]["pad"]["horizontals"] == 2
+    plan = Plan(pad, own)
+    for entry, line in zip(document["fibres"], plan.lines, strict=True):
+        assert entry["in_pad_mm"] == pytest.approx(line.length - 1.0, abs=0.01)  # less what runs into the walls
+        assert entry["resistance_ohm"] == pytest.approx(10 * entry["cut_mm"], rel=1e-3)
+    whole = build(pad, tmp_path, [], settings(pad, leads="one side"))
+    less = whole["silicone_volume_ml"] - document["silicone_volume_ml"]
+    assert less == pytest.approx(6 * 10 * 6 / 1000, abs=1e-3)
+    left, low, right, high = plan.tray.bounds
+    heights, shown = mould_relief(plan, round(10 * (right - left)), round(10 * (high - low)))
+    row, column = round(10 * high), round(10 * (-4 - left))
+    assert (shown[row, column], heights[row, column]) == (WALL, plan.silicone_mm)
+    assert heights.shape == shown.shape == (round(10 * (high - low)), round(10 * (right - left)))
+    drawing = tracks_svg(plan)
+    edge = re.search(r'<path id="edge" d="([^"]*)"', drawing)
+    assert edge is not None
+    assert edge[1].count("M") == 2
+    assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
+
+
+def test_a_pad_without_crossings_has_a_page(tmp_path):
+    document = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
+    assert document["crossings"]["gap_mm"] is None
+    assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("bend_mm", "acceleration", "least_mm_s"), [(3.0, 100.0, 10.0), (1.0, 25.0, 5.0)])
+def test_a_needle_follows_the_leads_and_is_slow_in_tight_bends(bend_mm, acceleration, least_mm_s):
+    """The root of acceleration times radius, 17 and 5 mm/s, of which the feed is at most 10 mm/s."""
+    own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(least_bend_mm=bend_mm))
+    own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
+    plan = Plan(PAD, own)
+    strokes = [stroke for step in laying_steps(plan, 0.3) for stroke in step.strokes]
+    for stroke in strokes:
+        line = shapely.LineString(turned_over(stroke.places_mm))
+        assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
+        places = np.asarray(shapely.points(turned_over(stroke.places_mm)))
+        places = places[shapely.within(places, plan.silicone)]
+        assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
+    assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)
+    assert strokes[0].feeds_mm_s.max() == 10.0
