@@ -22,7 +22,7 @@ from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.settings import RigSettings
 from padforge.sense.twin.identification import identify
 from padforge.sense.twin.identified_pad import Identification
-from padforge.sense.twin.laid_pad import Plan
+from padforge.sense.twin.laid_pad import PadPlan
 from padforge.sense.twin.responses import responses
 
 PRESSES = (150, 300, 600, 1500, 3000)
@@ -92,7 +92,7 @@ def printed_pad(
     turn, shift = rng.choice([-3.0, 3.0]), rng.uniform(2, 3, 2) * rng.choice([-1, 1], 2)
     wiring, dead = rng.permutation(fibres), set(rng.choice(fibres, n_dead, replace=False).tolist())
     gains_v = GAIN_V * np.exp(GAIN_SD * rng.standard_normal(fibres))
-    as_built_mm = [plan.to_mm(path) for path in _offset_paths(Plan.of(plan), lateral_offset_mm / unit_mm, rng)]
+    as_built_mm = [plan.to_mm(path) for path in _offset_paths(PadPlan.of(plan), lateral_offset_mm / unit_mm, rng)]
     channel_fibres = [None if channel in dead else int(fibre) for channel, fibre in enumerate(wiring)]
     low, high = np.array(sensed_rectangle(plan.layout))
     width, height = (unit_mm * (high - low)).tolist()
@@ -110,7 +110,7 @@ def printed_pad(
     return replace(twin, channels=tuple(replace(channel, noise_v=noise_v) for channel in channels))
 
 
-def _offset_paths(plan: Plan, std: float, rng: np.random.Generator) -> list[Array]:
+def _offset_paths(plan: PadPlan, std: float, rng: np.random.Generator) -> list[Array]:
     """Return paths beside the planned ones, offset by Gaussian processes of a standard deviation; grid units."""
     paths = []
     for path, length in zip(plan.course, plan.length, strict=True):

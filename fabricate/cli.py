@@ -139,7 +139,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
 
 def _line(finding: dict[str, Any]) -> str:
     """A finding for people: its verdict and, of its places, the first three."""
-    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["places_mm"]]
+    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
     more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
     where = f" at {' '.join(places[:3])}{more}" if places else ""
     return f"{MARKS[finding['status']]} {finding['name']}: {finding['message']}{where}"

@@ -76,17 +76,17 @@ def place_fibres(plan: Plan, languages: Collection[str]) -> FibrePlacement:
     if not wanted:
         return FibrePlacement({}, [])
     fibre = plan.settings.fibre.material
-    steps = laying_steps(plan, fibre.diameter_mm, fibre.largest_stretch or math.inf)
+    steps = laying_steps(plan, fibre.diameter_mm, fibre.max_strain or math.inf)
     work, summary, dispenser = (
         list(instructions(plan, steps)),
         list(summary_lines(plan, steps)),
         plan.settings.dispenser,
     )
     texts = {name: write(work, summary, dispenser) for name, write in map(LANGUAGES.__getitem__, wanted)}
-    return FibrePlacement(texts | {"dispensing.svg": toolpath_svg(plan, steps)}, check_course(plan, steps))
+    return FibrePlacement(texts | {"toolpath.svg": toolpath_svg(plan, steps)}, check_course(plan, steps))
 
 
-FORMAT = "padforge-fabrication/1"
+FORMAT = "padforge-fabrication/2"
 FORMATS = ("stl", "3mf", "step", "svg", "dxf", "png", *LANGUAGES)
 
 Write = tuple[str, Callable[[Path], None]]

@@ -43,15 +43,15 @@ class Fibre:
 
     Attributes:
         ohm_per_mm: resistance at rest, of each mm of its length.
-        least_bend_mm: radius of the tightest bend that it bears.
-        largest_stretch: share of its length by which it may be made longer.
+        min_bend_radius_mm: radius of the tightest bend that it bears.
+        max_strain: share of its length by which it may be made longer.
     """
 
     name: str
     diameter_mm: float
     ohm_per_mm: float | None = None
-    least_bend_mm: float | None = None
-    largest_stretch: float | None = None
+    min_bend_radius_mm: float | None = None
+    max_strain: float | None = None
 
 
 AB = (1.0, 1.0)
@@ -72,8 +72,8 @@ _GRADES = (
 SILICONES = {PUBLISHED: replace(_GRADES[1], shrinkage=0.0), **{grade.name: grade for grade in _GRADES}}
 """By name; "published": EcoFlex 00-20 in moulds of the pad's own size, as the published pads were cast."""
 
-_CORD = Fibre("conductive rubber cord 2 mm", 2.0, ohm_per_mm=350 / 25.4, largest_stretch=0.5)
-FIBRES = {PUBLISHED: Fibre("carbon-black TPE", 0.3, largest_stretch=0.8), _CORD.name: _CORD}
+_CORD = Fibre("conductive rubber cord 2 mm", 2.0, ohm_per_mm=350 / 25.4, max_strain=0.5)
+FIBRES = {PUBLISHED: Fibre("carbon-black TPE", 0.3, max_strain=0.8), _CORD.name: _CORD}
 """By name; "published": of the paper, which has no resistance. The cord's figures are its seller's (Adafruit)."""
 
 PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
@@ -173,10 +173,10 @@ class FibreSettings(_MaterialSettings):
     ohm_per_mm: Annotated[Positive | None, *OfPreset] = Field(
         default=None, description='resistance at rest, Ohm per mm of length; or "preset"'
     )
-    least_bend_mm: Annotated[float | None, *OfPreset] = Field(
+    min_bend_radius_mm: Annotated[float | None, *OfPreset] = Field(
         default=None, ge=0, le=1000, description='radius of the tightest bend it bears, mm; or "preset"'
     )
-    largest_stretch: Annotated[float | None, *OfPreset] = Field(
+    max_strain: Annotated[float | None, *OfPreset] = Field(
         default=None, gt=0, le=100, description='share of its length by which it bears to be stretched; or "preset"'
     )
 

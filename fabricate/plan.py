@@ -186,13 +186,13 @@ class CommonTrack(NamedTuple):
         shallow: index of the fibre of the stretch.
         deep: index of the fibre below it.
         length_mm: how long the shallow one's centre line is nearer to the deep one's than a track is wide.
-        place_mm: the middle of it.
+        position_mm: the middle of it.
     """
 
     shallow: int
     deep: int
     length_mm: float
-    place_mm: tuple[float, float]
+    position_mm: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ class Plan:
         return [c for c in self.crossings if self.family(c.first) == self.family(c.second)]
 
     @property
-    def clash_places_mm(self) -> Array:
+    def clash_positions_mm(self) -> Array:
         """(n, 2) where the clashes are."""
         return self.pad.to_mm(np.array([c.position for c in self.clashes]).reshape(-1, 2))
 
@@ -345,7 +345,7 @@ class Plan:
             InputError: lists the crossings of fibres of one family.
         """
         if self.clashes and self.settings.mould.levels == "two":
-            places = self.clash_places_mm.tolist()
+            places = self.clash_positions_mm.tolist()
             listed = ", ".join(
                 f"{c.first + 1} x {c.second + 1} at ({x:.1f}, {y:.1f}) mm"
                 for c, (x, y) in zip(self.clashes, places, strict=True)

@@ -236,9 +236,9 @@ class FabricationSettings:
         return replace(self, mould=mould, pad=pad, silicone=self.silicone.model_copy(update={"shrinkage": 0.0}))
 
     @property
-    def least_bend_mm(self) -> float:
+    def min_bend_radius_mm(self) -> float:
         """Radius of the tightest bend that the rules and the fibre allow, mm."""
-        return max(self.rules.min_bend_radius_mm, self.fibre.material.least_bend_mm or 0)
+        return max(self.rules.min_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
 
     def lead_room(self, tallest_mm: float, flare_mm: float) -> "LeadRoom":
         """What leads to one side keep, for ridges so tall and walls that lean outwards so far."""
@@ -250,8 +250,8 @@ class FabricationSettings:
             apart = max(apart, width + 2 * flare_mm + 2 * self.printer.line_mm)
         edge = max(apart / 2, foot / 2 + mould.min_silicone_mm)
         # a fibre may meet its lead at a corner, which the rule for bends only lets pass in a straight stretch
-        border = max(mould.border_mm, self.least_bend_mm / 2)
-        return LeadRoom(border, apart, max(self.least_bend_mm, (foot + mould.min_silicone_mm) / 2), edge)
+        border = max(mould.border_mm, self.min_bend_radius_mm / 2)
+        return LeadRoom(border, apart, max(self.min_bend_radius_mm, (foot + mould.min_silicone_mm) / 2), edge)
 
     def require_consistent(self, layout: Layout) -> None:
         """Refuse settings that contradict each other or the pitch of the pad.

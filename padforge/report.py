@@ -39,7 +39,7 @@ def write_report(folder: Path) -> Path:
     mismatches: list[str] = []
     for format_, file, write_sections in (
         (DESIGN_FORMAT, "design.json", design_sections),
-        ("padforge-fabrication/1", "fabrication.json", fabrication_sections),
+        ("padforge-fabrication/2", "fabrication.json", fabrication_sections),
         ("padforge-recording/1", "recording/start.json", sense.recording_sections),
         ("padforge-identification/1", "identification.json", identification_sections),
         ("padforge-calibration/1", "calibration.json", sense.calibration_sections),

@@ -18,7 +18,7 @@ class Finding:
         status: "pass", "warn" (it works, with care) or "fail".
         measured, limit: in the unit the message says; mm unless it says otherwise.
         message: one sentence for people.
-        places_mm: where, in mm from the pad's centre (or in the frame of a mesh file); empty where a place means
+        positions_mm: where, in mm from the pad's centre (or in the frame of a mesh file); empty where a place means
             nothing.
     """
 
@@ -27,11 +27,11 @@ class Finding:
     measured: Number
     limit: Number
     message: str
-    places_mm: tuple[Place, ...] = ()
+    positions_mm: tuple[Place, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """The finding as JSON, places rounded to the micrometre."""
-        return asdict(self) | {"places_mm": [[round(x, 3), round(y, 3)] for x, y in self.places_mm]}
+        return asdict(self) | {"positions_mm": [[round(x, 3), round(y, 3)] for x, y in self.positions_mm]}
 
 
 def grade(measured: float, limit: float) -> Status:

@@ -28,7 +28,7 @@ class Strain(NamedTuple):
 
     depth_mm: float
     most: float
-    place_mm: tuple[float, float]
+    position_mm: tuple[float, float]
 
 
 def strains(plan: Plan) -> list[Strain]:
@@ -68,14 +68,14 @@ def fibre_strain(plan: Plan) -> list[Finding]:
     if not by_depth:
         return []
     worst = max(by_depth, key=lambda each: each.most)
-    limit, radius = plan.settings.fibre.material.largest_stretch, plan.settings.pad.bent_radius_mm
+    limit, radius = plan.settings.fibre.material.max_strain, plan.settings.pad.bent_radius_mm
     status: Status = "pass"
     if worst.most > 0 and (limit is None or worst.most > _EASY * limit):
         status = "warn" if limit is None or worst.most <= limit else "fail"
     depths = ", ".join(f"{100 * each.most:.3g} % at {each.depth_mm:.3g} mm" for each in by_depth)
     bears = f"they bear {100 * limit:.3g} %" if limit is not None else "what they bear is unknown"
     message = f"bent to {radius:g} mm, fibres are stretched by up to {depths} deep; {bears}"
-    return [Finding("fibre_strain", status, worst.most, limit or 0.0, message, as_places([worst.place_mm]))]
+    return [Finding("fibre_strain", status, worst.most, limit or 0.0, message, as_places([worst.position_mm]))]
 
 
 _SPECK_MM2 = 0.01
@@ -174,7 +174,7 @@ def _crossing_gap(plan: Plan) -> Finding:
 
 def _same_family_crossings(plan: Plan) -> Finding:
     """Tracks of one depth that cross become one, and the fibres in them touch; each further depth is more work."""
-    places = plan.clash_places_mm
+    places = plan.clash_positions_mm
     message = f"{len(places)} crossings of fibres of one family"
     if plan.settings.mould.levels == "two":
         status: Status = "fail" if len(places) else "pass"
@@ -196,9 +196,9 @@ def _common_tracks(plan: Plan) -> list[Finding]:
     long = [each for each in plan.common_tracks if each.length_mm > limit]
     message = (
         f"tracks lie over deeper ones for {worst.length_mm:.2f} mm at most, fibre {worst.shallow + 1} over"
-        f" {worst.deep + 1} at ({worst.place_mm[0]:.1f}, {worst.place_mm[1]:.1f}) mm"
+        f" {worst.deep + 1} at ({worst.position_mm[0]:.1f}, {worst.position_mm[1]:.1f}) mm"
     )
-    places = as_places(each.place_mm for each in long)
+    places = as_places(each.position_mm for each in long)
     return [Finding("common_tracks", "warn" if long else "pass", worst.length_mm, limit, message, places)]
 
 
@@ -274,7 +274,7 @@ def _fibre_bend(plan: Plan) -> Finding:
 
     Bends are measured as by the rules (`bend_radius`), on fibres with their leads.
     """
-    limit = plan.settings.least_bend_mm
+    limit = plan.settings.min_bend_radius_mm
     bends = [bend_radius(*traced, limit / 2) for traced in plan.traced(_BEND_TURN, limit / 2)] if limit else []
     tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_SLACK)]
     least = min((radius for _, radius, _ in tight), default=limit)

@@ -49,7 +49,7 @@ def _corners(told: Go | Lay) -> Iterator[tuple[Place, float]]:
         yield told.place, told.speed_mm_s
         return
     stroke = told.stroke
-    for (x, y), feed in zip(stroke.places_mm[1:].tolist(), stroke.feeds_mm_s.tolist(), strict=True):
+    for (x, y), feed in zip(stroke.positions_mm[1:].tolist(), stroke.feeds_mm_s.tolist(), strict=True):
         yield (x, y, stroke.z_mm), feed
 
 

@@ -34,20 +34,20 @@ class Stroke:
 
     Attributes:
         fibre: its number among all, 0..F-1.
-        places_mm: (n, 2) corners of the way, in the frame of the pad turned over.
+        positions_mm: (n, 2) corners of the way, in the frame of the pad turned over.
         z_mm: height of the needle's mouth, negative within the track.
         feeds_mm_s: (n - 1,) speed from each corner to the next.
     """
 
     fibre: int
-    places_mm: Array
+    positions_mm: Array
     z_mm: float
     feeds_mm_s: Array
 
     @cached_property
     def steps_mm(self) -> Array:
         """(n - 1,) distance from each corner to the next."""
-        return np.hypot(*np.diff(self.places_mm, axis=0).T)
+        return np.hypot(*np.diff(self.positions_mm, axis=0).T)
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ class Step:
     strokes: tuple[Stroke, ...]
 
 
-def laying_steps(plan: Plan, diameter_mm: float, largest_stretch: float = math.inf) -> list[Step]:
+def laying_steps(plan: Plan, diameter_mm: float, max_strain: float = math.inf) -> list[Step]:
     """The way of the needle, in the order of the laying page: the deepest step first.
 
     Args:
         plan: of the mould, with the leads and the dispenser of its settings.
         diameter_mm: of the fibre.
-        largest_stretch: elongation that the fibre bears, 1 for twice its length; inf where nobody knows.
+        max_strain: elongation that the fibre bears, 1 for twice its length; inf where nobody knows.
     """
     courses = plan.courses(_FLAT_SHARE * TOLERANCE_MM, plan.settings.mould.lead_mm)
     bends = _Bends(plan, diameter_mm)
@@ -76,7 +76,7 @@ def laying_steps(plan: Plan, diameter_mm: float, largest_stretch: float = math.i
             thinned = whole.simplify(_THINNED_SHARE * TOLERANCE_MM, preserve_topology=False)
             places, corner = _with_ends(shapely.get_coordinates(thinned), diameter_mm)
             radii = bends.least_radii(fibre, places)
-            feeds = _feeds(plan.settings.dispenser, radii, diameter_mm, largest_stretch)
+            feeds = _feeds(plan.settings.dispenser, radii, diameter_mm, max_strain)
             kept = corner | np.concatenate([[True], np.diff(feeds) != 0, [True]])
             z = round(diameter_mm - layer.depth_mm, 9)
             strokes.append(Stroke(fibre, turned_over(places[kept]), z, feeds[kept[:-1]]))
@@ -84,9 +84,9 @@ def laying_steps(plan: Plan, diameter_mm: float, largest_stretch: float = math.i
     return steps
 
 
-def turned_over(places_mm: Array) -> Array:
+def turned_over(positions_mm: Array) -> Array:
     """Places (..., 2) of the plan as they lie on the pad turned over, and the other way round; no -0."""
-    return places_mm * (-1, 1) + 0.0
+    return positions_mm * (-1, 1) + 0.0
 
 
 def _with_ends(places: Array, end_mm: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -134,7 +134,7 @@ class _Bends:
         return np.divide(2 * half, most, out=np.full(len(most), np.inf), where=most > _STRAIGHT)
 
 
-def _feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, largest_stretch: float) -> Array:
+def _feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, max_strain: float) -> Array:
     """(n,) speed in bends of radii (n,), mm/s: what the machine and what the fibre can follow, the slower of both.
 
     In a bend of radius r the machine needs v^2 / r of acceleration; and the outside of a fibre is stretched by
@@ -142,7 +142,7 @@ def _feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, la
     """
     most = dispenser.feed_mm_s
     of_machine = np.sqrt(dispenser.acceleration_mm_s2 * radii_mm)
-    of_fibre = most * (1 - diameter_mm / (2 * radii_mm * largest_stretch))
+    of_fibre = most * (1 - diameter_mm / (2 * radii_mm * max_strain))
     tenths = np.floor(np.minimum(of_machine, of_fibre) / most * _FEED_STEPS + 1e-6)
     return most * np.clip(tenths, 1, _FEED_STEPS) / _FEED_STEPS
 
@@ -177,8 +177,8 @@ def _box(plan: Plan, steps: Sequence[Step]) -> Finding:
 
 def _corners(stroke: Stroke, height_mm: float) -> Array:
     """(n + 2, 3) corners of the way to a fibre, along it and up again, mm in the frame of the pad turned over."""
-    along = np.pad(stroke.places_mm, ((0, 0), (0, 1)), constant_values=stroke.z_mm)
-    above = np.pad(stroke.places_mm[[0, -1]], ((0, 0), (0, 1)), constant_values=height_mm)
+    along = np.pad(stroke.positions_mm, ((0, 0), (0, 1)), constant_values=stroke.z_mm)
+    above = np.pad(stroke.positions_mm[[0, -1]], ((0, 0), (0, 1)), constant_values=height_mm)
     return np.vstack([above[:1], along, above[1:]])
 
 
@@ -190,7 +190,7 @@ def _tip(plan: Plan, steps: Sequence[Step]) -> Finding:
         walls = without(plan.silicone, plan.ridges[step.layer.level])
         shapely.prepare(walls)
         for stroke in (each for each in step.strokes if each.z_mm < 0):
-            line = shapely.LineString(turned_over(stroke.places_mm))
+            line = shapely.LineString(turned_over(stroke.positions_mm))
             rooms.append(2 * float(shapely.distance(line, walls)))
             if rooms[-1] < tip:
                 places.append(shapely.get_coordinates(shapely.shortest_line(line, walls))[0])
@@ -239,7 +239,7 @@ def instructions(plan: Plan, steps: Sequence[Step]) -> Iterator[Instruction]:
     for number, step in enumerate(steps, 1):
         for stroke in step.strokes:
             name = f"fibre {stroke.fibre + 1}, {fibre_name(plan, stroke.fibre)}"
-            (start_x, start_y), (end_x, end_y) = stroke.places_mm[[0, -1]].tolist()
+            (start_x, start_y), (end_x, end_y) = stroke.positions_mm[[0, -1]].tolist()
             yield Go((start_x, start_y, height), dispenser.travel_mm_s)
             yield Go((start_x, start_y, stroke.z_mm), dispenser.feed_mm_s)
             yield Pause(f"{name}: fasten its end under the needle")

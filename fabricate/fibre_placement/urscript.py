@@ -51,7 +51,7 @@ def _body(work: Iterable[Instruction], dispenser: DispenserSettings) -> Iterator
 
 
 def _laid(stroke: Stroke, dispenser: DispenserSettings) -> Iterator[str]:
-    places = np.round(stroke.places_mm, 3)
+    places = np.round(stroke.positions_mm, 3)
     feeds, blends = stroke.feeds_mm_s.tolist(), _blends(places).tolist()
     for (x, y), feed, blend in zip(places[1:].tolist(), feeds, blends, strict=True):
         place = ", ".join(map(_number, (x, y, stroke.z_mm)))

@@ -549,10 +549,10 @@ def toolpath_svg(plan: Plan, steps: Sequence[Step]) -> str:
     Dashed are the ways above the pad, red is the box, where it is near.
     """
     strokes = [stroke for step in steps for stroke in step.strokes]
-    places = np.vstack([stroke.places_mm for stroke in strokes])
+    places = np.vstack([stroke.positions_mm for stroke in strokes])
     (left, low), (right, high) = places.min(axis=0) - _ROOM_MM, places.max(axis=0) + _ROOM_MM
     right = max(right, left + _LEAST_MM)
-    ends = np.stack([stroke.places_mm[[0, -1]] for stroke in strokes])
+    ends = np.stack([stroke.positions_mm[[0, -1]] for stroke in strokes])
     legend = list(_legend(plan, steps))
     width, height = right - left, high - low + _TOOLPATH_LINE_MM * (len(legend) + 1)
     return "\n".join(
@@ -597,7 +597,7 @@ def _laid(steps: Sequence[Step]) -> Iterator[str]:
     for step in steps:
         yield f'<g id="{step.layer.name}" stroke="{step.layer.colour}" stroke-width="0.3">'
         for stroke in step.strokes:
-            yield f'<path id="fibre-{stroke.fibre + 1}" d="{_path(stroke.places_mm)}"/>'
+            yield f'<path id="fibre-{stroke.fibre + 1}" d="{_path(stroke.positions_mm)}"/>'
         yield "</g>"
 
 

@@ -343,7 +343,7 @@ def _common_tracks(plan: Plan) -> list[dict[str, Any]]:
             "shallow": each.shallow + 1,
             "deep": each.deep + 1,
             "length_mm": round(each.length_mm, 3),
-            "place_mm": [round(x, 3) for x in each.place_mm],
+            "position_mm": [round(x, 3) for x in each.position_mm],
         }
         for each in sorted(long, key=lambda each: -each.length_mm)
     ]
@@ -439,17 +439,17 @@ def _laying(document: Mapping[str, Any]) -> Iterator[str]:
         yield ""
         yield (
             f"Or let a machine lay them in this order, on the pad turned over: its ways are in {' and '.join(programs)}"
-            " and drawn in `dispensing.svg`. It waits while you fasten and cut each fibre and seal each step."
+            " and drawn in `toolpath.svg`. It waits while you fasten and cut each fibre and seal each step."
         )
 
 
 def _handling(fibre: Mapping[str, Any]) -> str:
     """What a fibre bears, as far as it is known, as a sentence."""
     limits = []
-    if fibre["largest_stretch"] is not None:
-        limits.append(f"{100 * fibre['largest_stretch']:.3g} % of stretch at most")
-    if fibre["least_bend_mm"] is not None:
-        limits.append(f"bends of no less than {fibre['least_bend_mm']:g} mm radius")
+    if fibre["max_strain"] is not None:
+        limits.append(f"{100 * fibre['max_strain']:.3g} % of stretch at most")
+    if fibre["min_bend_radius_mm"] is not None:
+        limits.append(f"bends of no less than {fibre['min_bend_radius_mm']:g} mm radius")
     return f" Lay them unstretched: {fibre['name']} bears {' and '.join(limits)}." if limits else ""
 
 
@@ -493,7 +493,7 @@ def _shared_places(shared: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     rows = [
         (
             f"{each['shallow']} over {each['deep']}",
-            *(f"{x:.1f} mm" for x in each["place_mm"]),
+            *(f"{x:.1f} mm" for x in each["position_mm"]),
             f"{each['length_mm']:.1f} mm",
         )
         for each in shared
@@ -513,7 +513,7 @@ def _remarks(findings: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     if remarks:
         yield ""
     for finding in sorted(remarks, key=lambda finding: finding["status"]):
-        count = len(finding["places_mm"])
+        count = len(finding["positions_mm"])
         places = f" ({count} {'place' if count == 1 else 'places'}, see `fabrication.json`)" if count else ""
         yield f"- **{finding['status']}** {finding['name']}: {finding['message']}{places}"
 

@@ -250,7 +250,7 @@ def draw_tracks(plan: Plan, path: Path) -> None:
     left, low, right, high = plan.silicone.bounds
     room = 0.06 * (right - left)
     order = fibre_layers(plan)
-    places = plan.clash_places_mm
+    places = plan.clash_positions_mm
     title = (
         f"Fibres as they lie in the tray, from above: {plan.pad.layout.fibres} fibres, {len(plan.crossings)} crossings"
     )
@@ -329,7 +329,7 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: FibreLayer) -> list[Any]:
 
 def _marked(findings: Sequence[Finding]) -> list[Finding]:
     """The findings that have something to show, those that fail first."""
-    worth = [finding for finding in findings if finding.status != "pass" and finding.places_mm]
+    worth = [finding for finding in findings if finding.status != "pass" and finding.positions_mm]
     return sorted(worth, key=lambda finding: finding.status)
 
 
@@ -363,8 +363,8 @@ class _Sheet:
         handles = []
         for finding in _marked(findings):
             colour, shapes = marks[finding.status]
-            shape, places = next(shapes, "X"), np.array(finding.places_mm).T
-            label = f"{finding.status}: {finding.name} ({len(finding.places_mm)})"
+            shape, places = next(shapes, "X"), np.array(finding.positions_mm).T
+            label = f"{finding.status}: {finding.name} ({len(finding.positions_mm)})"
             style = {"marker": shape, "mfc": "none", "linestyle": "none", "ms": 10, "zorder": 5}
             self.axes.plot(*places, mec="white", mew=3.4, **style)  # keeps the mark off whatever it lies on
             handles += self.axes.plot(*places, mec=colour, mew=1.5, label=label, **style)

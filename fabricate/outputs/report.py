@@ -173,7 +173,7 @@ def _base64(values: NDArray[Any]) -> str:
     return base64.b64encode(values.tobytes()).decode()
 
 
-_SHOWN = ("mould.stl", "mould.png", "tracks.png", "dispensing.svg", ORIENTATION_FILE)
+_SHOWN = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE)
 _SHOWN_PLACES = 3
 
 
@@ -200,7 +200,7 @@ def _mould(folder: Path, shown: Collection[str], document: Mapping[str, Any]) ->
     captions = {
         "mould.png": f"The mould from above, {size} mm: colour tells family and height.",
         "tracks.png": "The fibres as they lie in the mould; the deeper one interrupts the other.",
-        "dispensing.svg": "The ways of a needle that lays the fibres, the pad turned over.",
+        "toolpath.svg": "The ways of a needle that lays the fibres, the pad turned over.",
     }
     return PageSection(
         "Mould",
@@ -250,6 +250,6 @@ def _checks(findings: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _places(finding: Mapping[str, Any]) -> str:
-    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["places_mm"]]
+    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
     more = f" and {len(places) - _SHOWN_PLACES} more" if len(places) > _SHOWN_PLACES else ""
     return " ".join(places[:_SHOWN_PLACES]) + more

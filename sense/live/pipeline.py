@@ -23,7 +23,7 @@ from padforge.sense.localizer.normalization import Scaled
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
 from padforge.sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
 
-from .press_buffer import DONE, NEEDS, Press, Ring
+from .press_buffer import DONE, NEEDS, BufferedPress, Ring
 
 TRAIL = 12
 """Presses that are kept to be shown."""
@@ -118,7 +118,7 @@ class Live:
         self._usual = _usual(self._localizers[-1])
         self._finder = Finder(fibres)
         self._ring = Ring(1 + fibres)
-        self._press: Press | None = None
+        self._press: BufferedPress | None = None
         self._count = self._free = 0
         self.presses: deque[Estimate] = deque(maxlen=TRAIL)
         self.findings: list[FibreFault] = []
@@ -204,7 +204,7 @@ class Live:
         events = self._advance(begun)
         begun = max(begun, self._free + 1)
         time_s = float(self._ring.rows(touched, touched + 1)[0, 0])
-        self._press = Press(self._count, time_s, touched, begun, self._free, self._rest(begun))
+        self._press = BufferedPress(self._count, time_s, touched, begun, self._free, self._rest(begun))
         self._count += 1
         return events
 
@@ -230,7 +230,7 @@ class Live:
             self._free, self._press = press.lifted, None
         return events
 
-    def _estimate(self, press: Press, localizer: Localizer, end: int) -> Estimate:
+    def _estimate(self, press: BufferedPress, localizer: Localizer, end: int) -> Estimate:
         readings, begun, lifted, free = press.excerpt(self._ring, end)
         # The press before stands in by its end alone: the rest of this one reaches back no further.
         begins, ends = ([free - 1, begun], [free, lifted]) if free > 0 else ([begun], [lifted])
@@ -252,7 +252,7 @@ class Live:
         self.presses.append(estimate)
         return estimate
 
-    def _judge(self, press: Press, end: int) -> list[FibreFault]:
+    def _judge(self, press: BufferedPress, end: int) -> list[FibreFault]:
         """What a press that is over says of the fibres."""
         if self._monitor is None:
             return []

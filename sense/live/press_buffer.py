@@ -72,7 +72,7 @@ class Excerpt(NamedTuple):
 
 
 @dataclass
-class Press:
+class BufferedPress:
     """A press under way.
 
     Attributes:

@@ -16,7 +16,7 @@ from padforge.sense.recordings.simulation.strengths import strengths
 
 from .fitting import Fit, Freedom, fit
 from .identified_pad import Identification
-from .laid_pad import LaidPad, Plan
+from .laid_pad import LaidPad, PadPlan
 from .responses import Responses, information, of_one_depth, responses
 from .scatter import response_scatter
 from .smooth import smooth_function
@@ -82,12 +82,12 @@ def identify(
     live = _live(shown.certainty, len(pad.knots))
     learnt, held_out = answers.of(learnt_rows, live), answers.of(np.flatnonzero(held), live)
     compared = learnt.of(np.arange(min(PATCHES, len(learnt))))
-    plan = Plan.of(pad)
+    plan = PadPlan.of(pad)
     candidates = _on_plan(plan, learnt, compared, rng, report)
     _refuse_stranger(candidates[0][0].match)
     laid = _laid(candidates, compared)
     best = laid[0][1]
-    plain = Plan.of(Morphology.straight(pad.layout))
+    plain = PadPlan.of(Morphology.straight(pad.layout))
     straight = [] if np.allclose(plain.course, plan.course) else _on_plan(plain, learnt, compared, rng, report)
     report("courses", 0, 3)
     found = _fitted(best.pad, learnt, report)
@@ -145,7 +145,7 @@ def _live(certainty: Array, fibres: int) -> Indices:
 
 
 def _on_plan(
-    plan: Plan, learnt: Responses, compared: Responses, rng: np.random.Generator, report: Report
+    plan: PadPlan, learnt: Responses, compared: Responses, rng: np.random.Generator, report: Report
 ) -> list[tuple[Wiring, Fit]]:
     """The wirings that go best with the presses, best first, each with the pad fitted that lies on its plan."""
     found = wirings(plan, learnt, rng, lambda done, of: report("wiring", done, of))[:TRIED]

@@ -39,7 +39,7 @@ AWAY, COUNTS = slice(2, 2 + 2 * ASIDE), slice(2 + 2 * ASIDE, OWN)
 
 
 @dataclass(frozen=True)
-class Plan:
+class PadPlan:
     """Elements of F a fibre, evenly spaced along each.
 
     Attributes:
@@ -53,7 +53,7 @@ class Plan:
     layout: Layout
 
     @classmethod
-    def of(cls, pad: Morphology) -> "Plan":
+    def of(cls, pad: Morphology) -> "PadPlan":
         """Of a morphology."""
         course, tangent, length = [], [], []
         for line in flatten(pad, FLAT):
@@ -94,14 +94,14 @@ class LaidPad:
             the sensitivity.
     """
 
-    plan: Plan
+    plan: PadPlan
     fibres: tuple[int, ...]
     mirrored: bool
     step: float
     values: Array
 
     @classmethod
-    def on_plan(cls, plan: Plan, fibres: tuple[int, ...], frame: PlanTransform, width: float) -> "LaidPad":
+    def on_plan(cls, plan: PadPlan, fibres: tuple[int, ...], frame: PlanTransform, width: float) -> "LaidPad":
         """A pad that lies as planned, with a Gaussian reach of standard deviation `width` and gains of 1."""
         step = NARROW * width
         distance = np.linspace(0, (SPLINES + 1) * step, 100)

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from padforge.design.twin import PlanTransform
 from padforge.sense.recordings.processing.limits import Array, Mask
 
-from .laid_pad import Plan
+from .laid_pad import PadPlan
 from .responses import Responses
 
 WIDTH = 0.55
@@ -56,7 +56,7 @@ class Wiring:
 class Matcher:
     """Says how well a frame goes with presses."""
 
-    def __init__(self, plan: Plan, presses: Responses, rng: np.random.Generator) -> None:
+    def __init__(self, plan: PadPlan, presses: Responses, rng: np.random.Generator) -> None:
         chosen = np.sort(rng.choice(len(presses), min(PRESSES, len(presses)), replace=False))
         self._plan, self._presses = plan, presses.of(chosen)
         self._course, self._length = plan.course[:, ::COARSE], plan.length[:, ::COARSE]
@@ -106,7 +106,10 @@ def assigned(correlations: Array) -> tuple[float, tuple[int, ...]]:
 
 
 def wirings(
-    plan: Plan, presses: Responses, rng: np.random.Generator, report: Callable[[int, int], None] = lambda done, of: None
+    plan: PadPlan,
+    presses: Responses,
+    rng: np.random.Generator,
+    report: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Wiring]:
     """The wirings that go best with the presses, each with its best frame, best first."""
     matcher = Matcher(plan, presses, rng)
@@ -126,7 +129,7 @@ def wirings(
     return sorted(best.values(), key=lambda wiring: -wiring.match)
 
 
-def _off_middle(middle: Array, lying: PlanTransform, plan: Plan) -> Array:
+def _off_middle(middle: Array, lying: PlanTransform, plan: PadPlan) -> Array:
     """The middle of what was pressed, as a shift that is undone where it lies far off the pad's own middle."""
     turned = lying.rotate(middle[None])[0]
     return turned if np.abs(turned).max() > plan.unit_mm else np.zeros(2)

@@ -30,7 +30,7 @@ FILES = {
     *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")),
     "mould.step",
     *("tracks.svg", "tracks.dxf", "mould.png", "tracks.png", "laying.md", "orientation.svg", "fabrication.json"),
-    *("laying.gcode", "laying.script", "dispensing.svg"),
+    *("laying.gcode", "laying.script", "toolpath.svg"),
 }
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
@@ -154,7 +154,7 @@ def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path, size):
 
 def test_the_document_has_what_a_lab_needs(built, tmp_path):
     _, document = built
-    assert document["format"] == "padforge-fabrication/1"
+    assert document["format"] == "padforge-fabrication/2"
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
     assert document["size_mm"] == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
     assert document["sizes"]["tray_mm"] == pytest.approx(side)
@@ -205,7 +205,7 @@ def test_what_stops_the_needle_is_told(tmp_path):
     assert [*found] == [finding["name"] for finding in by_hand["findings"]]
     assert "dispenser" not in by_hand["settings"]
     assert by_machine["settings"]["dispenser"]["origin_mm"] == [10.0, 110.0]
-    assert by_machine["files"] == ["laying.script", "dispensing.svg"]
+    assert by_machine["files"] == ["laying.script", "toolpath.svg"]
 
 
 def other_solid(monkeypatch, body: str) -> None:
@@ -309,7 +309,7 @@ def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"format": "padforge-fabrication/1", "sha256": ["mould.step"]}'])
+@pytest.mark.parametrize("text", ["", "[]", '{"format": "padforge-fabrication/2", "sha256": ["mould.step"]}'])
 def test_nothing_goes_by_a_document_that_says_nothing(tmp_path, text):
     (tmp_path / "fabrication.json").write_text(text)
     (tmp_path / "mould.step").write_text("somebody's own")

@@ -75,7 +75,7 @@ def test_a_keep_out_at_the_edge_joins_the_wall():
 def test_keep_outs_that_do_harm_are_found(hole, name, status):
     found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=(hole,))))}
     assert found[name].status == status
-    assert found[name].places_mm
+    assert found[name].positions_mm
 
 
 def test_the_lids_bores_keep_off_pillars():
@@ -197,14 +197,14 @@ def test_a_pad_without_crossings_has_a_page(tmp_path):
 @pytest.mark.parametrize(("bend_mm", "acceleration", "least_mm_s"), [(3.0, 100.0, 10.0), (1.0, 25.0, 5.0)])
 def test_a_needle_follows_the_leads_and_is_slow_in_tight_bends(bend_mm, acceleration, least_mm_s):
     """The root of acceleration times radius, 17 and 5 mm/s, of which the feed is at most 10 mm/s."""
-    own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(least_bend_mm=bend_mm))
+    own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(min_bend_radius_mm=bend_mm))
     own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
     plan = Plan(PAD, own)
     strokes = [stroke for step in laying_steps(plan, 0.3) for stroke in step.strokes]
     for stroke in strokes:
-        line = shapely.LineString(turned_over(stroke.places_mm))
+        line = shapely.LineString(turned_over(stroke.positions_mm))
         assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
-        places = np.asarray(shapely.points(turned_over(stroke.places_mm)))
+        places = np.asarray(shapely.points(turned_over(stroke.positions_mm)))
         places = places[shapely.within(places, plan.silicone)]
         assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
     assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)

@@ -64,7 +64,7 @@ FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
         ("fibre", {"name": "yarn"}, (f"'yarn', allowed are {', '.join(FIBRES)}; or", "own with diameter_mm set")),
         ("fibre", {"diameter_mm": 11.0}, ("[fibre] diameter_mm: got ",)),
         ("fibre", {"ohm_per_mm": "unknown"}, ("[fibre] ohm_per_mm: got ",)),
-        ("fibre", {"least_bend_mm": -1.0}, ("[fibre] least_bend_mm: got ",)),
+        ("fibre", {"min_bend_radius_mm": -1.0}, ("[fibre] min_bend_radius_mm: got ",)),
         ("fibre", {"name": ""}, ("[fibre] name: got ",)),
         ("fibre", {"name": "two\nlines"}, ("[fibre] name: got ",)),
     ],

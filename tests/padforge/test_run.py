@@ -57,7 +57,7 @@ def test_run_makes_everything(finished: tuple[Path, str]) -> None:
     assert [row["lost"] for row in json.loads((out / "calibration.json").read_text())["errors"]] == [0, 1]
     for name in ("design", "fabrication", "calibration", "morphology", "localizer"):
         document = json.loads((out / f"{name}.json").read_text())
-        assert document["format"] == f"padforge-{name}/{2 if name in ('design', 'localizer') else 1}"
+        assert document["format"] == f"padforge-{name}/{2 if name in ('design', 'fabrication', 'localizer') else 1}"
         assert set(document["provenance"]) >= {"command", "seed", "versions", "inputs"}
     text = (out / "report.html").read_text()
     assert text.count('src="data:image/') == 6

@@ -20,7 +20,7 @@ FOUND = {"presses": "found"}
 """What the source of a recording says whose presses were found in its readings."""
 
 
-class _Presses(NamedTuple):
+class _PressColumns(NamedTuple):
     """(Q,) readings at which presses begin and end, as in a `Recording`, and how they are known."""
 
     begun: Indices
@@ -123,13 +123,13 @@ def _places(given: Mapping[str, Array]) -> Array | None:
     return places if places is None or places.shape[1] == 2 else places.T
 
 
-def _told(given: Mapping[str, Array], places: Array | None, count: int) -> _Presses | None:
+def _told(given: Mapping[str, Array], places: Array | None, count: int) -> _PressColumns | None:
     """Presses as the arrays tell them; None where they do not."""
     if "begun" in given:
         begun, lifted = (as_numbers(given[name], np.int64, name) for name in ("begun", "lifted"))
         if len(begun) != len(lifted):
             raise InputError(f"begun has {len(begun)} values and lifted {len(lifted)}, expected as many")
-        return _Presses(begun, lifted, {})
+        return _PressColumns(begun, lifted, {})
     if "press" in given:
         press = given["press"]
         if len(press) != count:
@@ -160,16 +160,16 @@ def _contact(press: Array) -> Mask:
     return down
 
 
-def _runs(values: Array, down: Mask) -> _Presses:
+def _runs(values: Array, down: Mask) -> _PressColumns:
     """Presses that last while the pad is `down` (R,) and `values` (R, k) stay the same."""
     before = np.vstack([np.full((1, values.shape[1]), np.nan), values[:-1]])
     begun = np.flatnonzero(down & (values != before).any(axis=1))
     ends = np.append(np.flatnonzero(~down), len(values))
     lifted = np.minimum(ends[np.searchsorted(ends, begun)], np.append(begun[1:], len(values)))
-    return _Presses(begun, lifted, {})
+    return _PressColumns(begun, lifted, {})
 
 
-def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _Presses:
+def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _PressColumns:
     """Presses that the readings show."""
     from padforge.sense.recordings.processing.press_detection import as_commanded, find_presses
 
@@ -178,10 +178,10 @@ def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _Press
     presses = find_presses(readings, times_s)
     if len(presses.touched) == 0:
         raise InputError("has no press: no place or number tells one, and none is found in the readings")
-    return _Presses(*as_commanded(presses, times_s), FOUND)
+    return _PressColumns(*as_commanded(presses, times_s), FOUND)
 
 
-def _pressed(places: Array | None, presses: _Presses, count: int) -> Array:
+def _pressed(places: Array | None, presses: _PressColumns, count: int) -> Array:
     """(Q, 2) places of presses, NaN where they are unknown."""
     if places is None:
         return np.full((len(presses.begun), 2), np.nan)
@@ -189,7 +189,7 @@ def _pressed(places: Array | None, presses: _Presses, count: int) -> Array:
     return np.where(places == UNKNOWN, np.nan, places)
 
 
-def _of_presses(name: str, values: Array, presses: _Presses, count: int) -> Array:
+def _of_presses(name: str, values: Array, presses: _PressColumns, count: int) -> Array:
     """(Q, ...) values of presses, from such, or from (R, ...) of readings, R = `count`."""
     if len(values) == len(presses.begun):
         return values

@@ -14,8 +14,8 @@ from padforge.sense.rig.boards.due.framing import (
     FULL_SCALE,
     MAX_CHANNELS,
     Ack,
-    Block,
     BoardSettings,
+    DueBlock,
     Identity,
     Kind,
     Status,
@@ -53,7 +53,7 @@ class EmulatedBoard(SerialBoard):
         serial = b"emulated board".ljust(16, b"\0")
         self._identity = Identity(firmware, framing.BITS, MAX_CHANNELS, "padforge-due", serial)
         self._silent = silent
-        self._decoder = framing.Decoder()
+        self._decoder = framing.DueDecoder()
         self._settings = BoardSettings(1_000_000, 0xFF, 1)
         self._sequence = self._overruns = self._overrun_asked = 0
         self._halting = False
@@ -112,14 +112,14 @@ class EmulatedBoard(SerialBoard):
     def _at_once(self) -> int:
         return min(max(BLOCK_NS // self._settings.period_ns, 1), framing.MAX_SAMPLES)
 
-    def _block(self, first: int, times_s: Array) -> Block:
+    def _block(self, first: int, times_s: Array) -> DueBlock:
         mask, averaging = self._settings.mask, self._settings.averaging
         inputs = [i for i in range(MAX_CHANNELS) if mask >> i & 1]
         steps = np.clip(np.rint(self._source(times_s)[:, inputs] / self._supply_v * FULL_SCALE), 0, FULL_SCALE)
         time_us = (first + len(times_s)) * self._settings.period_ns // 1000
         numbers = (self._sequence % 2**16, first % 2**32, time_us % 2**32, self._overruns)
         self._sequence += 1
-        return Block((steps * averaging).astype(np.uint16), averaging, mask, *numbers)
+        return DueBlock((steps * averaging).astype(np.uint16), averaging, mask, *numbers)
 
 
 def judge_settings(settings: BoardSettings) -> Status:

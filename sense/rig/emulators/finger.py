@@ -31,7 +31,7 @@ PATIENCE_S = 3.0
 
 
 @dataclass
-class Stroke:
+class FingerStroke:
     """A press: where, how deep, mm, and from when to when the finger is down, s; `up_s` is inf while nobody knows."""
 
     kind: str
@@ -76,7 +76,7 @@ class Finger:
         self._scatter_mm, self._mishaps = scatter_mm, mishaps
         self._view: Mapping[str, Any] = {"phase": "settle"}
         self._now_s = -math.inf
-        self.strokes: list[Stroke] = []
+        self.strokes: list[FingerStroke] = []
 
     def look(self, view: Mapping[str, Any]) -> None:
         """See what is shown: its "phase" and "target", [x, y] mm."""
@@ -105,18 +105,18 @@ class Finger:
                 stroke.up_s = at_s
         return stroke.at(at_s)
 
-    def _next(self, last: Stroke | None, at_s: float) -> Stroke | None:
+    def _next(self, last: FingerStroke | None, at_s: float) -> FingerStroke | None:
         """The stroke that is begun now, if any is."""
         if last is not None and last.kind == "double":
             again_s = at_s + AGAIN_S
-            self.strokes.append(Stroke("echo", last.place_mm, last.depth_mm, again_s, again_s + SHORT_S))
+            self.strokes.append(FingerStroke("echo", last.place_mm, last.depth_mm, again_s, again_s + SHORT_S))
             return self.strokes[-1]
         if self._view["phase"] != "press":
             return None
         kind = str(self._rng.choice(MISHAPS)) if self._rng.random() < self._mishaps else "press"
         place_mm = np.array(self._view["target"]) + self._scatter_mm * self._rng.standard_normal(2)
         depth_mm = self._depth_mm * self._rng.uniform(*DEPTHS)
-        stroke = Stroke(kind, place_mm, depth_mm, at_s + self._rng.uniform(*LATE_S))
+        stroke = FingerStroke(kind, place_mm, depth_mm, at_s + self._rng.uniform(*LATE_S))
         if kind in ("short", "light"):
             stroke.up_s = stroke.down_s + SHORT_S
         if kind == "light":

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from padforge.sense.rig.boards.line.framing import ASK, Header, header_line, sample_line
+from padforge.sense.rig.boards.line.framing import ASK, LineHeader, header_line, sample_line
 
 from .serial_board import OUT_BYTES, SerialBoard, Source
 
@@ -19,7 +19,7 @@ class EmulatedLineBoard(SerialBoard):
     def __init__(
         self,
         source: Source,
-        header: Header,
+        header: LineHeader,
         *,
         boot_us: int = 0,
         skew_ppm: float = 0.0,

@@ -14,7 +14,7 @@ from padforge.sense.rig.arms.printer.driver import Printer
 from padforge.sense.rig.arms.ur5.driver import UR5
 from padforge.sense.rig.boards.due.driver import Arduino
 from padforge.sense.rig.boards.line.driver import LineBoard
-from padforge.sense.rig.boards.line.framing import Header
+from padforge.sense.rig.boards.line.framing import LineHeader
 from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
 
@@ -108,7 +108,7 @@ def _board(rig: RigSettings, volts: Source, inputs: int) -> Board:
         return EmulatedBoard(volts)
     if rig.board == "line":
         said = (("name", "emulated"), ("serial", "0"))
-        return EmulatedLineBoard(volts, Header(rig.converter_rate_hz, 12, SUPPLY_V, inputs, said=said))
+        return EmulatedLineBoard(volts, LineHeader(rig.converter_rate_hz, 12, SUPPLY_V, inputs, said=said))
     raise InputError(f"[rig] board: got {rig.board!r}, emulated are {' and '.join(_DRIVERS)}")
 
 

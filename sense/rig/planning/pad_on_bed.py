@@ -9,7 +9,7 @@ from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.settings import RigSettings
 
-FILE, FORMAT = "fabrication.json", "padforge-fabrication/1"
+FILE, FORMAT = "fabrication.json", "padforge-fabrication/2"
 _LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "surface_mm": 1, "walls_mm": 1}
 _SLACK_MM = 1e-6
 

@@ -42,7 +42,7 @@ class Learning:
 
 
 @dataclass(frozen=True)
-class _Presses:
+class _ForcePresses:
     """How presses are made and read; whether networks are given their depth, and so do not find it."""
 
     indenter: Indenter
@@ -79,7 +79,7 @@ def force_study(
     tasks = [
         Task(
             f"{label}, noise of {_counts(noise)}, {name}",
-            partial(_found, pad, _Presses(indenter, each, told, noise), learning, seed),
+            partial(_found, pad, _ForcePresses(indenter, each, told, noise), learning, seed),
         )
         for label, pad in pads.items()
         for noise in noise_counts
@@ -126,7 +126,7 @@ def committee(
     return lambda given: np.mean([network(given) for network in members], axis=0)
 
 
-def _found(pad: Morphology, made: _Presses, learning: Learning, seed: int) -> State:
+def _found(pad: Morphology, made: _ForcePresses, learning: Learning, seed: int) -> State:
     """The test presses as they were made, "pressed", and as networks find them, "found": (T, 3) x, y, depth.
 
     The full scale of a fibre is the greatest signal it gave in the presses that were learnt from.

@@ -54,7 +54,7 @@ def shape_study(
         hidden, epochs: of a network. seed: of presses, noise and networks.
     """
     tasks = [
-        Task(f"{label}, {of}, {name}", partial(work, _Presses(pad, of, presses, test, seed), hidden, epochs))
+        Task(f"{label}, {of}, {name}", partial(work, _ShapePresses(pad, of, presses, test, seed), hidden, epochs))
         for label, pad in pads.items()
         for of in SETS
         for name, work in (("shape", _classified), ("place", _located))
@@ -75,7 +75,7 @@ def shape_study(
 
 
 @dataclass(frozen=True)
-class _Presses:
+class _ShapePresses:
     """Presses of a set of shapes on a pad, the last `test` of them to test on.
 
     Attributes:
@@ -126,7 +126,7 @@ def circumradius(sides: int | None) -> float:
     return 1.0 if sides is None else float(np.sqrt(2 * np.pi / (sides * np.sin(2 * np.pi / sides))))
 
 
-def _classified(presses: _Presses, hidden: int, epochs: int) -> State:
+def _classified(presses: _ShapePresses, hidden: int, epochs: int) -> State:
     """Confusions (K, K) on the test presses: how often shape i, by row, was taken for j."""
     given, _, shape, rng = presses.made()
     count = len(SETS[presses.of])
@@ -136,7 +136,7 @@ def _classified(presses: _Presses, hidden: int, epochs: int) -> State:
     return {"confusions": confusions}
 
 
-def _located(presses: _Presses, hidden: int, epochs: int) -> State:
+def _located(presses: _ShapePresses, hidden: int, epochs: int) -> State:
     """Mean error of the place on the test presses, grid units: "unknown", and "known" to networks told the shape."""
     given, places, shape, rng = presses.made()
     told = np.column_stack([given, np.eye(len(SETS[presses.of]))[shape]])

@@ -19,7 +19,7 @@ class TestSound:
     def test_a_missing_triangle(self):
         found = inspected(trimesh.Trimesh(self.box.vertices, self.box.faces[1:]))
         assert found["manifold"].status == found["watertight"].status == "fail"
-        assert found["watertight"].measured == len(found["watertight"].places_mm) == 3
+        assert found["watertight"].measured == len(found["watertight"].positions_mm) == 3
         assert "ridge_width" not in found
 
     def test_two_boxes_that_share_an_edge(self):

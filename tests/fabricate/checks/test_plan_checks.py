@@ -31,7 +31,7 @@ def test_a_buildable_pad_passes_every_check():
 
 def test_published_pad_that_was_built_shows_its_crossings(published):
     finding = found(Morphology.load(published / "5para_dis.mat"), "same_family_crossings")
-    assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 6, 6)
+    assert (finding.status, finding.measured, len(finding.positions_mm)) == ("warn", 6, 6)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_straight_pad_is_judged_by_its_settings(name, settings, status, measur
     assert finding.measured == pytest.approx(measured, abs=1e-9)
     assert limit is ... or finding.limit == pytest.approx(limit)
     if name in ("ridge_width", "slenderness"):
-        assert len(finding.places_mm) == (0 if status == "pass" else {"ridge_width": 2, "slenderness": 1}[name])
+        assert len(finding.positions_mm) == (0 if status == "pass" else {"ridge_width": 2, "slenderness": 1}[name])
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_every_height_is_to_be_a_whole_number_of_layers(key, height):
 @pytest.mark.parametrize(("grid", "named"), [(2, "numbers 1, 2, 3, 4"), (5, "10 numbers")])
 def test_numbers_without_room_are_named_or_counted(grid, named):
     finding = found(Morphology.straight(grid, 4.0), "numbers", with_settings({"number_mm": 9.0, "exit_mm": 0.0}))
-    assert (finding.status, finding.measured, len(finding.places_mm)) == ("warn", 0, 2 * grid)
+    assert (finding.status, finding.measured, len(finding.positions_mm)) == ("warn", 0, 2 * grid)
     assert finding.message == f"no room beside the fibre's start for {named}"
 
 
@@ -112,9 +112,9 @@ class TestFibres:
     def test_crossings_of_one_family(self, levels, status):
         finding = found(level_pad(1.8, 1.2), "same_family_crossings", with_settings({"levels": levels}))
         assert (finding.status, finding.measured) == (status, 2)
-        assert all(isinstance(value, float) for place in finding.document()["places_mm"] for value in place)
+        assert all(isinstance(value, float) for place in finding.document()["positions_mm"] for value in place)
         assert found(level_pad(1.8, 1.2), "silicone_wall").status == "pass"  # they lie at two depths
-        (left, y), (right, _) = finding.places_mm
+        (left, y), (right, _) = finding.positions_mm
         assert left == pytest.approx(-right, abs=1e-3)
         assert y == pytest.approx(0, abs=1e-3)
 
@@ -123,9 +123,9 @@ class TestFibres:
         knots = np.array([[0, 1], [0.9, 1], [0.93, 1.05], [1.5, 1.05], [2, 1]])
         upright = np.stack([np.ones(5), np.linspace(0, 2, 5)], axis=1)
         finding = found(Morphology(np.stack([knots, upright]), 11.25), "fibre_bend")
-        assert (finding.status, finding.limit, len(finding.places_mm)) == ("fail", 1.0, 1)
+        assert (finding.status, finding.limit, len(finding.positions_mm)) == ("fail", 1.0, 1)
         assert 0.1 < float(np.asarray(finding.measured)) < 0.6
-        x, y = finding.places_mm[0]
+        x, y = finding.positions_mm[0]
         assert x == pytest.approx((0.915 - 1) * 11.25, abs=0.4)
         assert y == pytest.approx(0.025 * 11.25, abs=0.4)
 
@@ -136,7 +136,7 @@ class TestFibres:
         """Fibres that swing gently: their bends are of some 13 mm."""
         knots = np.array([[0, 1], [0.1, 1.01], [0.5, 1.1], [1.5, 0.9], [1.9, 0.99], [2, 1]])
         pad = Morphology(np.stack([knots, knots[:, ::-1]]), 15.0)
-        settings = with_settings(rules={"min_bend_radius_mm": float(rule)}, fibre={"least_bend_mm": float(bears)})
+        settings = with_settings(rules={"min_bend_radius_mm": float(rule)}, fibre={"min_bend_radius_mm": float(bears)})
         finding = found(pad, "fibre_bend", settings)
         assert (finding.status, finding.limit) == (status, limit)
 
@@ -154,9 +154,9 @@ class TestFibres:
         assert kinks.limit == pytest.approx(np.degrees(0.5))
         assert bends.measured == pytest.approx(min(0.5 / angle, 1.0), rel=2e-3)
         if status == "fail":
-            assert len(kinks.places_mm) == len(bends.places_mm) == 1
-            assert kinks.places_mm[0] == pytest.approx((-11.25, 0))
-            assert bends.places_mm[0] == pytest.approx((-11.25, 0), abs=0.02)
+            assert len(kinks.positions_mm) == len(bends.positions_mm) == 1
+            assert kinks.positions_mm[0] == pytest.approx((-11.25, 0))
+            assert bends.positions_mm[0] == pytest.approx((-11.25, 0), abs=0.02)
 
     def test_leads_to_one_side_bend_as_tightly_as_is_allowed(self):
         one_side = with_settings(pad={"leads": "one side"}, rules={"min_bend_radius_mm": 3.0})
@@ -181,8 +181,8 @@ class TestSilicone:
         finding = found(level_pad(1.5 - away, 1.5 + away), "silicone_wall")
         assert finding.status == status
         assert finding.measured == pytest.approx(gap_mm, abs=max(0.015, 0.02 * gap_mm))
-        assert all(abs(y) < gap_mm for _, y in finding.places_mm)
-        assert bool(finding.places_mm) == (status != "pass")
+        assert all(abs(y) < gap_mm for _, y in finding.positions_mm)
+        assert bool(finding.positions_mm) == (status != "pass")
 
     @pytest.mark.parametrize(("length", "patches"), [(0.02, 0), (0.05, 1)])
     def test_corners_of_less_than_a_hundredth_of_a_square_millimetre_are_no_walls(self, length, patches):
@@ -208,7 +208,7 @@ class TestSilicone:
         assert (finding.status, finding.limit) == (status, 2.0)
         assert finding.measured == pytest.approx(2 * width / np.sin(np.arctan(0.4 / 1.5)), rel=0.05)
         assert "fibre 2 over 1 at (0.0, 0.0) mm" in finding.message.replace("-0.0", "0.0")
-        assert len(finding.places_mm) == (status == "warn")
+        assert len(finding.positions_mm) == (status == "warn")
 
     def test_tracks_of_one_family_at_two_depths_lie_over_each_other_as_well(self):
         plan = Plan(level_pad(1.51, 1.49))
@@ -228,11 +228,11 @@ class TestSilicone:
         finding = found(level_pad(from_wall_mm / 10, 2.0), "tray_wall")
         assert finding.status == status
         assert finding.measured == pytest.approx(from_wall_mm - 0.2, abs=0.01)
-        assert all(y == pytest.approx(-15 + from_wall_mm, abs=0.01) for _, y in finding.places_mm)
+        assert all(y == pytest.approx(-15 + from_wall_mm, abs=0.01) for _, y in finding.positions_mm)
 
     def test_a_border_keeps_tracks_off_the_wall(self):
         finding = found(level_pad(0.01, 2.0), "tray_wall", with_settings({"border_mm": 2.0}))
-        assert (finding.status, finding.places_mm) == ("pass", ())
+        assert (finding.status, finding.positions_mm) == ("pass", ())
 
 
 class TestFolds:
@@ -256,7 +256,7 @@ class TestFolds:
         finding = found(bump, "folds", with_settings(wide))
         assert (finding.status, finding.measured) == ("warn", 3)
         knots = np.array([(-2, 0), (0, 2 * up), (2, 0)])[:, :: -1 if family else 1]
-        assert np.array(finding.places_mm) == pytest.approx(knots, abs=0.3)
+        assert np.array(finding.positions_mm) == pytest.approx(knots, abs=0.3)
         assert found(bump, "folds", with_settings({**narrow, "ridge_draft_deg": 10.0})).status == "warn"  # at the foot
 
     @pytest.mark.parametrize(("family", "rise"), [(0, 1.0), (0, -0.6), (1, 0.8)])
@@ -268,7 +268,7 @@ class TestFolds:
         finding = found(pad, "folds", with_settings({"tolerance_mm": 0.97 * cut}))
         assert (finding.status, finding.measured) == ("warn", 1)
         corner = np.array([-2, 10 * 0.8 * rise])[:: -1 if family else 1]
-        assert np.array(finding.places_mm[0]) == pytest.approx(corner, abs=1e-3)
+        assert np.array(finding.positions_mm[0]) == pytest.approx(corner, abs=1e-3)
         assert f"{cut:.2f} mm" in finding.message
         assert found(pad, "folds", with_settings({"tolerance_mm": 1.03 * cut})).status == "pass"
 
@@ -290,8 +290,8 @@ class TestFolds:
         second = np.asarray(np.gradient(first, axis=1))
         bend = np.abs(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
         tight = scanned[bend * 0.2 > np.hypot(first[..., 0], first[..., 1]) ** 3]
-        assert (finding.status, finding.measured) == ("warn", len(finding.places_mm))
-        assert all(np.hypot(*(tight - place).T).min() < 0.02 for place in finding.places_mm)
+        assert (finding.status, finding.measured) == ("warn", len(finding.positions_mm))
+        assert all(np.hypot(*(tight - place).T).min() < 0.02 for place in finding.positions_mm)
 
 
 def bent(pad: Morphology, radius: float, **settings: dict[str, Any]) -> Plan:
@@ -323,7 +323,7 @@ def test_fibres_below_the_middle_are_pressed():
 
 @pytest.mark.parametrize(("stretch", "status"), [(1.0, "pass"), (0.1, "warn"), (0.05, "fail")])
 def test_it_is_judged_by_what_the_fibre_bears(stretch, status):
-    plan = bent(Morphology.straight(2, 10.0), 20.0, fibre={"largest_stretch": stretch})
+    plan = bent(Morphology.straight(2, 10.0), 20.0, fibre={"max_strain": stretch})
     (finding,) = (finding for finding in check_plan(plan) if finding.name == "fibre_strain")
     assert finding.status == status
     assert finding.measured == pytest.approx(1.95 / 23)

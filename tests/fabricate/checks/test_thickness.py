@@ -92,7 +92,7 @@ class TestWidth:
         if status == "fail":
             assert found["ridge_width"].measured == pytest.approx(width, abs=0.015)
             assert near(found["ridge_width"], 4.5, -5.5, 2.6)
-            assert len(found["ridge_width"].places_mm) == 1
+            assert len(found["ridge_width"].positions_mm) == 1
 
     @pytest.mark.parametrize(
         ("printer", "status"),
@@ -116,7 +116,7 @@ class TestWidth:
         assert faults(found) == ({} if status == "pass" else {"silicone_wall": status})
         if status != "pass":
             assert found["silicone_wall"].measured == pytest.approx(gap, abs=0.015)
-            assert {round(y) for _, y in found["silicone_wall"].places_mm} == {3, -7}
+            assert {round(y) for _, y in found["silicone_wall"].positions_mm} == {3, -7}
             allowed = tray(*CROSS, ridge(spanning(3.4 + gap), 1.2))
             assert not faults(inspected(allowed, min_silicone_mm=gap - 0.04)) or gap < 0.1
 
@@ -124,13 +124,13 @@ class TestWidth:
         crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), 10, (0, 0.5)))
         found = inspected(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5))))
         assert faults(found) == {"silicone_wall": "warn"}
-        assert len(found["silicone_wall"].places_mm) == 2
+        assert len(found["silicone_wall"].positions_mm) == 2
 
     def test_narrow_silicone_before_a_wall(self):
         found = inspected(tray(*CROSS, ridge(spanning(9.5)), draft_deg=0))
         assert faults(found) == {"silicone_wall": "warn"}
         assert found["silicone_wall"].measured == pytest.approx(0.3, abs=0.015)
-        assert all(9.6 < y < 10.1 for _, y in found["silicone_wall"].places_mm)
+        assert all(9.6 < y < 10.1 for _, y in found["silicone_wall"].positions_mm)
 
     def test_a_slot_through_the_wall_does_not_hide_the_casting(self):
         slot = Manifold.cube((10, 1.5, DEPTH + 1)).translate((5, -0.75, FLOOR))
@@ -149,8 +149,8 @@ class TestWidth:
         found = inspected(tray(*CROSS, draft_deg=0) - cut)
         assert found["wall_thickness"].status == status
         assert found["wall_thickness"].measured == pytest.approx(wall, rel=0.06)
-        assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in found["wall_thickness"].places_mm)
-        assert bool(found["wall_thickness"].places_mm) == (status != "pass")
+        assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in found["wall_thickness"].positions_mm)
+        assert bool(found["wall_thickness"].positions_mm) == (status != "pass")
 
     @pytest.mark.parametrize("layer", [0.1, 0.4])
     def test_a_leaning_wall_is_measured_in_the_middle_of_its_last_layer(self, layer):
@@ -227,8 +227,8 @@ class TestLean:
         undercut = inspected(tray(*CROSS, draft_deg=-lean_deg))["undercut"]
         assert (undercut.status, undercut.limit) == ("fail", 0)
         assert undercut.measured == pytest.approx(lean_deg, rel=0.01)
-        assert undercut.places_mm
-        assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.places_mm)
+        assert undercut.positions_mm
+        assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.positions_mm)
 
     @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45.8, "pass"), (46.3, "fail")])
     def test_a_funnel_on_a_plate_is_no_cavity(self, lean_deg, status):

@@ -62,7 +62,7 @@ def faults(found: dict[str, Finding]) -> dict[str, str]:
 
 
 def near(found: Finding, x: float, y: float, within: float = 1.0) -> bool:
-    return any(math.hypot(px - x, py - y) <= within for px, py in found.places_mm)
+    return any(math.hypot(px - x, py - y) <= within for px, py in found.positions_mm)
 
 
 CROSS = [ridge(spanning(3.0), 1.2), ridge(spanning(-3.0), 1.2), ridge(shapely.affinity.rotate(spanning(1), 90, (0, 0)))]

@@ -96,8 +96,8 @@ def test_what_is_asked_for_is_made_and_the_same_again():
     assert place_fibres(plan, ["stl", "png"]).texts == {}
     assert not place_fibres(plan, ["stl", "png"]).findings
     both = place_fibres(plan, ["urscript", "gcode"])
-    assert list(both.texts) == ["laying.gcode", "laying.script", "dispensing.svg"]
-    assert list(place_fibres(plan, ["urscript"]).texts) == ["laying.script", "dispensing.svg"]
+    assert list(both.texts) == ["laying.gcode", "laying.script", "toolpath.svg"]
+    assert list(place_fibres(plan, ["urscript"]).texts) == ["laying.script", "toolpath.svg"]
     assert place_fibres(Plan(Morphology.random(1, 2, seed=1)), ["gcode", "urscript"]).texts == both.texts
     assert {finding.name for finding in both.findings} == {"dispenser_box", "dispenser_tip"}
 
@@ -111,7 +111,7 @@ def test_the_fibre_of_the_settings_sets_depth_and_pace():
         assert ways[0].corners[:, 2] == pytest.approx(float(str(fibre.get("diameter_mm", 0.3))) - 1.2)
         return sum((np.linalg.norm(np.diff(way.corners, axis=0), axis=1) / way.speeds).sum() for way in ways)
 
-    assert seconds(largest_stretch=0.05) > 1.2 * seconds(largest_stretch=2.0)
+    assert seconds(max_strain=0.05) > 1.2 * seconds(max_strain=2.0)
     assert seconds(diameter_mm=0.2) < seconds(diameter_mm=0.39)
 
 
@@ -194,7 +194,9 @@ def test_the_drawing_shows_every_fibre_as_it_is_laid_with_its_number_turn_and_de
     ways = [part for part in travel.attrib["d"].split("M") if part]
     for way, before, after in zip(ways, strokes[:-1], strokes[1:], strict=True):
         ends = [[float(part) for part in place.split(",")] for place in way.split("L")]
-        assert np.array(ends) * (1, -1) == pytest.approx(np.array([before.places_mm[-1], after.places_mm[0]]), abs=1e-3)
+        assert np.array(ends) * (1, -1) == pytest.approx(
+            np.array([before.positions_mm[-1], after.positions_mm[0]]), abs=1e-3
+        )
     (box,) = (path for path in root.findall(f"{SVG}path") if path.get("id") == "box")
     (clip,) = root.findall(f"{SVG}clipPath")
     assert box.get("clip-path") == f"url(#{clip.get('id')})"

@@ -31,7 +31,7 @@ def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
     radius = window_mm / np.maximum(
         np.interp(arc + window_mm / 2, arc, turned) - np.interp(arc - window_mm / 2, arc, turned), 1e-9
     )
-    along = stroke.places_mm[:, family] * (-1 if family == 0 else 1)
+    along = stroke.positions_mm[:, family] * (-1 if family == 0 else 1)
     return np.array([radius[(t >= a) & (t <= b)].min(initial=1e9) for a, b in pairwise(along)])
 
 
@@ -81,7 +81,7 @@ def test_bends_only_where_they_are_slow_a_fibre_down():
     inner[1] = [(1, 0.5), (1, 1.0), (1, 1.5)]
     bent, straight = strokes(Plan(Morphology(assemble_knots(inner), 10.0)))
     assert straight.feeds_mm_s.tolist() == [10.0]
-    assert len(straight.places_mm) == 2
+    assert len(straight.positions_mm) == 2
     at_most = bent.feeds_mm_s == 10
     assert 0 < bent.steps_mm[~at_most].sum() < 6
     assert at_most[[0, -1]].all()
@@ -131,9 +131,9 @@ def test_the_box_holds_all_ways_or_it_is_told_where_not(keys, room, places):
     assert found.measured == pytest.approx(room, abs=1e-9)
     assert found.status == ("pass" if room == 0 else "fail")
     if places is not None:
-        assert np.array(sorted(found.places_mm)) == pytest.approx(np.array(places))
+        assert np.array(sorted(found.positions_mm)) == pytest.approx(np.array(places))
     else:
-        assert len(found.places_mm) == (4 if room else 0)
+        assert len(found.positions_mm) == (4 if room else 0)
 
 
 @pytest.mark.parametrize(
@@ -148,8 +148,8 @@ def test_the_box_holds_all_ways_or_it_is_told_where_not(keys, room, places):
 def test_a_needle_wider_than_a_track_would_cut_the_silicone(tip, mould, status):
     found = findings(mould, tip_mm=tip)["dispenser_tip"]
     assert (found.status, found.measured) == (status, tip)
-    assert bool(found.places_mm) == (status == "fail")
-    assert all(max(map(abs, place)) < EDGE - 29 for place in found.places_mm)  # leads lie outside
+    assert bool(found.positions_mm) == (status == "fail")
+    assert all(max(map(abs, place)) < EDGE - 29 for place in found.positions_mm)  # leads lie outside
 
 
 def test_by_default_the_needle_can_go_its_way():

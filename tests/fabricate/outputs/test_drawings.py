@@ -43,12 +43,12 @@ def bezier_points(control: np.ndarray) -> np.ndarray:
     return ((1 - u) ** 3 * a + 3 * (1 - u) ** 2 * u * b + 3 * (1 - u) * u**2 * c + u**3 * d).reshape(-1, 2)
 
 
-def assert_on_curve(plan: Plan, fibre: int, places_mm: np.ndarray) -> None:
+def assert_on_curve(plan: Plan, fibre: int, positions_mm: np.ndarray) -> None:
     """Places (n, 2) mm lie within 0.1 µm of the fibre as scipy has it, and cover it from end to end."""
     axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
     curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
-    travel = np.clip(places_mm[:, axis], knots[0, axis], knots[-1, axis])
-    off = np.abs(places_mm[:, 1 - axis] - curve(travel)) / np.hypot(1, curve(travel, 1))
+    travel = np.clip(positions_mm[:, axis], knots[0, axis], knots[-1, axis])
+    off = np.abs(positions_mm[:, 1 - axis] - curve(travel)) / np.hypot(1, curve(travel, 1))
     assert off.max() < 1e-4
     assert np.ptp(travel) == pytest.approx(plan.pad.layout.size_mm[0])
 

@@ -128,7 +128,7 @@ def test_tracks_over_each_other_are_listed_from_twice_a_right_angled_crossing_on
         if listed:
             (shared,) = document["common_tracks"]
             assert (shared["shallow"], shared["deep"]) == (2, 1)
-            assert shared["place_mm"] == pytest.approx([0, 0], abs=1e-3)
+            assert shared["position_mm"] == pytest.approx([0, 0], abs=1e-3)
             ((tracks, *_, length),) = rows(laying_page.laying_page(document), "tracks")
             assert (tracks, length) == ("2 over 1", f"{shared['length_mm']:.1f} mm")
 
@@ -168,7 +168,7 @@ def test_the_page_has_what_to_mix_and_to_cut():
 
 
 def test_every_fibre_has_its_resistance_by_its_length_and_its_resistor():
-    plan = Plan(Morphology.random(2, 3, seed=5), with_settings(fibre={"ohm_per_mm": 130.0, "least_bend_mm": 2.5}))
+    plan = Plan(Morphology.random(2, 3, seed=5), with_settings(fibre={"ohm_per_mm": 130.0, "min_bend_radius_mm": 2.5}))
     document = whole(plan)
     page = laying_page.laying_page(document)
     table = rows(page.partition("## Wire")[2], "number")
@@ -215,17 +215,17 @@ def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
     table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-    page = laying_page.laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "dispensing.svg"]})
-    assert "in `laying.gcode` and `laying.script` and drawn in `dispensing.svg`" in page.partition("## Lay\n")[2]
+    page = laying_page.laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "toolpath.svg"]})
+    assert "in `laying.gcode` and `laying.script` and drawn in `toolpath.svg`" in page.partition("## Lay\n")[2]
     page = laying_page.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
     assert "tracks up; fibres 1 and 5 start at the cut corner" in page
 
 
 def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
     findings = (
-        {"name": "bed", "status": "pass", "message": "fits", "places_mm": []},
-        {"name": "thin", "status": "warn", "message": "thin walls", "places_mm": [[1.0, 2.0]]},
-        {"name": "wall", "status": "fail", "message": "no wall", "places_mm": []},
+        {"name": "bed", "status": "pass", "message": "fits", "positions_mm": []},
+        {"name": "thin", "status": "warn", "message": "thin walls", "positions_mm": [[1.0, 2.0]]},
+        {"name": "wall", "status": "fail", "message": "no wall", "positions_mm": []},
     )
     lid = with_settings({"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True})
     page = laying_page.laying_page(whole(Plan(Morphology.straight(2), lid), findings))

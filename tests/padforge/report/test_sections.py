@@ -74,7 +74,7 @@ def test_report_shows_results_of_rules_and_checks(pad: Path) -> None:
     design, mould = design_document(), json.loads((pad / "fabrication.json").read_text())
     broken = {"rule": "min_gap_mm", "fibres": [1, 2], "measured": 0.25, "limit": 0.8, "place_mm": [1.0, 2.0]}
     design["violations"] = [broken]
-    mould["findings"][0] |= {"status": "warn", "message": "thin", "places_mm": [[k, 0.5] for k in range(5)]}
+    mould["findings"][0] |= {"status": "warn", "message": "thin", "positions_mm": [[k, 0.5] for k in range(5)]}
     written(pad / "design.json", design)
     written(pad / "fabrication.json", mould)
     text = write_report(pad).read_text()
@@ -192,7 +192,7 @@ def test_report_refuses_folder_without_results(tmp_path: Path) -> None:
 
 DAMAGED = {
     "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}', "{", "[]"],
-    "fabrication.json": ['{"format": "padforge-fabrication/1", "findings": []}'],
+    "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
     "calibration.json": ['{"format": "padforge-calibration/1", "errors": []}'],
     "fibre_loss.json": ['{"format": "padforge-fibre-loss/1", "ways": {"x": {"by_subset": [{"lost": [1]}]}}}'],
     "recording/start.json": ['{"format": "padforge-recording/1", "fibres": 4}'],

@@ -15,7 +15,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, locate
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.live.pipeline import Estimate, Live
-from padforge.sense.live.press_buffer import HISTORY, SLACK, Press
+from padforge.sense.live.press_buffer import HISTORY, SLACK, BufferedPress
 from padforge.sense.recordings.processing.press_detection import Event
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
@@ -173,7 +173,7 @@ def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt,
 
 
 def test_a_press_that_is_let_go_before_it_began_lasts_a_reading() -> None:
-    press = Press(0, 0.0, 12, 10, 0, np.zeros(1))
+    press = BufferedPress(0, 0.0, 12, 10, 0, np.zeros(1))
     press.let_go(4)
     assert press.lifted == 11
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from padforge.sense.twin.fitting import Freedom, fit
-from padforge.sense.twin.laid_pad import AWAY, COUNTS, LaidPad, Plan
+from padforge.sense.twin.laid_pad import AWAY, COUNTS, LaidPad, PadPlan
 from padforge.sense.twin.responses import Responses
 from padforge.sense.twin.scatter import response_scatter
 from padforge.sense.twin.smooth import smooth_function
@@ -20,7 +20,7 @@ FREE = Freedom(aside_mm=1.0, uneven=0.2)
 @pytest.fixture(scope="module")
 def start(printed):
     fibres = tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
-    return LaidPad.on_plan(Plan.of(PLAN), fibres, printed.frame, 0.5)
+    return LaidPad.on_plan(PadPlan.of(PLAN), fibres, printed.frame, 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_channels_and_frame_are_found_first_of_all(printed, answers, missing) ->
         volts, there = answers.volts.copy(), answers.there.copy()
         volts[::3, 0], there[::3, 0] = 5.0, False
         answers = Responses(answers.places_mm, volts, there)
-    found = wirings(Plan.of(PLAN), answers, np.random.default_rng(0))[0]
+    found = wirings(PadPlan.of(PLAN), answers, np.random.default_rng(0))[0]
     assert found.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
     assert found.frame.mirrored
     assert np.hypot(*np.subtract(found.frame.shift_mm, printed.frame.shift_mm)) < 1.0

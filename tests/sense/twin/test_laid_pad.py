@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design.twin import PlanTransform
 from padforge.sense.twin.kernels.response import along_fibre, channel_response
-from padforge.sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, Plan, own_values
+from padforge.sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, PadPlan, own_values
 from padforge.sense.twin.responses import Responses
 
 from .conftest import PLAN
@@ -18,7 +18,7 @@ PLACES = np.random.default_rng(2).uniform(-10, 10, (40, 2))
 
 @pytest.fixture
 def pad() -> LaidPad:
-    laid = LaidPad.on_plan(Plan.of(PLAN), (2, 0, 3), PlanTransform(True, 4.0, (1.0, -2.0), 0.95), 0.5)
+    laid = LaidPad.on_plan(PadPlan.of(PLAN), (2, 0, 3), PlanTransform(True, 4.0, (1.0, -2.0), 0.95), 0.5)
     return replace(laid, values=laid.values + 0.03 * np.random.default_rng(0).standard_normal(laid.values.size))
 
 

@@ -69,7 +69,7 @@ class Printer:
         self._link = link = MarlinLink(rig.printer_port, rig.printer_baud)
         try:
             link.begin(CONNECT_S)
-            firmware = marlin.Firmware.of(link.ask("M115"))
+            firmware = marlin.PrinterDialect.of(link.ask("M115"))
             if marlin.FIRMWARE not in firmware.name:
                 raise RigFault("refused", f"the firmware is {firmware.name or 'of no name'!r}, allowed is Marlin")
             if marlin.waits_for_moves(firmware.name):

@@ -51,7 +51,7 @@ def halts(line: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Firmware:
+class PrinterDialect:
     """What a printer says of itself in answer to M115.
 
     Attributes:
@@ -64,7 +64,7 @@ class Firmware:
     capabilities: frozenset[str] = field(default_factory=frozenset)
 
     @classmethod
-    def of(cls, lines: list[str]) -> "Firmware":
+    def of(cls, lines: list[str]) -> "PrinterDialect":
         """From the lines of the answer."""
         text = "\n".join(lines)
         name = re.search(r"FIRMWARE_NAME:(.*?)(?: [A-Z_]+:|$)", text, re.MULTILINE)

@@ -40,7 +40,7 @@ _ODD = 3
 
 
 @dataclass(frozen=True)
-class Seen:
+class ObservedState:
     """Where the nozzle was: when that was said, its place, its speed in mm/s, and whether a move was under way."""
 
     time_s: float
@@ -63,10 +63,10 @@ class Mover(threading.Thread):
         self._move: StraightMove | None = None
         self._begun_s, self._acceleration, self._odd = 0.0, 0.0, 0
         self._orders: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
-        self._seen: deque[Seen] = deque(maxlen=_KEPT)
+        self._seen: deque[ObservedState] = deque(maxlen=_KEPT)
         self._ending = threading.Event()
         self.fault: RigFault | None = None
-        self.latest = Seen(time.monotonic(), at, 0.0, False)
+        self.latest = ObservedState(time.monotonic(), at, 0.0, False)
 
     def run(self) -> None:
         """Look, and do what is ordered, until the end or a fault."""
@@ -83,7 +83,7 @@ class Mover(threading.Thread):
         except Exception as error:  # a thread that dies silently would look like a printer at rest
             self.fault = RigFault("lost", f"what moves the printer has failed ({error!r})")
 
-    def take(self) -> list[Seen]:
+    def take(self) -> list[ObservedState]:
         """What was seen since the last call."""
         return [self._seen.popleft() for _ in range(len(self._seen))]
 
@@ -208,7 +208,7 @@ class Mover(threading.Thread):
         before, moving = self.latest, self._move is not None
         passed_s = now_s - before.time_s
         speed = math.dist(at, before.at) / passed_s if moving and passed_s > 0 else 0.0
-        self.latest = Seen(now_s, at, speed, moving)
+        self.latest = ObservedState(now_s, at, speed, moving)
         self._seen.append(self.latest)
 
 

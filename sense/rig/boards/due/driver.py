@@ -13,7 +13,18 @@ from padforge.sense.rig.boards.sample_clock import SampleClock
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.settings import RigSettings
 
-from .framing import FULL_SCALE, MAX_AVERAGING, MAX_CHANNELS, Ack, Block, BoardSettings, Identity, Kind, Request, Status
+from .framing import (
+    FULL_SCALE,
+    MAX_AVERAGING,
+    MAX_CHANNELS,
+    Ack,
+    BoardSettings,
+    DueBlock,
+    Identity,
+    Kind,
+    Request,
+    Status,
+)
 from .serial_link import SerialLink, port_of
 
 FIRMWARE_MAJOR = 1
@@ -25,7 +36,7 @@ _ANSWER_S = 1.0
 _JUMP_US = 5000
 """Board time and sample index may differ by so much from block to block: interrupts come late."""
 
-Arrival = tuple[float, Block]
+Arrival = tuple[float, DueBlock]
 """A block and the host time at which it came."""
 
 
@@ -56,8 +67,8 @@ class Arduino:
         self._wanted = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
         self._supply_v = supply_v
         self._link: SerialLink | None = None
-        self._reader: BlockReader[Block] | None = None
-        self._assembler: Assembler | None = None
+        self._reader: BlockReader[DueBlock] | None = None
+        self._assembler: DueAssembler | None = None
 
     @classmethod
     def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "Arduino":
@@ -71,7 +82,7 @@ class Arduino:
         try:
             identity = self._identify(link)
             settings = self._set(link)
-            self._assembler = Assembler(settings, self._inputs, self._supply_v)
+            self._assembler = DueAssembler(settings, self._inputs, self._supply_v)
             self._start(link, settings)
         except BaseException:
             self.close()
@@ -153,20 +164,20 @@ class Arduino:
     def _start(self, link: SerialLink, settings: BoardSettings) -> None:
         halted = False
 
-        def receive() -> tuple[float, list[Block]]:
+        def receive() -> tuple[float, list[DueBlock]]:
             nonlocal halted
             if halted:
                 raise RigFault("data", f"{self._port}: the board has lost conversions and stopped")
             now_s, frames = link.receive()
             halted = any(isinstance(frame, Ack) and frame.status == Status.HALTED for frame in frames)
-            return now_s, [frame for frame in frames if isinstance(frame, Block)]
+            return now_s, [frame for frame in frames if isinstance(frame, DueBlock)]
 
         link.decoder.damaged = 0
         self._reader = BlockReader(self._port, receive, 1e9 / settings.period_ns)
         self._reader.begin(lambda: link.send(Request(Kind.START)))
 
 
-class Assembler:
+class DueAssembler:
     """Makes `Samples` of blocks: times by a `SampleClock`, volts fibre by fibre, what is missing by the index.
 
     Attributes:
@@ -202,7 +213,7 @@ class Assembler:
             np.concatenate([np.empty(0, np.int64), *missing]),
         )
 
-    def _place(self, block: Block) -> tuple[int, int]:
+    def _place(self, block: DueBlock) -> tuple[int, int]:
         """Index of the first sample, counted on without wrapping, and how many are lost before it."""
         if (block.mask, block.averaging) != (self._settings.mask, self._settings.averaging):
             raise RigFault("data", "the board sends other channels than it was set to", "connect again")

@@ -118,7 +118,7 @@ class Ack:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class DueBlock:
     """Consecutive samples.
 
     Attributes:
@@ -141,7 +141,7 @@ class Block:
         return _BLOCK.pack(Kind.BLOCK, len(self.counts), *fields) + self.counts.astype("<u2").tobytes()
 
 
-Frame = Request | BoardSettings | Identity | Ack | Block
+Frame = Request | BoardSettings | Identity | Ack | DueBlock
 
 _SETTINGS = struct.Struct("<IHB")
 _IDENTITY = struct.Struct("<3BBB16s16s")
@@ -209,7 +209,7 @@ def unpack(payload: bytes) -> Frame:
     raise ValueError(f"kind {kind} of {len(payload)} bytes, expected one of {[int(known) for known in Kind]}")
 
 
-def _unpack_block(payload: bytes) -> Block:
+def _unpack_block(payload: bytes) -> DueBlock:
     if len(payload) < _BLOCK.size:
         raise ValueError(f"a block of {len(payload)} bytes, expected at least {_BLOCK.size}")
     _, samples, averaging, mask, *numbers = _BLOCK.unpack_from(payload)
@@ -220,10 +220,10 @@ def _unpack_block(payload: bytes) -> Block:
     counts = np.frombuffer(payload, "<u2", offset=_BLOCK.size).reshape(samples, channels)
     if counts.max() > averaging * FULL_SCALE:
         raise ValueError(f"a count of {counts.max()}, expected at most {averaging * FULL_SCALE}")
-    return Block(counts, averaging, mask, *numbers)
+    return DueBlock(counts, averaging, mask, *numbers)
 
 
-class Decoder:
+class DueDecoder:
     """Finds the frames in a stream of bytes that comes in any portions.
 
     Attributes:

@@ -10,7 +10,7 @@ from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.rig.devices.serial_port import host_ports
 from padforge.sense.settings import RigSettings
 
-from .framing import BoardSettings, Decoder, Frame, Request, encode
+from .framing import BoardSettings, DueDecoder, Frame, Request, encode
 
 BAUD = 115_200
 """Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
@@ -56,7 +56,7 @@ class SerialLink:
     def __init__(self, port: str) -> None:
         """Open `port` for this process alone; raises RigFault("refused") where that cannot be."""
         self.port = port
-        self.decoder = Decoder()
+        self.decoder = DueDecoder()
         self._stream = ByteStream(port, BAUD)
 
     def receive(self) -> tuple[float, list[Frame]]:

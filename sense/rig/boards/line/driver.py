@@ -15,7 +15,7 @@ from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.devices.serial_port import host_ports
 from padforge.sense.settings import RigSettings
 
-from .framing import ASK, Decoder, Header, Sample
+from .framing import ASK, LineDecoder, LineHeader, Sample
 
 RESONATOR_SKEW = 5e-3
 """Small boards have a ceramic resonator in place of a quartz."""
@@ -35,7 +35,7 @@ _MISPLACED, _FORGIVEN = 8, 0.1
 
 
 @dataclass(frozen=True)
-class Lines:
+class LineReader:
     """Samples that came together: their times by the board, and (n, C) counts."""
 
     times_us: list[int]
@@ -57,9 +57,9 @@ class LineBoard:
         """
         self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
         self._stream: ByteStream | None = None
-        self._decoder = Decoder()
-        self._reader: BlockReader[Lines] | None = None
-        self._assembler: Assembler | None = None
+        self._decoder = LineDecoder()
+        self._reader: BlockReader[LineReader] | None = None
+        self._assembler: LineAssembler | None = None
 
     @classmethod
     def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
@@ -69,11 +69,11 @@ class LineBoard:
     def connect(self) -> dict[str, Any]:
         """Open the port, ask the board what it is and begin to read; see `Converter`."""
         self.close()
-        self._stream, self._decoder = ByteStream(self._port, self._baud), Decoder()
+        self._stream, self._decoder = ByteStream(self._port, self._baud), LineDecoder()
         try:
             header = self._identify(self._stream)
             inputs = chosen_inputs(self._inputs, header.channels, "the board")
-            self._assembler = Assembler(header, inputs)
+            self._assembler = LineAssembler(header, inputs)
             self._start(self._stream, header)
         except BaseException:
             self.close()
@@ -118,7 +118,7 @@ class LineBoard:
             self._stream.close()
         self._reader = None
 
-    def _identify(self, stream: ByteStream) -> Header:
+    def _identify(self, stream: ByteStream) -> LineHeader:
         deadline, again = time.monotonic() + _ANSWER_S, 0.0
         while self._decoder.header is None:
             if (now := time.monotonic()) > deadline:
@@ -134,14 +134,14 @@ class LineBoard:
             raise RigFault("refused", message, f"set converter_rate_hz = {header.rate_hz:g}")
         return header
 
-    def _start(self, stream: ByteStream, header: Header) -> None:
+    def _start(self, stream: ByteStream, header: LineHeader) -> None:
         settled, good_s = False, time.monotonic()
 
-        def receive() -> tuple[float, list[Lines]]:
+        def receive() -> tuple[float, list[LineReader]]:
             nonlocal good_s
             now_s, data = stream.receive()
             found = self._decoder.feed(data)
-            headers = [each for each in found if isinstance(each, Header)]
+            headers = [each for each in found if isinstance(each, LineHeader)]
             if headers and (settled or headers[-1] != header):  # before, it answers a question that was asked again
                 raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
             if self._decoder.in_a_row >= _BAD_LINES and now_s - good_s > _BAD_S:
@@ -150,14 +150,14 @@ class LineBoard:
             if not samples:
                 return now_s, []
             good_s = now_s
-            return now_s, [Lines([each.time_us for each in samples], [each.counts for each in samples])]
+            return now_s, [LineReader([each.time_us for each in samples], [each.counts for each in samples])]
 
         self._reader = BlockReader(self._port, receive, header.rate_hz)
         self._reader.begin()
         settled = True
 
 
-class Assembler:
+class LineAssembler:
     """Makes `ConverterSamples` of lines: times by a `SampleClock`, volts fibre by fibre, what is missing by the times.
 
     Every sample has its slot, a period after the one before; the slots follow the board, whose rate need not be quite
@@ -167,7 +167,7 @@ class Assembler:
         taken, missing: samples so far, and those that are missing.
     """
 
-    def __init__(self, header: Header, inputs: Sequence[int]) -> None:
+    def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
         self.clock = SampleClock(1e-6, RESONATOR_SKEW)
         self.taken = self.missing = 0
         self._columns = list(inputs)
@@ -177,7 +177,7 @@ class Assembler:
         self._slot_us = 0.0
         self._misplaced = 0.0
 
-    def samples(self, arrivals: Iterable[tuple[float, Lines]]) -> ConverterSamples:
+    def samples(self, arrivals: Iterable[tuple[float, LineReader]]) -> ConverterSamples:
         """The samples of the lines that have arrived since the last call.
 
         Raises:

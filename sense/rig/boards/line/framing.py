@@ -39,7 +39,7 @@ _MAX_TIME = 2**63
 
 
 @dataclass(frozen=True)
-class Header:
+class LineHeader:
     """What a board says of itself; `checked` where its lines carry a check, `said` the words that are its own."""
 
     rate_hz: float
@@ -63,7 +63,7 @@ class Sample:
     counts: tuple[int, ...]
 
 
-def header_line(header: Header) -> bytes:
+def header_line(header: LineHeader) -> bytes:
     """A header as it is sent."""
     numbers = ((name, f"{getattr(header, name):g}") for name in _LIMITS)
     words = [*header.said, *numbers, *([("check", "crc32")] if header.checked else [])]
@@ -80,7 +80,7 @@ def _line(text: str, checked: bool) -> bytes:
     return body + (b"*%08x\n" % crc32(body) if checked else b"\n")
 
 
-class Decoder:
+class LineDecoder:
     """Finds headers and samples in a stream of bytes that comes in any portions.
 
     Attributes:
@@ -89,7 +89,7 @@ class Decoder:
     """
 
     def __init__(self) -> None:
-        self.header: Header | None = None
+        self.header: LineHeader | None = None
         self.damaged = 0
         self._complaints: Counter[str] = Counter()
         self._rest = b""
@@ -104,13 +104,13 @@ class Decoder:
         """What was wrong with most of them."""
         return max(self._complaints, key=lambda said: self._complaints[said], default="")
 
-    def feed(self, data: bytes) -> list[Header | Sample]:
+    def feed(self, data: bytes) -> list[LineHeader | Sample]:
         """The headers and samples that `data` completes, in order."""
         *lines, rest = (self._rest + data).split(b"\n")
         self._rest = rest[: _MAX_LINE + 1]  # one byte too long is damaged whatever follows
         return [found for line in lines if (found := self._found(line.removesuffix(b"\r"))) is not None]
 
-    def _found(self, line: bytes) -> Header | Sample | None:
+    def _found(self, line: bytes) -> LineHeader | Sample | None:
         try:
             if line.startswith(_MAGIC.encode()):
                 found = self.header = _header(_verified(line).decode("ascii"))
@@ -136,7 +136,7 @@ def _verified(line: bytes) -> bytes:
     return body
 
 
-def _header(text: str) -> Header:
+def _header(text: str) -> LineHeader:
     version, *words = text.removeprefix(_MAGIC).split()
     if version != _VERSION:
         raise ValueError(f"it speaks version {version} of the line protocol, expected {_VERSION}")
@@ -144,7 +144,7 @@ def _header(text: str) -> Header:
     if (check := said.pop("check", "none")) not in ("crc32", "none"):
         raise ValueError(f"check is {check[:20]!r}, allowed are crc32 and none")
     rate_hz, bits, reference_v, channels = (_number(name, said.pop(name, "missing")) for name in _LIMITS)
-    return Header(rate_hz, int(bits), reference_v, int(channels), check == "crc32", tuple(said.items()))
+    return LineHeader(rate_hz, int(bits), reference_v, int(channels), check == "crc32", tuple(said.items()))
 
 
 def _number(name: str, text: str) -> float:
@@ -158,7 +158,7 @@ def _number(name: str, text: str) -> float:
     return value
 
 
-def _sample(line: bytes, header: Header) -> Sample:
+def _sample(line: bytes, header: LineHeader) -> Sample:
     if len(line) > _MAX_LINE:
         raise ValueError(f"a line of more than {_MAX_LINE} bytes")
     if header.checked and b"*" not in line:

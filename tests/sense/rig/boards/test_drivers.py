@@ -17,7 +17,7 @@ from padforge.sense.rig.boards.due import driver as due_driver
 from padforge.sense.rig.boards.due.driver import Arduino
 from padforge.sense.rig.boards.line import driver as line_driver
 from padforge.sense.rig.boards.line.driver import LineBoard
-from padforge.sense.rig.boards.line.framing import Header
+from padforge.sense.rig.boards.line.framing import LineHeader
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.emulators.due_board import EmulatedBoard
 from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
@@ -27,7 +27,7 @@ pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
 STEP_V = 3.3 / 4095
-HEADER = Header(1000, 12, 3.3, 16, said=(("name", "emulated"), ("serial", "7")))
+HEADER = LineHeader(1000, 12, 3.3, 16, said=(("name", "emulated"), ("serial", "7")))
 BAUD = 921_600
 Board = EmulatedBoard | EmulatedLineBoard
 Driver = Arduino | LineBoard
@@ -134,10 +134,10 @@ def test_a_second_without_a_gap_right_to_a_step_and_on_time(kind: str, monkeypat
         ("due", HEADER, {"inputs": range(8), "averaging": 16}),
         ("due", replace(HEADER, rate_hz=500.0), {"inputs": (11, 3, 0)}),
         ("line", replace(HEADER, rate_hz=10.0), {}),
-        ("line", Header(333.0, 16, 5.0, 16), {"inputs": (15, 0, 7)}),
+        ("line", LineHeader(333.0, 16, 5.0, 16), {"inputs": (15, 0, 7)}),
     ],
 )
-def test_other_rates_inputs_and_averages(kind: str, header: Header, options: dict[str, Any]) -> None:
+def test_other_rates_inputs_and_averages(kind: str, header: LineHeader, options: dict[str, Any]) -> None:
     board = emulated(kind, header)
     with connected(board, header.rate_hz, **options) as converter:
         samples = read_for(converter, 0.15)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology
-from padforge.sense.rig.emulators.finger import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, Stroke
+from padforge.sense.rig.emulators.finger import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, FingerStroke
 from padforge.sense.settings import RigSettings
 
 RATE_HZ = 50.0
@@ -48,6 +48,6 @@ def test_it_presses_where_it_is_asked_to_lifts_when_it_is_told_and_makes_every_m
     slid, still = (of_kind[kind].at(of_kind[kind].down_s + 1)[0] for kind in ("slide", "double"))
     assert np.linalg.norm(slid - of_kind["slide"].place_mm) > 10
     np.testing.assert_array_equal(still, of_kind["double"].place_mm)
-    stroke = Stroke("press", np.zeros(2), 4.0, down_s=1.0, up_s=2.0)  # it sinks in and leaves
+    stroke = FingerStroke("press", np.zeros(2), 4.0, down_s=1.0, up_s=2.0)  # it sinks in and leaves
     assert [stroke.at(at_s)[1] for at_s in (0.5, 1.0, 1.5, 1.9, 2.2)] == [0, 0, 4, 4, 0]
     assert 0 < stroke.at(1.05)[1] < 4

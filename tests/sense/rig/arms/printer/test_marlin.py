@@ -27,11 +27,11 @@ def test_lines_are_written_as_marlin_reads_them_and_what_a_printer_says_of_itsel
     assert marlin.numbered(0, "M110 N0") == b"N0 M110 N0*125\n"
     assert marlin.numbered(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
     assert marlin.move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
-    found = marlin.Firmware.of(M115)
+    found = marlin.PrinterDialect.of(M115)
     assert found.name == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
     assert found.machine == "Ender-3 Pro"
     assert found.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
-    assert marlin.Firmware.of(["echo: hello"]) == marlin.Firmware()
+    assert marlin.PrinterDialect.of(["echo: hello"]) == marlin.PrinterDialect()
     assert marlin.limits(M503, "M203") == (500.0, 400.0, 5.0)
     assert marlin.limits(M503, "M201") == (500.0, 500.0, 100.0)
     assert marlin.limits(M503[2:], "M203") is None

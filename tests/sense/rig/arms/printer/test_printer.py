@@ -12,7 +12,7 @@ import pytest
 from padforge.sense.rig.arms.printer import marlin
 from padforge.sense.rig.arms.printer.driver import Printer
 from padforge.sense.rig.arms.printer.link import MarlinLink
-from padforge.sense.rig.boards.line.framing import Header
+from padforge.sense.rig.boards.line.framing import LineHeader
 from padforge.sense.rig.devices.protocols import ArmState, RigFault
 from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
 from padforge.sense.rig.emulators.printer import firmware
@@ -213,6 +213,6 @@ def test_what_is_silent_is_no_printer_and_a_board_that_restarts_as_its_port_is_o
 @pytest.mark.slow
 def test_what_never_falls_silent_is_no_printer():
     """As where the port is that of the board that reads the fibres."""
-    board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), Header(1000, 12, 3.3, 4))
+    board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), LineHeader(1000, 12, 3.3, 4))
     with board, closing(MarlinLink(board.port, BAUD)) as link:
         assert fault_of(lambda: link.begin(0.5), "refused", "no printer answers") < 5

@@ -8,9 +8,9 @@ import pytest
 from padforge.sense.rig.boards.due import framing
 from padforge.sense.rig.boards.due.framing import (
     Ack,
-    Block,
     BoardSettings,
-    Decoder,
+    DueBlock,
+    DueDecoder,
     Frame,
     Identity,
     Kind,
@@ -34,7 +34,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(program: Path, *steps: str | Request | BoardSettings) -> list[Frame]:
     """What the board sends as the script is run with frames of the host in it: as the program would write it."""
     script = [step if isinstance(step, str) else f"host {encode(step).hex()}" for step in steps]
-    decoder, stream = Decoder(), sent(program, script)
+    decoder, stream = DueDecoder(), sent(program, script)
     frames = decoder.feed(stream)
     assert decoder.damaged == 0
     assert stream == b"".join(map(encode, frames))
@@ -51,7 +51,7 @@ def expected(first: int, samples: int, inputs: list[int], averaging: int) -> np.
     return ((256 * channel + turns[:, None]) % 4096).reshape(samples, averaging, -1).sum(1)
 
 
-def check_blocks(blocks: list[Block], wanted: BoardSettings) -> None:
+def check_blocks(blocks: list[DueBlock], wanted: BoardSettings) -> None:
     inputs = [i for i in range(12) if wanted.mask >> i & 1]
     samples = min(max(20_000_000 // wanted.period_ns, 1), 16)
     for number, block in enumerate(blocks):
@@ -77,7 +77,7 @@ def test_blocks_hold_every_conversion_in_its_place(program: Path, wanted: BoardS
     ack, started, *blocks = run(program, wanted, START, *script)
     assert ack == Ack(Kind.SETTINGS, Status.OK, wanted)
     assert started == Ack(Kind.START, Status.OK, wanted)
-    found = [block for block in blocks if isinstance(block, Block)]
+    found = [block for block in blocks if isinstance(block, DueBlock)]
     assert len(found) == len(blocks) == 8 * 16 // len(found[0].counts)
     check_blocks(found, wanted)
     assert judge_settings(wanted) == Status.OK
@@ -111,7 +111,7 @@ def test_start_twice_goes_on_and_settings_wait_for_stop(program: Path) -> None:
     acks = [(ack.command, ack.status) for ack in frames if isinstance(ack, Ack)]
     assert acks[:3] == [(Kind.START, Status.OK), (Kind.START, Status.OK), (Kind.SETTINGS, Status.RUNNING)]
     assert acks[3:] == [(Kind.STOP, Status.OK), (Kind.SETTINGS, Status.OK), (Kind.START, Status.OK)]
-    blocks = [block for block in frames if isinstance(block, Block)]
+    blocks = [block for block in frames if isinstance(block, DueBlock)]
     check_blocks(blocks[:2], default)
     assert [(block.first, block.mask) for block in blocks] == [(0, 0xFF), (16, 0xFF), (0, 3)]
 
@@ -120,17 +120,17 @@ def test_a_host_too_slow_costs_whole_blocks_that_are_counted_and_one_that_closes
     program: Path,
 ) -> None:
     frames = run(program, START, f"trigger {16 * 70}", "loop 100", "trigger 16", "loop 2")
-    blocks = [block for block in frames if isinstance(block, Block)]
+    blocks = [block for block in frames if isinstance(block, DueBlock)]
     assert [block.first for block in blocks[:64]] == list(range(0, 1024, 16))
     assert [(block.first, block.overruns, block.sequence) for block in blocks[64:]] == [(1120, 96, 64)]
     frames = run(program, START, "trigger 16", "loop 2", "close", "trigger 64", "loop 20")
-    assert sum(isinstance(frame, Block) for frame in frames) == 1
+    assert sum(isinstance(frame, DueBlock) for frame in frames) == 1
 
 
 @pytest.mark.parametrize("trouble", [["slip", "trigger 64"], ["masked 64"]])
 def test_lost_conversions_stop_the_board_rather_than_give_wrong_values(program: Path, trouble: list[str]) -> None:
     frames = run(program, START, "trigger 16", "loop 2", *trouble, "loop 20", "trigger 64", "loop 20")
-    assert [block.first for block in frames if isinstance(block, Block)] == [0]
+    assert [block.first for block in frames if isinstance(block, DueBlock)] == [0]
     assert isinstance(frames[-1], Ack)
     assert (frames[-1].command, frames[-1].status) == (Kind.STOP, Status.HALTED)
 

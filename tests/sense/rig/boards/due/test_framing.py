@@ -13,16 +13,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.boards.due.driver import Assembler
+from padforge.sense.rig.boards.due.driver import DueAssembler
 from padforge.sense.rig.boards.due.framing import (
     FULL_SCALE,
     MAX_AVERAGING,
     MAX_CHANNELS,
     MAX_SAMPLES,
     Ack,
-    Block,
     BoardSettings,
-    Decoder,
+    DueBlock,
+    DueDecoder,
     Frame,
     Identity,
     Kind,
@@ -39,20 +39,20 @@ SETTINGS = st.builds(BoardSettings, U32, U16, U8)
 
 
 @st.composite
-def blocks(draw: st.DrawFn) -> Block:
+def blocks(draw: st.DrawFn) -> DueBlock:
     mask = draw(st.integers(1, 2**MAX_CHANNELS - 1))
     samples, averaging = draw(st.integers(1, MAX_SAMPLES)), draw(st.integers(1, MAX_AVERAGING))
     least = draw(st.sampled_from([0, 0, 255, FULL_SCALE]))  # zeros and full scale are the hard cases of COBS
     most = draw(st.sampled_from([least, averaging * FULL_SCALE]))
     rng = np.random.default_rng(draw(st.integers(0, 99)))
     counts = rng.integers(min(least, most), most + 1, (samples, mask.bit_count())).astype(np.uint16)
-    return Block(counts, averaging, mask, draw(U16), draw(U32), draw(U32), draw(U32))
+    return DueBlock(counts, averaging, mask, draw(U16), draw(U32), draw(U32), draw(U32))
 
 
-def largest(averaging: int) -> Block:
+def largest(averaging: int) -> DueBlock:
     """Every count at its limit and no number with a zero byte, so that COBS has most to add."""
     counts = np.full((MAX_SAMPLES, MAX_CHANNELS), averaging * FULL_SCALE, np.uint16)
-    return Block(counts, averaging, 2**MAX_CHANNELS - 1, 0x0101, 0x01010101, 0x01010101, 0x01010101)
+    return DueBlock(counts, averaging, 2**MAX_CHANNELS - 1, 0x0101, 0x01010101, 0x01010101, 0x01010101)
 
 
 FRAMES = st.one_of(
@@ -74,7 +74,7 @@ def stream(count: int) -> list[bytes]:
     rng = np.random.default_rng(count)
     counts = (2000 + rng.integers(-300, 300, (count, MAX_SAMPLES, 8))).astype(np.uint16)
     counts[:, :, 3] = 0  # a dead channel: COBS has much to do
-    return [encode(Block(c, 1, 0xFF, i, 16 * i, 16_000 * i, 0)) for i, c in enumerate(counts)]
+    return [encode(DueBlock(c, 1, 0xFF, i, 16 * i, 16_000 * i, 0)) for i, c in enumerate(counts)]
 
 
 def cobs_byte_by_byte(payload: bytes) -> bytes:
@@ -111,7 +111,7 @@ def test_cobs_takes_out_the_zeros_as_on_the_board_and_puts_them_back(payload: by
 def test_frames_come_back_whatever_the_portions(frames: list[Frame], data: st.DataObject) -> None:
     sent = b"".join(map(encode, frames))
     edges = [0, *sorted(data.draw(st.lists(st.integers(0, len(sent)), max_size=20))), len(sent)]
-    decoder = Decoder()
+    decoder = DueDecoder()
     found = [frame for a, b in pairwise(edges) for frame in decoder.feed(sent[a:b])]
     assert payloads(found) == payloads(frames)
     assert decoder.damaged == 0
@@ -126,9 +126,9 @@ def damage_in_one_place(sent: bytes) -> Iterator[bytes]:
 
 def test_every_flipped_bit_dropped_byte_and_inserted_byte_costs_one_block_at_most() -> None:
     frames = stream(3)
-    whole = payloads(Decoder().feed(b"".join(frames)))
+    whole = payloads(DueDecoder().feed(b"".join(frames)))
     for damaged in damage_in_one_place(frames[1]):
-        decoder = Decoder()
+        decoder = DueDecoder()
         found = payloads(decoder.feed(frames[0] + damaged + frames[2]))
         assert found in (whole, [whole[0], whole[2]])
         assert decoder.damaged > 0 or found == whole
@@ -138,7 +138,7 @@ def test_every_flipped_bit_dropped_byte_and_inserted_byte_costs_one_block_at_mos
 @given(st.sampled_from([1e-3, 1e-2, 0.1]), st.integers(0, 10**6))
 def test_no_amount_of_damage_gives_a_wrong_frame(share: float, seed: int) -> None:
     frames = stream(60)
-    whole = payloads(Decoder().feed(b"".join(frames)))
+    whole = payloads(DueDecoder().feed(b"".join(frames)))
     rng = np.random.default_rng(seed)
     data = np.frombuffer(b"".join(frames), np.uint8).copy()
     hit = rng.random(len(data)) < share
@@ -146,11 +146,11 @@ def test_no_amount_of_damage_gives_a_wrong_frame(share: float, seed: int) -> Non
     data = np.delete(data, np.flatnonzero(rng.random(len(data)) < share / 2))
     left = iter(whole)
     # a subsequence: right, in order, none twice
-    assert all(payload in left for payload in payloads(Decoder().feed(data.tobytes())))
+    assert all(payload in left for payload in payloads(DueDecoder().feed(data.tobytes())))
 
 
 def test_noise_without_an_edge_neither_grows_nor_passes() -> None:
-    decoder = Decoder()
+    decoder = DueDecoder()
     for _ in range(1000):
         assert decoder.feed(b"\x55" * 1000) == []
     assert len(pickle.dumps(decoder)) < 1000
@@ -160,7 +160,7 @@ def test_noise_without_an_edge_neither_grows_nor_passes() -> None:
 
 
 def of_counts(counts: object, averaging: int = 1, mask: int = 0xFF) -> bytes:
-    return Block(np.array(counts, np.uint16), averaging, mask, 0, 0, 0, 0).pack()
+    return DueBlock(np.array(counts, np.uint16), averaging, mask, 0, 0, 0, 0).pack()
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_a_payload_that_is_no_frame_counts_as_damaged_although_its_check_is_righ
         def pack(self) -> bytes:
             return payload
 
-    decoder = Decoder()
+    decoder = DueDecoder()
     assert decoder.feed(encode(Forged(Kind.STOP))) == []
     assert decoder.damaged == 1
 
@@ -210,7 +210,7 @@ def test_the_bytes_of_a_frame_are_as_documented() -> None:
     assert BoardSettings(1_000_000, 0x0FF, 4).pack() == bytes.fromhex("02 40420f00 ff00 04")
     assert Ack(3, 1, BoardSettings(1, 2, 3)).pack() == bytes.fromhex("82 03 01 01000000 0200 03")
     head = bytes.fromhex("90 02 05 1100 0600 07000000 08000000 09000000")
-    sent = Block(np.array([[1, 2], [3, 4]], np.uint16), 5, 0x0011, 6, 7, 8, 9)
+    sent = DueBlock(np.array([[1, 2], [3, 4]], np.uint16), 5, 0x0011, 6, 7, 8, 9)
     assert sent.pack() == head + bytes.fromhex("0100 0200 0300 0400")
     identity = Identity((1, 2, 3), 12, 8, "pad", bytes(range(16)))
     assert identity.pack() == b"\x81\x01\x02\x03\x0c\x08pad" + bytes(13) + bytes(range(16))
@@ -219,23 +219,23 @@ def test_the_bytes_of_a_frame_are_as_documented() -> None:
 STEP_V = 3.3 / 4095
 
 
-def block(first: int, time_us: int | None = None, samples: int = 16) -> Block:
+def block(first: int, time_us: int | None = None, samples: int = 16) -> DueBlock:
     counts = np.full((samples, 8), first % 4096, np.uint16)
     time_us = (first + samples) * 1000 if time_us is None else time_us
-    return Block(counts, 1, 0xFF, first // 16 % 2**16, first % 2**32, time_us % 2**32, 0)
+    return DueBlock(counts, 1, 0xFF, first // 16 % 2**16, first % 2**32, time_us % 2**32, 0)
 
 
-def assembler(inputs: tuple[int, ...] = (0, 1, 2, 3, 4, 5, 6, 7), averaging: int = 1) -> Assembler:
-    return Assembler(BoardSettings(1_000_000, sum(1 << i for i in inputs), averaging), inputs, 3.3)
+def assembler(inputs: tuple[int, ...] = (0, 1, 2, 3, 4, 5, 6, 7), averaging: int = 1) -> DueAssembler:
+    return DueAssembler(BoardSettings(1_000_000, sum(1 << i for i in inputs), averaging), inputs, 3.3)
 
 
 def test_samples_whose_numbers_all_wrap_take_no_more_memory_than_a_few() -> None:
     count = 70_000
     start = 2**32 - count // 32 * 16
-    decoder, assembles, held, before = Decoder(), assembler(), [], -np.inf
+    decoder, assembles, held, before = DueDecoder(), assembler(), [], -np.inf
     for first in range(start, start + count, 400):
         sent = [encode(block(index)) for index in range(first, first + 400, 16)]
-        frames = [frame for frame in decoder.feed(b"".join(sent)) if isinstance(frame, Block)]
+        frames = [frame for frame in decoder.feed(b"".join(sent)) if isinstance(frame, DueBlock)]
         samples = assembles.samples(((first + 16 * i) * 1e-3, frame) for i, frame in enumerate(frames))
         assert samples.times_s[0] > before
         before = samples.times_s[-1]
@@ -251,7 +251,7 @@ def test_samples_whose_numbers_all_wrap_take_no_more_memory_than_a_few() -> None
     [block(0), block(64, 17_000), block(16, 90_000), block(2**31)],
     ids=["again", "too early", "too late", "far away"],
 )
-def test_a_block_that_cannot_follow_or_is_of_other_channels_is_a_fault(second: Block) -> None:
+def test_a_block_that_cannot_follow_or_is_of_other_channels_is_a_fault(second: DueBlock) -> None:
     assembles = assembler()
     assembles.samples([(1.0, block(0))])
     with pytest.raises(RigFault, match="off its time") as caught:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from padforge.sense.rig.boards.line import framing
-from padforge.sense.rig.boards.line.driver import Assembler, Lines
-from padforge.sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line
+from padforge.sense.rig.boards.line.driver import LineAssembler, LineReader
+from padforge.sense.rig.boards.line.framing import LineDecoder, LineHeader, Sample, header_line, sample_line
 from padforge.sense.rig.devices.protocols import ConverterSamples
 from tests.sense.rig.boards.compiling import compiled, sent
 
@@ -15,8 +15,8 @@ FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"
 PAGE = Path(__file__).parents[5] / "docs" / "devices.md"
 SAID = (("name", "padforge-line"),)
 HEADERS = {
-    "ESP32": Header(500, 12, 3.3, 16, said=(*SAID, ("serial", "a1b2c3d4e5f6"))),
-    "TEENSY": Header(500, 12, 3.3, 16, said=SAID),
+    "ESP32": LineHeader(500, 12, 3.3, 16, said=(*SAID, ("serial", "a1b2c3d4e5f6"))),
+    "TEENSY": LineHeader(500, 12, 3.3, 16, said=SAID),
 }
 BOOT_US, PERIOD_US = 4_294_900_000, 2000
 
@@ -26,27 +26,27 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return compiled("line", FIRMWARE, tmp_path_factory.mktemp("firmware"), "ESP32")
 
 
-def read(program: Path, *script: str) -> tuple[list[Header | Sample], bytes]:
-    stream, decoder = sent(program, list(script)), Decoder()
+def read(program: Path, *script: str) -> tuple[list[LineHeader | Sample], bytes]:
+    stream, decoder = sent(program, list(script)), LineDecoder()
     found = decoder.feed(stream)
     assert decoder.damaged == 0
     return found, stream
 
 
-def samples_of(found: list[Header | Sample]) -> list[Sample]:
+def samples_of(found: list[LineHeader | Sample]) -> list[Sample]:
     return [each for each in found if isinstance(each, Sample)]
 
 
-def taken_of(header: Header, samples: list[Sample]) -> ConverterSamples:
-    lines = Lines([each.time_us for each in samples], [each.counts for each in samples])
-    return Assembler(header, range(header.channels)).samples([(1.0, lines)])
+def taken_of(header: LineHeader, samples: list[Sample]) -> ConverterSamples:
+    lines = LineReader([each.time_us for each in samples], [each.counts for each in samples])
+    return LineAssembler(header, range(header.channels)).samples([(1.0, lines)])
 
 
 @pytest.mark.parametrize("board", ["ESP32", pytest.param("TEENSY", marks=pytest.mark.slow)])
 def test_it_says_what_it_is_as_it_starts_and_whenever_it_is_asked(board: str, program: Path, tmp_path: Path) -> None:
     runs = program if board == "ESP32" else compiled("line", FIRMWARE, tmp_path, board)
     found, _ = read(runs, "run 5000", "host x", "host ?", "run 5000")
-    assert [place for place, each in enumerate(found) if isinstance(each, Header)] == [0, 4]
+    assert [place for place, each in enumerate(found) if isinstance(each, LineHeader)] == [0, 4]
     assert found[0] == found[4] == HEADERS[board]
 
 
@@ -77,8 +77,8 @@ def test_the_sketch_that_the_page_begins_with_speaks_the_protocol(tmp_path: Path
     (tmp_path / "sketch.ino").write_text(PAGE.read_text("utf-8").split("```cpp\n")[1].split("```")[0], "utf-8")
     runs = compiled("simplest", tmp_path, tmp_path)
     found, _ = read(runs, "run 100000", "host ?", "run 1000", "held 25000", "run 100000")
-    header = Header(100, 10, 5.0, 4, checked=False, said=(("name", "uno"),))
-    assert [each for each in found if isinstance(each, Header)] == [header, header]
+    header = LineHeader(100, 10, 5.0, 4, checked=False, said=(("name", "uno"),))
+    assert [each for each in found if isinstance(each, LineHeader)] == [header, header]
     samples = samples_of(found)
     assert {each.counts for each in samples} == {(0, 100, 200, 300)}
     taken = taken_of(header, samples)

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.sense.rig.boards.line import framing
-from padforge.sense.rig.boards.line.driver import Assembler, Lines
-from padforge.sense.rig.boards.line.framing import Decoder, Header, Sample, header_line, sample_line
+from padforge.sense.rig.boards.line.driver import LineAssembler, LineReader
+from padforge.sense.rig.boards.line.framing import LineDecoder, LineHeader, Sample, header_line, sample_line
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 
-HEADER = Header(500, 12, 3.3, 4, said=(("name", "my-board"),))
+HEADER = LineHeader(500, 12, 3.3, 4, said=(("name", "my-board"),))
 SAMPLES = [Sample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
 LINES = [sample_line(sample.time_us, sample.counts, True) for sample in SAMPLES]
 
@@ -22,8 +22,8 @@ def checked(text: bytes) -> bytes:
     return text + b"*%08x\n" % crc32(text)
 
 
-def decoded(*lines: bytes, header: bytes = header_line(HEADER)) -> tuple[list[Header | Sample], Decoder]:
-    decoder = Decoder()
+def decoded(*lines: bytes, header: bytes = header_line(HEADER)) -> tuple[list[LineHeader | Sample], LineDecoder]:
+    decoder = LineDecoder()
     decoder.feed(header)
     return decoder.feed(b"".join(lines)), decoder
 
@@ -31,7 +31,7 @@ def decoded(*lines: bytes, header: bytes = header_line(HEADER)) -> tuple[list[He
 def test_the_example_of_the_protocol_is_read() -> None:
     """The one that whoever writes a board's program has before him."""
     text = "\n".join(line.strip() for line in (framing.__doc__ or "").splitlines() if line.startswith("    "))
-    found = Decoder().feed(text.encode() + b"\n")
+    found = LineDecoder().feed(text.encode() + b"\n")
     assert found[0] == HEADER
     assert found[1:] == [Sample(2000, (2048, 1991, 870, 2003)), Sample(4000, (2049, 1990, 871, 2004))]
 
@@ -39,7 +39,7 @@ def test_the_example_of_the_protocol_is_read() -> None:
 @settings(max_examples=30)
 @given(st.data())
 def test_what_is_written_is_read_in_any_portions(data: st.DataObject) -> None:
-    header = Header(
+    header = LineHeader(
         data.draw(st.sampled_from([10.0, 333.25, 10_000.0])),
         data.draw(st.integers(1, 24)),
         data.draw(st.sampled_from([0.1, 1.1, 5.0])),
@@ -52,7 +52,7 @@ def test_what_is_written_is_read_in_any_portions(data: st.DataObject) -> None:
     stream = b"".join(sent)
     if data.draw(st.booleans()):
         stream = stream.replace(b"\n", b"\r\n")
-    decoder, found, at = Decoder(), [], 0
+    decoder, found, at = LineDecoder(), [], 0
     while at < len(stream):
         size = data.draw(st.integers(1, 100))
         found += decoder.feed(stream[at : at + size])
@@ -107,7 +107,7 @@ def test_lines_for_people_wrong_ones_and_those_without_a_header_are_passed_over_
     header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"  # whose check may be left out
     found, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
     assert (found, decoder.damaged) == ([Sample(10, (1, 2))], 1)
-    decoder = Decoder()
+    decoder = LineDecoder()
     assert decoder.feed(b"boot: 1,2,3\n" + LINES[0]) == []
     for _ in range(1000):
         decoder.feed(b"1" * 1000)
@@ -130,20 +130,20 @@ def test_lines_for_people_wrong_ones_and_those_without_a_header_are_passed_over_
     ],
 )
 def test_a_header_that_cannot_be_is_told(text: str, complaint: str) -> None:
-    decoder = Decoder()
+    decoder = LineDecoder()
     assert decoder.feed(f"# padforge-line {text}\n".encode()) == []
     assert decoder.header is None
     assert complaint in decoder.complaint
 
 
-THREE = Header(1000, 10, 5.0, 3)
+THREE = LineHeader(1000, 10, 5.0, 3)
 
 
-def read(times_us: list[int] | np.ndarray, assembler: Assembler | None = None) -> ConverterSamples:
+def read(times_us: list[int] | np.ndarray, assembler: LineAssembler | None = None) -> ConverterSamples:
     """The samples of lines of these times, all come at once; the first count is the number of the line."""
-    assembler = assembler or Assembler(THREE, (0, 1, 2))
+    assembler = assembler or LineAssembler(THREE, (0, 1, 2))
     counts = [(k, 10, 1023) for k in range(len(times_us))]
-    return assembler.samples([(1.0, Lines([int(time_us) for time_us in times_us], counts))])
+    return assembler.samples([(1.0, LineReader([int(time_us) for time_us in times_us], counts))])
 
 
 WRAPPED = ((2**32 - 3000 + 1000 * np.array([0, 1, 4, 5, 25])) % 2**32).tolist()
@@ -168,7 +168,7 @@ def test_every_sample_has_its_slot_and_the_slots_left_out_are_missing(times_us, 
 
 @pytest.mark.parametrize("share", [0.98, 0.999, 1.001, 1.02])
 def test_a_rate_that_is_not_quite_what_it_says_and_lines_that_are_late_lose_nothing(share: float) -> None:
-    rng, assembler = np.random.default_rng(0), Assembler(THREE, (0, 1, 2))
+    rng, assembler = np.random.default_rng(0), LineAssembler(THREE, (0, 1, 2))
     samples = read(np.cumsum(np.full(2000, 1000 / share)) + rng.uniform(-150, 150, 2000), assembler)
     assert len(samples.times_s) == 2000
     assert not samples.missing.any()
@@ -190,7 +190,7 @@ def test_a_rate_that_is_not_quite_what_it_says_and_lines_that_are_late_lose_noth
     ids=["reset", "reset after half the range", "far away", "milliseconds", "too fast"],
 )
 def test_times_that_cannot_be_line_after_line_are_a_fault(before_us: int, after: np.ndarray, said: str) -> None:
-    assembler = Assembler(THREE, (0, 1, 2))
+    assembler = LineAssembler(THREE, (0, 1, 2))
     read(before_us + np.arange(1001) * 1000, assembler)
     with pytest.raises(RigFault, match=said) as caught:
         read(after, assembler)
