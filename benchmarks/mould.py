@@ -103,7 +103,7 @@ def _max_deviation_mm(plan: Plan, points: NDArray[np.float64]) -> float:
     curves = [plan.pad.to_mm(line) for line in flatten(plan.pad, EXACT_MM / plan.pad.unit_mm)]
     deviations = []
     for layer in range(len(plan.heights_mm)):
-        fibres = [curve for curve, level in zip(curves, plan.levels, strict=True) if level == layer]
+        fibres = [curve for curve, level in zip(curves, plan.layer_indices, strict=True) if level == layer]
         edges = np.concatenate([np.stack([curve[:-1], curve[1:]], axis=1) for curve in fibres])
         tree = shapely.STRtree(np.asarray(shapely.linestrings(edges)))
         _, distance = tree.query_nearest(inside, return_distance=True, all_matches=False)

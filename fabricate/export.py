@@ -215,11 +215,11 @@ def _earlier_files(out: Path) -> dict[str, str]:
 
 def _bodies(plan: Plan) -> list[tuple[str, Body]]:
     """What is printed, the mould first: all but the holder larger than the pad by what the silicone shrinks."""
-    bodies = [("mould", mould_body(plan.enlarged))]
+    bodies = [("mould", mould_body(plan.shrinkage_compensated))]
     if plan.settings.mould.lid:
-        bodies.append(("lid", lid_body(plan.enlarged)))
+        bodies.append(("lid", lid_body(plan.shrinkage_compensated)))
     if plan.settings.mould.conductive:
-        bodies.append(("conductive", conductive_body(conductive_plan(plan).enlarged)))
+        bodies.append(("conductive", conductive_body(conductive_plan(plan).shrinkage_compensated)))
     if plan.settings.mould.holder:
         wide = conductive_plan(plan) if plan.settings.mould.conductive else plan  # so that either pad fits
         bodies.append(("holder", holder_body(wide)))
@@ -283,11 +283,11 @@ def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
     message += f", curves within {1000 * max(model.fit_mm for model in made):g} µm"
     measured = [round(volume, 6), round(surface, 6)]
     found = check_result("cad_solid", True, measured, [round(most_volume, 6), round(most_surface, 6)], message)
-    return ("mould.step", partial(write_step, shape=assembly(made, plan.enlarged))), found
+    return ("mould.step", partial(write_step, shape=assembly(made, plan.shrinkage_compensated))), found
 
 
 def _drawings(plan: Plan, findings: Sequence[Finding], formats: Sequence[str]) -> Iterator[Write]:
-    plan = plan.enlarged  # they show the tray
+    plan = plan.shrinkage_compensated  # they show the tray
     if "svg" in formats:
         yield "tracks.svg", partial(write_utf8, text=tracks_svg(plan))
     if "dxf" in formats:
@@ -308,7 +308,7 @@ def _document(
     """The fabrication document: all a lab needs to print, cast, cut and lay."""
     settings = plan.settings
     size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
-    rim = settings.mould.floor_mm + plan.enlarged.silicone_mm
+    rim = settings.mould.floor_mm + plan.shrinkage_compensated.silicone_mm
     pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
     bench = laying_document(plan, printed[0].mesh.volume() - pins)
     return {

@@ -59,7 +59,7 @@ class Lead:
             points.append(cubic(span, np.arange(1, steps + 1) / steps))
         return np.vstack(points)
 
-    def traced(self, step: float, past_mm: float) -> tuple[Array, Array]:
+    def trace(self, step: float, past_mm: float) -> tuple[Array, Array]:
         """Points (n, 2) from the fibre's end to so far past the edge, mm, and the exact headings there, radians.
 
         Args:

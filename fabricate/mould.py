@@ -216,7 +216,7 @@ def sizes(plan: Plan) -> dict[str, Any]:
 
     Of what is not square there are width and height.
     """
-    printed = plan.enlarged
+    printed = plan.shrinkage_compensated
     mould = printed.settings.mould
     achieved = {
         "pad_mm": _sides(plan.cavity),
@@ -332,7 +332,7 @@ def conductive_body(plan: Plan) -> Body:
 def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
     """The outlines of the wells at the ends of the ridges of every level, as polygons of so many sides, mm."""
     places: list[list[tuple[float, float]]] = [[] for _ in plan.heights_mm]
-    for level, pair in zip(plan.levels, plan.leads.pairs, strict=True):
+    for level, pair in zip(plan.layer_indices, plan.leads.pairs, strict=True):
         for lead in pair:
             place, out = lead.turned_mm.copy(), lead.outward[lead.axis]
             place[lead.axis] = plan.leads.edge_mm(lead) + out * WELL_RIM_MM + out * WELL_MM / 2

@@ -200,7 +200,7 @@ class Plan:
     """A morphology with the settings of its mould; what is derived from them is computed when first asked for.
 
     Attributes:
-        used: where this one is of what is printed, larger than the pad, the plan of the pad as it is used.
+        nominal: where this one is of what is printed, larger than the pad, the plan of the pad as it is used.
 
     Raises:
         InputError: settings that contradict each other or the pitch, or keep-outs that are none of this pad.
@@ -208,37 +208,39 @@ class Plan:
 
     pad: Morphology
     settings: FabricationSettings = DEFAULTS
-    used: "Plan | None" = field(default=None, repr=False, compare=False)
+    nominal: "Plan | None" = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_type("pad", self.pad, Morphology)
         check_type("settings", self.settings, FabricationSettings).require_consistent(self.pad.layout)
-        if self.settings.pad.keep_out_mm and self.used is None:
+        if self.settings.pad.keep_out_mm and self.nominal is None:
             keep_outs(self.settings.pad.for_layout(self.pad.layout))
 
     @cached_property
-    def enlarged(self) -> "Plan":
+    def shrinkage_compensated(self) -> "Plan":
         """The plan of what is printed: larger in every direction by what the silicone shrinks; this one if it does not.
 
-        Heights are whole layers, see `FabricationSettings.enlarged`. Its own pad is as large as its mould.
+        Heights are whole layers, see `FabricationSettings.shrinkage_compensated`. Its own pad is as large as its mould.
         """
-        shrunk = self.settings.shrunk
+        shrunk = self.settings.shrinkage_factor
         if shrunk == 1:
             return self
         layout = self.pad.layout
         larger = Layout(*layout.counts, layout.pitch_x_mm / shrunk, layout.pitch_y_mm / shrunk)
         pad = Morphology.from_dict({**self.pad.to_dict(), "pitch_mm": larger.pitch_mm})
-        return Plan(pad, self.settings.enlarged(), self)
+        return Plan(pad, self.settings.shrinkage_compensated(), self)
 
     @cached_property
     def depths_mm(self) -> tuple[float, ...]:
         """How deep the tracks of every level lie in the pad, ascending, mm: their ridges, shrunk."""
-        return tuple(round(self.settings.shrunk * height, 9) for height in self.enlarged.heights_mm)
+        return tuple(
+            round(self.settings.shrinkage_factor * height, 9) for height in self.shrinkage_compensated.heights_mm
+        )
 
     @property
     def thickness_mm(self) -> float:
         """How thick the pad comes out, mm: what the mould holds, shrunk."""
-        return round(self.settings.shrunk * self.enlarged.silicone_mm, 9)
+        return round(self.settings.shrinkage_factor * self.shrinkage_compensated.silicone_mm, 9)
 
     @cached_property
     def lines(self) -> list[shapely.LineString]:
@@ -246,9 +248,9 @@ class Plan:
         return self._centre_lines(self.settings.mould.tolerance_mm)
 
     def _centre_lines(self, tolerance_mm: float) -> list[shapely.LineString]:
-        return [shapely.LineString(course) for course in self.courses(_CENTRE_SHARE * tolerance_mm, INTO_WALL_MM)]
+        return [shapely.LineString(course) for course in self.paths(_CENTRE_SHARE * tolerance_mm, INTO_WALL_MM)]
 
-    def courses(self, tolerance_mm: float, past_mm: float) -> list[Array]:
+    def paths(self, tolerance_mm: float, past_mm: float) -> list[Array]:
         """Of every fibre (n, 2) corners of its course and its leads, until so far past its tongues' ends, mm."""
         past = self.settings.mould.exit_mm, past_mm
         curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
@@ -258,7 +260,7 @@ class Plan:
             found.append(np.vstack([start.beyond(*past), before, self.pad.to_mm(curve), after, end.beyond(*past)]))
         return found
 
-    def traced(self, step: float, past_mm: float) -> list[tuple[Array, Array]]:
+    def trace(self, step: float, past_mm: float) -> list[tuple[Array, Array]]:
         """Of every fibre and its leads points (n, 2), mm, and the exact headings (n,) there, radians, unwrapped.
 
         Where it turns in one place, as it may where it meets a lead, that place stands there twice.
@@ -271,7 +273,7 @@ class Plan:
         found = []
         for fibre, (spans, slopes) in enumerate(zip(beziers(self.pad), slope_beziers(self.pad), strict=True)):
             points, headings = trace_curve(spans, slopes, step)
-            (before, coming), (after, going) = (lead.traced(step, past) for lead in self.leads.pairs[fibre])
+            (before, coming), (after, going) = (lead.trace(step, past) for lead in self.leads.pairs[fibre])
             headings = np.pi / 2 - headings if self.family(fibre) else headings
             whole = np.concatenate([coming[::-1] + np.pi, headings, going])
             found.append((np.vstack([before[::-1], self.pad.to_mm(points), after]), np.unwrap(whole)))
@@ -284,8 +286,8 @@ class Plan:
         ends = pad.to_mm(pad.knots[:, [0, -1]])
         if self.settings.pad.leads == "edges":
             return straight_on(ends, pad.layout, mould.border_mm)
-        if self.used is not None:
-            return self.used.leads.scaled(1 / self.used.settings.shrunk)
+        if self.nominal is not None:
+            return self.nominal.leads.scaled(1 / self.nominal.settings.shrinkage_factor)
         return to_one_side(ends, pad.layout, self.settings.lead_room(self.heights_mm[-1], self.flare_mm))
 
     @cached_property
@@ -318,9 +320,9 @@ class Plan:
     def common_tracks(self) -> list[CommonTrack]:
         """Where tracks of different depths lie over each other, leads included; at every crossing, and alongside."""
         found = []
-        for level in range(max(self.levels)):
-            shallow = [fibre for fibre, own in enumerate(self.levels) if own == level]
-            deep = [fibre for fibre, own in enumerate(self.levels) if own > level]
+        for level in range(max(self.layer_indices)):
+            shallow = [fibre for fibre, own in enumerate(self.layer_indices) if own == level]
+            deep = [fibre for fibre, own in enumerate(self.layer_indices) if own > level]
             lines = [[shapely.get_coordinates(self.lines[fibre]) for fibre in fibres] for fibres in (shallow, deep)]
             shared = common_stretches(lines[0], lines[1], self.settings.mould.ridge_width_mm)
             for line, other, begin, end in zip(shared.line, shared.other, shared.begin, shared.end, strict=True):
@@ -333,7 +335,7 @@ class Plan:
         return self.pad.layout.family(fibre)
 
     @cached_property
-    def levels(self) -> tuple[int, ...]:
+    def layer_indices(self) -> tuple[int, ...]:
         """(F,) level of every fibre, 0 the shallowest; fibres that cross differ, if the settings allow for it."""
         clashes = self.clashes if self.settings.mould.levels == "as_needed" else []
         return fibre_levels(self.pad.layout.counts, clashes, self.settings.pad.deep_family == "horizontal")
@@ -361,7 +363,7 @@ class Plan:
         mould = self.settings.mould
         return tuple(
             round(mould.shallow_ridge_height_mm + level * mould.level_step_mm, 9)
-            for level in range(1 + max(self.levels))
+            for level in range(1 + max(self.layer_indices))
         )
 
     @cached_property
@@ -381,7 +383,7 @@ class Plan:
         half = mould.ridge_width_mm / 2 + below_mm * self.settings.ridge_slope
         chord = 2 * math.acos(1 - _ARC_SHARE * tolerance / half)
         centres = self.lines if tolerance_mm is None else self._centre_lines(tolerance)
-        lines = [line for line, own in zip(centres, self.levels, strict=True) if own == level]
+        lines = [line for line, own in zip(centres, self.layer_indices, strict=True) if own == level]
         bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
@@ -497,14 +499,14 @@ class FibreLayer:
     """The fibres of one depth, all of one family.
 
     Attributes:
-        family: 0 horizontal, 1 vertical. level: as in `Plan.levels`.
+        family: 0 horizontal, 1 vertical. index: as in `Plan.layer_indices`.
         depth_mm: of their tracks in the casting.
         fibres: their numbers among all, 0..F-1.
         colour: "#rrggbb", the family's own for its deepest level and paler the shallower.
     """
 
     family: int
-    level: int
+    index: int
     depth_mm: float
     fibres: tuple[int, ...]
     colour: str
@@ -518,7 +520,8 @@ class FibreLayer:
 def fibre_layers(plan: Plan) -> list[FibreLayer]:
     """The levels of a plan in laying order, the deepest first."""
     laid = [
-        tuple(fibre for fibre, own in enumerate(plan.levels) if own == level) for level in range(len(plan.heights_mm))
+        tuple(fibre for fibre, own in enumerate(plan.layer_indices) if own == level)
+        for level in range(len(plan.heights_mm))
     ]
     families = [plan.family(fibres[0]) for fibres in laid]
     found = []

@@ -214,24 +214,27 @@ class FabricationSettings:
         return layer * max(1, int(STEP_MM / step)) if step else math.inf
 
     @property
-    def shrunk(self) -> float:
+    def shrinkage_factor(self) -> float:
         """How large the pad is as a share of its mould: 1 - shrinkage."""
         return 1 - self.silicone.material.shrinkage
 
-    def enlarged(self) -> "FabricationSettings":
+    def shrinkage_compensated(self) -> "FabricationSettings":
         """Those of the mould, larger by 1 / `shrunk` and taken for what does not shrink; floor and walls are as set.
 
         What is whole layers high stays so: ridges, or the cavity. A printer makes whole layers of any height, and of
         one that lies between them, such as the 0.4004 mm that 0.4 mm by 0.1 % would be, every slicer its own. So it
         is rounded here, and known: what is set comes out within half a layer (`Plan.depths_mm` has what does).
         """
-        larger = {key: getattr(self.mould, key) / self.shrunk for key in (*_ACROSS, *_RIDGES, *_DEPTH)}
+        larger = {key: getattr(self.mould, key) / self.shrinkage_factor for key in (*_ACROSS, *_RIDGES, *_DEPTH)}
         layer = self.printer.layer_mm
         for keys in (_RIDGES, _DEPTH):
             if all(self.printer.is_whole(getattr(self.mould, key)) for key in keys):
                 larger |= {key: round(round(larger[key] / layer) * layer, 9) for key in keys}
         mould = self.mould.model_copy(update=larger)
-        keep_outs = tuple(tuple((x / self.shrunk, y / self.shrunk) for x, y in each) for each in self.pad.keep_out_mm)
+        keep_outs = tuple(
+            tuple((x / self.shrinkage_factor, y / self.shrinkage_factor) for x, y in each)
+            for each in self.pad.keep_out_mm
+        )
         pad = self.pad.model_copy(update={"keep_out_mm": keep_outs})
         return replace(self, mould=mould, pad=pad, silicone=self.silicone.model_copy(update={"shrinkage": 0.0}))
 

@@ -33,7 +33,7 @@ def joints(plan: Plan, level: int, half_mm: float) -> Joints:
     """The joints of the walls, `half_mm` from their fibres, of all fibres of a level."""
     found: Joints = {}
     for fibre, (knots, slope) in enumerate(zip(plan.pad.to_mm(plan.pad.knots), slopes(plan.pad), strict=True)):
-        if plan.levels[fibre] == level:
+        if plan.layer_indices[fibre] == level:
             along = np.stack([np.ones_like(slope), slope], axis=1)[:, :: -1 if plan.family(fibre) else 1]
             along /= np.linalg.norm(along, axis=1, keepdims=True)
             beside = half_mm * np.stack([-along[:, 1], along[:, 0]], axis=1)

@@ -149,7 +149,7 @@ def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> Co
     """
     plan = Plan(pad, settings)
     plan.require_levels()
-    return mould_model(plan.enlarged, "mould").shape
+    return mould_model(plan.shrinkage_compensated, "mould").shape
 
 
 def mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> Model:
@@ -211,9 +211,9 @@ def models(plan: Plan, bodies: Mapping[str, Body]) -> list[Model]:
     made = []
     for name, body in bodies.items():
         if name == "mould":
-            made.append(mould_model(plan.enlarged, name))
+            made.append(mould_model(plan.shrinkage_compensated, name))
         elif name == "conductive":
-            second = conductive_plan(plan).enlarged
+            second = conductive_plan(plan).shrinkage_compensated
             made.append(mould_model(second, name, well_outlines(second, sides=_ROUND)))
         else:
             made.append(body_model(body, name))

@@ -437,7 +437,7 @@ def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) ->
 
 def _ridges(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_Standing]:
     """The terraces of the ridges of every level."""
-    families = {level: plan.family(fibre) for fibre, level in enumerate(plan.levels)}
+    families = {level: plan.family(fibre) for fibre, level in enumerate(plan.layer_indices)}
     for level, height_mm in enumerate(plan.heights_mm):
         for down_mm in terraces(height_mm, plan.settings.terrace_mm):
             outline = plan.outline(level, down_mm, FINE_MM)

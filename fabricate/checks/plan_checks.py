@@ -47,7 +47,7 @@ def strains(plan: Plan) -> list[Strain]:
     found = []
     for level, depth in enumerate(plan.depths_mm):
         out = neutral - depth + plan.settings.fibre.material.diameter_mm / 2
-        lines = [line for line, own in zip(plan.lines, plan.levels, strict=True) if own == level]
+        lines = [line for line, own in zip(plan.lines, plan.layer_indices, strict=True) if own == level]
         share, place = max((_along(shapely.get_coordinates(line), out < 0) for line in lines), key=lambda each: each[0])
         found.append(Strain(depth, abs(share) * out / (radius_mm + neutral), place))
     return found
@@ -97,7 +97,7 @@ def check_tracks(plan: Plan) -> list[Finding]:
 
     What tracks have in common is only looked at where the rules have a limit.
     """
-    mould = plan.enlarged
+    mould = plan.shrinkage_compensated
     return [
         _ridge_width(mould),
         _track_size(plan),
@@ -275,7 +275,7 @@ def _fibre_bend(plan: Plan) -> Finding:
     Bends are measured as by the rules (`bend_radius`), on fibres with their leads.
     """
     limit = plan.settings.min_bend_radius_mm
-    bends = [bend_radius(*traced, limit / 2) for traced in plan.traced(_BEND_TURN, limit / 2)] if limit else []
+    bends = [bend_radius(*traced, limit / 2) for traced in plan.trace(_BEND_TURN, limit / 2)] if limit else []
     tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_SLACK)]
     least = min((radius for _, radius, _ in tight), default=limit)
     names = _listed("fibre", [fibre for fibre, _, _ in tight])
@@ -307,7 +307,7 @@ def _folds(plan: Plan) -> Finding:
     found: list[tuple[float, NDArray[np.floating]]] = []
     curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, _FINE_MM / pad.unit_mm), strict=True)
     for fibre, (spans, slopes, line) in enumerate(curves):
-        half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.levels[fibre]] * plan.settings.ridge_slope
+        half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.layer_indices[fibre]] * plan.settings.ridge_slope
         points, headings = trace_curve(spans, slopes, _TURN)
         aside = -1 if plan.family(fibre) else 1
         places, walls = _inner_walls(pad.to_mm(points)[:, ::aside], headings, half)
@@ -354,7 +354,7 @@ def _listed(noun: str, numbers: Sequence[int]) -> str:
 
 def _middles(plan: Plan, level: int) -> list[tuple[float, ...]]:
     """The middle of the course of every ridge of a level."""
-    lines = [line for line, own in zip(plan.lines, plan.levels, strict=True) if own == level]
+    lines = [line for line, own in zip(plan.lines, plan.layer_indices, strict=True) if own == level]
     return [line.interpolate(0.5, normalized=True).coords[0] for line in lines]
 
 
@@ -366,7 +366,7 @@ def pillars(plan: Plan) -> list[Finding]:
     """The checks of `[pad] keep_out_mm`, none without: of the mould as printed, and of its tracks."""
     if not plan.settings.pad.keep_out_mm:
         return []
-    return [_fibres(plan), _width(plan.enlarged), _one_piece(plan)]
+    return [_fibres(plan), _width(plan.shrinkage_compensated), _one_piece(plan)]
 
 
 def _fibres(plan: Plan) -> Finding:
@@ -434,7 +434,7 @@ def meshed(plan: Plan) -> Inspected:
     """The mesh of a plan, and every check on both."""
     from padforge.fabricate.mesh import mesh_arrays
 
-    vertices, triangles = mesh_arrays(mould_mesh(plan.enlarged))
+    vertices, triangles = mesh_arrays(mould_mesh(plan.shrinkage_compensated))
     return vertices, triangles, inspect(plan, vertices, triangles)
 
 

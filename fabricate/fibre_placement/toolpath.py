@@ -66,7 +66,7 @@ def laying_steps(plan: Plan, diameter_mm: float, max_strain: float = math.inf) -
         diameter_mm: of the fibre.
         max_strain: elongation that the fibre bears, 1 for twice its length; inf where nobody knows.
     """
-    courses = plan.courses(_FLAT_SHARE * TOLERANCE_MM, plan.settings.mould.lead_mm)
+    courses = plan.paths(_FLAT_SHARE * TOLERANCE_MM, plan.settings.mould.lead_mm)
     bends = _Bends(plan, diameter_mm)
     steps = []
     for layer in fibre_layers(plan):
@@ -113,7 +113,7 @@ class _Bends:
     @cached_property
     def traced(self) -> list[tuple[Array, Array]]:
         """Of every fibre and its leads points (n, 2), mm, and the heading at each, radians."""
-        return self.plan.traced(_TURN, self.plan.settings.mould.lead_mm)
+        return self.plan.trace(_TURN, self.plan.settings.mould.lead_mm)
 
     def least_radii(self, fibre: int, places: Array) -> Array:
         """(n - 1,) least bend radius, mm, between each two of n places (n, 2) along a fibre and its leads.
@@ -187,7 +187,7 @@ def _tip(plan: Plan, steps: Sequence[Step]) -> Finding:
     tip = plan.settings.dispenser.tip_mm
     rooms, places = [], []
     for step in steps:
-        walls = without(plan.silicone, plan.ridges[step.layer.level])
+        walls = without(plan.silicone, plan.ridges[step.layer.index])
         shapely.prepare(walls)
         for stroke in (each for each in step.strokes if each.z_mm < 0):
             line = shapely.LineString(turned_over(stroke.positions_mm))

@@ -27,7 +27,7 @@ SURPLUS_PERCENT = 10
 
 def silicone_document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
     """What fills the mould to the top of its walls: the box around it without the mould itself."""
-    printed, material = plan.enlarged, plan.settings.silicone.material
+    printed, material = plan.shrinkage_compensated, plan.settings.silicone.material
     volume_ml = (printed.tray.area * (plan.settings.mould.floor_mm + printed.silicone_mm) - mould_mm3) / 1000
     mass_g = volume_ml * material.density_g_per_ml * (1 + SURPLUS_PERCENT / 100)
     part_a_g, part_b_g = (round(mass_g * part / sum(material.parts), 2) for part in material.parts)
@@ -294,7 +294,7 @@ def _adhesive(plan: Plan) -> dict[str, Any]:
     steps = []
     for layer in fibre_layers(plan):
         tapered = layer.depth_mm / 2 if plan.settings.ridge_slope else 0
-        outline = plan.outline(layer.level, tapered) if tapered else plan.ridges[layer.level]
+        outline = plan.outline(layer.index, tapered) if tapered else plan.ridges[layer.index]
         steps.append(overlap(outline, plan.silicone).area * layer.depth_mm / 1000)
     return {"name": "silicone adhesive", "volume_ml": round(sum(steps), 4), "steps_ml": [round(ml, 4) for ml in steps]}
 
@@ -306,13 +306,13 @@ def _fibres(plan: Plan) -> list[dict[str, Any]]:
             "number": fibre + 1,
             "fibre": fibre_name(plan, fibre),
             "level": level,
-            "ridge_mm": plan.enlarged.heights_mm[level],
+            "ridge_mm": plan.shrinkage_compensated.heights_mm[level],
             "depth_mm": plan.depths_mm[level],
             "in_pad_mm": round(course, 2),
             "cut_mm": round(course + 2 * mould.lead_mm, 2),
             **fibre_resistances(plan, course + 2 * mould.lead_mm),
         }
-        for fibre, (level, course) in enumerate(zip(plan.levels, courses.tolist(), strict=True))
+        for fibre, (level, course) in enumerate(zip(plan.layer_indices, courses.tolist(), strict=True))
     ]
 
 
@@ -321,7 +321,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
     table: list[list[Any]] = []
     for crossing in plan.crossings:
         pair = crossing.first, crossing.second
-        depths = [plan.depths_mm[plan.levels[fibre]] for fibre in pair]
+        depths = [plan.depths_mm[plan.layer_indices[fibre]] for fibre in pair]
         gap = abs(depths[0] - depths[1]) - plan.settings.fibre.material.diameter_mm
         place = [round(x, 3) for x in plan.pad.to_mm(crossing.position).tolist()]
         table.append([*(fibre_name(plan, fibre) for fibre in pair), *place, *depths, round(gap, 3)])

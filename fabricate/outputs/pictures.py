@@ -228,7 +228,7 @@ def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
     order = fibre_layers(plan)
     tints = [PAPER, FAINT, _NUMBER, *[PAPER] * len(plan.heights_mm)]
     for layer in order:
-        tints[RIDGE + layer.level] = layer.colour
+        tints[RIDGE + layer.index] = layer.colour
     entries = [(PAPER, "floor"), (FAINT, f"wall, {plan.silicone_mm:g} mm")]
     if any(plan.numbers):
         entries.append((_NUMBER, f"mirrored numbers, {plan.settings.mould.shallow_ridge_height_mm:g} mm"))

@@ -26,7 +26,7 @@ def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
     for line, curve in zip(plan.lines, exact, strict=True):
         assert shapely.distance(shapely.points(curve), line).max() < tolerance_mm / 4
     for level, ridge in enumerate(plan.ridges):
-        own = [shapely.LineString(curve) for curve, at in zip(exact, plan.levels, strict=True) if at == level]
+        own = [shapely.LineString(curve) for curve, at in zip(exact, plan.layer_indices, strict=True) if at == level]
         curves, inside = shapely.union_all(own), plan.cavity.buffer(-0.5)  # clear of the ends, which go on straight
         assert ridge.intersection(inside).within(curves.buffer(0.2 + tolerance_mm, quad_segs=16))
         assert curves.buffer(0.2 - tolerance_mm, quad_segs=16).intersection(inside).within(ridge)
@@ -53,7 +53,7 @@ def test_ridges_run_into_the_walls_at_both_ends(border_mm):
 
 def test_a_mould_shrunk_is_the_pad():
     plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": 1.0}, silicone={"shrinkage": 0.03}))
-    mould = plan.enlarged
+    mould = plan.shrinkage_compensated
     assert mould.cavity.bounds[2] * 0.97 == pytest.approx(plan.cavity.bounds[2], rel=1e-12)
     for larger, slot in zip(mould.exits, plan.exits, strict=True):
         assert np.array(larger.bounds) * 0.97 == pytest.approx(slot.bounds, rel=1e-12)
@@ -63,14 +63,14 @@ def test_a_mould_shrunk_is_the_pad():
     assert mould.heights_mm[:2] == (0.4, 1.2)  # 0.412 and 1.237 mm in whole layers
     assert plan.depths_mm == pytest.approx([0.97 * height for height in mould.heights_mm], rel=1e-8)
     assert plan.thickness_mm == pytest.approx(0.97 * mould.silicone_mm) == pytest.approx(0.97 * 6.2)
-    assert mould.enlarged is mould
+    assert mould.shrinkage_compensated is mould
     assert (mould.depths_mm, mould.thickness_mm) == (mould.heights_mm, mould.silicone_mm)
 
 
 def test_a_pad_that_does_not_shrink_is_its_own_mould():
     plan = Plan(Morphology.straight(2), with_settings(silicone={"name": "EcoFlex 00-20", "shrinkage": 0.0}))
-    assert plan.enlarged is plan
-    assert Plan(Morphology.straight(2)).enlarged.pad.pitch_mm == 11.25
+    assert plan.shrinkage_compensated is plan
+    assert Plan(Morphology.straight(2)).shrinkage_compensated.pad.pitch_mm == 11.25
 
 
 @settings(max_examples=50)
@@ -93,7 +93,7 @@ def test_a_star_of_crossings_needs_one_level_more():
 
 def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
     plan = Plan(Morphology.random(3, 3, seed=3))
-    levels = plan.levels
+    levels = plan.layer_indices
     assert max(levels) >= 2
     crossing = {tuple(sorted((c.first, c.second), key=lambda fibre: levels[fibre])) for c in plan.crossings}
     assert any(levels[deep] - levels[shallow] > 1 for shallow, deep in crossing)
@@ -103,12 +103,12 @@ def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
 def test_crossing_fibres_of_a_family_lie_a_step_apart_and_the_pad_is_thickened_for_them():
     plan = Plan(level_pad(1.8, 1.2))
     assert plan.heights_mm == (0.4, 1.2, 2.0)
-    assert plan.levels[0] != plan.levels[1]
+    assert plan.layer_indices[0] != plan.layer_indices[1]
     assert plan.silicone_mm == 6.0
     assert Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5})).silicone_mm == 2.0 + COVER_MM
     assert Plan(Morphology.straight(2), with_settings({"silicone_mm": 1.5})).silicone_mm == 1.5
-    assert Plan(Morphology.straight(2)).levels == (1, 1, 0, 0)
-    assert Plan(Morphology.straight(2), with_settings(pad={"deep_family": "vertical"})).levels == (0, 0, 1, 1)
+    assert Plan(Morphology.straight(2)).layer_indices == (1, 1, 0, 0)
+    assert Plan(Morphology.straight(2), with_settings(pad={"deep_family": "vertical"})).layer_indices == (0, 0, 1, 1)
 
 
 def test_two_levels_only_refuse_a_family_that_crosses_itself():
@@ -127,7 +127,7 @@ def test_published_pads_take_as_many_levels_as_their_crossings_need(published):
     for name, least in (("1para", 2), ("5para_dis", 3), ("20para", 8)):
         plan = Plan(Morphology.load(published / f"{name}.mat"))
         assert len(plan.heights_mm) >= least
-        assert all(plan.levels[c.first] != plan.levels[c.second] for c in plan.crossings)
+        assert all(plan.layer_indices[c.first] != plan.layer_indices[c.second] for c in plan.crossings)
         assert np.diff(plan.heights_mm) == pytest.approx(0.8)
 
 

@@ -124,7 +124,7 @@ def test_leads_of_a_shrinking_silicone_come_out_as_planned():
     plan = Plan(
         PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))
     )
-    large = plan.enlarged
+    large = plan.shrinkage_compensated
     assert np.array(large.cavity.bounds) * 0.99 == pytest.approx(plan.cavity.bounds)
     assert large.lengths_mm * 0.99 == pytest.approx(plan.lengths_mm)
 

@@ -117,21 +117,21 @@ def test_terraces_are_whole_layers_with_steps_no_printer_places():
 def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
     hole = [[[0, 0], [3, 0], [0, 4]]]
     asked = with_settings({"border_mm": 1.5}, pad={"keep_out_mm": hole}, silicone={"shrinkage": shrinkage})
-    mould = asked.enlarged().mould
-    corners = np.array(asked.enlarged().pad.keep_out_mm) * (1 - shrinkage)
+    mould = asked.shrinkage_compensated().mould
+    corners = np.array(asked.shrinkage_compensated().pad.keep_out_mm) * (1 - shrinkage)
     np.testing.assert_allclose(corners, hole, rtol=1e-12)
     for key in ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm"):
         assert getattr(mould, key) * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), rel=1e-12)
     for key in ("floor_mm", "wall_mm", "wall_draft_deg", "tolerance_mm", "min_silicone_mm", "lead_mm"):
         assert getattr(mould, key) == getattr(asked.mould, key)
-    assert asked.enlarged().shrunk == 1
+    assert asked.shrinkage_compensated().shrinkage_factor == 1
 
 
 @pytest.mark.parametrize(("layer_mm", "shrinkage"), [(0.1, 1e-3), (0.1, 0.02), (0.2, 0.13)])
 def test_heights_of_whole_layers_stay_so_and_come_out_within_half_a_layer(layer_mm, shrinkage):
     asked = with_settings(printer={"layer_mm": layer_mm}, silicone={"shrinkage": shrinkage})
     for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
-        height = getattr(asked.enlarged().mould, key)
+        height = getattr(asked.shrinkage_compensated().mould, key)
         assert height / layer_mm == pytest.approx(round(height / layer_mm))
         assert height * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), abs=layer_mm / 2)
 
@@ -139,7 +139,7 @@ def test_heights_of_whole_layers_stay_so_and_come_out_within_half_a_layer(layer_
 def test_heights_between_layers_are_larger_like_all_else():
     asked = with_settings({"silicone_mm": 5.55, "shallow_ridge_height_mm": 0.45}, silicone={"shrinkage": 0.1})
     for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
-        assert getattr(asked.enlarged().mould, key) * 0.9 == pytest.approx(getattr(asked.mould, key))
+        assert getattr(asked.shrinkage_compensated().mould, key) * 0.9 == pytest.approx(getattr(asked.mould, key))
 
 
 def test_the_defaults_are_those_the_pads_were_made_with():

@@ -39,9 +39,9 @@ def part(model: Model, name: str) -> Compound:
 
 def judged(plan: Plan, **wells) -> Model:
     """The model of a plan's mould, valid and as large as its mesh."""
-    model = mould_model(plan.enlarged, "mould", **wells)
+    model = mould_model(plan.shrinkage_compensated, "mould", **wells)
     assert all(solid.is_valid for solid in model.shape.solids())
-    apart = model.apart(build_mesh(mould_body(plan.enlarged, **wells)))
+    apart = model.apart(build_mesh(mould_body(plan.shrinkage_compensated, **wells)))
     assert max(apart) < 2e-4, apart
     return model
 
@@ -200,7 +200,9 @@ def test_the_mould_is_that_of_silicone_that_shrinks():
     model = judged(plan)
     for shape in (model.shape, build_mould(SOFT, plan.settings)):
         size = np.array([*shape.bounding_box().size])
-        assert size == pytest.approx([2 * plan.enlarged.tray.bounds[2]] * 2 + [2.0 + plan.enlarged.silicone_mm])
+        assert size == pytest.approx(
+            [2 * plan.shrinkage_compensated.tray.bounds[2]] * 2 + [2.0 + plan.shrinkage_compensated.silicone_mm]
+        )
 
 
 def test_all_that_is_printed_stands_side_by_side_with_the_lid_on():

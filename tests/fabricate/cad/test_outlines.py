@@ -68,7 +68,7 @@ def deviation(plan: Plan, level: int, fit_mm: float = FIT_MM) -> tuple[float, in
     points = np.concatenate(sampled)
     clear = plan.cavity.bounds[2] - 1.0  # near the walls ends of tracks are square
     points = points[np.abs(points).max(axis=1) < clear]
-    exact = [exact_fibre(plan.pad, fibre) for fibre, own in enumerate(plan.levels) if own == level]
+    exact = [exact_fibre(plan.pad, fibre) for fibre, own in enumerate(plan.layer_indices) if own == level]
     distance, _ = KDTree(np.concatenate(exact)).query(points)
     return float(np.abs(distance - plan.settings.mould.ridge_width_mm / 2).max()), len(points)
 
@@ -183,7 +183,7 @@ HALF_MM = PLAN.settings.mould.ridge_width_mm / 2
 
 def test_two_joints_a_knot_half_a_width_away_across_the_fibre():
     for level in range(len(PLAN.heights_mm)):
-        found, fibres = joints(PLAN, level, HALF_MM), [f for f, own in enumerate(PLAN.levels) if own == level]
+        found, fibres = joints(PLAN, level, HALF_MM), [f for f, own in enumerate(PLAN.layer_indices) if own == level]
         assert len(found) == 2 * PLAN.pad.knots.shape[1] * len(fibres)
         for fibre in fibres:
             travel, knots = PLAN.family(fibre), PLAN.pad.to_mm(PLAN.pad.knots[fibre])

@@ -20,7 +20,7 @@ from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
     """A fabrication document as far as the page reads it."""
-    volume = mould_mesh(plan.enlarged).volume()
+    volume = mould_mesh(plan.shrinkage_compensated).volume()
     return {
         "files": ["mould.stl"],
         "size_mm": [64.669, 64.669, 8.0],
@@ -93,7 +93,7 @@ def test_a_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(p
     depths = [{document["fibres"][n - 1]["depth_mm"] for n in step} for step in document["laying_order"]]
     assert depths == [{2.8}, {2.0}, {1.2}, {0.4}]
     assert sorted(n for step in document["laying_order"] for n in step) == list(range(1, 9))
-    assert [fibre["level"] for fibre in document["fibres"]] == list(plan.levels)
+    assert [fibre["level"] for fibre in document["fibres"]] == list(plan.layer_indices)
     crossings = document["crossings"]
     assert crossings["total"] == len(crossings["table"]) == 30
     assert (crossings["same_family"], crossings["gap_mm"]) == (6, 0.5)
