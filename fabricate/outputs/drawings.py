@@ -302,7 +302,6 @@ class _TrackSheet:
     """Layout of the drawing of the tracks, mm, y upwards.
 
     Attributes:
-        plan: of the mould.
         text_mm: text height.
         sentence: on the orientation.
         spans: Bezier control points of every fibre and its leads; shape (n, 4, 2).
@@ -316,7 +315,6 @@ class _TrackSheet:
     def __init__(self, plan: Plan) -> None:
         layout, pairs = plan.pad.layout, plan.leads.pairs
         x_min, y_min, x_max, y_max = plan.silicone.bounds
-        self.plan = plan
         self.text_mm = min(_TEXT_MM, 0.6 * plan.least_pitch_mm)
         self.sentence = orientation_sentence(layout.counts, plan.settings.pad.leads)
         self.spans = [
@@ -345,9 +343,9 @@ class _TrackSheet:
         texts += [(line, x_min, first_y - row * line_mm) for row, line in enumerate(lines)]
         self.notes = [_Label(*text, "start", _NOTE) for text in texts]
 
-        left_mm = 2 * _GAP_MM + len(str(layout.fibres)) * self.text_mm
+        numbers_mm = 2 * _GAP_MM + len(str(layout.fibres)) * self.text_mm
         y_low = bar_y - 3 * _GAP_MM - len(lines) * line_mm
-        self.frame: Bounds = (x_min - left_mm, y_low, x_min + width + 2 * _GAP_MM, y_max + 2 * _GAP_MM)
+        self.frame: Bounds = (x_min - numbers_mm, y_low, x_min + width + 2 * _GAP_MM, y_max + 2 * _GAP_MM)
 
 
 def tracks_svg(plan: Plan) -> str:

@@ -405,7 +405,22 @@ def _crossing_lines(document: Document) -> Iterator[str]:
     if is_short or document["common_tracks"]:
         yield "Positions are from the centre of the pad. As it lies, x runs to the left and y away from you."
         yield ""
-    yield from _common_track_lines(document["common_tracks"])
+    if tracks := document["common_tracks"]:
+        yield (
+            "Here a track lies over a deeper one for longer than at two crossings at right angles. It has no floor of"
+            " silicone there: let the adhesive over the deeper fibre cure, and check that it covers it, before you lay"
+            " the upper one."
+        )
+        yield ""
+        rows = []
+        for track in tracks[:_MAX_ROWS]:
+            lengths_mm = (f"{mm:.1f} mm" for mm in (*track["position_mm"], track["length_mm"]))
+            rows.append((f"{track['shallow']} over {track['deep']}", *lengths_mm))
+        yield from _table_lines(("tracks", "x", "y", "in common"), rows)
+        if len(tracks) > _MAX_ROWS:
+            yield ""
+            yield f"These are the {_MAX_ROWS} longest of {len(tracks)}; `fabrication.json` has them all."
+        yield ""
     if is_short:
         number = {fibre["fibre"]: fibre["number"] for fibre in document["fibres"]}
         rows = [
@@ -422,26 +437,6 @@ def _crossing_lines(document: Document) -> Iterator[str]:
 
 def _depths(first_mm: float, second_mm: float) -> str:
     return f"{first_mm:.3g} and {second_mm:.3g} mm"
-
-
-def _common_track_lines(tracks: Sequence[Document]) -> Iterator[str]:
-    if not tracks:
-        return
-    yield (
-        "Here a track lies over a deeper one for longer than at two crossings at right angles. It has no floor of"
-        " silicone there: let the adhesive over the deeper fibre cure, and check that it covers it, before you lay the"
-        " upper one."
-    )
-    yield ""
-    rows = []
-    for track in tracks[:_MAX_ROWS]:
-        lengths_mm = (f"{mm:.1f} mm" for mm in (*track["position_mm"], track["length_mm"]))
-        rows.append((f"{track['shallow']} over {track['deep']}", *lengths_mm))
-    yield from _table_lines(("tracks", "x", "y", "in common"), rows)
-    if len(tracks) > _MAX_ROWS:
-        yield ""
-        yield f"These are the {_MAX_ROWS} longest of {len(tracks)}; `fabrication.json` has them all."
-    yield ""
 
 
 def _check_lines(findings: Sequence[Document]) -> Iterator[str]:

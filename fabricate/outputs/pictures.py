@@ -149,7 +149,14 @@ def _rasterize_triangles(corners: Array, rows: int, columns: int) -> tuple[Ints,
     """Return row, column and height of all pixels whose centres lie in triangles (m, 3, 3)."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     triangle, row = _expand_ranges(*_covered(low[:, 1], high[:, 1], rows))
-    line, column = _expand_ranges(*_covered(*_cut_row(corners[triangle, :, :2], row), columns))
+    # The row cuts the sides of the triangle at its first and at its last column.
+    x, y = np.moveaxis(corners[triangle, :, :2], 2, 0)
+    run, rise = np.roll(x, -1, axis=1) - x, np.roll(y, -1, axis=1) - y
+    share = np.divide(row[:, None] - y, rise, out=np.full(rise.shape, np.nan), where=rise != 0)
+    meets = (share >= -_ROUNDING) & (share <= 1 + _ROUNDING)
+    cuts = np.where(meets, x + np.clip(share, 0, 1) * run, np.nan)
+    x_min, x_max = np.fmin.reduce(cuts, axis=1, initial=np.inf), np.fmax.reduce(cuts, axis=1, initial=-np.inf)
+    line, column = _expand_ranges(*_covered(x_min, x_max, columns))
     triangle, row = triangle[line], row[line]
     origin, a, b = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(a, b)
@@ -170,19 +177,6 @@ def _expand_ranges(first: Ints, last: Ints) -> tuple[Ints, Ints]:
     lengths = np.maximum(0, last - first + 1)
     index = np.repeat(np.arange(len(lengths)), lengths)
     return index, np.arange(len(index)) - np.repeat(np.cumsum(lengths) - lengths - first, lengths)
-
-
-def _cut_row(corners: Array, row: Ints) -> tuple[Array, Array]:
-    """Return the least and the greatest x at height `row` (n,) in the triangles (n, 3, 2)."""
-    x_min, x_max = np.full(len(row), np.inf), np.full(len(row), -np.inf)
-    for edge in range(3):
-        (x, y), (to_x, to_y) = corners[:, edge].T, corners[:, (edge + 1) % 3].T
-        rise = to_y - y
-        share = np.divide(row - y, rise, out=np.full(len(row), np.nan), where=rise != 0)
-        meets = (share >= -_ROUNDING) & (share <= 1 + _ROUNDING)
-        cut = np.where(meets, x + np.clip(share, 0, 1) * (to_x - x), np.nan)
-        x_min, x_max = np.fmin(x_min, cut), np.fmax(x_max, cut)
-    return x_min, x_max
 
 
 CARE = "#7b3fa0"
