@@ -48,6 +48,15 @@ XY Size Compensation: 0 | X-Y contour compensation and X-Y hole compensation: 0 
 | it would be added to both sides of every ridge
 Elephant foot compensation: 0.1 to 0.2 mm | Elephant foot compensation: 0.1 to 0.2 mm \
 | Initial Layer Horizontal Expansion: -0.1 to -0.2 mm | {foot}; no ridge is in that layer"""
+_RESIN_SETTINGS = """\
+- Slice it in layers of {layer:g} mm, flat on the plate: tilted, the floor comes out in steps, and the pad takes on \
+its face.
+- Turn anti-aliasing, blur and compensation of sizes off. A ridge is {pixels} wide: grey ones make its sides soft, and \
+what is added on either side narrows the silicone between two.
+- Let the bottom layers, which are exposed longer and grow sideways, end below the ridges: the floor is {floor:g} mm, \
+{layers:.3g} layers.
+- Calibrate the exposure: a wall that is {ridge:g} mm wide in the file must be so on the plate.
+- Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."""
 _SOLID_MM = 0.8
 """Thickness of solid plastic that hides the infill below it."""
 _MAX_WALLS = 4
@@ -206,24 +215,13 @@ def _print_lines(document: Document) -> Iterator[str]:
     yield "- Print it as it lies, open side up, without supports."
     if printer.resin:
         pixels = mould.ridge_width_mm / printer.nozzle_mm
-        yield (
-            f"- Slice it in layers of {printer.layer_mm:g} mm, flat on the plate: tilted, the floor comes out in steps,"
-            " and the pad takes on its face."
+        yield _RESIN_SETTINGS.format(
+            layer=printer.layer_mm,
+            pixels=f"{pixels:.3g} pixel{'s' * (pixels != 1)}",
+            floor=mould.floor_mm,
+            layers=mould.floor_mm / printer.layer_mm,
+            ridge=mould.ridge_width_mm,
         )
-        yield (
-            "- Turn anti-aliasing, blur and compensation of sizes off. A ridge is"
-            f" {pixels:.3g} pixel{'s' * (pixels != 1)} wide: grey ones make its sides soft, and what is added on either"
-            " side narrows the silicone between two."
-        )
-        yield (
-            "- Let the bottom layers, which are exposed longer and grow sideways, end below the ridges: the floor is"
-            f" {mould.floor_mm:g} mm, {mould.floor_mm / printer.layer_mm:.3g} layers."
-        )
-        yield (
-            f"- Calibrate the exposure: a wall that is {mould.ridge_width_mm:g} mm wide in the file must be so on the"
-            " plate."
-        )
-        yield "- Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."
     if mould.lid:
         yield "- Print the lid as well."
     if mould.holder:

@@ -316,17 +316,9 @@ def _remarks(findings: Sequence[Finding]) -> list[Finding]:
 
 
 class _Picture:
-    """A figure whose axes are in mm and cover whole pixels."""
+    """A figure whose axes cover `bounds` (x_min, y_min, x_max, y_max), mm, in whole pixels; legend and note below."""
 
     def __init__(self, bounds: Bounds, title: str, n_entries: int, note: str = "") -> None:
-        """Lay out an empty figure.
-
-        Args:
-            bounds: x_min, y_min, x_max and y_max of the axes, mm.
-            title: above the axes.
-            n_entries: entries of the legend to make room for.
-            note: text below the legend.
-        """
         from matplotlib.figure import Figure
 
         x_min, y_min, x_max, y_max = bounds

@@ -234,12 +234,15 @@ def test_page_lists_failed_checks_and_follows_settings():
         {"name": "thin", "status": "warn", "message": "thin walls", "positions_mm": [[1.0, 2.0]]},
         {"name": "wall", "status": "fail", "message": "no wall", "positions_mm": []},
     )
-    lid = with_settings({"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True})
+    lid = with_settings(
+        {"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True, "nozzle_mm": 0.05, "layer_mm": 0.05}
+    )
     page = laying_page(fabrication_document(Plan(Morphology.straight(2), lid), findings))
     assert "1 of 3 checks pass" in page
     assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 position,")
     assert "pour through its spout" in page
-    assert "of resin" in page
+    for text in ("of resin", "in layers of 0.05 mm", "A ridge is 8 pixels wide", "the floor is 2 mm, 40 layers"):
+        assert text in page
     assert "PrusaSlicer" not in page
     assert page.index("- Slice it") < page.index("- Turn anti-aliasing") < page.index("- Wash and cure")
     assert "read the right way" not in page
@@ -291,11 +294,3 @@ def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
 def test_ridge_is_whole_lines(ridge, nozzle, width, why):
     mould, printer = MouldSettings(ridge_width_mm=ridge), PrinterSettings(nozzle_mm=nozzle)
     assert print_setting("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
-
-
-def test_resin_settings_are_in_pixels_and_layers():
-    resin = with_settings(printer={"resin": True, "nozzle_mm": 0.05, "layer_mm": 0.05})
-    page = laying_page(fabrication_document(Plan(Morphology.straight(2), resin)))
-    assert "in layers of 0.05 mm" in page
-    assert "A ridge is 8 pixels wide" in page
-    assert "the floor is 2 mm, 40 layers" in page
