@@ -279,11 +279,11 @@ def _cut_corner(pad: Document) -> str:
 def _mix_lines(silicone: Document) -> Iterator[str]:
     parts = [round(silicone[key], 1) for key in ("part_a_g", "part_b_g")]
     masses = [f"{mass:.1f} g" for mass in (*parts, sum(parts))]
-    yield from _table_lines((silicone["name"], "part A", "part B", "total"), [("mass", *masses)])
+    yield from _table_lines((silicone["name"], "part A", "part B", "together"), [("mass", *masses)])
     yield ""
     yield (
         f"The mould holds {silicone['volume_ml']:.1f} ml, the pad is {silicone['thickness_mm']:.3g} mm thick."
-        f" The masses include {silicone['surplus_percent']:g} % for losses in the cup."
+        f" The masses include {silicone['surplus_percent']:g} % for what stays in the cup."
     )
     if silicone["shrinkage"]:
         yield (
