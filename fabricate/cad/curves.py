@@ -28,8 +28,8 @@ Joints = dict[tuple[float, float], Array]
 
 FINE_MM = 3e-4
 """Tolerance of the drawn rings against the exact outlines; their vertices are far nearer."""
-MAX_SPANS = 4
-"""Longer splines are cut: the CAD kernel's default integration is inexact on edges of many spans (6e-4 at six)."""
+MAX_SPANS = 8
+"""Longer splines are cut: the CAD kernel's default integration is inexact on edges of many spans (1.4e-4 at twelve)."""
 _JOINT_MM = 1e-3
 """A joint farther from an outline lies inside it, where walls of two fibres, or of one that folds, merge."""
 _CORNER_RAD = 0.2

@@ -57,8 +57,8 @@ _MIN_CIRCLE_CORNERS = 32
 """Polygons of fewer corners are no circles."""
 _SPACING_MM = 10.0
 """Distance between bodies that stand side by side."""
-_INTEGRATION_TOLERANCE = 1e-2
-"""Relative error asked for of volumes and surfaces: the adaptive integration it selects is a million times better."""
+_AREA_TOLERANCE = 1e-2
+"""Relative error asked for of areas; it selects an adaptive integration that is faster and far more accurate."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class CadModel:
     def compare(self, mesh: "Manifold") -> tuple[float, float]:
         """Return the relative deviations of volume and surface area from those of a mesh of the same body."""
         volumes, surfaces = GProp_GProps(), GProp_GProps()
-        BRepGProp.VolumeProperties_s(self.part.compound, volumes, _INTEGRATION_TOLERANCE)
-        BRepGProp.SurfaceProperties_s(self.part.compound, surfaces, _INTEGRATION_TOLERANCE)
+        BRepGProp.VolumeProperties_s(self.part.compound, volumes)
+        BRepGProp.SurfaceProperties_s(self.part.compound, surfaces, _AREA_TOLERANCE)
         surface_mm2 = surfaces.Mass() - 2 * self.contact_mm2
         return abs(volumes.Mass() / mesh.volume() - 1), abs(surface_mm2 / mesh.surface_area() - 1)
 

@@ -20,15 +20,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from OCP.BRep import BRep_Builder
-from OCP.collections import Array1_double, Array1_gp_Pnt, Array1_gp_Pnt2d, Array1_int, Array2_gp_Pnt
+from OCP.collections import Array1_double, Array1_gp_Pnt, Array1_gp_Pnt2d, Array1_int
 from OCP.Geom import (
     Geom_BSplineCurve,
-    Geom_BSplineSurface,
     Geom_Circle,
     Geom_CylindricalSurface,
     Geom_Ellipse,
     Geom_Line,
     Geom_Plane,
+    Geom_SurfaceOfLinearExtrusion,
 )
 from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Line
 from OCP.gp import gp_Ax2, gp_Ax3, gp_Dir, gp_Dir2d, gp_Pnt, gp_Pnt2d
@@ -55,8 +55,6 @@ _TOLERANCE_MM = 1e-6
 _MAX_DEVIATION_MM = 5e-3
 """More than curves deviate from outlines: so near its edge, the wall below may pass the top of a track."""
 _UP = gp_Dir(0, 0, 1)
-_SAMPLES, _MARGIN_MM = 33, 0.01
-"""Points at which a sloped curve is sampled for its extreme heights, and by how much it might exceed them."""
 _ELLIPSE_SAMPLES = 65
 """Points that the parameters of an ellipse on its cylinder are interpolated through."""
 _CACHED = 256
@@ -211,7 +209,7 @@ class _Shell:
         k, wall = face.edge, self._wall(face.edge)
         start, end = self.planar_map.edges[k].nodes
         low, high = self.steps(k, face.bottom), self.steps(k, face.top)
-        surface = wall.surface(_height(face.bottom), _height(face.top))
+        surface = wall.surface(_height(face.bottom))
         rising = self._vertical_edges(end, low[1], high[1])
         falling = self._vertical_edges(start, low[0], high[0])[::-1]
         bottom, top = self._horizontal_edge(k, face.bottom), self._horizontal_edge(k, face.top)
@@ -324,8 +322,8 @@ def _height(surface: Surface) -> Height:
 class Wall(Protocol):
     """Upright surface over an edge of a planar map, and the curves on it.
 
-    Lines rise to planes, arcs to cylinders and splines to B-spline surfaces. The second parameter of a surface is the
-    height, the first that of the curve.
+    Lines rise to planes, arcs to cylinders and splines to extrusions. The first parameter of a surface is that of the
+    curve, the second grows with the height.
 
     Attributes:
         normal_is_right: whether the surface's own normal points to the right of the curve's direction.
@@ -337,8 +335,8 @@ class Wall(Protocol):
         """Return the curve at a height, with its first and last parameter."""
         ...
 
-    def surface(self, bottom: Height, top: Height) -> Any:
-        """Return the upright surface between two heights, or more of it."""
+    def surface(self, z: Height) -> Any:
+        """Return the upright surface through the curve at a height, unbounded."""
         ...
 
     def horizontal_pcurve(self, z: Height) -> Any:
@@ -369,9 +367,9 @@ class _PlaneWall:
         direction = gp_Dir(end.X() - start.X(), end.Y() - start.Y(), end.Z() - start.Z())
         return Geom_Line(start, direction), 0.0, start.Distance(end)
 
-    def surface(self, bottom: Height, top: Height) -> Any:
+    def surface(self, z: Height) -> Any:
         (x0, y0), (x1, y1) = self._ends.tolist()
-        return Geom_Plane(gp_Pnt(x0, y0, _heights(bottom, self._ends)[0]), gp_Dir(y1 - y0, x0 - x1, 0))
+        return Geom_Plane(gp_Pnt(x0, y0, _heights(z, self._ends)[0]), gp_Dir(y1 - y0, x0 - x1, 0))
 
     def horizontal_pcurve(self, z: Height) -> None:
         return None
@@ -411,7 +409,7 @@ class _ArcWall:
         middle, x, y = z(np.add(self._centre, self._radius * np.array([[0, 0], [1, 0], [0, 1]]))).tolist()
         return middle, math.hypot(x - middle, y - middle), math.atan2(y - middle, x - middle)
 
-    def surface(self, bottom: Height, top: Height) -> Any:
+    def surface(self, z: Height) -> Any:
         return Geom_CylindricalSurface(gp_Ax3(gp_Pnt(*self._centre, 0), _UP, gp_Dir(1, 0, 0)), self._radius)
 
     def horizontal_pcurve(self, z: Height) -> Any:
@@ -428,48 +426,40 @@ class _ArcWall:
 
 
 class _SplineWall:
-    """Its parameter is the arc length along the outline curve.
+    """Extrusion of a spline from the foot of its wall; its parameters are the arc length and the height above the foot.
 
-    At the foot and the top of a track the edges share the full curve, which files hold once; elsewhere each has a part.
+    At the foot and the top the edges share the full curve, which files hold once; elsewhere each has a part.
     """
 
     normal_is_right = True
 
     def __init__(self, curve: OutlineCurve, spline: BSpline, edge: MapEdge) -> None:
         self._z_range, self._spline = curve.z_range, spline
+        self._foot_mm = curve.z_range[0] if math.isfinite(curve.z_range[0]) else 0.0
         self._range = edge.start, edge.end
 
     @cached_property
     def _trimmed(self) -> BSpline:
         return trim_spline(self._spline, *self._range)
 
-    @cached_property
-    def _samples(self) -> Array:
-        return self._spline(np.linspace(*self._range, _SAMPLES))
-
-    def _spline_at(self, z: Height) -> BSpline:
-        return self._spline if z in self._z_range else self._trimmed
-
     def curve(self, z: Height) -> tuple[Any, float, float]:
-        spline = self._spline_at(z)
-        if spline is self._spline:
-            return _level_curve(spline, z), *self._range
-        return _raised_curve(spline, _heights(z, spline.c)), *self._range
+        if not callable(z) and z in self._z_range:
+            return _level_curve(self._spline, z), *self._range
+        return _raised_curve(self._trimmed, _heights(z, self._trimmed.c)), *self._range
 
-    def surface(self, bottom: Height, top: Height) -> Any:
-        low = min(_heights(bottom, self._samples)) - _MARGIN_MM if callable(bottom) else bottom
-        high = max(_heights(top, self._samples)) + _MARGIN_MM if callable(top) else top
-        return _upright_surface(self._spline, min(self._z_range[0], low), max(self._z_range[1], high))
+    def surface(self, z: Height) -> Any:
+        return _extrusion(self._spline, self._foot_mm)
 
     def horizontal_pcurve(self, z: Height) -> Any:
         if not callable(z):
-            return Geom2d_Line(gp_Pnt2d(0, z), gp_Dir2d(1, 0))
-        spline = self._spline_at(z)
+            return Geom2d_Line(gp_Pnt2d(0, z - self._foot_mm), gp_Dir2d(1, 0))
+        spline = self._trimmed
         greville = (spline.t[1:-3] + spline.t[2:-2] + spline.t[3:-1]) / 3
-        return _spline_2d(spline, np.column_stack([greville, _heights(z, spline.c)]))
+        heights = np.array(_heights(z, spline.c)) - self._foot_mm
+        return _spline_2d(spline, np.column_stack([greville, heights]))
 
     def vertical_pcurve(self, side: int, z: float) -> Any:
-        return Geom2d_Line(gp_Pnt2d(self._range[side], z), gp_Dir2d(0, 1))
+        return Geom2d_Line(gp_Pnt2d(self._range[side], z - self._foot_mm), gp_Dir2d(0, 1))
 
 
 def _heights(z: Height, points: Array) -> list[float]:
@@ -489,14 +479,8 @@ def _raised_curve(spline: BSpline, heights: list[float]) -> Any:
 
 
 @lru_cache(_CACHED)
-def _upright_surface(spline: BSpline, low: float, high: float) -> Any:
-    poles = Array2_gp_Pnt(1, len(spline.c), 1, 2)
-    for row, (x, y) in enumerate(spline.c.tolist(), 1):
-        poles.SetValue(row, 1, gp_Pnt(x, y, low))
-        poles.SetValue(row, 2, gp_Pnt(x, y, high))
-    knots, multiplicities = _knots(spline)
-    heights, ends = _fill(Array1_double, [low, high]), _fill(Array1_int, [2, 2])
-    return Geom_BSplineSurface(poles, knots, heights, multiplicities, ends, 3, 1)
+def _extrusion(spline: BSpline, z: float) -> Any:
+    return Geom_SurfaceOfLinearExtrusion(_level_curve(spline, z), _UP)
 
 
 def _spline_2d(spline: BSpline, poles: Array) -> Any:
