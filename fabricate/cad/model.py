@@ -27,7 +27,7 @@ from padforge.fabricate.cad.planar_map import contact_mm2 as contact_area_mm2
 from padforge.fabricate.cad.planar_map import fill_cells as fill_cells
 from padforge.fabricate.cad.solids import solids
 from padforge.fabricate.mould import (
-    COLOURS,
+    BODY_COLOURS,
     INTO_FLOOR_MM,
     Body,
     Prism,
@@ -168,7 +168,7 @@ def mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> Mo
             break
     else:
         raise InputError(f"{name}: the CAD kernel finds a solid invalid; leave step out of the formats")
-    colours = {TRAY: COLOURS["mould"], **_TRACKS}
+    colours = {TRAY: BODY_COLOURS["mould"], **_TRACKS}
     children = [_part(part, own, colours.get(part, _GREY)) for part, own in together.items()]
     contact = contact_area_mm2(drawing, parts)
     if plan.settings.mould.pins:
@@ -187,7 +187,7 @@ def body_model(body: Body, name: str) -> Model:
     own = _valid({name: lambda: body_solid(body).solids()})
     if not own:
         raise InputError(f"{name}: the CAD kernel finds the solid invalid; leave step out of the formats")
-    return Model(_part(name, own[name], COLOURS[name]))
+    return Model(_part(name, own[name], BODY_COLOURS[name]))
 
 
 def _valid(makes: Mapping[str, Callable[[], Iterable[Solid]]]) -> dict[str, list[Solid]] | None:

@@ -17,8 +17,8 @@ from shapely.geometry.base import BaseGeometry
 from padforge.design.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import beziers
-from padforge.fabricate.fibre_placement.toolpath import Step, turned_over
-from padforge.fabricate.plan import COLOURS, FAMILIES, Plan, fibre_layers, fibre_name, polygon_rings
+from padforge.fabricate.fibre_placement.toolpath import Step, mirror_x
+from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS, Plan, fibre_layers, fibre_name, polygon_rings
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
@@ -140,7 +140,7 @@ def _pad(plan: Plan, scale: float) -> Iterator[str]:
             yield f'<polyline points="{path}" stroke="{layer.colour}" stroke-width="{width}"/>'
     for fibre, number in enumerate(plan.numbers):
         if number is not None:
-            yield f'<path class="cast" d="{_rings(number)}" fill="{COLOURS[plan.family(fibre)]}"/>'
+            yield f'<path class="cast" d="{_rings(number)}" fill="{FAMILY_COLOURS[plan.family(fibre)]}"/>'
 
 
 def _above(plan: Plan, name: str, panel: _Panel, shown: BaseGeometry) -> Iterator[str]:
@@ -149,11 +149,11 @@ def _above(plan: Plan, name: str, panel: _Panel, shown: BaseGeometry) -> Iterato
     if not panel.mirrored:
         yield f'<path d="{_rings(plan.tray)}" fill="{FAINT}" transform="{panel.transform}"/>'
     yield f'<use xlink:href="#pad" transform="{panel.transform}"/>'
-    size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * panel.scale)
+    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panel.scale)
     for fibre, lead in enumerate(plan.ends(0)):
         start = lead.turned_mm.copy()
         start[lead.axis] = -((_BESIDE_MM + size / 2) / panel.scale - shown.bounds[lead.axis])
-        colour = COLOURS[plan.family(fibre)]
+        colour = FAMILY_COLOURS[plan.family(fibre)]
         yield _orientation_text(str(fibre + 1), *panel.at(start[None])[0], colour=colour, size=size, bold=True)
     reach = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
     for axis, tip in zip("xy", np.eye(2) * reach, strict=True):
@@ -188,11 +188,11 @@ def _sides(plan: Plan, panels: tuple[_Panel, _Panel, _Panel], top: float) -> Ite
     for panel in panels:
         yield _box(panel.x - half, top, 2 * half, _SLAB_MM, PAPER)
     starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
-    size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * tray.scale)
+    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * tray.scale)
     for panel, y, fill in ((tray, low - _TRACK_MM, FAINT), (over, top, "white"), (used, top, "")):
         for fibre, x_mm in starts:
             x = panel.x + (-x_mm if panel.mirrored else x_mm) * panel.scale
-            colour = COLOURS[plan.family(fibre)]
+            colour = FAMILY_COLOURS[plan.family(fibre)]
             yield _box(x - 0.4, y, 0.8, _TRACK_MM, fill or colour)
             yield _orientation_text(str(fibre + 1), x, floor + size, colour=colour, size=size)
     yield f'<path id="probe" d="M{_mm(used.x - 2)},{_mm(top - 7)}v4a2,2 0 0 0 4,0v-4z" fill="{INK}"/>'
@@ -286,7 +286,7 @@ class TrackSheet:
     @cached_property
     def text_mm(self) -> float:
         """Height of the writing."""
-        return min(_TEXT_MM, 0.6 * self.plan.least_pitch_mm)
+        return min(_TEXT_MM, 0.6 * self.plan.min_pitch_mm)
 
     @cached_property
     def frame(self) -> tuple[float, float, float, float]:
@@ -309,7 +309,7 @@ class TrackSheet:
     def ends(self) -> Array:
         """(F, 2, 2) where every fibre enters and leaves the silicone."""
         past = self.plan.settings.mould.exit_mm
-        return np.array([[lead.beyond(past) for lead in pair] for pair in self.plan.leads.pairs])
+        return np.array([[lead.point_past_edge(past) for lead in pair] for pair in self.plan.leads.pairs])
 
     @cached_property
     def numbers(self) -> list[Writing]:
@@ -319,7 +319,7 @@ class TrackSheet:
         for fibre, (x, y) in [each for end in range(1 + one_side) for each in enumerate(self.ends[:, end].tolist())]:
             below = self.plan.leads.pairs[fibre][0].axis == 1
             place = (x, y - _ASIDE_MM - self.text_mm / 2) if below else (x - _ASIDE_MM, y)
-            anchor, colour = "middle" if below else "end", COLOURS[self.plan.family(fibre)]
+            anchor, colour = "middle" if below else "end", FAMILY_COLOURS[self.plan.family(fibre)]
             texts.append(Writing(str(fibre + 1), *place, anchor, colour))
         return texts
 
@@ -578,7 +578,7 @@ def toolpath_svg(plan: Plan, steps: Sequence[Step]) -> str:
 
 def _ground(plan: Plan) -> Iterator[str]:
     """The silicone, and the box that the needle may not leave."""
-    rings = [turned_over(ring) for polygon in polygon_rings(plan.silicone) for ring in polygon]
+    rings = [mirror_x(ring) for polygon in polygon_rings(plan.silicone) for ring in polygon]
     yield f'<path id="silicone" stroke="#888" stroke-width="0.2" d="{"".join(_path(ring) + "Z" for ring in rings)}"/>'
     (x0, x1, y0, y1), (x, y) = plan.settings.dispenser.box_mm[:4], plan.settings.dispenser.origin_mm
     corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) - (x, y)
@@ -603,7 +603,7 @@ def _laid(steps: Sequence[Step]) -> Iterator[str]:
 
 def _marks(plan: Plan, ends: Array, fibres: Sequence[int]) -> Iterator[str]:
     for turn, (fibre, (start, end)) in enumerate(zip(fibres, ends, strict=True), 1):
-        off, beyond = (2.5 * turned_over(lead.outward) for lead in plan.leads.pairs[fibre])
+        off, beyond = (2.5 * mirror_x(lead.outward) for lead in plan.leads.pairs[fibre])
         (x, y), (u, v) = start, end
         yield f'<circle cx="{_um(x)}" cy="{_um(-y)}" r="0.8" stroke="{INK}" stroke-width="0.2"/>'
         yield f'<circle cx="{_um(u)}" cy="{_um(-v)}" r="0.5" fill="{INK}"/>'

@@ -20,8 +20,8 @@ from padforge.fabricate.checks import Finding
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.outputs.drawings import SCALE_MM, orientation_sentence
 from padforge.fabricate.plan import (
-    COLOURS,
     FAMILIES,
+    FAMILY_COLOURS,
     INTO_WALL_MM,
     FibreLayer,
     Plan,
@@ -309,7 +309,7 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: FibreLayer) -> list[Any]:
     from shapely.ops import substring
 
     width = max(1.3, sheet.points(plan.settings.fibre.material.diameter_mm))
-    size = min(11.0, 0.5 * sheet.points(plan.least_pitch_mm))
+    size = min(11.0, 0.5 * sheet.points(plan.min_pitch_mm))
     drawn = []
     for fibre in layer.fibres:
         line = substring(plan.lines[fibre], INTO_WALL_MM, plan.lines[fibre].length - INTO_WALL_MM)
@@ -322,7 +322,7 @@ def _draw_layer(sheet: "_Sheet", plan: Plan, layer: FibreLayer) -> list[Any]:
         for x, y in (line.coords[0], line.coords[-1])[: 1 + (plan.settings.pad.leads == "one side")]:
             sheet.axes.annotate(
                 str(fibre + 1), (x, y), away, textcoords="offset points", ha=place[0], va=place[1],
-                color=COLOURS[layer.family], fontsize=size, fontweight="bold",
+                color=FAMILY_COLOURS[layer.family], fontsize=size, fontweight="bold",
             )  # fmt: skip
     return drawn[:1]
 

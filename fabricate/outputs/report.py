@@ -28,7 +28,7 @@ from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION as ORIENTATI
 from padforge.fabricate.outputs.drawings import ORIENTATION_FILE as ORIENTATION_FILE
 from padforge.fabricate.outputs.drawings import ORIENTATION_LINK as ORIENTATION_LINK
 from padforge.fabricate.outputs.laying_page import laying_page
-from padforge.fabricate.plan import COLOURS, FAMILIES
+from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
 MOST_BYTES = 3_000_000
 """A packed mesh takes no more: base64 makes 4 MB of it, half of what a page may have."""
@@ -164,7 +164,7 @@ def _tops(document: Mapping[str, Any], ground_mm: float) -> list[list[float]]:
     floor_mm = ground_mm + float(document["settings"]["mould"]["floor_mm"])
     found = {}
     for fibre in document["fibres"]:
-        colour = COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
+        colour = FAMILY_COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
         found[float(fibre["ridge_mm"])] = [part / 255 for part in bytes.fromhex(colour[1:])]
     return [[floor_mm + ridge_mm, *colour] for ridge_mm, colour in sorted(found.items())][:_MOST_LEVELS]
 

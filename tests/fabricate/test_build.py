@@ -20,7 +20,7 @@ from padforge.design.morphology import Morphology
 from padforge.fabricate import export
 from padforge.fabricate.cad import model
 from padforge.fabricate.export import FORMATS, build
-from padforge.fabricate.mesh import COLOURS
+from padforge.fabricate.mesh import BODY_COLOURS
 from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -38,7 +38,7 @@ SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("mould")
-    return out, build(PAD, out, FORMATS, SETTINGS)
+    return out, build(PAD, out, tuple(FORMATS), SETTINGS)
 
 
 def test_all_files_are_there_with_their_digests_and_nothing_else(built):
@@ -52,7 +52,7 @@ def test_all_files_are_there_with_their_digests_and_nothing_else(built):
 @pytest.mark.slow
 def test_the_same_work_gives_the_same_bytes(built, tmp_path):
     out, _ = built
-    build(PAD, tmp_path / "again", FORMATS, SETTINGS)
+    build(PAD, tmp_path / "again", tuple(FORMATS), SETTINGS)
     for name in FILES:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
 
@@ -101,7 +101,7 @@ def test_3mf_is_strictly_one_named_object_of_one_material(built, body):
     (material,) = group.GetAllPropertyIDs()
     colour = group.GetDisplayColor(material)
     assert group.GetName(material) == "PLA"
-    assert f"#{colour.Red:02X}{colour.Green:02X}{colour.Blue:02X}" == COLOURS[body]
+    assert f"#{colour.Red:02X}{colour.Green:02X}{colour.Blue:02X}" == BODY_COLOURS[body]
     assert found.GetObjectLevelProperty() == (group.GetUniqueResourceID(), material, True)
     told = [model.GetMetaDataGroup().GetMetaData(k) for k in range(model.GetMetaDataGroup().GetMetaDataCount())]
     version = document["provenance"]["versions"]["padforge"]
@@ -266,7 +266,7 @@ def full_disk(*_, **__):
 
 
 @pytest.mark.parametrize(
-    ("last", "stop"), [("write_utf8", full_disk), ("write_utf8", KeyboardInterrupt), ("write_json", full_disk)]
+    ("last", "stop"), [("_write_utf8", full_disk), ("_write_utf8", KeyboardInterrupt), ("write_json", full_disk)]
 )
 def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last, stop):
     build(PAD, tmp_path, ["stl", "svg"])
@@ -279,7 +279,7 @@ def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError) as told:
         build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert contents(tmp_path) == before
-    if last == "write_utf8" and stop is full_disk:
+    if last == "_write_utf8" and stop is full_disk:
         assert str(told.value) == f"{tmp_path / 'tracks.svg'}: cannot be written (No space left on device)"
 
 

@@ -12,7 +12,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.fabricate.mould import mould_body
-from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, fibre_levels, number_strokes
+from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number
 from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
@@ -79,7 +79,7 @@ def test_fibres_that_cross_never_share_a_level(grid, data):
     fibres = [*itertools.combinations(range(grid), 2), *itertools.combinations(range(grid, 2 * grid), 2)]
     pairs = data.draw(st.lists(st.sampled_from(fibres), max_size=12)) if fibres else []
     deep = data.draw(st.booleans())
-    levels = fibre_levels((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
+    levels = assign_layers((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
     assert all(levels[i] != levels[j] for i, j in pairs)
     horizontal, vertical = levels[:grid], levels[grid:]
     assert min(horizontal if deep else vertical) > max(vertical if deep else horizontal)
@@ -88,7 +88,7 @@ def test_fibres_that_cross_never_share_a_level(grid, data):
 
 def test_a_star_of_crossings_needs_one_level_more():
     star = [Crossing(0, other, (0.0, 0.0)) for other in range(1, 5)]
-    assert max(fibre_levels((5, 5), star, deep_horizontal=True)) == 2
+    assert max(assign_layers((5, 5), star, deep_horizontal=True)) == 2
 
 
 def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
@@ -134,7 +134,7 @@ def test_published_pads_take_as_many_levels_as_their_crossings_need(published):
 @pytest.mark.parametrize(("height", "width"), [(1.5, 0.2), (2.5, 0.4), (5.0, 0.8)])
 def test_strokes_and_gaps_are_as_wide_as_ridges(height, width):
     for number in (8, 23, 96):
-        outline = number_strokes(number, height, width)
+        outline = draw_number(number, height, width)
         digits = shapely.get_parts(outline)
         assert len(digits) == len(str(number))
         assert len(digits) == 1 or digits[0].distance(digits[1]) == pytest.approx(max(width, 0.25 * height))

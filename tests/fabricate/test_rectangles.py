@@ -14,7 +14,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.checks.plan_checks import check_plan, meshed
 from padforge.fabricate.export import build
-from padforge.fabricate.fibre_placement.toolpath import laying_steps, turned_over
+from padforge.fabricate.fibre_placement.toolpath import mirror_x, plan_toolpath
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
 from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
@@ -39,7 +39,7 @@ def test_the_tray_is_as_wide_and_high_as_the_pad():
     assert sizes(plan)["pad_mm"] == [56.0, 60.0]
     left, low, right, high = plan.tray.bounds
     assert (right - left) - (high - low) == pytest.approx(56 - 60)
-    starts = np.array([lead.beyond(0) for lead in plan.ends(0)])
+    starts = np.array([lead.point_past_edge(0) for lead in plan.ends(0)])
     assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
     assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
 
@@ -103,12 +103,12 @@ def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches,
     pad = Morphology.straight(fibres, pitches)
     plan = Plan(pad, settings(pad, {"border_mm": border}, leads="one side"))
     room = plan.settings.lead_room(plan.heights_mm[-1], plan.flare_mm)
-    apart = min(room.apart_mm, *pitches)
+    apart = min(room.spacing_mm, *pitches)
     ways = []
     for fibre, pair in enumerate(plan.leads.pairs):
         for lead in pair:
-            assert lead.beyond(0)[1] == pytest.approx(plan.cavity.bounds[1])
-            way = np.vstack([lead.end_mm, lead.bends(1e-4), lead.beyond(0)])
+            assert lead.point_past_edge(0)[1] == pytest.approx(plan.cavity.bounds[1])
+            way = np.vstack([lead.end_mm, lead.flatten_bends(1e-4), lead.point_past_edge(0)])
             assert lead.length_mm == pytest.approx(shapely.LineString(way).length, rel=1e-4)
             ways.append((fibre, shapely.LineString(way)))
     for fibre, way in ways:
@@ -116,7 +116,7 @@ def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches,
         for other, its in ways:
             if other != fibre:
                 assert way.distance(its) > apart - 1e-3
-    exits = sorted(lead.beyond(0)[0] for pair in plan.leads.pairs for lead in pair)
+    exits = sorted(lead.point_past_edge(0)[0] for pair in plan.leads.pairs for lead in pair)
     assert np.diff(exits).min() > apart - 1e-6
 
 
@@ -137,7 +137,7 @@ def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
     for ring in walls.to_polygons():
         solid = solid.symmetric_difference(shapely.Polygon(ring))
     for lead in (lead for pair in plan.leads.pairs for lead in pair):
-        x, y = lead.beyond(DEFAULTS.mould.exit_mm + 1)
+        x, y = lead.point_past_edge(DEFAULTS.mould.exit_mm + 1)
         assert solid.distance(shapely.Point(-x, y)) > 1
     low, high = plan.tray.bounds[1], plan.tray.bounds[3]
     assert bed_frame(plan)["centre_mm"] == pytest.approx([110.0, 110.0 - (low + high) / 2])
@@ -200,11 +200,11 @@ def test_a_needle_follows_the_leads_and_is_slow_in_tight_bends(bend_mm, accelera
     own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(min_bend_radius_mm=bend_mm))
     own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
     plan = Plan(PAD, own)
-    strokes = [stroke for step in laying_steps(plan, 0.3) for stroke in step.strokes]
+    strokes = [stroke for step in plan_toolpath(plan, 0.3) for stroke in step.strokes]
     for stroke in strokes:
-        line = shapely.LineString(turned_over(stroke.positions_mm))
+        line = shapely.LineString(mirror_x(stroke.positions_mm))
         assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
-        places = np.asarray(shapely.points(turned_over(stroke.positions_mm)))
+        places = np.asarray(shapely.points(mirror_x(stroke.positions_mm)))
         places = places[shapely.within(places, plan.silicone)]
         assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
     assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)

@@ -8,14 +8,14 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design.morphology import Morphology, assemble_knots
-from padforge.fabricate.fibre_placement.toolpath import Stroke, check_course, laying_steps
+from padforge.fabricate.fibre_placement.toolpath import Stroke, check_toolpath, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import with_settings
 
 
 def strokes(plan: Plan, stretch: float = math.inf) -> list[Stroke]:
-    return [stroke for step in laying_steps(plan, 0.3, stretch) for stroke in step.strokes]
+    return [stroke for step in plan_toolpath(plan, 0.3, stretch) for stroke in step.strokes]
 
 
 def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
@@ -113,7 +113,7 @@ EDGE = 33.75 / 2 + 2 + 30
 
 def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object):
     plan = Plan(pad, with_settings(mould, dispenser=dispenser))
-    return {finding.name: finding for finding in check_course(plan, laying_steps(plan, 0.3))}
+    return {finding.name: finding for finding in check_toolpath(plan, plan_toolpath(plan, 0.3))}
 
 
 @pytest.mark.parametrize(
