@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -64,7 +65,6 @@ if TYPE_CHECKING:
     from padforge.fabricate.cad.model import Model
 
 FORMAT = "padforge-fabrication/2"
-LANGUAGES = {"gcode": gcode, "urscript": urscript}
 _CAD_VOLUME, _CAD_SURFACE, _CAD_TOLERANCE_MM = 5e-4, 5e-3, 0.01
 """Maximum relative differences of volume and surface between a CAD solid and its mesh, at the last tolerance.
 
@@ -111,10 +111,10 @@ class Fabrication:
         with profiling.stage("CAD solid"):
             return models(self.plan, {body.name: body.body for body in self.bodies})
 
-    def program(self, language: str) -> str:
-        """Return the program of the toolpath in one of `LANGUAGES`."""
+    def program(self, language: Callable[..., str]) -> str:
+        """Return the program of the toolpath in a language, `gcode` or `urscript`."""
         instructions, summary = build_instructions(self.plan, self.toolpath), summary_lines(self.plan, self.toolpath)
-        return LANGUAGES[language](instructions, summary, self.plan.settings.dispenser)
+        return language(instructions, summary, self.plan.settings.dispenser)
 
 
 # writers of the formats
@@ -136,14 +136,6 @@ def _write_cad(fabrication: Fabrication, path: Path) -> None:
     from padforge.fabricate.cad.step_file import write_step
 
     write_step(path, shape=assembly(fabrication.models, fabrication.plan.shrinkage_compensated))
-
-
-def _write_drawing(draw: Callable[[Plan], str], fabrication: Fabrication, path: Path) -> None:
-    _write_utf8(path, draw(fabrication.plan.shrinkage_compensated))  # drawings show the tray
-
-
-def _write_program(language: str, fabrication: Fabrication, path: Path) -> None:
-    _write_utf8(path, fabrication.program(language))
 
 
 def _check_cad(fabrication: Fabrication) -> list[Finding]:
@@ -182,23 +174,28 @@ class ExportFormat(NamedTuple):
     check: Callable[[Fabrication], list[Finding]] = lambda _: []
 
 
-_TOOLPATH_DRAWING = {"toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath))}
+def _program_format(file: str, language: Callable[..., str]) -> ExportFormat:
+    """Return the format of a program: with it comes a drawing of the toolpath, the same for all languages."""
+    program = {file: lambda f, path: _write_utf8(path, f.program(language))}
+    drawing = {"toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath))}
+    return ExportFormat(program | drawing, _check_toolpath)
+
+
 FORMATS = {
     "stl": ExportFormat({"*.stl": lambda _, body, path: write_stl(path, body.vertices, body.triangles)}),
     "3mf": ExportFormat({"*.3mf": _write_body_3mf}),
     "step": ExportFormat({"mould.step": _write_cad}, _check_cad),
-    "svg": ExportFormat({"tracks.svg": partial(_write_drawing, tracks_svg)}),
-    "dxf": ExportFormat({"tracks.dxf": partial(_write_drawing, tracks_dxf)}),
+    # drawings and pictures show the tray, compensated for shrinkage
+    "svg": ExportFormat({"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))}),
+    "dxf": ExportFormat({"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))}),
     "png": ExportFormat(
         {
             "mould.png": lambda f, path: draw_mould(f.plan.shrinkage_compensated, f.findings, path),
             "tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
         }
     ),
-    "gcode": ExportFormat({"laying.gcode": partial(_write_program, "gcode"), **_TOOLPATH_DRAWING}, _check_toolpath),
-    "urscript": ExportFormat(
-        {"laying.script": partial(_write_program, "urscript"), **_TOOLPATH_DRAWING}, _check_toolpath
-    ),
+    "gcode": _program_format("laying.gcode", gcode),
+    "urscript": _program_format("laying.script", urscript),
 }
 
 
@@ -252,16 +249,7 @@ def build(
     wanted = [name for name in FORMATS if name in formats]
     for check in dict.fromkeys(FORMATS[name].check for name in reversed(wanted)):  # the toolpath's before CAD's
         fabrication.findings.extend(check(fabrication))
-    writers: dict[str, Callable[[Path], None]] = {}
-    named = [(file, write) for name in wanted for file, write in FORMATS[name].files.items()]
-    for body in bodies:
-        for file, write in named:
-            if "*" in file:
-                writers[file.replace("*", body.name)] = partial(write, fabrication, body)
-    for file, write in named:
-        if "*" not in file:
-            writers.pop(file, None)  # a drawing that several programs share comes after the last of them
-            writers[file] = partial(write, fabrication)
+    writers = _choose_writers(fabrication, [FORMATS[name] for name in wanted])
     document = _compile_document(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
     writers["laying.md"] = partial(_write_utf8, text=laying_page(document))
@@ -296,6 +284,20 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
         if broken := [result.message for result in results if result.name in SOUND and result.status == "fail"]:
             raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
     return findings
+
+
+def _choose_writers(fabrication: Fabrication, formats: Sequence[ExportFormat]) -> dict[str, Callable[[Path], None]]:
+    """Return the writer of each file, those of the bodies first."""
+    writers = {}
+    files = [item for export in formats for item in export.files.items()]
+    for body, (file, write) in product(fabrication.bodies, files):
+        if "*" in file:
+            writers[file.replace("*", body.name)] = partial(write, fabrication, body)
+    for file, write in files:
+        if "*" not in file:
+            writers.pop(file, None)  # a drawing that several programs share comes after the last of them
+            writers[file] = partial(write, fabrication)
+    return writers
 
 
 def _compile_document(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ Turned over for fibre placement and use, the tracks are the mirror image of the 
 the finished pad; where the silicone shrinks, the mould has a plan of its own (`Plan.shrinkage_compensated`)."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -64,22 +64,17 @@ def assign_layers(counts: tuple[int, int], clashes: Sequence[Crossing], deep_hor
         deep_horizontal: whether horizontals are the deep family, which has the upper indices.
     """
     horizontal, vertical = range(counts[0]), range(counts[0], sum(counts))
-    shallow, deep = (vertical, horizontal) if deep_horizontal else (horizontal, vertical)
-    layers = _colour_crossings(shallow, clashes)
-    first_deep = 1 + max(layers.values(), default=-1)
-    layers |= {fibre: first_deep + colour for fibre, colour in _colour_crossings(deep, clashes).items()}
+    layers: dict[int, int] = {}
+    for family in (vertical, horizontal) if deep_horizontal else (horizontal, vertical):
+        first = 1 + max(layers.values(), default=-1)
+        colours = dict.fromkeys(family, 0)
+        edges = {(c.first, c.second) for c in clashes if c.first in colours and c.second in colours}
+        if edges:
+            import networkx
+
+            colours |= networkx.greedy_color(networkx.Graph(sorted(edges)), strategy="DSATUR")
+        layers |= {fibre: first + colour for fibre, colour in colours.items()}
     return tuple(layers[fibre] for fibre in range(sum(counts)))
-
-
-def _colour_crossings(family: Iterable[int], clashes: Sequence[Crossing]) -> dict[int, int]:
-    """Colour the fibres of a family with 0, 1, ..., differently where two cross."""
-    colours = dict.fromkeys(family, 0)
-    edges = {(c.first, c.second) for c in clashes if c.first in colours and c.second in colours}
-    if edges:
-        import networkx
-
-        colours |= networkx.greedy_color(networkx.Graph(sorted(edges)), strategy="DSATUR")
-    return colours
 
 
 _SEGMENTS = {
@@ -92,13 +87,7 @@ _DIGITS = ("abcdef", "bc", "abged", "abgcd", "fgbc", "afgcd", "afgedc", "abc", "
 
 
 def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
-    """Draw the outline of a number, centred, mirrored left to right since a casting is read from the other side.
-
-    Args:
-        number: positive integer.
-        height_mm: height of the digits between centre lines.
-        width_mm: width of their strokes.
-    """
+    """Draw a number, centred, from the height and stroke width of its digits; mirrored, to be read on the casting."""
     advance = 0.5 + (width_mm + max(width_mm, 0.25 * height_mm)) / height_mm
     strokes = [
         np.add(_SEGMENTS[segment], (position * advance, 0)) * height_mm
@@ -111,35 +100,31 @@ def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
     return affinity.scale(centred, xfact=-1, origin=(0, 0))
 
 
-def _position_numbers(
-    numbers: Sequence[BaseGeometry],
-    lines: Sequence[shapely.LineString],
-    area: BaseGeometry,
-    cavity: shapely.Polygon,
-    clearance_mm: float,
-    reach_mm: float,
-) -> list[BaseGeometry | None]:
-    """Move each centred number to the nearest free position beside the start of its line; None without room.
+def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[BaseGeometry | None]:
+    """Move each centred number to the nearest free position beside its fibre's start; None without room.
 
-    Candidates lie up to `reach_mm` into the pad and half of it to either side of the start, within `area`, at least
-    `clearance_mm` from its edge, from centre lines and from other numbers.
+    Candidates lie in the cavity, up to a reach into it and half of that to either side of the start, clear of walls,
+    pillars, ridges and other numbers.
     """
+    mould, lines = plan.settings.mould, plan.lines
+    clearance = mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope + mould.min_silicone_mm
+    reach = min(plan.min_pitch_mm, _NUMBER_DISTANCE * mould.number_mm)
     shapely.prepare(lines)
-    floor, occupied = area.buffer(-clearance_mm, join_style="mitre"), []
+    floor, occupied = plan.cavity.difference(plan.pillars).buffer(-clearance, join_style="mitre"), []
     positioned: list[BaseGeometry | None] = []
-    ahead, aside = np.arange(0, reach_mm, _NUMBER_STEP_MM), np.arange(-reach_mm / 2, reach_mm / 2, _NUMBER_STEP_MM)
+    ahead, aside = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
     depth, shift = (grid.ravel() for grid in np.meshgrid(ahead, aside))
     nearest_first = np.argsort(np.hypot(depth, shift), kind="stable")
     for number, line in zip(numbers, lines, strict=True):
         start, second = np.array(line.coords[:2])
         inward = np.sign(second - start)  # along an axis: lines leave the walls at right angles
-        start = np.where(inward > 0, cavity.bounds[:2], start)
+        start = np.where(inward > 0, plan.cavity.bounds[:2], start)
         middles = (start + depth[:, None] * inward + shift[:, None] * inward[::-1])[nearest_first]
         half = np.array(number.bounds[2:])
         boxes = shapely.box(*(middles - half).T, *(middles + half).T)
         free = shapely.within(boxes, floor)
         for other in (*lines, *occupied):
-            free[free] = ~shapely.dwithin(other, boxes[free], clearance_mm)
+            free[free] = ~shapely.dwithin(other, boxes[free], clearance)
         first = int(np.argmax(free))
         if free[first]:
             occupied.append(boxes[first])
@@ -214,10 +199,8 @@ class Plan:
     @cached_property
     def lines(self) -> list[shapely.LineString]:
         """Centre line of every fibre with its leads into the wall, within a fifth of the tolerance, mm."""
-        return self._centre_lines(self.settings.mould.tolerance_mm)
-
-    def _centre_lines(self, tolerance_mm: float) -> list[shapely.LineString]:
-        return [shapely.LineString(path) for path in self.paths(_CENTRE_SHARE * tolerance_mm, INTO_WALL_MM)]
+        tolerance_mm = _CENTRE_SHARE * self.settings.mould.tolerance_mm
+        return [shapely.LineString(path) for path in self.paths(tolerance_mm, INTO_WALL_MM)]
 
     def paths(self, tolerance_mm: float, past_mm: float) -> list[Array]:
         """Flatten every fibre with its leads to corners (n, 2), mm, until `past_mm` past the ends of its tongues."""
@@ -355,8 +338,10 @@ class Plan:
         tolerance = mould.tolerance_mm if tolerance_mm is None else tolerance_mm
         half = mould.ridge_width_mm / 2 + below_mm * self.settings.ridge_slope
         chord = 2 * math.acos(1 - _ARC_SHARE * tolerance / half)
-        centre_lines = self.lines if tolerance_mm is None else self._centre_lines(tolerance)
-        lines = [line for line, index in zip(centre_lines, self.layer_indices, strict=True) if index == layer]
+        lines = self.lines
+        if tolerance_mm is not None:
+            lines = [shapely.LineString(path) for path in self.paths(_CENTRE_SHARE * tolerance_mm, INTO_WALL_MM)]
+        lines = [line for line, index in zip(lines, self.layer_indices, strict=True) if index == layer]
         bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
@@ -368,14 +353,9 @@ class Plan:
     @cached_property
     def numbers(self) -> list[BaseGeometry | None]:
         """Mirrored number of every fibre, from 1, beside its start; None without room, an empty list if unwanted."""
-        mould = self.settings.mould
-        if not mould.number_mm:
-            return []
-        outlines = [draw_number(n + 1, mould.number_mm, mould.ridge_width_mm) for n in range(self.pad.layout.fibres)]
-        clearance = mould.ridge_width_mm / 2 + self.heights_mm[-1] * self.settings.ridge_slope + mould.min_silicone_mm
-        reach = min(self.min_pitch_mm, _NUMBER_DISTANCE * mould.number_mm)
-        floor = self.cavity.difference(self.pillars)
-        return _position_numbers(outlines, self.lines, floor, self.cavity, clearance, reach)
+        height, width = self.settings.mould.number_mm, self.settings.mould.ridge_width_mm
+        numbers = range(1, self.pad.layout.fibres + 1)
+        return _position_numbers(self, [draw_number(n, height, width) for n in numbers]) if height else []
 
     @cached_property
     def cavity(self) -> shapely.Polygon:

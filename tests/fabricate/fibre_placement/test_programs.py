@@ -1,6 +1,7 @@
 """Programs that lay fibres, run by machines that know their words only, and the drawing of their ways."""
 
 import re
+from collections.abc import Callable
 from xml.etree import ElementTree
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import Fabrication, build
+from padforge.fabricate.fibre_placement.gcode import gcode
 from padforge.fabricate.fibre_placement.toolpath import plan_toolpath
+from padforge.fabricate.fibre_placement.urscript import urscript
 from padforge.fabricate.outputs.drawings import toolpath_svg
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
@@ -27,7 +30,7 @@ PLANS = {
 }
 
 
-def program(plan: Plan, language: str) -> str:
+def program(plan: Plan, language: Callable[..., str]) -> str:
     return Fabrication(plan, [], []).program(language)
 
 
@@ -54,7 +57,7 @@ def require_travels_above(plan: Plan, run: Run) -> None:
                 assert not sideways or start[2] == end[2] == plan.settings.dispenser.travel_height_mm
 
 
-LANGUAGES = {"gcode": (run_gcode, 0.006), "urscript": (run_urscript, 0.011)}
+LANGUAGES = {"gcode": (gcode, run_gcode, 0.006), "urscript": (urscript, run_urscript, 0.011)}
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
@@ -66,16 +69,16 @@ def test_programs_place_every_fibre_along_its_path(request, language, name):
         plan = PLANS[name]()
     else:
         plan = Plan(Morphology.load(request.getfixturevalue("published") / f"{name}.mat"))
-    machine, limit_mm = LANGUAGES[language]
-    run = machine(program(plan, language))
+    write, machine, limit_mm = LANGUAGES[language]
+    run = machine(program(plan, write))
     require_laid(plan, run, limit_mm, plan.settings.dispenser.origin_mm if language == "gcode" else (0, 0))
     require_travels_above(plan, run)
 
 
 def test_pauses_are_in_the_order_of_the_work():
     plan = Plan(level_pad(1.8, 1.2))  # three layers
-    asked = run_gcode(program(plan, "gcode")).asked
-    assert asked[1:] == run_urscript(program(plan, "urscript")).asked[2:]  # one more: the pad's pose is unknown
+    asked = run_gcode(program(plan, gcode)).asked
+    assert asked[1:] == run_urscript(program(plan, urscript)).asked[2:]  # one more: the pad's pose is unknown
     words = [re.sub(r".*?(fasten|cut|seal|zero).*", r"\1", message) for message in asked]
     fibre = ["fasten", "cut"]
     layers = [len(step) for step in laying_document(plan, 1.0)["laying_order"]]
@@ -85,8 +88,8 @@ def test_pauses_are_in_the_order_of_the_work():
 
 def test_gcode_has_nothing_that_a_firmware_misreads():
     plan = Plan(Morphology.straight(4))
-    lines = program(plan, "gcode").splitlines()
-    assert all(line.isascii() for line in (*lines, program(plan, "urscript")))
+    lines = program(plan, gcode).splitlines()
+    assert all(line.isascii() for line in (*lines, program(plan, urscript)))
     waits = [line for line in lines if line.startswith("M0")]
     assert len(waits) == 1 + 2 * 8 + 2
     for line in waits:
@@ -100,14 +103,14 @@ def test_build_writes_a_program_in_each_language_and_one_drawing(tmp_path):
     document = build(pad, tmp_path, ["urscript", "gcode"])
     assert document["files"] == ["laying.gcode", "laying.script", "toolpath.svg"]
     assert [finding["name"] for finding in document["findings"][-2:]] == ["dispenser_box", "dispenser_tip"]
-    assert (tmp_path / "laying.gcode").read_text() == program(Plan(pad), "gcode") == program(Plan(pad), "gcode")
+    assert (tmp_path / "laying.gcode").read_text() == program(Plan(pad), gcode) == program(Plan(pad), gcode)
 
 
 def test_fibre_settings_set_depth_and_speed():
     pad = Morphology.random(1, 3, seed=2)
 
     def seconds(**fibre: object) -> float:
-        run = run_gcode(program(Plan(pad, with_settings(fibre=fibre)), "gcode"))
+        run = run_gcode(program(Plan(pad, with_settings(fibre=fibre)), gcode))
         ways = [way for _, way in run.laid()]
         assert ways[0].corners[:, 2] == pytest.approx(float(str(fibre.get("diameter_mm", 0.3))) - 1.2)
         return sum((np.linalg.norm(np.diff(way.corners, axis=0), axis=1) / way.speeds).sum() for way in ways)
@@ -119,7 +122,7 @@ def test_fibre_settings_set_depth_and_speed():
 def test_gcode_has_positions_speeds_and_height_of_the_settings():
     dispenser = {"origin_mm": [50.0, -20.0], "travel_height_mm": 7.5, "feed_mm_s": 6.0}
     plan = Plan(Morphology.straight(1), with_settings(dispenser=dispenser))
-    text = program(plan, "gcode")
+    text = program(plan, gcode)
     code = [line for line in text.splitlines() if not line.startswith(";")]
     assert code[:2] == ["G21", "G90"]
     assert [line[:4] for line in code[2:5]] == ["M0 (", "G1 Z", "G1 X"]  # a lift before anything goes sideways
@@ -136,7 +139,7 @@ def test_gcode_has_positions_speeds_and_height_of_the_settings():
 
 def script(**keys: object) -> list[str]:
     plan = Plan(Morphology.random(1, 2, seed=3), with_settings(dispenser=keys))
-    return [line.strip() for line in program(plan, "urscript").splitlines()]
+    return [line.strip() for line in program(plan, urscript).splitlines()]
 
 
 def test_urscript_halts_while_the_pose_is_unknown():
