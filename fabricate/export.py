@@ -32,27 +32,11 @@ from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.checks.mesh_checks import SOUND, sound
 from padforge.fabricate.checks.plan_checks import inspect
 from padforge.fabricate.fibre_placement.gcode import gcode
-from padforge.fabricate.fibre_placement.toolpath import (
-    Step,
-    build_instructions,
-    check_toolpath,
-    plan_toolpath,
-    summary_lines,
-)
+from padforge.fabricate.fibre_placement.toolpath import Step, check_toolpath, plan_toolpath
 from padforge.fabricate.fibre_placement.urscript import urscript
 from padforge.fabricate.materials import PLASTICS
 from padforge.fabricate.mesh import build_mesh, mesh_arrays, write_3mf, write_stl
-from padforge.fabricate.mould import (
-    Body,
-    bed_frame,
-    conductive_body,
-    conductive_plan,
-    holder_body,
-    lid_body,
-    lid_holes,
-    mould_body,
-    sizes,
-)
+from padforge.fabricate.mould import Body, bed_frame, lid_holes, printed_bodies, sizes
 from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, orientation_svg, toolpath_svg, tracks_dxf, tracks_svg
 from padforge.fabricate.outputs.laying_page import laying_document, laying_page, pad_document
 from padforge.fabricate.outputs.pictures import draw_mould, draw_tracks
@@ -111,14 +95,6 @@ class Fabrication:
         with profiling.stage("CAD solid"):
             return models(self.plan, {body.name: body.body for body in self.bodies})
 
-    def program(self, language: Callable[..., str]) -> str:
-        """Return the program of the toolpath in a language, `gcode` or `urscript`."""
-        instructions, summary = build_instructions(self.plan, self.toolpath), summary_lines(self.plan, self.toolpath)
-        return language(instructions, summary, self.plan.settings.dispenser)
-
-
-# writers of the formats
-
 
 def _write_utf8(path: Path, text: str) -> None:
     path.write_bytes(text.encode("utf-8"))  # line ends as they are: the bytes do not depend on the system
@@ -174,9 +150,9 @@ class ExportFormat(NamedTuple):
     check: Callable[[Fabrication], list[Finding]] = lambda _: []
 
 
-def _program_format(file: str, language: Callable[..., str]) -> ExportFormat:
+def _program_format(file: str, language: Callable[[Plan, Sequence[Step]], str]) -> ExportFormat:
     """Return the format of a program: with it comes a drawing of the toolpath, the same for all languages."""
-    program = {file: lambda f, path: _write_utf8(path, f.program(language))}
+    program = {file: lambda f, path: _write_utf8(path, language(f.plan, f.toolpath))}
     drawing = {"toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath))}
     return ExportFormat(program | drawing, _check_toolpath)
 
@@ -243,7 +219,8 @@ def build(
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
         plan.require_levels()
-        bodies = _build_bodies(plan)
+        meshes = [(name, body, build_mesh(body)) for name, body in printed_bodies(plan).items()]
+        bodies = [PrintedBody(name, body, mesh, *mesh_arrays(mesh)) for name, body, mesh in meshes]
     with profiling.stage("checks"):
         fabrication = Fabrication(plan, bodies, _check_bodies(plan, bodies))
     wanted = [name for name in FORMATS if name in formats]
@@ -255,20 +232,6 @@ def build(
     writers["laying.md"] = partial(_write_utf8, text=laying_page(document))
     _write_files(out, writers, document, warn)
     return document
-
-
-def _build_bodies(plan: Plan) -> list[PrintedBody]:
-    """Build all bodies to print, the mould first: all but the holder compensated for shrinkage."""
-    mould, printed = plan.settings.mould, plan.shrinkage_compensated
-    bodies = {"mould": mould_body(printed)}
-    if mould.lid:
-        bodies["lid"] = lid_body(printed)
-    if mould.conductive:
-        bodies["conductive"] = conductive_body(conductive_plan(plan).shrinkage_compensated)
-    if mould.holder:  # with conductive, wide enough for either pad
-        bodies["holder"] = holder_body(conductive_plan(plan) if mould.conductive else plan)
-    meshes = {name: build_mesh(body) for name, body in bodies.items()}
-    return [PrintedBody(name, bodies[name], mesh, *mesh_arrays(mesh)) for name, mesh in meshes.items()]
 
 
 def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:

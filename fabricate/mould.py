@@ -232,6 +232,23 @@ def holder_body(plan: Plan) -> Body:
     return _tray(marked, [hollow], mould.floor_mm, HOLDER_WALL_MM)
 
 
+def printed_bodies(plan: Plan) -> dict[str, Body]:
+    """Build all bodies to print for the plan of a pad, the mould first: all but the holder compensated for shrinkage.
+
+    Raises:
+        InputError: settings that do not fit the pad.
+    """
+    mould, printed = plan.settings.mould, plan.shrinkage_compensated
+    bodies = {"mould": mould_body(printed)}
+    if mould.lid:
+        bodies["lid"] = lid_body(printed)
+    if mould.conductive:
+        bodies["conductive"] = conductive_body(conductive_plan(plan).shrinkage_compensated)
+    if mould.holder:  # with conductive, wide enough for either pad
+        bodies["holder"] = holder_body(conductive_plan(plan) if mould.conductive else plan)
+    return bodies
+
+
 def bed_frame(plan: Plan) -> dict[str, Any]:
     """Compute the pose of the pad in its holder, which a slicer puts in the middle of the bed; mm and degrees.
 

@@ -3,25 +3,28 @@
 G0 is avoided: GRBL executes it at the machine's maximum speed whatever the feed, and hands are near.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
-from padforge.fabricate.fibre_placement.toolpath import Instruction, LinearMove, Pause
-from padforge.fabricate.settings import DispenserSettings
+from padforge.fabricate.fibre_placement.toolpath import (
+    Instruction,
+    LinearMove,
+    Pause,
+    Step,
+    build_instructions,
+    summary_lines,
+)
+from padforge.fabricate.plan import Plan
 
 
-def gcode(instructions: Iterable[Instruction], summary: Iterable[str], dispenser: DispenserSettings) -> str:
-    """Write the program, in the machine's coordinates with the pad's middle at the dispenser's origin.
+def gcode(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath, in the machine's coordinates with the pad's middle at the dispenser's origin.
 
     M0 waits until all moves are done, then for the operator.
-
-    Args:
-        instructions: of the toolpath.
-        summary: comments at the head.
-        dispenser: speeds, travel height and origin.
     """
+    dispenser = plan.settings.dispenser
     x, y = dispenser.origin_mm
     lines = [
-        *(f"; {line}" for line in summary),
+        *(f"; {line}" for line in summary_lines(plan, steps)),
         f"; the pad's middle is at X{_format(x)} Y{_format(y)}; set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
         "G21",
         "G90",
@@ -29,7 +32,7 @@ def gcode(instructions: Iterable[Instruction], summary: Iterable[str], dispenser
         f"G1 Z{_format(dispenser.travel_height_mm)} F{_format_feed(dispenser.travel_mm_s)}",
     ]
     words: dict[str, str] = {}
-    for instruction in instructions:
+    for instruction in build_instructions(plan, steps):
         if isinstance(instruction, Pause):
             lines.append(f"M0 ({instruction.message})")
             continue

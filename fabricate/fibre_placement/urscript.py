@@ -1,12 +1,21 @@
 """Toolpaths as URScript, for the arms of Universal Robots: movel over the pad, movep along a fibre, popups to wait."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from padforge.design.morphology import Array
-from padforge.fabricate.fibre_placement.toolpath import TOLERANCE_MM, Instruction, LinearMove, Pause
+from padforge.fabricate.fibre_placement.toolpath import (
+    TOLERANCE_MM,
+    Instruction,
+    LinearMove,
+    Pause,
+    Step,
+    build_instructions,
+    summary_lines,
+)
+from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DispenserSettings
 
 _BLEND_SHARE = 0.4
@@ -14,21 +23,17 @@ _BLEND_SHARE = 0.4
 _UNKNOWN = "where the pad lies is unknown: [dispenser] arm_pose in pad.toml says it"
 
 
-def urscript(instructions: Iterable[Instruction], summary: Iterable[str], dispenser: DispenserSettings) -> str:
-    """Write the program: positions in mm in the frame of the pad, transformed into the arm's base by `at`.
+def urscript(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath, in mm in the frame of the pad, transformed into the arm's base by `at`.
 
     Along a fibre the tip rounds the corners by arcs within the toolpath's tolerance. While the pose of the pad is
     unknown, the program says so and ends before anything moves.
-
-    Args:
-        instructions: of the toolpath.
-        summary: comments at the head.
-        dispenser: speeds, acceleration, travel height and pose.
     """
+    dispenser = plan.settings.dispenser
     pose, dynamics = dispenser.arm_pose or (0.0,) * 6, _dynamics(dispenser.travel_mm_s, dispenser)
     lines = [
         "def padforge_laying():",
-        *(f"  # {line}" for line in summary),
+        *(f"  # {line}" for line in summary_lines(plan, steps)),
         "  # the TCP is the mouth of the needle; pad is the middle of its upper face in the base of the arm, m and rad",
         f"  pad = p[{', '.join(f'{value:.10g}' for value in pose)}]",
         *([_popup(_UNKNOWN), "  halt"] if dispenser.arm_pose is None else []),
@@ -38,7 +43,7 @@ def urscript(instructions: Iterable[Instruction], summary: Iterable[str], dispen
         _popup("needle over the pad, all its ways free?"),
         "  here = pose_trans(pose_inv(pad), get_actual_tcp_pose())",
         f"  movel(at(here[0] * 1000, here[1] * 1000, {_format(dispenser.travel_height_mm)}), {dynamics})",
-        *(line for instruction in instructions for line in _lines(instruction, dispenser)),
+        *(line for instruction in build_instructions(plan, steps) for line in _lines(instruction, dispenser)),
         "end",
         "",
     ]

@@ -17,7 +17,7 @@ from build123d import Solid, import_step
 from padforge.design.common.files import sha256
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.fabricate import export
+from padforge.fabricate import export, mould
 from padforge.fabricate.cad import model
 from padforge.fabricate.export import FORMATS, build
 from padforge.fabricate.mesh import BODY_COLOURS
@@ -222,7 +222,7 @@ def other_solid(monkeypatch, body: str) -> None:
 
 def in_pieces(monkeypatch, body: str) -> None:
     pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
-    monkeypatch.setattr(export, body, lambda plan: pieces)
+    monkeypatch.setattr(mould, body, lambda plan: pieces)
 
 
 def full_step(*_, **__):

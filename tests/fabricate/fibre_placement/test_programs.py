@@ -31,7 +31,7 @@ PLANS = {
 
 
 def program(plan: Plan, language: Callable[..., str]) -> str:
-    return Fabrication(plan, [], []).program(language)
+    return language(plan, Fabrication(plan, [], []).toolpath)
 
 
 def require_laid(plan: Plan, run: Run, limit_mm: float, shift: tuple[float, float]) -> None:
