@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -17,7 +18,7 @@ import shapely
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import cubic, quadratic
 from padforge.design.settings import Layout
-from padforge.fabricate.settings import LeadRoom
+from padforge.fabricate.settings import WELL_SLOT_MM, FabricationSettings
 
 _HANDLE = 4 / 3 * np.tan(np.pi / 16)
 """Handles of a cubic for an eighth of a circle of radius 1, which it is within 4.3e-6 of."""
@@ -130,21 +131,51 @@ def straight_leads(ends_mm: Array, layout: Layout, border_mm: float) -> Leads:
     return Leads(tuple(pairs), (-x, -y, x, y))
 
 
-def one_side_leads(ends_mm: Array, layout: Layout, room: LeadRoom) -> Leads:
+class LeadSpacing(NamedTuple):
+    """Distances of leads to one side.
+
+    Attributes:
+        border_mm: width of the silicone around the pad in which they are straight.
+        pitch_mm: between the centre lines of neighbours.
+        radius_mm: of their bends.
+        edge_mm: from the outermost lead's centre line to the silicone's edge.
+    """
+
+    border_mm: float
+    pitch_mm: float
+    radius_mm: float
+    edge_mm: float
+
+
+def lead_spacing(settings: FabricationSettings, max_height_mm: float, flare_mm: float) -> LeadSpacing:
+    """Compute the distances of leads to one side, from the tallest ridge's height and the walls' outward lean."""
+    mould, radius = settings.mould, settings.min_bend_radius_mm
+    foot = mould.ridge_width_mm + 2 * max_height_mm * settings.ridge_slope
+    pitch = max(foot + mould.min_silicone_mm, settings.rules.min_gap_mm)
+    if mould.exit_mm:
+        width = max(mould.exit_width_mm, WELL_SLOT_MM if mould.conductive else 0)
+        pitch = max(pitch, width + 2 * flare_mm + 2 * settings.printer.line_mm)
+    edge = max(pitch / 2, foot / 2 + mould.min_silicone_mm)
+    # a fibre may meet its lead at a corner, which the rule for bends allows only within a straight stretch
+    border = max(mould.border_mm, radius / 2)
+    return LeadSpacing(border, pitch, max(radius, (foot + mould.min_silicone_mm) / 2), edge)
+
+
+def one_side_leads(ends_mm: Array, layout: Layout, spacing: LeadSpacing) -> Leads:
     """Compute leads that all end on the lower edge; fibre ends of shape (F, 2, 2), mm."""
     (half_x, half_y), (horizontals, verticals) = (side / 2 for side in layout.size_mm), layout.counts
-    gap, radius = room.spacing_mm, room.radius_mm
-    inner = half_x + room.border_mm + radius  # x of the lowest horizontal's lead
-    y_min = -half_y - room.border_mm
+    border, gap, radius, edge = spacing
+    inner = half_x + border + radius  # x of the lowest horizontal's lead
+    y_min = -half_y - border
     if verticals:
         inner = max(inner, half_x - layout.pitch_x_mm + gap)
     if horizontals:
         y_min = min(y_min, layout.pitch_y_mm - half_y - radius)
     outer = inner + horizontals * gap  # x of the innermost vertical's lead
     if not horizontals:
-        outer = max(half_x + room.border_mm + gap, 0.0)
+        outer = max(half_x + border + gap, 0.0)
     outer = max(outer, half_x - layout.pitch_x_mm + 2 * radius)
-    top = half_y + room.border_mm + radius
+    top = half_y + border + radius
     pairs = []
     for fibre, (start, end) in enumerate(ends_mm):
         if layout.family(fibre):
@@ -157,8 +188,8 @@ def one_side_leads(ends_mm: Array, layout: Layout, room: LeadRoom) -> Leads:
             x = inner + fibre * gap
             pairs.append((_down(start, [(-x, start[1])], y_min, radius), _down(end, [(x, end[1])], y_min, radius)))
     max_rank = (verticals + 1) // 2 - 1
-    x_max = (outer + max_rank * gap if verticals else inner + (horizontals - 1) * gap) + room.edge_mm
-    y_max = top + max_rank * gap + room.edge_mm if verticals else half_y + room.border_mm
+    x_max = (outer + max_rank * gap if verticals else inner + (horizontals - 1) * gap) + edge
+    y_max = top + max_rank * gap + edge if verticals else half_y + border
     return Leads(tuple(pairs), (-x_max, y_min, x_max, y_max))
 
 

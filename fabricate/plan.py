@@ -30,7 +30,7 @@ from padforge.design.paths.curves import (
 )
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import Layout
-from padforge.fabricate.leads import Lead, Leads, one_side_leads, straight_leads
+from padforge.fabricate.leads import Lead, Leads, lead_spacing, one_side_leads, straight_leads
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 FAMILIES = ("horizontal", "vertical")
@@ -241,7 +241,7 @@ class Plan:
             return straight_leads(ends, pad.layout, mould.border_mm)
         if self.nominal is not None:
             return self.nominal.leads.scaled(1 / self.nominal.settings.shrinkage_factor)
-        return one_side_leads(ends, pad.layout, self.settings.lead_room(self.heights_mm[-1], self.flare_mm))
+        return one_side_leads(ends, pad.layout, lead_spacing(self.settings, self.heights_mm[-1], self.flare_mm))
 
     def ends(self, end: int) -> list[Lead]:
         """Return the leads of all fibres' starts, 0, or other ends, 1."""

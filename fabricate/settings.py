@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
@@ -144,22 +144,6 @@ _MAX_TERRACE_STEP_MM = 0.03
 """Maximum width of the terraces of a tapered ridge: the positioning accuracy of printers."""
 
 
-class LeadRoom(NamedTuple):
-    """Distances that leads to one side keep.
-
-    Attributes:
-        border_mm: width of the silicone around the pad in which they are straight.
-        spacing_mm: between the centre lines of neighbours.
-        radius_mm: of their bends.
-        edge_mm: from the outermost lead's centre line to the silicone's edge.
-    """
-
-    border_mm: float
-    spacing_mm: float
-    radius_mm: float
-    edge_mm: float
-
-
 @dataclass(frozen=True)
 class FabricationSettings:
     """All settings of a mould and of fibre placement; the pad's fibres are those of the morphology.
@@ -230,19 +214,6 @@ class FabricationSettings:
     def min_bend_radius_mm(self) -> float:
         """Minimum bend radius by the rules and the fibre, mm."""
         return max(self.rules.min_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
-
-    def lead_room(self, max_height_mm: float, flare_mm: float) -> LeadRoom:
-        """Compute the distances of leads to one side, from the tallest ridge's height and the walls' outward lean."""
-        mould, radius = self.mould, self.min_bend_radius_mm
-        foot = mould.ridge_width_mm + 2 * max_height_mm * self.ridge_slope
-        spacing = max(foot + mould.min_silicone_mm, self.rules.min_gap_mm)
-        if mould.exit_mm:
-            width = max(mould.exit_width_mm, WELL_SLOT_MM if mould.conductive else 0)
-            spacing = max(spacing, width + 2 * flare_mm + 2 * self.printer.line_mm)
-        edge = max(spacing / 2, foot / 2 + mould.min_silicone_mm)
-        # a fibre may meet its lead at a corner, which the rule for bends allows only within a straight stretch
-        border = max(mould.border_mm, radius / 2)
-        return LeadRoom(border, spacing, max(radius, (foot + mould.min_silicone_mm) / 2), edge)
 
     def require_consistent(self, layout: Layout) -> None:
         """Check that settings do not contradict each other or the pitch of the pad.

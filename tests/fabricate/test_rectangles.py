@@ -15,6 +15,7 @@ from padforge.design.settings import PadSettings
 from padforge.fabricate.checks.plan_checks import check_plan, meshed
 from padforge.fabricate.export import build
 from padforge.fabricate.fibre_placement.toolpath import mirror_x, plan_toolpath
+from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
 from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
@@ -102,8 +103,7 @@ def test_mould_of_few_fibres_is_sound(fibres, leads):
 def test_one_side_leads_keep_their_spacing(fibres, pitches, border):
     pad = Morphology.straight(fibres, pitches)
     plan = Plan(pad, settings(pad, {"border_mm": border}, leads="one side"))
-    room = plan.settings.lead_room(plan.heights_mm[-1], plan.flare_mm)
-    apart = min(room.spacing_mm, *pitches)
+    apart = min(lead_spacing(plan.settings, plan.heights_mm[-1], plan.flare_mm).pitch_mm, *pitches)
     ways = []
     for fibre, pair in enumerate(plan.leads.pairs):
         for lead in pair:
