@@ -46,7 +46,7 @@ from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-    from padforge.fabricate.cad.model import Model
+    from padforge.fabricate.cad.model import CadModel
 
 FORMAT = "padforge-fabrication/2"
 _CAD_VOLUME, _CAD_SURFACE, _CAD_TOLERANCE_MM = 5e-4, 5e-3, 0.01
@@ -88,12 +88,12 @@ class Fabrication:
         return plan_toolpath(self.plan, fibre.diameter_mm, fibre.max_strain or math.inf)
 
     @cached_property
-    def models(self) -> "list[Model]":
+    def models(self) -> "list[CadModel]":
         """The CAD models of the bodies."""
-        from padforge.fabricate.cad.model import models
+        from padforge.fabricate.cad.model import build_models
 
         with profiling.stage("CAD solid"):
-            return models(self.plan, {body.name: body.body for body in self.bodies})
+            return build_models(self.plan, {body.name: body.body for body in self.bodies})
 
 
 def _write_utf8(path: Path, text: str) -> None:
@@ -108,10 +108,10 @@ def _write_body_3mf(fabrication: Fabrication, body: PrintedBody, path: Path) -> 
 
 
 def _write_cad(fabrication: Fabrication, path: Path) -> None:
-    from padforge.fabricate.cad.model import assembly
+    from padforge.fabricate.cad.model import assemble
     from padforge.fabricate.cad.step_file import write_step
 
-    write_step(path, shape=assembly(fabrication.models, fabrication.plan.shrinkage_compensated))
+    write_step(path, part=assemble(fabrication.models, fabrication.plan.shrinkage_compensated))
 
 
 def _check_cad(fabrication: Fabrication) -> list[Finding]:
@@ -120,7 +120,7 @@ def _check_cad(fabrication: Fabrication) -> list[Finding]:
     Raises:
         InputError: a CAD solid is not valid, or differs from its mesh.
     """
-    differences = [model.apart(body.mesh) for model, body in zip(fabrication.models, fabrication.bodies, strict=True)]
+    differences = [model.compare(body.mesh) for model, body in zip(fabrication.models, fabrication.bodies, strict=True)]
     coarseness = max(1.0, fabrication.plan.settings.mould.tolerance_mm / _CAD_TOLERANCE_MM)
     max_volume, max_surface = coarseness * _CAD_VOLUME, coarseness * _CAD_SURFACE
     for body, (volume, surface) in zip(fabrication.bodies, differences, strict=True):

@@ -180,9 +180,9 @@ def one_side_leads(ends_mm: Array, layout: Layout, spacing: LeadSpacing) -> Lead
     for fibre, (start, end) in enumerate(ends_mm):
         if layout.family(fibre):
             number = fibre - horizontals
-            to_left = 2 * number < verticals
-            away = (number if to_left else verticals - 1 - number) * gap
-            corners = [(end[0], top + away), ((-1 if to_left else 1) * (outer + away), top + away)]
+            is_left_half = 2 * number < verticals
+            away = (number if is_left_half else verticals - 1 - number) * gap
+            corners = [(end[0], top + away), ((-1 if is_left_half else 1) * (outer + away), top + away)]
             pairs.append((_down(start, [], y_min, radius), _down(end, corners, y_min, radius)))
         else:
             x = inner + fibre * gap
