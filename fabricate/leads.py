@@ -180,9 +180,9 @@ def one_side_leads(ends_mm: Array, layout: Layout, spacing: LeadSpacing) -> Lead
     for fibre, (start, end) in enumerate(ends_mm):
         if layout.family(fibre):
             number = fibre - horizontals
-            is_left_half = 2 * number < verticals
-            away = (number if is_left_half else verticals - 1 - number) * gap
-            corners = [(end[0], top + away), ((-1 if is_left_half else 1) * (outer + away), top + away)]
+            negative_x = 2 * number < verticals
+            away = (number if negative_x else verticals - 1 - number) * gap
+            corners = [(end[0], top + away), ((-1 if negative_x else 1) * (outer + away), top + away)]
             pairs.append((_down(start, [], y_min, radius), _down(end, corners, y_min, radius)))
         else:
             x = inner + fibre * gap
