@@ -1,4 +1,4 @@
-"""`padforge fabricate`: the edge where morphologies come in and moulds go out."""
+"""`padforge fabricate`: build the mould of a morphology, or check one."""
 
 from functools import partial
 from pathlib import Path
@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
     from padforge.design.morphology import Morphology
 
-MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
+_warn = partial(click.echo, err=True)
+_MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
 
 class BuildByDefault(click.Group):
-    """A group whose first word may be left out: what names no command is for `build`."""
+    """A group whose default command is `build`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Put `build` in front of arguments that begin with no command and no call for help."""
+        """Insert `build` before arguments that start with neither a command nor a help option."""
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
             args = ["build", *args]
         return super().parse_args(ctx, args)
@@ -54,7 +55,7 @@ formats_option = click.option(
 
 
 def split_formats(formats: str) -> tuple[str, ...]:
-    """The names that `--formats` lists."""
+    """Split the value of `--formats` into names."""
     return tuple(name.strip() for name in formats.split(",") if name.strip())
 
 
@@ -71,9 +72,9 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     \b
     padforge fabricate build out/pad/morphology.json --formats stl,3mf,dxf
     padforge fabricate 5.mat --out out/published   a pad of the published study
-    padforge fabricate build out/pad/morphology.json --formats gcode   the way of a machine that lays the fibres
+    padforge fabricate build out/pad/morphology.json --formats gcode   the toolpath of a machine that places the fibres
 
-    The mould is written whatever the checks find, and what they find is printed; `check` turns it into an exit code.
+    The mould is written whatever the checks find, and their findings are printed; `check` exits 1 when one fails.
     """
     from padforge.design.common.files import locked_folder
     from padforge.design.morphology import Morphology
@@ -86,14 +87,12 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     folder = out or pad_folder(morphology)
     with locked_folder(folder):
         inputs = [path for path in (morphology, spec) if path]
-        document = build_files(
-            pad, folder, split_formats(formats), settings, inputs, warn=partial(click.echo, err=True)
-        )
+        document = build_files(pad, folder, split_formats(formats), settings, inputs, warn=_warn)
     show_result(document, mould_lines(document, folder), as_json)
 
 
 def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
-    """What a person wants to know of a mould, in a few lines: where it is, and what to look at."""
+    """Summarise a fabrication document in a few lines: the mould, and the findings to look at."""
     size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     remarks = [finding for finding in document["findings"] if finding["status"] != "pass"]
     passed = len(document["findings"]) - len(remarks)
@@ -110,7 +109,9 @@ def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
 @click.argument("mesh_or_morphology", type=click.Path(path_type=Path))
 @spec_option
 @click.option(
-    "--picture", type=click.Path(dir_okay=False, path_type=Path), help="PNG to draw, with the places found marked."
+    "--picture",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="PNG to draw, with the positions of the findings marked.",
 )
 @json_option
 @click.pass_context
@@ -119,7 +120,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
 
     \b
     padforge fabricate check out/pad/mould.stl
-    padforge fabricate check out/pad/morphology.json --picture found.png
+    padforge fabricate check out/pad/morphology.json --picture findings.png
     """
     from padforge.design.common.files import atomic_file
     from padforge.fabricate.checks.plan_checks import inspect_file
@@ -138,20 +139,20 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
 
 
 def _line(finding: dict[str, Any]) -> str:
-    """A finding for people: its verdict and, of its places, the first three."""
-    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
-    more = f" and {len(places) - 3} more places" if len(places) > 3 else ""
-    where = f" at {' '.join(places[:3])}{more}" if places else ""
-    return f"{MARKS[finding['status']]} {finding['name']}: {finding['message']}{where}"
+    """Format a finding with the first three of its positions."""
+    positions = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
+    more = f" and {len(positions) - 3} more places" if len(positions) > 3 else ""
+    where = f" at {' '.join(positions[:3])}{more}" if positions else ""
+    return f"{_MARKS[finding['status']]} {finding['name']}: {finding['message']}{where}"
 
 
 def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
-    """What the mould of a pad takes, with its fabrication.json and .stl written to `folder`: ml, and failed checks."""
+    """Build the mould of a pad, write fabrication.json and .stl to `folder`, and count ml and failed checks."""
     from padforge.fabricate.export import build as build_files
 
     from .settings import FabricationSettings
 
     settings = FabricationSettings.from_spec(spec)
-    found = build_files(pad, folder, ("stl",), settings, warn=partial(click.echo, err=True))
-    failed = sum(finding["status"] == "fail" for finding in found["findings"])
-    return {"mould_ml": found["mould_volume_ml"], "silicone_ml": found["silicone_volume_ml"], "failed": failed}
+    document = build_files(pad, folder, ("stl",), settings, warn=_warn)
+    failed = sum(finding["status"] == "fail" for finding in document["findings"])
+    return {"mould_ml": document["mould_volume_ml"], "silicone_ml": document["silicone_volume_ml"], "failed": failed}

@@ -1,15 +1,16 @@
-"""Making a mould and writing it: meshes, CAD, drawings, the fabrication document and the page for the bench.
+"""Building a mould and writing its files: meshes, CAD, drawings, programs, laying page and fabrication document.
 
 The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
-appear together or not at all.
+appear together or not at all. A new export format is one line in `FORMATS`, and its writer.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,26 +32,13 @@ from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.checks.mesh_checks import SOUND, sound
 from padforge.fabricate.checks.plan_checks import inspect
 from padforge.fabricate.fibre_placement.gcode import gcode
-from padforge.fabricate.fibre_placement.toolpath import check_course, instructions, laying_steps, summary_lines
+from padforge.fabricate.fibre_placement.toolpath import Step, check_toolpath, plan_toolpath
 from padforge.fabricate.fibre_placement.urscript import urscript
 from padforge.fabricate.materials import PLASTICS
-from padforge.fabricate.mesh import write_3mf, write_stl, write_utf8
-from padforge.fabricate.mould import (
-    Body,
-    bed_frame,
-    conductive_body,
-    conductive_plan,
-    holder_body,
-    lid_body,
-    lid_holes,
-    mould_body,
-    sizes,
-)
-from padforge.fabricate.outputs.drawings import ORIENTATION_FILE as ORIENTATION_FILE
-from padforge.fabricate.outputs.drawings import orientation_svg, toolpath_svg, tracks_dxf, tracks_svg
-from padforge.fabricate.outputs.laying_page import laying_document as laying_document
-from padforge.fabricate.outputs.laying_page import laying_page
-from padforge.fabricate.outputs.laying_page import pad_document as pad_document
+from padforge.fabricate.mesh import build_mesh, mesh_arrays, write_3mf, write_stl
+from padforge.fabricate.mould import Body, bed_frame, lid_holes, printed_bodies, sizes
+from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, orientation_svg, toolpath_svg, tracks_dxf, tracks_svg
+from padforge.fabricate.outputs.laying_page import laying_document, laying_page, pad_document
 from padforge.fabricate.outputs.pictures import draw_mould, draw_tracks
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
@@ -58,56 +46,140 @@ from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-LANGUAGES = {"gcode": ("laying.gcode", gcode), "urscript": ("laying.script", urscript)}
-"""The file of each language, and what writes it."""
-
-
-@dataclass(frozen=True)
-class FibrePlacement:
-    """Texts by the names of their files, programs first, and findings; both empty where no language is asked for."""
-
-    texts: dict[str, str]
-    findings: list[Finding]
-
-
-def place_fibres(plan: Plan, languages: Collection[str]) -> FibrePlacement:
-    """The programs in the `LANGUAGES` wanted, with a picture of the ways; other names are for others to read."""
-    wanted = [name for name in LANGUAGES if name in languages]
-    if not wanted:
-        return FibrePlacement({}, [])
-    fibre = plan.settings.fibre.material
-    steps = laying_steps(plan, fibre.diameter_mm, fibre.max_strain or math.inf)
-    work, summary, dispenser = (
-        list(instructions(plan, steps)),
-        list(summary_lines(plan, steps)),
-        plan.settings.dispenser,
-    )
-    texts = {name: write(work, summary, dispenser) for name, write in map(LANGUAGES.__getitem__, wanted)}
-    return FibrePlacement(texts | {"toolpath.svg": toolpath_svg(plan, steps)}, check_course(plan, steps))
-
+    from padforge.fabricate.cad.model import CadModel
 
 FORMAT = "padforge-fabrication/2"
-FORMATS = ("stl", "3mf", "step", "svg", "dxf", "png", *LANGUAGES)
-
-Write = tuple[str, Callable[[Path], None]]
-"""A file's name and what writes it to a path."""
-
 _CAD_VOLUME, _CAD_SURFACE, _CAD_TOLERANCE_MM = 5e-4, 5e-3, 0.01
-"""How far volume and surface of a CAD solid and of its mesh may lie apart, as shares of them, at what tolerance.
+"""Maximum relative differences of volume and surface between a CAD solid and its mesh, at the last tolerance.
 
-The mesh keeps its tolerance, and where it is coarser it is off by more in proportion: chords cut their arcs' segments
-off, and a gap between two walls may be there in one of them and not in the other.
+For a coarser mesh they grow in proportion: chords cut off segments of their arcs, and a gap between two walls may be
+open in one of the two only.
 """
 
 
-@dataclass(frozen=True)
-class Printed:
-    """A body as it is printed: vertices (n, 3) mm in the precision of an STL and triangles (m, 3) vertex numbers."""
+class PrintedBody(NamedTuple):
+    """A body to print, with its mesh: vertices (n, 3), mm, in the precision of an STL, and triangles (m, 3)."""
 
     name: str
+    body: Body
     mesh: "Manifold"
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
+
+
+@dataclass(frozen=True)
+class Fabrication:
+    """All that the files of a mould are written from; toolpath and CAD models are built on first use.
+
+    Attributes:
+        plan: of the finished pad.
+        bodies: to print, the mould first.
+        findings: of all checks so far.
+    """
+
+    plan: Plan
+    bodies: list[PrintedBody]
+    findings: list[Finding]
+
+    @cached_property
+    def toolpath(self) -> list[Step]:
+        """The toolpath of the fibres, layer by layer."""
+        fibre = self.plan.settings.fibre.material
+        return plan_toolpath(self.plan, fibre.diameter_mm, fibre.max_strain or math.inf)
+
+    @cached_property
+    def models(self) -> "list[CadModel]":
+        """The CAD models of the bodies."""
+        from padforge.fabricate.cad.model import build_models
+
+        with profiling.stage("CAD solid"):
+            return build_models(self.plan, {body.name: body.body for body in self.bodies})
+
+
+def _write_utf8(path: Path, text: str) -> None:
+    path.write_bytes(text.encode("utf-8"))  # line ends as they are: the bytes do not depend on the system
+
+
+def _write_body_3mf(fabrication: Fabrication, body: PrintedBody, path: Path) -> None:
+    layout, (material, _) = fabrication.plan.pad.layout, PLASTICS[fabrication.plan.settings.printer.resin]
+    pitches = " and ".join(f"{pitch:g}" for pitch in dict.fromkeys((layout.pitch_x_mm, layout.pitch_y_mm)))
+    title = f"{body.name}, for a pad of {layout.horizontals} + {layout.verticals} fibres {pitches} mm apart"
+    write_3mf(path, body.vertices, body.triangles, name=body.name, title=title, material=material)
+
+
+def _write_cad(fabrication: Fabrication, path: Path) -> None:
+    from padforge.fabricate.cad.model import assemble
+    from padforge.fabricate.cad.step_file import write_step
+
+    write_step(path, part=assemble(fabrication.models, fabrication.plan.shrinkage_compensated))
+
+
+def _check_cad(fabrication: Fabrication) -> list[Finding]:
+    """Compare all CAD models with their meshes.
+
+    Raises:
+        InputError: a CAD solid is not valid, or differs from its mesh.
+    """
+    differences = [model.compare(body.mesh) for model, body in zip(fabrication.models, fabrication.bodies, strict=True)]
+    coarseness = max(1.0, fabrication.plan.settings.mould.tolerance_mm / _CAD_TOLERANCE_MM)
+    max_volume, max_surface = coarseness * _CAD_VOLUME, coarseness * _CAD_SURFACE
+    for body, (volume, surface) in zip(fabrication.bodies, differences, strict=True):
+        if volume > max_volume or surface > max_surface:
+            shares = f"volume {100 * volume:.3g} %, surface {100 * surface:.3g} %"
+            raise InputError(f"{body.name}: the CAD solid is not of its mesh ({shares} off); nothing was written")
+    volume, surface = (max(shares) for shares in zip(*differences, strict=True))
+    message = f"volume and surface are within {100 * volume:.3f} % and {100 * surface:.3f} % of the mesh's"
+    message += f", curves within {1000 * max(model.fit_mm for model in fabrication.models):g} µm"
+    measured, limit = [round(volume, 6), round(surface, 6)], [round(max_volume, 6), round(max_surface, 6)]
+    return [check_result("cad_solid", True, measured, limit, message)]
+
+
+def _check_toolpath(fabrication: Fabrication) -> list[Finding]:
+    return check_toolpath(fabrication.plan, fabrication.toolpath)
+
+
+class ExportFormat(NamedTuple):
+    """An export format.
+
+    Attributes:
+        files: writer of each file, called with the fabrication, the body where the name has "*" for it, and the path.
+        check: what has to be checked for it before anything is written.
+    """
+
+    files: Mapping[str, Callable[..., None]]
+    check: Callable[[Fabrication], list[Finding]] = lambda _: []
+
+
+def _program_format(file: str, language: Callable[[Plan, Sequence[Step]], str]) -> ExportFormat:
+    """Return the format of a program: with it comes a drawing of the toolpath, the same for all languages."""
+    program = {file: lambda f, path: _write_utf8(path, language(f.plan, f.toolpath))}
+    drawing = {"toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath))}
+    return ExportFormat(program | drawing, _check_toolpath)
+
+
+FORMATS = {
+    "stl": ExportFormat({"*.stl": lambda _, body, path: write_stl(path, body.vertices, body.triangles)}),
+    "3mf": ExportFormat({"*.3mf": _write_body_3mf}),
+    "step": ExportFormat({"mould.step": _write_cad}, _check_cad),
+    # drawings and pictures show the tray, compensated for shrinkage
+    "svg": ExportFormat({"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))}),
+    "dxf": ExportFormat({"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))}),
+    "png": ExportFormat(
+        {
+            "mould.png": lambda f, path: draw_mould(f.plan.shrinkage_compensated, f.findings, path),
+            "tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
+        }
+    ),
+    "gcode": _program_format("laying.gcode", gcode),
+    "urscript": _program_format("laying.script", urscript),
+}
+
+
+def require_formats(formats: Sequence[str]) -> None:
+    """Raise InputError for a format that is none of `FORMATS`."""
+    for name in check_type("formats", formats, Sequence):
+        if not isinstance(name, str) or name not in FORMATS:
+            raise InputError(f"formats: got {short_repr(name)}, allowed are {', '.join(FORMATS)}")
 
 
 def build(
@@ -119,207 +191,93 @@ def build(
     *,
     warn: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Make the mould of a pad and write it, with the lid and the second mould the settings ask for.
+    """Build the mould of a pad and write it, with the further bodies that the settings ask for.
 
-    Files of an earlier mould in `out` go, also those that are not written anew; unless somebody has changed them.
+    Files of an earlier mould in `out` that are not overwritten are deleted, unless they were changed since.
 
     Args:
         pad: the fibres.
-        out: folder that takes the files; made if missing.
+        out: folder for the files; created if missing.
         formats: which of `FORMATS` to write; `fabrication.json` and `laying.md` always are.
         settings: tray, ridges, printer, fibre, rules and dispenser.
         inputs: files the work came from, for the provenance.
-        warn: told in a line what is gone of an earlier mould, and what is left of it.
+        warn: called with a line for every file of an earlier mould that was deleted or that remains.
 
     Returns:
         The fabrication document, as written to `fabrication.json`; "sha256" has the digests of the other files.
 
     Raises:
         InputError: an unknown format, an input that is no file, settings that contradict each other or refuse this
-            pad, a mould that is no closed solid, or files that cannot be written; `out` is as it was then.
+            pad, a mould that is no closed solid, or files that cannot be written; `out` is unchanged then.
     """
     out = check_path("out", out)
     require_formats(formats)
+    inputs = [check_file(check_path("inputs", path)) for path in check_type("inputs", inputs, Sequence)]
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
-    made_by = provenance("fabricate", inputs=_require_files(inputs), packages=packages)  # minutes later they may differ
+    origin = provenance("fabricate", inputs=inputs, packages=packages)  # now: the files may change within minutes
     profiling.add_count("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
         plan.require_levels()
-        printed = [_meshed(name, body) for name, body in _bodies(plan)]
+        meshes = [(name, body, build_mesh(body)) for name, body in printed_bodies(plan).items()]
+        bodies = [PrintedBody(name, body, mesh, *mesh_arrays(mesh)) for name, body, mesh in meshes]
     with profiling.stage("checks"):
-        findings = _checked(plan, printed)
-    by_machine = place_fibres(plan, formats)
-    findings += by_machine.findings
-    cad = []
-    if "step" in formats:
-        with profiling.stage("CAD solid"):
-            file, finding = _cad(plan, printed)
-        cad.append(file)
-        findings.append(finding)
-    writes = [
-        *(write for body in printed for write in _solids(plan, body, formats)),
-        *cad,
-        *_drawings(plan, findings, formats),
-        *((name, partial(write_utf8, text=text)) for name, text in by_machine.texts.items()),
-    ]
-    document = _document(plan, printed, findings, [name for name, _ in writes], formats, made_by)
-    writes += [
-        (ORIENTATION_FILE, partial(write_utf8, text=orientation_svg(plan))),
-        ("laying.md", partial(write_utf8, text=laying_page(document))),
-    ]
-    _put_in_place(out, writes, document, warn)
+        fabrication = Fabrication(plan, bodies, _check_bodies(plan, bodies))
+    wanted = [name for name in FORMATS if name in formats]
+    for check in dict.fromkeys(FORMATS[name].check for name in reversed(wanted)):  # the toolpath's before CAD's
+        fabrication.findings.extend(check(fabrication))
+    writers = _choose_writers(fabrication, [FORMATS[name] for name in wanted])
+    document = _compile_document(fabrication, list(writers), origin)
+    writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
+    writers["laying.md"] = partial(_write_utf8, text=laying_page(document))
+    _write_files(out, writers, document, warn)
     return document
 
 
-def require_formats(formats: Sequence[str]) -> None:
-    """Raise InputError for a format that is none of `FORMATS`."""
-    for name in check_type("formats", formats, Sequence):
-        if not isinstance(name, str) or name not in FORMATS:
-            raise InputError(f"formats: got {short_repr(name)}, allowed are {', '.join(FORMATS)}")
+def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
+    """Check the mould, and that every body is a closed solid.
 
-
-def _require_files(inputs: Sequence[Path]) -> list[Path]:
-    inputs = [check_path("inputs", given) for given in check_type("inputs", inputs, Sequence)]
-    for given in inputs:
-        check_file(given)
-    return inputs
-
-
-def _put_in_place(out: Path, writes: Sequence[Write], document: dict[str, Any], warn: Callable[[str], None]) -> None:
-    """Write the files of a mould and their digests at once, and take those of an earlier one out."""
-    names = {name for name, _ in writes}
-    earlier = _earlier_files(out)
-    gone = find_unchanged(out, earlier) - names
-    with atomic_files(out, without=gone) as folder:
-        for name, write in writes:
-            with profiling.stage(f"write {name}"), reraise_write_error(out / name):
-                write(folder / name)
-        document["sha256"] = {name: sha256(folder / name) for name, _ in writes}
-        write_json(folder / "fabrication.json", document)
-    for name in sorted(gone):
-        warn(f"{out / name} is gone: it was of the mould before this one")
-    for file in sorted(out.iterdir()):
-        if file.name in earlier.keys() - names:
-            warn(f"{file} is left from the mould before this one: it is not as it was written")
-
-
-def _earlier_files(out: Path) -> dict[str, str]:
-    """The digest of every file that was written with the fabrication document in a folder, if there is one."""
-    try:
-        digests = read_json(out / "fabrication.json", FORMAT).get("sha256")
-    except InputError:
-        return {}
-    return digests if isinstance(digests, dict) else {}
-
-
-def _bodies(plan: Plan) -> list[tuple[str, Body]]:
-    """What is printed, the mould first: all but the holder larger than the pad by what the silicone shrinks."""
-    bodies = [("mould", mould_body(plan.shrinkage_compensated))]
-    if plan.settings.mould.lid:
-        bodies.append(("lid", lid_body(plan.shrinkage_compensated)))
-    if plan.settings.mould.conductive:
-        bodies.append(("conductive", conductive_body(conductive_plan(plan).shrinkage_compensated)))
-    if plan.settings.mould.holder:
-        wide = conductive_plan(plan) if plan.settings.mould.conductive else plan  # so that either pad fits
-        bodies.append(("holder", holder_body(wide)))
-    return bodies
-
-
-def _meshed(name: str, body: Body) -> Printed:
-    from padforge.fabricate.mesh import build_mesh, mesh_arrays
-
-    solid = build_mesh(body)
-    return Printed(name, solid, *mesh_arrays(solid))
-
-
-def _checked(plan: Plan, printed: Sequence[Printed]) -> list[Finding]:
-    findings = inspect(plan, printed[0].vertices, printed[0].triangles)
-    _require_sound(printed[0], findings)
-    for body in printed[1:]:
-        holes = lid_holes(plan) if body.name == "lid" else 0
-        _require_sound(body, sound(body.vertices, body.triangles, genus=holes))
+    Raises:
+        InputError: a body is no closed solid.
+    """
+    findings = inspect(plan, bodies[0].vertices, bodies[0].triangles)
+    for body in bodies:
+        genus = lid_holes(plan) if body.name == "lid" else 0
+        results = findings if body is bodies[0] else sound(body.vertices, body.triangles, genus=genus)
+        if broken := [result.message for result in results if result.name in SOUND and result.status == "fail"]:
+            raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
     return findings
 
 
-def _require_sound(body: Printed, findings: Sequence[Finding]) -> None:
-    broken = [f.message for f in findings if f.name in SOUND and f.status == "fail"]
-    if broken:
-        raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
+def _choose_writers(fabrication: Fabrication, formats: Sequence[ExportFormat]) -> dict[str, Callable[[Path], None]]:
+    """Return the writer of each file, those of the bodies first."""
+    writers = {}
+    files = [item for export in formats for item in export.files.items()]
+    for body, (file, write) in product(fabrication.bodies, files):
+        if "*" in file:
+            writers[file.replace("*", body.name)] = partial(write, fabrication, body)
+    for file, write in files:
+        if "*" not in file:
+            writers.pop(file, None)  # a drawing that several programs share comes after the last of them
+            writers[file] = partial(write, fabrication)
+    return writers
 
 
-def _solids(plan: Plan, body: Printed, formats: Sequence[str]) -> Iterator[Write]:
-    """The wanted mesh files of a body."""
-    if "stl" in formats:
-        yield f"{body.name}.stl", partial(write_stl, vertices=body.vertices, triangles=body.triangles)
-    if "3mf" in formats:
-        layout = plan.pad.layout
-        apart = " and ".join(f"{pitch:g}" for pitch in dict.fromkeys((layout.pitch_x_mm, layout.pitch_y_mm)))
-        title = f"{body.name}, for a pad of {layout.horizontals} + {layout.verticals} fibres {apart} mm apart"
-        material, _ = PLASTICS[plan.settings.printer.resin]
-        label = {"name": body.name, "title": title, "material": material}
-        yield f"{body.name}.3mf", partial(write_3mf, vertices=body.vertices, triangles=body.triangles, **label)
-
-
-def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
-    """The STEP file of all bodies, made and judged by their meshes before anything is written.
-
-    Raises:
-        InputError: a CAD solid is not valid, or not of its mesh.
-    """
-    from padforge.fabricate.cad.model import assemble, build_models
-    from padforge.fabricate.cad.step_file import write_step
-
-    made = build_models(plan, dict(_bodies(plan)))
-    apart = [model.compare(body.mesh) for model, body in zip(made, printed, strict=True)]
-    coarse = max(1.0, plan.settings.mould.tolerance_mm / _CAD_TOLERANCE_MM)
-    most_volume, most_surface = coarse * _CAD_VOLUME, coarse * _CAD_SURFACE
-    for body, (volume, surface) in zip(printed, apart, strict=True):
-        if volume > most_volume or surface > most_surface:
-            shares = f"volume {100 * volume:.3g} %, surface {100 * surface:.3g} %"
-            raise InputError(f"{body.name}: the CAD solid is not of its mesh ({shares} off); nothing was written")
-    volume, surface = (max(shares) for shares in zip(*apart, strict=True))
-    message = f"volume and surface are within {100 * volume:.3f} % and {100 * surface:.3f} % of the mesh's"
-    message += f", curves within {1000 * max(model.fit_mm for model in made):g} µm"
-    measured = [round(volume, 6), round(surface, 6)]
-    found = check_result("cad_solid", True, measured, [round(most_volume, 6), round(most_surface, 6)], message)
-    return ("mould.step", partial(write_step, part=assemble(made, plan.shrinkage_compensated))), found
-
-
-def _drawings(plan: Plan, findings: Sequence[Finding], formats: Sequence[str]) -> Iterator[Write]:
-    plan = plan.shrinkage_compensated  # they show the tray
-    if "svg" in formats:
-        yield "tracks.svg", partial(write_utf8, text=tracks_svg(plan))
-    if "dxf" in formats:
-        yield "tracks.dxf", partial(write_utf8, text=tracks_dxf(plan))
-    if "png" in formats:
-        yield "mould.png", lambda path: draw_mould(plan, findings, path)
-        yield "tracks.png", lambda path: draw_tracks(plan, path)
-
-
-def _document(
-    plan: Plan,
-    printed: Sequence[Printed],
-    findings: Sequence[Finding],
-    files: Sequence[str],
-    formats: Sequence[str],
-    made_by: Mapping[str, Any],
-) -> dict[str, Any]:
-    """The fabrication document: all a lab needs to print, cast, cut and lay."""
-    settings = plan.settings
-    size = [round(side, 6) for side in np.ptp(printed[0].vertices.astype(float), axis=0).tolist()]
+def _compile_document(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> dict[str, Any]:
+    """Compile the fabrication document: all that a lab needs to print, cast, cut and place fibres."""
+    plan, settings, mould = fabrication.plan, fabrication.plan.settings, fabrication.bodies[0]
     rim = settings.mould.floor_mm + plan.shrinkage_compensated.silicone_mm
-    pins = printed[0].mesh.trim_by_plane((0, 0, 1), rim).volume()
-    bench = laying_document(plan, printed[0].mesh.volume() - pins)
+    pins_mm3 = mould.mesh.trim_by_plane((0, 0, 1), rim).volume()
+    laying = laying_document(plan, mould.mesh.volume() - pins_mm3)
     return {
         "format": FORMAT,
-        "files": list(files),
-        "size_mm": size,
+        "files": files,
+        "size_mm": [round(side, 6) for side in np.ptp(mould.vertices.astype(float), axis=0).tolist()],
         "sizes": sizes(plan),
-        "mould_volume_ml": round(printed[0].mesh.volume() / 1000, 4),
-        "silicone_volume_ml": bench["silicone"]["volume_ml"],
-        "findings": [finding.document() for finding in findings],
-        **bench,
+        "mould_volume_ml": round(mould.mesh.volume() / 1000, 4),
+        "silicone_volume_ml": laying["silicone"]["volume_ml"],
+        "findings": [finding.document() for finding in fabrication.findings],
+        **laying,
         **({"frame": bed_frame(plan)} if settings.mould.holder else {}),
         "settings": {
             "pitch_mm": plan.pad.pitch_mm,
@@ -329,7 +287,30 @@ def _document(
             "rules": settings.rules.model_dump(include={"min_bend_radius_mm"}),
             "silicone": settings.silicone.model_dump(mode="json"),
             "fibre": settings.fibre.model_dump(),
-            **({"dispenser": settings.dispenser.model_dump(mode="json")} if {*LANGUAGES} & {*formats} else {}),
+            **({"dispenser": settings.dispenser.model_dump(mode="json")} if "toolpath.svg" in files else {}),
         },
-        "provenance": dict(made_by),
+        "provenance": dict(origin),
     }
+
+
+def _write_files(
+    out: Path, writers: Mapping[str, Callable[[Path], None]], document: dict[str, Any], warn: Callable[[str], None]
+) -> None:
+    """Write the files of a mould and their digests at once, and delete those of an earlier one."""
+    try:
+        earlier = read_json(out / "fabrication.json", FORMAT).get("sha256")
+    except InputError:
+        earlier = {}
+    earlier = earlier if isinstance(earlier, dict) else {}
+    deleted = find_unchanged(out, earlier) - writers.keys()
+    with atomic_files(out, without=deleted) as folder:
+        for name, write in writers.items():
+            with profiling.stage(f"write {name}"), reraise_write_error(out / name):
+                write(folder / name)
+        document["sha256"] = {name: sha256(folder / name) for name in writers}
+        write_json(folder / "fabrication.json", document)
+    for name in sorted(deleted):
+        warn(f"{out / name} is gone: it was of the mould before this one")
+    for file in sorted(out.iterdir()):
+        if file.name in earlier.keys() - writers.keys():
+            warn(f"{file} is left from the mould before this one: it is not as it was written")

@@ -1,7 +1,7 @@
-"""`[mould]`, `[printer]` and `[dispenser]` of `pad.toml`, and everything a mould depends on gathered in one object."""
+"""Settings of a mould: `[mould]`, `[printer]` and `[dispenser]` of `pad.toml`, and all that it depends on together."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
@@ -17,17 +17,17 @@ class MouldSettings(Settings):
     """`[mould]`: the tray the silicone is cast in and the ridges that leave the tracks.
 
     The pad is cast with its tracks down: a taller ridge leaves a track deeper in the silicone. The defaults keep
-    0.5 mm between two 0.3 mm fibres that cross, and are whole numbers of 0.1 mm and of 0.2 mm layers.
+    0.5 mm between two 0.3 mm fibres that cross, and are multiples of 0.1 mm and of 0.2 mm layers.
 
     Attributes:
-        levels: "as_needed": one ridge height a family, and further ones where fibres of one family cross, each as
-            much taller as the deep family is than the shallow one; "two": a pad with such crossings is refused.
+        levels: "as_needed": one ridge height a family, and further ones where fibres of one family cross, spaced by the
+            difference of the families' heights; "two": a pad with such crossings is refused.
         exit_mm, exit_width_mm: slots in the wall around every ridge end; they leave a tongue of silicone on the pad
             that relieves the lead of strain.
-        holder: a shallow tray without ridges, to be printed last and left on the bed, in which the finished pad lies as
-            it was cast while the printer presses it; its place is then known (`frame` in fabrication.json).
+        holder: a shallow tray without ridges, printed last and left on the bed, which holds the finished pad in the
+            pose of casting while the printer presses it; `frame` in fabrication.json is that pose.
         conductive: a second mould with a well at every ridge end, for casting a conductive material into the tracks
-            in place of laid fibres.
+            in place of fibres.
     """
 
     floor_mm: float = Field(default=2.0, ge=0.4, le=50, description="thickness of the tray's floor, mm")
@@ -56,12 +56,12 @@ class MouldSettings(Settings):
 
     @property
     def level_step_mm(self) -> float:
-        """How much taller the ridges of one level are than those of the level below, mm."""
+        """Difference of ridge height from one layer to the next, mm."""
         return self.deep_ridge_height_mm - self.shallow_ridge_height_mm
 
 
 class PrinterSettings(Settings):
-    """`[printer]`: what the mould is printed on."""
+    """`[printer]`: the 3D printer of the mould."""
 
     nozzle_mm: float = Field(default=0.4, ge=0.01, le=5, description="nozzle diameter (resin: pixel size), mm")
     layer_mm: float = Field(default=0.1, ge=0.01, le=2, description="layer height, mm")
@@ -75,44 +75,40 @@ class PrinterSettings(Settings):
 
     @property
     def line_mm(self) -> float:
-        """The narrowest that it draws: its nozzle, or two pixels of its screen."""
+        """Minimum width of a printed line: the nozzle, or two pixels of a resin printer."""
         return self.nozzle_mm * (2 if self.resin else 1)
 
-    def is_whole(self, height_mm: float) -> bool:
-        """Whether a height is a whole number of layers."""
+    def is_whole_layers(self, height_mm: float) -> bool:
+        """Return whether a height is a whole number of layers."""
         layers = height_mm / self.layer_mm
         return round(layers) > 0 and abs(layers - round(layers)) <= 1e-6
 
 
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
-Place = Annotated[tuple[Coordinate, Coordinate], BeforeValidator(as_tuple)]
+Metres = Annotated[float, Field(ge=-10, le=10)]
+"""A coordinate in an arm's base; beyond its reach, the value was meant as mm."""
+Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Box = Annotated[
     tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(as_tuple)
 ]
-Metres = Annotated[float, Field(ge=-10, le=10)]
-"""No arm reaches farther: what is beyond was meant to be mm."""
-Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Pose = Annotated[
-    tuple[Metres, Metres, Metres, Angle, Angle, Angle] | None,
-    BeforeValidator(as_tuple),
-    *null_as("unknown"),
+    tuple[Metres, Metres, Metres, Angle, Angle, Angle] | None, BeforeValidator(as_tuple), *null_as("unknown")
 ]
 
 
 class DispenserSettings(Settings):
-    """`[dispenser]`: what lays the fibres where no hand does, a needle on a gantry or in an arm.
+    """`[dispenser]`: the needle on a gantry or an arm that places the fibres by machine.
 
-    The pad lies turned over, tracks up; z is 0 at its upper face. By default the needle is a tube of thin wall through
-    which a fibre of 0.3 mm runs and which fits into a track of 0.4 mm; it is slow, for hands are near, and a spool
-    hangs on it.
+    The pad lies turned over, tracks up; z is 0 at its upper face. By default the needle is a thin-walled tube for a
+    fibre of 0.3 mm which fits into a track of 0.4 mm; it is slow, since hands are near and it pulls on a spool.
 
     Attributes:
-        travel_height_mm: above the pad, and what stands out of it, on the way from one fibre to the next.
-        acceleration_mm_s2: in a bend of radius r the tip is no faster than the root of r times this.
-        origin_mm: where the middle of the pad lies on the machine.
-        box_mm: x, y and z from and to, as the machine counts them, which the tip may not leave; for an arm, which
-            counts from the middle of the pad, less the origin.
-        arm_pose: of the middle of the pad, x to the right and z up, in the base of a UR arm; the script does not move
+        travel_height_mm: above the pad, and anything that protrudes from it, between fibres.
+        acceleration_mm_s2: limits the speed in a bend of radius r to sqrt(acceleration r).
+        origin_mm: position of the pad's middle on the machine.
+        box_mm: limits of x, y and z in the machine's coordinates, which the tip may not leave; for an arm, which
+            counts from the pad's middle, less the origin.
+        arm_pose: of the pad's middle, x to the right and z up, in the base of a UR arm; the script does not move
             the arm while it is unknown.
     """
 
@@ -121,7 +117,9 @@ class DispenserSettings(Settings):
     travel_mm_s: float = Field(default=30.0, ge=0.1, le=500, description="speed between fibres, mm/s")
     feed_mm_s: float = Field(default=10.0, ge=0.1, le=500, description="speed along a straight fibre, mm/s")
     acceleration_mm_s2: float = Field(default=100.0, ge=1, le=1e5, description="greatest acceleration, mm/s^2")
-    origin_mm: Place = Field(default=(110.0, 110.0), description="the pad's middle [x, y] on the machine, mm")
+    origin_mm: Annotated[tuple[Coordinate, Coordinate], BeforeValidator(as_tuple)] = Field(
+        default=(110.0, 110.0), description="the pad's middle [x, y] on the machine, mm"
+    )
     box_mm: Box = Field(
         default=(0.0, 220.0, 0.0, 220.0, -20.0, 50.0),
         description="where the tip may go on the machine, [x0, x1, y0, y1, z0, z1], mm",
@@ -132,51 +130,25 @@ class DispenserSettings(Settings):
 
     @field_validator("box_mm")
     @classmethod
-    def _from_low_to_high(cls, box_mm: Box) -> Box:
+    def _check_ascending(cls, box_mm: Box) -> Box:
         if any(low >= high for low, high in zip(box_mm[::2], box_mm[1::2], strict=True)):
             raise ValueError("each axis goes from low to high: [x0, x1, y0, y1, z0, z1]")
         return box_mm
-
-
-STEP_MM = 0.03
-"""Width of the terraces of a tapered ridge: no wider than what printers place a line by."""
 
 
 WELL_MM, WELL_RIM_MM = 3.0, 1.0
 """Diameter of the wells for conductive material, and silicone around one."""
 WELL_SLOT_MM = WELL_MM + 2 * WELL_RIM_MM
 """Length and width of the slots of a mould with wells."""
-
-
-@dataclass(frozen=True)
-class LeadRoom:
-    """What leads to one side keep.
-
-    Attributes:
-        border_mm: of silicone around the pad, in which they are straight. apart_mm: between middles of neighbours.
-        radius_mm: of their bends. edge_mm: from the outermost lead's middle to the silicone's edge.
-    """
-
-    border_mm: float
-    apart_mm: float
-    radius_mm: float
-    edge_mm: float
-
-
-_SECTIONS: dict[str, type[Any]] = {"mould": MouldSettings, "printer": PrinterSettings}
-_SECTIONS |= {"pad": PadSettings, "rules": RulesSettings, "silicone": SiliconeSettings, "fibre": FibreSettings}
-_SECTIONS |= {"dispenser": DispenserSettings}
-
-_ACROSS = ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm")
-_RIDGES, _DEPTH = ("deep_ridge_height_mm", "shallow_ridge_height_mm"), ("silicone_mm",)
-"""Lengths of `[mould]` that the pad has too: seen from above, of the ridges upright, and of the cavity upright."""
+_MAX_TERRACE_STEP_MM = 0.03
+"""Maximum width of the terraces of a tapered ridge: the positioning accuracy of printers."""
 
 
 @dataclass(frozen=True)
 class FabricationSettings:
-    """All that shapes a mould, and the way of what lays its fibres, beside the morphology.
+    """All settings of a mould and of fibre placement; the pad's fibres are those of the morphology.
 
-    Of `[pad]` the deep family, keep-outs, leads and the radius it is bent to are used; its fibres are the morphology's.
+    From `[pad]` come the deep family, keep-outs, leads and the radius that it is bent to.
     """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
@@ -188,99 +160,86 @@ class FabricationSettings:
     dispenser: DispenserSettings = field(default_factory=DispenserSettings)
 
     def __post_init__(self) -> None:
-        for name, model in _SECTIONS.items():
+        for name, model in self._models().items():
             check_type(name, getattr(self, name), model)
 
     @classmethod
-    def from_spec(cls, spec: Spec) -> "FabricationSettings":
-        """The sections of one `pad.toml`."""
-        return cls(*map(check_type("spec", spec, Spec).section, _SECTIONS.values()))
+    def _models(cls) -> dict[str, Any]:
+        return {section.name: section.default_factory for section in fields(cls)}
 
-    @property
-    def flare_mm(self) -> float:
-        """How much wider the cavity is at the top than at the floor, both sides together, at least, mm."""
-        return 2 * self.mould.silicone_mm * math.tan(math.radians(self.mould.wall_draft_deg))
+    @classmethod
+    def from_spec(cls, spec: Spec) -> "FabricationSettings":
+        """Read the sections of a `pad.toml`."""
+        return cls(*map(check_type("spec", spec, Spec).section, cls._models().values()))
 
     @property
     def ridge_slope(self) -> float:
-        """How much a ridge widens on either side per mm of height, downwards."""
+        """Widening of a ridge on either side per mm of height, downwards."""
         return math.tan(math.radians(self.mould.ridge_draft_deg))
 
     @property
     def terrace_mm(self) -> float:
-        """Height of the terraces that taper a ridge: as many layers as keep their steps within `STEP_MM`, or one."""
+        """Height of a tapered ridge's terraces: as many layers as limit their steps, or one."""
         layer = self.printer.layer_mm
         step = self.ridge_slope * layer
-        return layer * max(1, int(STEP_MM / step)) if step else math.inf
+        return layer * max(1, int(_MAX_TERRACE_STEP_MM / step)) if step else math.inf
 
     @property
     def shrinkage_factor(self) -> float:
-        """How large the pad is as a share of its mould: 1 - shrinkage."""
+        """Ratio of the pad's size to that of its mould: 1 - shrinkage."""
         return 1 - self.silicone.material.shrinkage
 
     def shrinkage_compensated(self) -> "FabricationSettings":
-        """Those of the mould, larger by 1 / `shrunk` and taken for what does not shrink; floor and walls are as set.
+        """Return the settings of the mould: lengths of the pad larger by 1 / `shrinkage_factor`, without shrinkage.
 
-        What is whole layers high stays so: ridges, or the cavity. A printer makes whole layers of any height, and of
-        one that lies between them, such as the 0.4004 mm that 0.4 mm by 0.1 % would be, every slicer its own. So it
-        is rounded here, and known: what is set comes out within half a layer (`Plan.depths_mm` has what does).
+        Floor and walls stay as set. Heights in whole layers, of the ridges or of the cavity, remain so, since slicers
+        treat fractions of a layer differently: the pad's come out within half a layer (`Plan.depths_mm`).
         """
-        larger = {key: getattr(self.mould, key) / self.shrinkage_factor for key in (*_ACROSS, *_RIDGES, *_DEPTH)}
-        layer = self.printer.layer_mm
-        for keys in (_RIDGES, _DEPTH):
-            if all(self.printer.is_whole(getattr(self.mould, key)) for key in keys):
+        ridges, depth = ("deep_ridge_height_mm", "shallow_ridge_height_mm"), ("silicone_mm",)
+        horizontal = ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm")
+        factor, layer = self.shrinkage_factor, self.printer.layer_mm
+        larger = {key: getattr(self.mould, key) / factor for key in (*horizontal, *ridges, *depth)}
+        for keys in (ridges, depth):
+            if all(self.printer.is_whole_layers(getattr(self.mould, key)) for key in keys):
                 larger |= {key: round(round(larger[key] / layer) * layer, 9) for key in keys}
-        mould = self.mould.model_copy(update=larger)
-        keep_outs = tuple(
-            tuple((x / self.shrinkage_factor, y / self.shrinkage_factor) for x, y in each)
-            for each in self.pad.keep_out_mm
+        keep_outs = tuple(tuple((x / factor, y / factor) for x, y in corners) for corners in self.pad.keep_out_mm)
+        return replace(
+            self,
+            mould=self.mould.model_copy(update=larger),
+            pad=self.pad.model_copy(update={"keep_out_mm": keep_outs}),
+            silicone=self.silicone.model_copy(update={"shrinkage": 0.0}),
         )
-        pad = self.pad.model_copy(update={"keep_out_mm": keep_outs})
-        return replace(self, mould=mould, pad=pad, silicone=self.silicone.model_copy(update={"shrinkage": 0.0}))
 
     @property
     def min_bend_radius_mm(self) -> float:
-        """Radius of the tightest bend that the rules and the fibre allow, mm."""
+        """Minimum bend radius by the rules and the fibre, mm."""
         return max(self.rules.min_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
 
-    def lead_room(self, tallest_mm: float, flare_mm: float) -> "LeadRoom":
-        """What leads to one side keep, for ridges so tall and walls that lean outwards so far."""
-        mould = self.mould
-        foot = mould.ridge_width_mm + 2 * tallest_mm * self.ridge_slope
-        apart = max(foot + mould.min_silicone_mm, self.rules.min_gap_mm)
-        if mould.exit_mm:
-            width = max(mould.exit_width_mm, WELL_SLOT_MM if mould.conductive else 0)
-            apart = max(apart, width + 2 * flare_mm + 2 * self.printer.line_mm)
-        edge = max(apart / 2, foot / 2 + mould.min_silicone_mm)
-        # a fibre may meet its lead at a corner, which the rule for bends only lets pass in a straight stretch
-        border = max(mould.border_mm, self.min_bend_radius_mm / 2)
-        return LeadRoom(border, apart, max(self.min_bend_radius_mm, (foot + mould.min_silicone_mm) / 2), edge)
-
     def require_consistent(self, layout: Layout) -> None:
-        """Refuse settings that contradict each other or the pitch of the pad.
+        """Check that settings do not contradict each other or the pitch of the pad.
 
         Raises:
             InputError: names the key, its value and what is allowed.
         """
         mould = self.mould
-        across = (layout.pitch_y_mm, layout.horizontals), (layout.pitch_x_mm, layout.verticals)
-        pitch_mm = min(pitch for pitch, count in across if count)
-        _require_less("ridge_width_mm", mould.ridge_width_mm, pitch_mm, "the pitch")
-        _require_less("tolerance_mm", mould.tolerance_mm, mould.ridge_width_mm / 4, "a quarter of ridge_width_mm")
+        pitches = (layout.pitch_y_mm, layout.horizontals), (layout.pitch_x_mm, layout.verticals)
+        pitch_mm = min(pitch for pitch, count in pitches if count)
+        _check_less("ridge_width_mm", mould.ridge_width_mm, pitch_mm, "the pitch")
+        _check_less("tolerance_mm", mould.tolerance_mm, mould.ridge_width_mm / 4, "a quarter of ridge_width_mm")
         shallow, deep = mould.shallow_ridge_height_mm, mould.deep_ridge_height_mm
-        _require_less("shallow_ridge_height_mm", shallow, deep, "deep_ridge_height_mm")
-        _require_less("deep_ridge_height_mm", deep, mould.silicone_mm, "silicone_mm")
+        _check_less("shallow_ridge_height_mm", shallow, deep, "deep_ridge_height_mm")
+        _check_less("deep_ridge_height_mm", deep, mould.silicone_mm, "silicone_mm")
         if mould.exit_mm:
-            if self.pad.leads == "one side":  # where the leads of horizontals keep a distance of their own
+            if self.pad.leads == "one side":  # the leads of horizontals have a spacing of their own
                 pitch_mm = layout.pitch_x_mm if layout.verticals else math.inf
             if mould.exit_width_mm <= mould.ridge_width_mm:
                 allowed = f"more than ridge_width_mm, {mould.ridge_width_mm:g} mm"
                 raise InputError(f"[mould] exit_width_mm: got {mould.exit_width_mm:g}, allowed is {allowed}")
-            room = pitch_mm - self.flare_mm
-            if room <= mould.ridge_width_mm:
-                lean = f"the walls lean outwards by {self.flare_mm:.3g} mm, the pitch is {pitch_mm:g} mm"
+            flare_mm = 2 * mould.silicone_mm * math.tan(math.radians(mould.wall_draft_deg))  # of both sides together
+            if pitch_mm - flare_mm <= mould.ridge_width_mm:
+                lean = f"the walls lean outwards by {flare_mm:.3g} mm, the pitch is {pitch_mm:g} mm"
                 raise InputError(f"[mould] exit_mm: got {mould.exit_mm:g}, allowed is 0 only: {lean}")
-            _require_less("exit_width_mm", mould.exit_width_mm, room, "the pitch between slots")
+            _check_less("exit_width_mm", mould.exit_width_mm, pitch_mm - flare_mm, "the pitch between slots")
         if mould.spout and not mould.lid:
             raise InputError("[mould] spout: got true, allowed only with lid = true, which it is a part of")
 
@@ -288,6 +247,6 @@ class FabricationSettings:
 DEFAULTS = FabricationSettings()
 
 
-def _require_less(key: str, value: float, bound: float, name: str) -> None:
+def _check_less(key: str, value: float, bound: float, name: str) -> None:
     if value >= bound:
         raise InputError(f"[mould] {key}: got {value:g}, allowed is less than {name}, {bound:g} mm")

@@ -24,7 +24,7 @@ from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.mould import (
-    COLOURS,
+    BODY_COLOURS,
     INTO_FLOOR_MM,
     Body,
     Prism,
@@ -49,7 +49,7 @@ FITS_MM = (2e-3, 5e-4, 1e-4)
 
 Curves that hardly cross may meet in another order than the outlines they replace; finer ones do not.
 """
-_PART_COLOURS = {TRAY: COLOURS["mould"], HORIZONTAL_TRACKS: HORIZONTAL, VERTICAL_TRACKS: VERTICAL}
+_PART_COLOURS = {TRAY: BODY_COLOURS["mould"], HORIZONTAL_TRACKS: HORIZONTAL, VERTICAL_TRACKS: VERTICAL}
 _GREY = "#5D6B7A"
 _WELL_SIDES = 512
 """Sides of the polygons that stand for the round wells until these become arcs."""
@@ -139,7 +139,7 @@ def build_body_model(body: Body, name: str) -> CadModel:
 
     Args:
         body: prisms of the body.
-        name: one of `COLOURS`.
+        name: one of `BODY_COLOURS`.
 
     Raises:
         InputError: the CAD kernel finds the solid invalid.
@@ -147,7 +147,7 @@ def build_body_model(body: Body, name: str) -> CadModel:
     solids = _build_valid({name: lambda: [solid.wrapped for solid in body_solid(body).solids()]})
     if not solids:
         raise InputError(f"{name}: the CAD kernel finds the solid invalid; leave step out of the formats")
-    return CadModel(CadPart(name, COLOURS[name], solids[name]))
+    return CadModel(CadPart(name, BODY_COLOURS[name], solids[name]))
 
 
 def build_models(plan: Plan, bodies: Mapping[str, Body]) -> list[CadModel]:

@@ -143,7 +143,7 @@ def _layers(plan: Plan) -> Finding:
         "shallow_ridge_height_mm": mould.shallow_ridge_height_mm,
         "deep_ridge_height_mm": mould.deep_ridge_height_mm,
     }
-    uneven = [key for key, height in heights.items() if not printer.is_whole(height)]
+    uneven = [key for key, height in heights.items() if not printer.is_whole_layers(height)]
     least = min(heights.values()) / layer
     if least < 2 - 1e-6:
         return Finding("layers", "fail", least, 2.0, f"the lowest step has {least:.2f} layers of {layer:g} mm")

@@ -1,68 +1,64 @@
-"""The work as G-code that Marlin and GRBL both read: G1 in mm and mm/min, M0 to wait, nothing else.
+"""Toolpaths as G-code for both Marlin and GRBL: G1 in mm and mm/min, M0 to wait, nothing else.
 
-G0 is left out: GRBL goes it as fast as the machine can, whatever speed is said, and hands are near.
+G0 is avoided: GRBL executes it at the machine's maximum speed whatever the feed, and hands are near.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
-from padforge.fabricate.fibre_placement.toolpath import Go, Instruction, Lay, Pause, Place
-from padforge.fabricate.settings import DispenserSettings
+from padforge.fabricate.fibre_placement.toolpath import (
+    Instruction,
+    LinearMove,
+    Pause,
+    Step,
+    build_instructions,
+    summary_lines,
+)
+from padforge.fabricate.plan import Plan
 
-_DIGITS = 3
-"""To the micrometre."""
 
+def gcode(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath, in the machine's coordinates with the pad's middle at the dispenser's origin.
 
-def gcode(work: Iterable[Instruction], summary: Iterable[str], dispenser: DispenserSettings) -> str:
-    """The program: axes as the machine counts them, with the pad's middle at the dispenser's origin.
-
-    M0 waits until all ways are gone, then for the person.
+    M0 waits until all moves are done, then for the operator.
     """
+    dispenser = plan.settings.dispenser
     x, y = dispenser.origin_mm
-    head = [
-        *(f"; {line}" for line in summary),
-        f"; the pad's middle is at X{_number(x)} Y{_number(y)}; set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
+    lines = [
+        *(f"; {line}" for line in summary_lines(plan, steps)),
+        f"; the pad's middle is at X{_format(x)} Y{_format(y)}; set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
         "G21",
         "G90",
         "M0 (needle over the pad, zero of z is set)",
-        f"G1 Z{_number(dispenser.travel_height_mm)} F{_per_minute(dispenser.travel_mm_s)}",
+        f"G1 Z{_format(dispenser.travel_height_mm)} F{_format_feed(dispenser.travel_mm_s)}",
     ]
-    return "\n".join([*head, *_body(work, dispenser), ""])
-
-
-def _body(work: Iterable[Instruction], dispenser: DispenserSettings) -> Iterator[str]:
-    last: dict[str, str] = {}
-    for told in work:
-        if isinstance(told, Pause):
-            yield f"M0 ({told.message})"
+    words: dict[str, str] = {}
+    for instruction in build_instructions(plan, steps):
+        if isinstance(instruction, Pause):
+            lines.append(f"M0 ({instruction.message})")
             continue
-        for place, speed in _corners(told):
-            words = _words(place, speed, dispenser)
-            changed = [letter + word for letter, word in words.items() if last.get(letter) != word]
-            if any(word[0] != "F" for word in changed):  # else it stands there already
-                yield " ".join(["G1", *changed])
-                last = words
+        for (u, v, z), speed in _moves(instruction):
+            axes = {"X": _format(x + u), "Y": _format(y + v), "Z": _format(z)}
+            target = axes | {"F": _format_feed(speed)}
+            changed = [letter + number for letter, number in target.items() if words.get(letter) != number]
+            if any(word[0] != "F" for word in changed):  # else the needle is there already
+                lines.append(" ".join(["G1", *changed]))
+                words = target
+    return "\n".join([*lines, ""])
 
 
-def _corners(told: Go | Lay) -> Iterator[tuple[Place, float]]:
-    """Where to, and how fast, one after the other."""
-    if isinstance(told, Go):
-        yield told.place, told.speed_mm_s
-        return
-    stroke = told.stroke
-    for (x, y), feed in zip(stroke.positions_mm[1:].tolist(), stroke.feeds_mm_s.tolist(), strict=True):
-        yield (x, y, stroke.z_mm), feed
+def _moves(instruction: Instruction) -> Iterator[tuple[tuple[float, float, float], float]]:
+    """Yield the target positions and speeds of a move or a stroke."""
+    if isinstance(instruction, LinearMove):
+        yield instruction.position_mm, instruction.speed_mm_s
+    elif not isinstance(instruction, Pause):
+        feeds = instruction.feeds_mm_s.tolist()
+        for (x, y), feed in zip(instruction.positions_mm[1:].tolist(), feeds, strict=True):
+            yield (x, y, instruction.z_mm), feed
 
 
-def _words(place: Place, speed_mm_s: float, dispenser: DispenserSettings) -> dict[str, str]:
-    x, y = dispenser.origin_mm
-    axes = {"X": _number(x + place[0]), "Y": _number(y + place[1]), "Z": _number(place[2])}
-    return {**axes, "F": _per_minute(speed_mm_s)}
+def _format(value: float) -> str:
+    return f"{round(value, 3) + 0.0:.10g}"
 
 
-def _number(value: float) -> str:
-    return f"{round(value, _DIGITS) + 0.0:.10g}"
-
-
-def _per_minute(speed_mm_s: float) -> str:
-    """At least 1: a feed of 0 is none."""
-    return f"{max(1, round(60 * speed_mm_s))}"
+def _format_feed(speed_mm_s: float) -> str:
+    return f"{max(1, round(60 * speed_mm_s))}"  # mm/min; firmwares ignore a feed of 0

@@ -1,29 +1,39 @@
-"""The work as URScript, for the arms of Universal Robots: movel over the pad, movep along a fibre, popups to wait."""
+"""Toolpaths as URScript, for the arms of Universal Robots: movel over the pad, movep along a fibre, popups to wait."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from padforge.design.morphology import Array
-from padforge.fabricate.fibre_placement.toolpath import TOLERANCE_MM, Go, Instruction, Pause, Stroke
+from padforge.fabricate.fibre_placement.toolpath import (
+    TOLERANCE_MM,
+    Instruction,
+    LinearMove,
+    Pause,
+    Step,
+    build_instructions,
+    summary_lines,
+)
+from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DispenserSettings
 
 _BLEND_SHARE = 0.4
-"""Of the shorter of two pieces: the arcs at its ends may not meet."""
+"""Maximum blend as a share of the shorter of two segments: the arcs at its ends may not meet."""
 _UNKNOWN = "where the pad lies is unknown: [dispenser] arm_pose in pad.toml says it"
 
 
-def urscript(work: Iterable[Instruction], summary: Iterable[str], dispenser: DispenserSettings) -> str:
-    """The program: places in mm in the frame of the pad, which `at` puts into the base of the arm.
+def urscript(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath, in mm in the frame of the pad, transformed into the arm's base by `at`.
 
-    Along a fibre the tip goes through the corners on arcs that stay within the tolerance of the course. Where nobody
-    knows how the pad lies, the program says so and ends before anything moves.
+    Along a fibre the tip rounds the corners by arcs within the toolpath's tolerance. While the pose of the pad is
+    unknown, the program says so and ends before anything moves.
     """
+    dispenser = plan.settings.dispenser
     pose, dynamics = dispenser.arm_pose or (0.0,) * 6, _dynamics(dispenser.travel_mm_s, dispenser)
     lines = [
         "def padforge_laying():",
-        *(f"  # {line}" for line in summary),
+        *(f"  # {line}" for line in summary_lines(plan, steps)),
         "  # the TCP is the mouth of the needle; pad is the middle of its upper face in the base of the arm, m and rad",
         f"  pad = p[{', '.join(f'{value:.10g}' for value in pose)}]",
         *([_popup(_UNKNOWN), "  halt"] if dispenser.arm_pose is None else []),
@@ -32,38 +42,34 @@ def urscript(work: Iterable[Instruction], summary: Iterable[str], dispenser: Dis
         "  end",
         _popup("needle over the pad, all its ways free?"),
         "  here = pose_trans(pose_inv(pad), get_actual_tcp_pose())",
-        f"  movel(at(here[0] * 1000, here[1] * 1000, {_number(dispenser.travel_height_mm)}), {dynamics})",
-        *_body(work, dispenser),
+        f"  movel(at(here[0] * 1000, here[1] * 1000, {_format(dispenser.travel_height_mm)}), {dynamics})",
+        *(line for instruction in build_instructions(plan, steps) for line in _lines(instruction, dispenser)),
         "end",
         "",
     ]
     return "\n".join(lines)
 
 
-def _body(work: Iterable[Instruction], dispenser: DispenserSettings) -> Iterator[str]:
-    for told in work:
-        if isinstance(told, Pause):
-            yield _popup(told.message)
-        elif isinstance(told, Go):
-            yield f"  movel(at({', '.join(map(_number, told.place))}), {_dynamics(told.speed_mm_s, dispenser)})"
-        else:
-            yield from _laid(told.stroke, dispenser)
+def _lines(instruction: Instruction, dispenser: DispenserSettings) -> Iterator[str]:
+    if isinstance(instruction, Pause):
+        yield _popup(instruction.message)
+    elif isinstance(instruction, LinearMove):
+        position = _format(*instruction.position_mm)
+        yield f"  movel(at({position}), {_dynamics(instruction.speed_mm_s, dispenser)})"
+    else:
+        corners = np.round(instruction.positions_mm, 3)
+        feeds, blends = instruction.feeds_mm_s.tolist(), _blend_radii(corners).tolist()
+        for (x, y), feed, blend in zip(corners[1:].tolist(), feeds, blends, strict=True):
+            position = _format(x, y, instruction.z_mm)
+            yield f"  movep(at({position}), {_dynamics(feed, dispenser)}, r={blend / 1000:.7g})"
 
 
-def _laid(stroke: Stroke, dispenser: DispenserSettings) -> Iterator[str]:
-    places = np.round(stroke.positions_mm, 3)
-    feeds, blends = stroke.feeds_mm_s.tolist(), _blends(places).tolist()
-    for (x, y), feed, blend in zip(places[1:].tolist(), feeds, blends, strict=True):
-        place = ", ".join(map(_number, (x, y, stroke.z_mm)))
-        yield f"  movep(at({place}), {_dynamics(feed, dispenser)}, r={blend / 1000:.7g})"
+def _blend_radii(corners: Array) -> Array:
+    """Compute the distance (n - 1,) from each corner but the first to the start of its arc, mm; 0 at the end.
 
-
-def _blends(places: Array) -> Array:
-    """(n - 1,) how far from each corner but the first its arc begins, mm; 0 at the end.
-
-    An arc that begins b from a corner where the course turns by t passes the corner at b tan(t / 4).
+    An arc that starts b from a corner where the path turns by t passes the corner at b tan(t / 4).
     """
-    steps = np.diff(places, axis=0)
+    steps = np.diff(corners, axis=0)
     length = np.hypot(*steps.T)
     headings = np.arctan2(*steps.T[::-1])
     turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
@@ -80,5 +86,5 @@ def _popup(message: str) -> str:
     return f'  popup("{message}", title="padforge", blocking=True)'
 
 
-def _number(value: float) -> str:
-    return f"{round(value, 3) + 0.0:.10g}"
+def _format(*values_mm: float) -> str:
+    return ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values_mm)

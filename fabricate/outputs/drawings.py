@@ -20,8 +20,8 @@ from shapely.geometry.base import BaseGeometry
 from padforge.design.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import beziers
-from padforge.fabricate.fibre_placement.toolpath import Step, turned_over
-from padforge.fabricate.plan import COLOURS, FAMILIES, Plan, fibre_layers, fibre_name, polygon_rings
+from padforge.fabricate.fibre_placement.toolpath import Step, mirror_x
+from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS, Plan, fibre_layers, fibre_name, polygon_rings
 
 Point = Sequence[float] | Array
 Bounds = tuple[float, float, float, float]
@@ -198,7 +198,7 @@ def _draw_pad(plan: Plan, scale: float) -> Iterator[str]:
             yield _SVG.element("path", d=_SVG.path(points), stroke=layer.colour, stroke_width=0.35 / scale)
     for fibre, number in enumerate(plan.numbers):
         if number is not None:
-            fill = COLOURS[plan.family(fibre)]
+            fill = FAMILY_COLOURS[plan.family(fibre)]
             yield _SVG.element("path", **{"class": "cast"}, d=_SVG.outline(number), fill=fill)
 
 
@@ -208,11 +208,11 @@ def _draw_panel(plan: Plan, panel: _Panel) -> Iterator[str]:
         yield _SVG.element("path", d=_SVG.outline(plan.tray), fill=FAINT, transform=panel.transform)
     yield _SVG.element("use", **{"xlink:href": "#pad"}, transform=panel.transform)
     bounds = (plan.silicone if panel.mirrored else plan.tray).bounds
-    size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * panel.scale)
+    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panel.scale)
     for fibre, lead in enumerate(plan.ends(0)):
         start = lead.turned_mm.copy()
         start[lead.axis] = bounds[lead.axis] - (_BESIDE_MM + size / 2) / panel.scale
-        style = {"fill": COLOURS[plan.family(fibre)], "font_size": size, "font_weight": "bold"}
+        style = {"fill": FAMILY_COLOURS[plan.family(fibre)], "font_size": size, "font_weight": "bold"}
         yield _SVG.text(str(fibre + 1), panel.project(start[None])[0], **style)
     length = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
     for axis, tip in zip("xy", np.eye(2) * length, strict=True):
@@ -247,11 +247,11 @@ def _draw_sides(plan: Plan, panels: Sequence[_Panel], top: float) -> Iterator[st
     for panel in panels:
         yield box(panel.x - half, top, 2 * half, _SLAB_MM, PAPER)
     starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
-    size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * panels[0].scale)
+    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panels[0].scale)
     for panel, y, fill in zip(panels, (bottom - _TRACK_MM, top, top), (FAINT, "white", ""), strict=True):
         for fibre, x_mm in starts:
             x = panel.x + (-x_mm if panel.mirrored else x_mm) * panel.scale
-            colour = COLOURS[plan.family(fibre)]
+            colour = FAMILY_COLOURS[plan.family(fibre)]
             yield box(x - 0.4, y, 0.8, _TRACK_MM, fill or colour)
             yield _SVG.text(str(fibre + 1), (x, floor + size), fill=colour, font_size=size)
     x = panels[2].x
@@ -315,20 +315,20 @@ class _TrackSheet:
     def __init__(self, plan: Plan) -> None:
         layout, pairs = plan.pad.layout, plan.leads.pairs
         x_min, y_min, x_max, y_max = plan.silicone.bounds
-        self.text_mm = min(_TEXT_MM, 0.6 * plan.least_pitch_mm)
+        self.text_mm = min(_TEXT_MM, 0.6 * plan.min_pitch_mm)
         self.sentence = orientation_sentence(layout.counts, plan.settings.pad.leads)
         self.spans = [
             np.concatenate([start.spans[::-1, ::-1], plan.pad.to_mm(curve), end.spans])
             for (start, end), curve in zip(pairs, beziers(plan.pad), strict=True)
         ]
-        self.ends = np.array([[lead.beyond(plan.settings.mould.exit_mm) for lead in pair] for pair in pairs])
+        self.ends = np.array([[lead.point_past_edge(plan.settings.mould.exit_mm) for lead in pair] for pair in pairs])
 
         self.numbers: list[_Label] = []
         for ends in self.ends.swapaxes(0, 1)[: 1 + (plan.settings.pad.leads == "one side")].tolist():
             for fibre, (x, y) in enumerate(ends):
                 below = pairs[fibre][0].axis == 1
                 position = (x, y - _GAP_MM - self.text_mm / 2) if below else (x - _GAP_MM, y)
-                anchor, colour = "middle" if below else "end", COLOURS[plan.family(fibre)]
+                anchor, colour = "middle" if below else "end", FAMILY_COLOURS[plan.family(fibre)]
                 self.numbers.append(_Label(str(fibre + 1), *position, anchor, colour))
 
         bar_y = y_min - 4 * _GAP_MM - self.text_mm
@@ -497,7 +497,7 @@ def toolpath_svg(plan: Plan, steps: Sequence[Step]) -> str:
         content.append(svg.element("g", *paths, id=step.layer.name, stroke=step.layer.colour, stroke_width=0.3))
     for turn, stroke in enumerate(strokes, 1):
         start, end = stroke.positions_mm[[0, -1]] * _TO_SVG
-        before, after = (2.5 * turned_over(lead.outward) * _TO_SVG for lead in plan.leads.pairs[stroke.fibre])
+        before, after = (2.5 * mirror_x(lead.outward) * _TO_SVG for lead in plan.leads.pairs[stroke.fibre])
         content += [
             svg.element("circle", cx=start[0], cy=start[1], r=0.8, stroke=INK, stroke_width=0.2),
             svg.element("circle", cx=end[0], cy=end[1], r=0.5, fill=INK),

@@ -19,8 +19,8 @@ from padforge.fabricate.checks import Finding
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.outputs.drawings import SCALE_MM, orientation_sentence
 from padforge.fabricate.plan import (
-    COLOURS,
     FAMILIES,
+    FAMILY_COLOURS,
     INTO_WALL_MM,
     FibreLayer,
     Plan,
@@ -291,7 +291,7 @@ def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]
     from shapely.ops import substring
 
     width = max(1.3, picture.points(plan.settings.fibre.material.diameter_mm))
-    size = min(11.0, 0.5 * picture.points(plan.least_pitch_mm))
+    size = min(11.0, 0.5 * picture.points(plan.min_pitch_mm))
     handles = []
     for fibre in layer.fibres:
         line = substring(plan.lines[fibre], INTO_WALL_MM, plan.lines[fibre].length - INTO_WALL_MM)
@@ -304,7 +304,7 @@ def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]
         for x, y in (line.coords[0], line.coords[-1])[: 1 + (plan.settings.pad.leads == "one side")]:
             picture.axes.annotate(
                 str(fibre + 1), (x, y), offset, textcoords="offset points", ha=align_x, va=align_y,
-                color=COLOURS[layer.family], fontsize=size, fontweight="bold",
+                color=FAMILY_COLOURS[layer.family], fontsize=size, fontweight="bold",
             )  # fmt: skip
     return handles[:1]
 

@@ -26,7 +26,7 @@ from padforge.design.common.validation import InputError
 from padforge.fabricate.mesh import read_mesh
 from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION, ORIENTATION_FILE, ORIENTATION_LINK
 from padforge.fabricate.outputs.laying_page import laying_page
-from padforge.fabricate.plan import COLOURS, FAMILIES
+from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
 MAX_BYTES = 3_000_000
 """Size of a packed mesh: base64 makes 4 MB of it, half of the maximum of a page."""
@@ -128,7 +128,7 @@ def _draw_view(mesh: PackedMesh, document: Mapping[str, Any]) -> str:
     floor_mm = float(mesh.low_mm[2]) + float(document["settings"]["mould"]["floor_mm"])
     tops = {}
     for fibre in document["fibres"]:
-        colour = COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
+        colour = FAMILY_COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
         tops[float(fibre["ridge_mm"])] = [part / 255 for part in bytes.fromhex(colour[1:])]
     data = {
         "low": mesh.low_mm.tolist(),

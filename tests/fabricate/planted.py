@@ -6,9 +6,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design.morphology import Morphology, assemble_knots
-from padforge.design.settings import PadSettings, RulesSettings
-from padforge.fabricate.materials import FibreSettings, SiliconeSettings
-from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 
 def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:
@@ -29,25 +27,12 @@ def winding_pad(*places: tuple[float, float], pitch_mm: float = 10.0) -> Morphol
 
 
 def with_settings(
-    mould: dict[str, object] | None = None,
-    printer: dict[str, object] | None = None,
-    pad: dict[str, object] | None = None,
-    rules: dict[str, object] | None = None,
-    silicone: dict[str, object] | None = None,
-    fibre: dict[str, object] | None = None,
-    dispenser: dict[str, object] | None = None,
+    mould: dict[str, object] | None = None, printer: dict[str, object] | None = None, **sections: dict[str, object]
 ) -> FabricationSettings:
-    """The defaults with some keys changed."""
-    return replace(
-        DEFAULTS,
-        mould=MouldSettings.model_validate(mould or {}),
-        printer=PrinterSettings.model_validate(printer or {}),
-        pad=PadSettings.model_validate(pad or {}),
-        rules=RulesSettings.model_validate(rules or {}),
-        silicone=SiliconeSettings.model_validate(silicone or {}),
-        fibre=FibreSettings.model_validate(fibre or {}),
-        dispenser=DispenserSettings.model_validate(dispenser or {}),
-    )
+    """Return the defaults with some keys changed, section by section."""
+    changed = {"mould": mould, "printer": printer, **sections}
+    models = {name: type(getattr(DEFAULTS, name)) for name in changed}
+    return replace(DEFAULTS, **{name: models[name].model_validate(keys or {}) for name, keys in changed.items()})
 
 
 def mild_pad(grid: int, knots: int, seed: int) -> Morphology:

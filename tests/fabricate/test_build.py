@@ -17,11 +17,11 @@ from build123d import Solid, import_step
 from padforge.design.common.files import sha256
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.fabricate import export
+from padforge.fabricate import export, mould
 from padforge.fabricate.cad import model, step_file
 from padforge.fabricate.cad.step_file import CadPart
 from padforge.fabricate.export import FORMATS, build
-from padforge.fabricate.mesh import COLOURS
+from padforge.fabricate.mesh import BODY_COLOURS
 from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -39,10 +39,10 @@ SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, dict]:
     out = tmp_path_factory.mktemp("mould")
-    return out, build(PAD, out, FORMATS, SETTINGS)
+    return out, build(PAD, out, tuple(FORMATS), SETTINGS)
 
 
-def test_all_files_are_there_with_their_digests_and_nothing_else(built):
+def test_build_writes_all_files_with_their_digests_and_no_others(built):
     out, document = built
     assert {path.name for path in out.iterdir()} == FILES
     assert {*document["files"]} == FILES - {"fabrication.json", "laying.md", "orientation.svg"}
@@ -51,9 +51,9 @@ def test_all_files_are_there_with_their_digests_and_nothing_else(built):
 
 
 @pytest.mark.slow
-def test_the_same_work_gives_the_same_bytes(built, tmp_path):
+def test_build_is_reproducible_to_the_byte(built, tmp_path):
     out, _ = built
-    build(PAD, tmp_path / "again", FORMATS, SETTINGS)
+    build(PAD, tmp_path / "again", tuple(FORMATS), SETTINGS)
     for name in FILES:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
 
@@ -83,7 +83,7 @@ def test_stl_normals_point_out(built):
 
 
 @pytest.mark.parametrize("body", ["mould", "lid", "holder"])
-def test_3mf_is_strictly_one_named_object_of_one_material(built, body):
+def test_3mf_is_one_named_object_of_one_material_in_strict_mode(built, body):
     lib3mf = pytest.importorskip("lib3mf")
     out, document = built
     model = lib3mf.get_wrapper().CreateModel()
@@ -102,7 +102,7 @@ def test_3mf_is_strictly_one_named_object_of_one_material(built, body):
     (material,) = group.GetAllPropertyIDs()
     colour = group.GetDisplayColor(material)
     assert group.GetName(material) == "PLA"
-    assert f"#{colour.Red:02X}{colour.Green:02X}{colour.Blue:02X}" == COLOURS[body]
+    assert f"#{colour.Red:02X}{colour.Green:02X}{colour.Blue:02X}" == BODY_COLOURS[body]
     assert found.GetObjectLevelProperty() == (group.GetUniqueResourceID(), material, True)
     told = [model.GetMetaDataGroup().GetMetaData(k) for k in range(model.GetMetaDataGroup().GetMetaDataCount())]
     version = document["provenance"]["versions"]["padforge"]
@@ -120,7 +120,7 @@ def listed(iterator, current: str) -> list:
     return found
 
 
-def test_step_reads_back_as_the_same_solid_which_the_meshes_judge(built):
+def test_step_reads_back_as_a_valid_solid_of_the_meshes_volume(built):
     out, document = built
     whole = import_step(out / "mould.step")
     assert whole.is_valid
@@ -141,7 +141,7 @@ def test_step_reads_back_as_the_same_solid_which_the_meshes_judge(built):
 
 
 @pytest.mark.parametrize("size", [(1, 2), pytest.param((2, 12), marks=pytest.mark.slow)])
-def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path, size):
+def test_cad_limits_grow_with_the_mesh_tolerance(tmp_path, size):
     """What chords take away of the volume grows with the tolerance."""
     settings = with_settings({"tolerance_mm": 0.099, "ridge_width_mm": 1.2})
     (found,) = (
@@ -153,7 +153,7 @@ def test_a_coarse_mesh_is_no_reason_to_refuse(tmp_path, size):
     assert (5e-4 if size == (2, 12) else 0) < found["measured"][0] < found["limit"][0]
 
 
-def test_the_document_has_what_a_lab_needs(built, tmp_path):
+def test_document_has_sizes_frame_findings_and_crossings(built, tmp_path):
     _, document = built
     assert document["format"] == "padforge-fabrication/2"
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
@@ -172,7 +172,7 @@ def test_the_document_has_what_a_lab_needs(built, tmp_path):
     assert "frame" not in other  # without a holder nobody knows where the pad lies
 
 
-def test_a_shrinking_silicone_gets_a_larger_mould_and_the_same_pad(tmp_path):
+def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     pad, mould = Morphology.straight(2, 12.0), {"holder": True, "number_mm": 0.0, "exit_mm": 0.0}
     kept = build(pad, tmp_path / "kept", ["stl"], with_settings(mould))
     grown = build(pad, tmp_path / "grown", ["stl"], with_settings(mould, silicone={"shrinkage": 0.04}))
@@ -198,7 +198,7 @@ def test_a_shrinking_silicone_gets_a_larger_mould_and_the_same_pad(tmp_path):
     assert {finding["status"] for finding in grown["findings"]} == {"pass"}
 
 
-def test_what_stops_the_needle_is_told(tmp_path):
+def test_toolpath_findings_only_with_a_program(tmp_path):
     settings = replace(DEFAULTS, dispenser=DispenserSettings(origin_mm=(10.0, 110.0)))
     by_hand, by_machine = build(PAD, tmp_path, [], settings), build(PAD, tmp_path, ["urscript"], settings)
     found = {finding["name"]: finding["status"] for finding in by_machine["findings"]}
@@ -225,7 +225,7 @@ def other_solid(monkeypatch, body: str) -> None:
 
 def in_pieces(monkeypatch, body: str) -> None:
     pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
-    monkeypatch.setattr(export, body, lambda plan: pieces)
+    monkeypatch.setattr(mould, body, lambda plan: pieces)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ def in_pieces(monkeypatch, body: str) -> None:
         ),
     ],
 )
-def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, planted, formats, line):
+def test_build_refuses_in_one_line_and_writes_nothing(tmp_path, monkeypatch, planted, formats, line):
     pad, settings = Morphology.straight(1), with_settings({"lid": True})
     if planted:
         planted(monkeypatch)
@@ -269,9 +269,9 @@ def full_disk(*_, **__):
 
 
 @pytest.mark.parametrize(
-    ("last", "stop"), [("write_utf8", full_disk), ("write_utf8", KeyboardInterrupt), ("write_json", full_disk)]
+    ("last", "stop"), [("_write_utf8", full_disk), ("_write_utf8", KeyboardInterrupt), ("write_json", full_disk)]
 )
-def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last, stop):
+def test_interrupted_build_keeps_the_old_mould(tmp_path, monkeypatch, last, stop):
     build(PAD, tmp_path, ["stl", "svg"])
     before = contents(tmp_path)
 
@@ -282,11 +282,11 @@ def test_a_stop_in_midway_leaves_the_old_mould_whole(tmp_path, monkeypatch, last
     with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError) as told:
         build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert contents(tmp_path) == before
-    if last == "write_utf8" and stop is full_disk:
+    if last == "_write_utf8" and stop is full_disk:
         assert str(told.value) == f"{tmp_path / 'tracks.svg'}: cannot be written (No space left on device)"
 
 
-def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
+def test_build_keeps_the_old_mould_if_a_folder_is_in_the_way(tmp_path):
     build(PAD, tmp_path, ["stl"])
     (tmp_path / "tracks.svg").mkdir()
     before = (tmp_path / "mould.stl").read_bytes()
@@ -295,7 +295,7 @@ def test_a_folder_in_the_way_leaves_the_old_mould_whole(tmp_path):
     assert (tmp_path / "mould.stl").read_bytes() == before
 
 
-def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
+def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path):
     build(PAD, tmp_path, ["3mf", "stl", "svg", "dxf"])
     (tmp_path / "tracks.dxf").write_text("drawn upon")
     for name in ("mine.stl", "mould.step"):
@@ -313,14 +313,14 @@ def test_files_of_the_mould_before_go_unless_they_were_changed(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"format": "padforge-fabrication/2", "sha256": ["mould.step"]}'])
-def test_nothing_goes_by_a_document_that_says_nothing(tmp_path, text):
+def test_build_deletes_nothing_without_digests(tmp_path, text):
     (tmp_path / "fabrication.json").write_text(text)
     (tmp_path / "mould.step").write_text("somebody's own")
     build(PAD, tmp_path, [], warn=pytest.fail)
     assert (tmp_path / "mould.step").exists()
 
 
-def test_a_mould_is_of_the_file_that_was_there_as_it_was_begun(tmp_path, monkeypatch):
+def test_provenance_is_of_the_input_at_the_start(tmp_path, monkeypatch):
     """A search that writes into the folder of the pad meanwhile must not make it one of the new fibres."""
     pad = tmp_path / "morphology.json"
     PAD.save(pad)

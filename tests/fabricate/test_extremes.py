@@ -77,13 +77,13 @@ def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_wild_pad_has_a_closed_mould(kind):
+def test_mould_of_a_wild_pad_is_closed(kind):
     require_closed(wild(kind), {"border_mm": 1.0})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("key", [*KINDS, *ENDS])
-def test_whatever_can_be_planned_is_judged_in_plain_words(key):
+def test_check_judges_every_plan_in_plain_words(key):
     for value in ENDS.get(key, [None]):
         pad = wild(key) if value is None else Morphology.random(1, 3, seed=1)
         try:

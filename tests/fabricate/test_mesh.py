@@ -42,14 +42,14 @@ def require_line(error: BaseException, name: str = "") -> None:
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".3mf"])
-def test_a_mesh_comes_back_as_it_was_written(tmp_path, suffix):
+def test_read_mesh_returns_what_was_written(tmp_path, suffix):
     moved = VERTICES + np.array([0.1, -123.456, 7])
     vertices, triangles = read_mesh(written(tmp_path / f"box{suffix}", moved))
     assert vertices[triangles] == pytest.approx(moved[TRIANGLES].astype("f4"))
     assert {finding.status for finding in check_mesh(tmp_path / f"box{suffix}")} == {"pass"}
 
 
-def test_words_of_a_3mf_are_text_and_its_unit_is_heeded(tmp_path):
+def test_3mf_escapes_text_and_read_mesh_converts_units(tmp_path):
     path, hostile = tmp_path / "odd.3mf", '<a href="&amp;">"\''
     written(path, title=hostile)
     with zipfile.ZipFile(path) as archive:
@@ -61,7 +61,7 @@ def test_words_of_a_3mf_are_text_and_its_unit_is_heeded(tmp_path):
     assert np.ptp(read_mesh(path)[0], axis=0) == pytest.approx([254, 508, 127])
 
 
-def test_an_stl_of_text_and_a_3mf_may_have_several_bodies(tmp_path):
+def test_read_mesh_of_several_bodies_in_ascii_stl_and_3mf(tmp_path):
     far = BOX.copy().apply_translation((30, 0, 0))
     text = "\n".join(trimesh.exchange.stl.export_stl_ascii(mesh) for mesh in (BOX, far))
     (tmp_path / "two.stl").write_text(text)
@@ -119,7 +119,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_models_made_to_be_awkward_are_refused_in_one_line(tmp_path, name):
+def test_read_mesh_refuses_hostile_3mf_in_one_line(tmp_path, name):
     content, said = MODELS[name]
     with pytest.raises(InputError, match=said) as refusal:
         read_mesh(packed(tmp_path / "model.3mf", content))
@@ -128,7 +128,7 @@ def test_models_made_to_be_awkward_are_refused_in_one_line(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["torn.stl", "torn.3mf"])
 @pytest.mark.parametrize("content", [None, b"", b"solid\n", b"\0" * 84, b"\0" * 90, b"\xff" * 500, b"PK"])
-def test_what_is_no_mesh_is_refused_in_one_line(tmp_path, name, content):
+def test_check_mesh_refuses_other_files_in_one_line(tmp_path, name, content):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError) as refusal:
@@ -137,7 +137,7 @@ def test_what_is_no_mesh_is_refused_in_one_line(tmp_path, name, content):
 
 
 @pytest.mark.parametrize("odd", [np.nan, np.inf, 3e38])
-def test_a_corner_that_is_no_place_is_refused_not_dropped(tmp_path, odd):
+def test_read_mesh_refuses_vertices_that_are_not_finite(tmp_path, odd):
     changed = np.array(VERTICES)
     changed[3, 1] = odd
     with np.errstate(invalid="ignore", over="ignore"):
@@ -152,7 +152,7 @@ def test_a_corner_that_is_no_place_is_refused_not_dropped(tmp_path, odd):
     st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.integers(0, 16)), max_size=3),
     st.none() | st.floats(0, 1),
 )
-def test_damaged_files_are_judged_or_refused_in_one_line(tmp_path_factory, suffix, changes, end):
+def test_damaged_files_are_checked_or_refused_in_one_line(tmp_path_factory, suffix, changes, end):
     path = written(tmp_path_factory.getbasetemp() / f"damaged{suffix}")
     content = bytearray(path.read_bytes())
     for share, piece, gone in changes:
@@ -187,7 +187,7 @@ SOUND = {
 
 
 @pytest.mark.parametrize("name", [*BROKEN, *SOUND])
-def test_broken_meshes_of_any_size_have_findings_that_say_so(name):
+def test_inspect_mesh_detects_broken_meshes_of_any_size(name):
     vertices, triangles = (BROKEN | SOUND)[name]
     for size in (1e-9, 1.0, 1e4):
         found = inspect_mesh(vertices * size, triangles)
@@ -200,7 +200,7 @@ def test_broken_meshes_of_any_size_have_findings_that_say_so(name):
 
 
 @pytest.mark.parametrize("change", [np.nan, np.inf, 1e300])
-def test_vertices_and_triangles_that_cannot_be_are_refused(change):
+def test_inspect_mesh_refuses_invalid_vertices_and_triangles(change):
     changed = np.array(VERTICES)
     changed[0] = change
     for vertices, triangles in ((changed, TRIANGLES), (VERTICES, TRIANGLES + 3), (VERTICES, TRIANGLES - 1)):
@@ -209,7 +209,7 @@ def test_vertices_and_triangles_that_cannot_be_are_refused(change):
         require_line(refusal.value)
 
 
-def test_a_heap_of_triangles_is_told_from_its_first_pairs():
+def test_sound_stops_after_the_first_self_intersections():
     found = sound(np.random.default_rng(0).normal(size=(30_000, 3)), np.arange(30_000).reshape(-1, 3))
     failed = {finding.name: finding for finding in found if finding.status == "fail"}
     assert {"watertight", "self_intersection"} <= failed.keys()

@@ -84,7 +84,7 @@ def test_random_and_published_moulds_are_closed(request, pad):
         (conductive_plan, (2, 5.0), {}, "exit_width_mm"),
     ],
 )
-def test_what_has_no_room_is_refused(make, pad, mould, line):
+def test_bodies_without_room_are_refused(make, pad, mould, line):
     with pytest.raises(InputError, match=line):
         make(Plan(Morphology.straight(*pad), with_settings(mould)))
 
@@ -102,7 +102,7 @@ def test_what_has_no_room_is_refused(make, pad, mould, line):
         ),
     ],
 )
-def test_both_ways_to_the_mould_agree(settings):
+def test_mesh_agrees_with_the_cad_kernel(settings):
     tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
     plan = Plan(Morphology.straight(1) if tapered else Morphology.random(1, 3, seed=5), settings)
     body = mould_body(plan)
@@ -113,7 +113,7 @@ def test_both_ways_to_the_mould_agree(settings):
 
 
 @pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0, "border_mm": 1.5}, {"floor_mm": 1.2, "wall_mm": 0.8}])
-def test_the_holder_takes_the_pad_with_its_leads(mould):
+def test_holder_fits_the_pad_with_its_leads(mould):
     plan = Plan(Morphology.random(3, 2, seed=4), with_settings(mould))
     read, frame = as_read(holder_body(plan)), bed_frame(plan)
     assert_one_closed_body(read)
@@ -137,7 +137,7 @@ def test_the_holder_takes_the_pad_with_its_leads(mould):
         height_at(read, inside, -inside)  # where fibres 1 and 4 start, as the pad lies
 
 
-def test_the_frame_on_the_bed_is_that_of_the_mould():
+def test_bed_frame_agrees_with_the_sizes():
     plan = Plan(Morphology.straight(2), with_settings({"border_mm": 1.0}, printer={"bed_mm": [300.0, 200.0, 100.0]}))
     frame = bed_frame(plan)
     assert (frame["centre_mm"], frame["angle_deg"], frame["mirrored"]) == ([150.0, 100.0], 0.0, True)
@@ -145,7 +145,7 @@ def test_the_frame_on_the_bed_is_that_of_the_mould():
     assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
 
 
-def test_tracks_run_out_of_the_pad_through_its_tongues():
+def test_ridges_run_to_the_end_of_their_slots():
     plan = Plan(Morphology.straight(1, pitch_mm=10.0), with_settings({"number_mm": 0.0, "border_mm": 1.0}))
     read = as_read(mould_body(plan))
     edge = 10 + 1.0
@@ -160,7 +160,7 @@ def test_tracks_run_out_of_the_pad_through_its_tongues():
     assert {round(2 * side, 6) for side in plan.tray.bounds[2:]} == {round(2 * (edge + 2 + 2 + plan.flare_mm), 6)}
 
 
-def test_walls_and_ridges_lean_as_set():
+def test_walls_and_ridges_have_their_draft():
     plan = Plan(
         Morphology.straight(1, pitch_mm=20.0),
         with_settings({"number_mm": 0.0, "exit_mm": 0.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 10.0}),
@@ -177,7 +177,7 @@ def test_walls_and_ridges_lean_as_set():
     assert sizes(plan)["ridge_foot_mm"] == pytest.approx(0.4 + 2 * 1.2 * slope)
 
 
-def test_lid_has_the_holes_that_fit_the_pins():
+def test_lid_has_holes_for_pins_vents_and_spout():
     plan = Plan(Morphology.straight(2), with_settings({"lid": True, "pins": True}))
     pin = sizes(plan)["pin_mm"]
     assert pin == 2.0
@@ -201,7 +201,7 @@ def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
         assert_one_closed_body(as_read(body))
 
 
-def test_the_second_mould_has_a_well_at_every_ridge_end():
+def test_conductive_mould_has_a_well_at_every_ridge_end():
     plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
     read = as_read(conductive_body(plan))
     assert_one_closed_body(read)
@@ -212,7 +212,7 @@ def test_the_second_mould_has_a_well_at_every_ridge_end():
         assert height_at(read, x, -7.5 + 1.1 * WELL_MM / 2) == pytest.approx(2.0, abs=1e-4)
 
 
-def test_corners_that_meet_by_chance_are_drawn_apart():
+def test_mesh_arrays_separates_coincident_vertices():
     """Two blocks that share one upright line: joined there, the line would have four faces."""
     touching = Body((Prism(shapely.box(0, 0, 1, 1), 0, 1), Prism(shapely.box(1, 1, 2, 2), 0, 1)))
     vertices, triangles = mesh_arrays(build_mesh(touching))
@@ -222,7 +222,7 @@ def test_corners_that_meet_by_chance_are_drawn_apart():
 
 
 @pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])
-def test_laid_fibres_never_come_nearer_than_the_stated_gap(knots, seed):
+def test_crossing_gap_is_a_lower_bound(knots, seed):
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
     plan = Plan(Morphology.random(2, knots, seed))
     read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm

@@ -12,7 +12,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.fabricate.mould import mould_body
-from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, fibre_levels, number_strokes
+from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number
 from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
@@ -51,7 +51,7 @@ def test_ridges_run_into_the_walls_at_both_ends(border_mm):
         assert shapely.within(line, plan.tray)
 
 
-def test_a_mould_shrunk_is_the_pad():
+def test_shrinkage_compensated_times_the_factor_is_the_pad():
     plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": 1.0}, silicone={"shrinkage": 0.03}))
     mould = plan.shrinkage_compensated
     assert mould.cavity.bounds[2] * 0.97 == pytest.approx(plan.cavity.bounds[2], rel=1e-12)
@@ -67,7 +67,7 @@ def test_a_mould_shrunk_is_the_pad():
     assert (mould.depths_mm, mould.thickness_mm) == (mould.heights_mm, mould.silicone_mm)
 
 
-def test_a_pad_that_does_not_shrink_is_its_own_mould():
+def test_plan_without_shrinkage_is_its_own_mould():
     plan = Plan(Morphology.straight(2), with_settings(silicone={"name": "EcoFlex 00-20", "shrinkage": 0.0}))
     assert plan.shrinkage_compensated is plan
     assert Plan(Morphology.straight(2)).shrinkage_compensated.pad.pitch_mm == 11.25
@@ -75,23 +75,23 @@ def test_a_pad_that_does_not_shrink_is_its_own_mould():
 
 @settings(max_examples=50)
 @given(st.integers(1, 6), st.data())
-def test_fibres_that_cross_never_share_a_level(grid, data):
+def test_crossing_fibres_never_share_a_layer(grid, data):
     fibres = [*itertools.combinations(range(grid), 2), *itertools.combinations(range(grid, 2 * grid), 2)]
     pairs = data.draw(st.lists(st.sampled_from(fibres), max_size=12)) if fibres else []
     deep = data.draw(st.booleans())
-    levels = fibre_levels((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
+    levels = assign_layers((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
     assert all(levels[i] != levels[j] for i, j in pairs)
     horizontal, vertical = levels[:grid], levels[grid:]
     assert min(horizontal if deep else vertical) > max(vertical if deep else horizontal)
     assert set(levels) == set(range(max(levels) + 1))
 
 
-def test_a_star_of_crossings_needs_one_level_more():
+def test_a_star_of_crossings_needs_one_layer_more():
     star = [Crossing(0, other, (0.0, 0.0)) for other in range(1, 5)]
-    assert max(fibre_levels((5, 5), star, deep_horizontal=True)) == 2
+    assert max(assign_layers((5, 5), star, deep_horizontal=True)) == 2
 
 
-def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
+def test_common_tracks_include_all_crossings_of_layers():
     plan = Plan(Morphology.random(3, 3, seed=3))
     levels = plan.layer_indices
     assert max(levels) >= 2
@@ -100,7 +100,7 @@ def test_tracks_over_tracks_of_any_deeper_level_have_a_stretch_in_common():
     assert {(each.shallow, each.deep) for each in plan.common_tracks} >= crossing
 
 
-def test_crossing_fibres_of_a_family_lie_a_step_apart_and_the_pad_is_thickened_for_them():
+def test_layers_are_a_step_apart_and_thicken_the_pad():
     plan = Plan(level_pad(1.8, 1.2))
     assert plan.heights_mm == (0.4, 1.2, 2.0)
     assert plan.layer_indices[0] != plan.layer_indices[1]
@@ -111,7 +111,7 @@ def test_crossing_fibres_of_a_family_lie_a_step_apart_and_the_pad_is_thickened_f
     assert Plan(Morphology.straight(2), with_settings(pad={"deep_family": "vertical"})).layer_indices == (0, 0, 1, 1)
 
 
-def test_two_levels_only_refuse_a_family_that_crosses_itself():
+def test_require_levels_refuses_crossings_of_a_family():
     settings = with_settings({"levels": "two"})
     plan = Plan(level_pad(1.8, 1.2), settings)
     with pytest.raises(
@@ -123,7 +123,7 @@ def test_two_levels_only_refuse_a_family_that_crosses_itself():
     Plan(Morphology.straight(3), settings).require_levels()
 
 
-def test_published_pads_take_as_many_levels_as_their_crossings_need(published):
+def test_published_pads_have_a_layer_for_every_crossing(published):
     for name, least in (("1para", 2), ("5para_dis", 3), ("20para", 8)):
         plan = Plan(Morphology.load(published / f"{name}.mat"))
         assert len(plan.heights_mm) >= least
@@ -132,9 +132,9 @@ def test_published_pads_take_as_many_levels_as_their_crossings_need(published):
 
 
 @pytest.mark.parametrize(("height", "width"), [(1.5, 0.2), (2.5, 0.4), (5.0, 0.8)])
-def test_strokes_and_gaps_are_as_wide_as_ridges(height, width):
+def test_draw_number_has_strokes_and_gaps_of_their_width(height, width):
     for number in (8, 23, 96):
-        outline = number_strokes(number, height, width)
+        outline = draw_number(number, height, width)
         digits = shapely.get_parts(outline)
         assert len(digits) == len(str(number))
         assert len(digits) == 1 or digits[0].distance(digits[1]) == pytest.approx(max(width, 0.25 * height))
@@ -158,7 +158,7 @@ def test_numbers_keep_clear_of_ridges_walls_and_each_other(pad):
         assert all(number.distance(other) > 0.6 for other in placed[:i])
 
 
-def test_a_number_stands_beside_its_own_start():
+def test_numbers_are_next_to_the_start_of_their_fibre():
     plan = Plan(Morphology.straight(4))
     starts = np.array([line.coords[0] for line in plan.lines])
     for fibre, number in enumerate(plan.numbers):
@@ -167,7 +167,7 @@ def test_a_number_stands_beside_its_own_start():
         assert int(np.argmin(np.linalg.norm(starts - middle, axis=1))) == fibre
 
 
-def test_numbers_can_be_left_out_and_crowded_out():
+def test_numbers_may_be_unwanted_or_without_room():
     assert Plan(Morphology.straight(2), with_settings({"number_mm": 0.0})).numbers == []
     crowded = Plan(Morphology.straight(2, pitch_mm=4.0), with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
     assert crowded.numbers == [None] * 4
@@ -183,7 +183,7 @@ DIGITS = """
 
 
 @pytest.mark.parametrize("pad", [Morphology.straight(5), Morphology.random(5, 3, seed=2)])
-def test_numbers_in_the_mould_read_right_on_the_pad_as_it_is_used(pad):
+def test_numbers_of_the_mould_are_legible_on_the_pad(pad):
     """The heights of the mould's floor, which the tracks' side of the pad is cast from, seen as an arm sees the pad."""
     plan, mould = Plan(pad), with_settings({}).mould
     floor = shapely.union_all([prism.area for prism in mould_body(plan).adds if prism.top_mm > mould.floor_mm])

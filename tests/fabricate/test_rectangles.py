@@ -14,7 +14,8 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.checks.plan_checks import check_plan, meshed
 from padforge.fabricate.export import build
-from padforge.fabricate.fibre_placement.toolpath import laying_steps, turned_over
+from padforge.fabricate.fibre_placement.toolpath import mirror_x, plan_toolpath
+from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
 from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
@@ -34,12 +35,12 @@ def settings(pad: Morphology, mould: dict | None = None, **more) -> FabricationS
     return replace(DEFAULTS, mould=MouldSettings(**{"number_mm": 0.0, **(mould or {})}), pad=own)
 
 
-def test_the_tray_is_as_wide_and_high_as_the_pad():
+def test_tray_has_the_width_and_height_of_the_pad():
     plan = Plan(PAD, settings(PAD))
     assert sizes(plan)["pad_mm"] == [56.0, 60.0]
     left, low, right, high = plan.tray.bounds
     assert (right - left) - (high - low) == pytest.approx(56 - 60)
-    starts = np.array([lead.beyond(0) for lead in plan.ends(0)])
+    starts = np.array([lead.point_past_edge(0) for lead in plan.ends(0)])
     assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
     assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
 
@@ -72,13 +73,13 @@ def test_a_keep_out_at_the_edge_joins_the_wall():
         (((-1.0, -40.0), (1.0, -40.0), (1.0, 40.0), (-1.0, 40.0)), "one_piece", "fail"),
     ],
 )
-def test_keep_outs_that_do_harm_are_found(hole, name, status):
+def test_check_plan_detects_harmful_keep_outs(hole, name, status):
     found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=(hole,))))}
     assert found[name].status == status
     assert found[name].positions_mm
 
 
-def test_the_lids_bores_keep_off_pillars():
+def test_lid_bores_are_clear_of_pillars():
     hole = ((-6.0, -5.0), (6.0, -5.0), (6.0, 5.0), (-6.0, 5.0))
     plan = Plan(PAD, settings(PAD, {"lid": True, "spout": True}, keep_out_mm=(hole,)))
     for prism in lid_body(plan).cuts:
@@ -87,7 +88,7 @@ def test_the_lids_bores_keep_off_pillars():
 
 @pytest.mark.parametrize("fibres", [(0, 3), (2, 0), (1, 0), (0, 1), (1, 1)])
 @pytest.mark.parametrize("leads", ["edges", "one side"])
-def test_few_fibres_have_a_mould_as_any_other(fibres, leads):
+def test_mould_of_few_fibres_is_sound(fibres, leads):
     pad = Morphology.straight(fibres, (9.0, 12.0))
     found = {finding.name: finding for finding in meshed(Plan(pad, settings(pad, leads=leads)))[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
@@ -99,16 +100,15 @@ def test_few_fibres_have_a_mould_as_any_other(fibres, leads):
     st.tuples(st.floats(4, 25), st.floats(4, 25)),
     st.floats(0, 4),
 )
-def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches, border):
+def test_one_side_leads_keep_their_spacing(fibres, pitches, border):
     pad = Morphology.straight(fibres, pitches)
     plan = Plan(pad, settings(pad, {"border_mm": border}, leads="one side"))
-    room = plan.settings.lead_room(plan.heights_mm[-1], plan.flare_mm)
-    apart = min(room.apart_mm, *pitches)
+    apart = min(lead_spacing(plan.settings, plan.heights_mm[-1], plan.flare_mm).pitch_mm, *pitches)
     ways = []
     for fibre, pair in enumerate(plan.leads.pairs):
         for lead in pair:
-            assert lead.beyond(0)[1] == pytest.approx(plan.cavity.bounds[1])
-            way = np.vstack([lead.end_mm, lead.bends(1e-4), lead.beyond(0)])
+            assert lead.point_past_edge(0)[1] == pytest.approx(plan.cavity.bounds[1])
+            way = np.vstack([lead.end_mm, lead.flatten_bends(1e-4), lead.point_past_edge(0)])
             assert lead.length_mm == pytest.approx(shapely.LineString(way).length, rel=1e-4)
             ways.append((fibre, shapely.LineString(way)))
     for fibre, way in ways:
@@ -116,11 +116,11 @@ def test_leads_to_one_side_do_not_cross_and_keep_their_distance(fibres, pitches,
         for other, its in ways:
             if other != fibre:
                 assert way.distance(its) > apart - 1e-3
-    exits = sorted(lead.beyond(0)[0] for pair in plan.leads.pairs for lead in pair)
+    exits = sorted(lead.point_past_edge(0)[0] for pair in plan.leads.pairs for lead in pair)
     assert np.diff(exits).min() > apart - 1e-6
 
 
-def test_leads_of_a_shrinking_silicone_come_out_as_planned():
+def test_leads_are_compensated_for_shrinkage():
     plan = Plan(
         PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))
     )
@@ -129,7 +129,7 @@ def test_leads_of_a_shrinking_silicone_come_out_as_planned():
     assert large.lengths_mm * 0.99 == pytest.approx(plan.lengths_mm)
 
 
-def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
+def test_holder_slots_are_at_the_mirrored_leads():
     pad = Morphology.straight((1, 3), (9.0, 12.0))
     plan = Plan(pad, settings(pad, {"holder": True}, leads="one side"))
     walls = build_mesh(holder_body(plan)).slice(DEFAULTS.mould.floor_mm + 0.5)
@@ -137,7 +137,7 @@ def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
     for ring in walls.to_polygons():
         solid = solid.symmetric_difference(shapely.Polygon(ring))
     for lead in (lead for pair in plan.leads.pairs for lead in pair):
-        x, y = lead.beyond(DEFAULTS.mould.exit_mm + 1)
+        x, y = lead.point_past_edge(DEFAULTS.mould.exit_mm + 1)
         assert solid.distance(shapely.Point(-x, y)) > 1
     low, high = plan.tray.bounds[1], plan.tray.bounds[3]
     assert bed_frame(plan)["centre_mm"] == pytest.approx([110.0, 110.0 - (low + high) / 2])
@@ -152,13 +152,13 @@ def test_the_holder_has_its_slots_where_the_pad_turned_over_has_its_leads():
         ((2, 3), "one side", "all leads leave at the near side: horizontal fibres"),
     ],
 )
-def test_one_sentence_says_which_way_round(fibres, leads, says):
+def test_orientation_sentence_states_the_order_of_fibres(fibres, leads, says):
     pad = Morphology.straight(fibres, (8.0, 15.0))
     assert says in orientation_sentence(fibres, leads)
     assert says in re.sub(r"\s+", " ", orientation_svg(Plan(pad, settings(pad, leads=leads))))
 
 
-def test_the_page_and_drawings_have_holes_bending_exits_and_lengths(tmp_path):
+def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
     pad, hole = Morphology.straight((2, 3), (8.0, 15.0)), ((-7.0, -5.0), (-1.0, -5.0), (-1.0, 5.0), (-7.0, 5.0))
     own = settings(pad, leads="one side", keep_out_mm=(hole,), bent_radius_mm=30.0)
     own = replace(own, fibre=FibreSettings(ohm_per_mm=10.0))
@@ -195,16 +195,16 @@ def test_a_pad_without_crossings_has_a_page(tmp_path):
 
 
 @pytest.mark.parametrize(("bend_mm", "acceleration", "least_mm_s"), [(3.0, 100.0, 10.0), (1.0, 25.0, 5.0)])
-def test_a_needle_follows_the_leads_and_is_slow_in_tight_bends(bend_mm, acceleration, least_mm_s):
+def test_toolpath_follows_leads_and_slows_in_tight_bends(bend_mm, acceleration, least_mm_s):
     """The root of acceleration times radius, 17 and 5 mm/s, of which the feed is at most 10 mm/s."""
     own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(min_bend_radius_mm=bend_mm))
     own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
     plan = Plan(PAD, own)
-    strokes = [stroke for step in laying_steps(plan, 0.3) for stroke in step.strokes]
+    strokes = [stroke for step in plan_toolpath(plan, 0.3) for stroke in step.strokes]
     for stroke in strokes:
-        line = shapely.LineString(turned_over(stroke.positions_mm))
+        line = shapely.LineString(mirror_x(stroke.positions_mm))
         assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
-        places = np.asarray(shapely.points(turned_over(stroke.positions_mm)))
+        places = np.asarray(shapely.points(mirror_x(stroke.positions_mm)))
         places = places[shapely.within(places, plan.silicone)]
         assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
     assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)

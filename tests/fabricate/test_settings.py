@@ -1,6 +1,8 @@
 """Settings and materials: defaults, what is refused in one line, and what a shrinking silicone makes of them."""
 
 import math
+import re
+import tomllib
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from padforge.fabricate.settings import DEFAULTS, DispenserSettings, Fabrication
 from tests.fabricate.planted import with_settings
 
 
-def test_defaults_come_back_from_their_own_file(tmp_path):
+def test_defaults_survive_a_settings_file(tmp_path):
     path = tmp_path / "pad.toml"
     models = (MouldSettings, PrinterSettings, DispenserSettings, SiliconeSettings, FibreSettings)
     path.write_text(commented_toml({model.section(): model for model in models}), encoding="utf-8")
@@ -69,7 +71,7 @@ FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
         ("fibre", {"name": "two\nlines"}, ("[fibre] name: got ",)),
     ],
 )
-def test_a_bad_key_is_one_clear_line(section, keys, parts):
+def test_invalid_keys_are_refused_in_one_line(section, keys, parts):
     with pytest.raises(InputError) as error:
         FabricationSettings.from_spec(Spec({section: keys}, "pad.toml"))
     assert str(error.value).startswith("pad.toml: ")
@@ -99,14 +101,14 @@ def test_a_bad_key_is_one_clear_line(section, keys, parts):
         ),
     ],
 )
-def test_settings_that_contradict_each_other_or_the_pad_are_one_clear_line(mould, pitch_mm, line):
+def test_contradictory_settings_are_refused_in_one_line(mould, pitch_mm, line):
     with pytest.raises(InputError) as error:
         Plan(Morphology.straight(4, pitch_mm), with_settings(mould))
     assert str(error.value).startswith(line)
     assert "\n" not in str(error.value)
 
 
-def test_terraces_are_whole_layers_with_steps_no_printer_places():
+def test_terraces_are_whole_layers():
     for draft, layers in ((0.5, 34), (3.0, 5), (20.0, 1)):
         settings = FabricationSettings(mould=MouldSettings(ridge_draft_deg=draft))
         assert settings.terrace_mm == pytest.approx(layers * 0.1)
@@ -114,7 +116,7 @@ def test_terraces_are_whole_layers_with_steps_no_printer_places():
 
 
 @pytest.mark.parametrize("shrinkage", [0.013, 0.2])
-def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
+def test_shrinkage_compensated_scales_lengths_of_the_pad(shrinkage):
     hole = [[[0, 0], [3, 0], [0, 4]]]
     asked = with_settings({"border_mm": 1.5}, pad={"keep_out_mm": hole}, silicone={"shrinkage": shrinkage})
     mould = asked.shrinkage_compensated().mould
@@ -128,7 +130,7 @@ def test_a_mould_is_larger_by_what_the_silicone_shrinks(shrinkage):
 
 
 @pytest.mark.parametrize(("layer_mm", "shrinkage"), [(0.1, 1e-3), (0.1, 0.02), (0.2, 0.13)])
-def test_heights_of_whole_layers_stay_so_and_come_out_within_half_a_layer(layer_mm, shrinkage):
+def test_shrinkage_compensated_keeps_whole_layers(layer_mm, shrinkage):
     asked = with_settings(printer={"layer_mm": layer_mm}, silicone={"shrinkage": shrinkage})
     for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
         height = getattr(asked.shrinkage_compensated().mould, key)
@@ -136,45 +138,28 @@ def test_heights_of_whole_layers_stay_so_and_come_out_within_half_a_layer(layer_
         assert height * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), abs=layer_mm / 2)
 
 
-def test_heights_between_layers_are_larger_like_all_else():
+def test_shrinkage_compensated_scales_heights_between_layers():
     asked = with_settings({"silicone_mm": 5.55, "shallow_ridge_height_mm": 0.45}, silicone={"shrinkage": 0.1})
     for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
         assert getattr(asked.shrinkage_compensated().mould, key) * 0.9 == pytest.approx(getattr(asked.mould, key))
 
 
-def test_the_defaults_are_those_the_pads_were_made_with():
-    assert MouldSettings().model_dump() == {
-        "floor_mm": 2.0,
-        "wall_mm": 2.0,
-        "wall_draft_deg": 2.0,
-        "silicone_mm": 6.0,
-        "border_mm": 0.0,
-        "ridge_width_mm": 0.4,
-        "ridge_draft_deg": 0.0,
-        "deep_ridge_height_mm": 1.2,
-        "shallow_ridge_height_mm": 0.4,
-        "levels": "as_needed",
-        "min_silicone_mm": 0.4,
-        "exit_mm": 2.0,
-        "exit_width_mm": 3.0,
-        "number_mm": 2.5,
-        "pins": False,
-        "lid": False,
-        "spout": False,
-        "holder": False,
-        "conductive": False,
-        "lead_mm": 30.0,
-        "tolerance_mm": 0.01,
-    }
-    assert PrinterSettings().model_dump() == {
-        "nozzle_mm": 0.4,
-        "layer_mm": 0.1,
-        "bed_mm": [220.0, 220.0, 250.0],
-        "resin": False,
-    }
+PUBLISHED_MOULD = """
+mould = { floor_mm = 2.0, wall_mm = 2.0, wall_draft_deg = 2.0, silicone_mm = 6.0, border_mm = 0.0, ridge_width_mm = 0.4,
+  ridge_draft_deg = 0.0, deep_ridge_height_mm = 1.2, shallow_ridge_height_mm = 0.4, levels = "as_needed",
+  min_silicone_mm = 0.4, exit_mm = 2.0, exit_width_mm = 3.0, number_mm = 2.5, pins = false, lid = false, spout = false,
+  holder = false, conductive = false, lead_mm = 30.0, tolerance_mm = 0.01 }
+printer = { nozzle_mm = 0.4, layer_mm = 0.1, bed_mm = [220.0, 220.0, 250.0], resin = false }
+"""
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_defaults_are_those_of_the_published_pads():
+    published = tomllib.loads(re.sub(r"\n  ", " ", PUBLISHED_MOULD))
+    assert MouldSettings().model_dump() == published["mould"]
+    assert PrinterSettings().model_dump() == published["printer"]
+
+
+def test_numpy_numbers_are_accepted():
     assert Spec({}).section(MouldSettings, wall_mm=np.int64(3)) == MouldSettings(wall_mm=3)
     assert Spec({}).section(PrinterSettings, bed_mm=np.array([200, 210, 220])) == PrinterSettings(
         bed_mm=[200, 210, 220]
@@ -190,19 +175,19 @@ def test_numbers_of_numpy_are_numbers():
         ("Published", "published"),
     ],
 )
-def test_a_preset_is_found_however_its_name_is_written(written, preset):
+def test_preset_names_ignore_case_spaces_and_hyphens(written, preset):
     settings = SiliconeSettings(name=written)
     assert settings.name == preset
     assert settings.material == SILICONES[preset]
 
 
-def test_what_is_set_stands_in_place_of_the_preset():
+def test_keys_override_the_preset():
     grade = SiliconeSettings(name="Dragon Skin 30", shrinkage=0.004).material
     assert (grade.shrinkage, grade.cure_h, grade.density_g_per_ml) == (0.004, 16, 1.08)
     assert FibreSettings(ohm_per_mm=120.0).material == Fibre("carbon-black TPE", 0.3, 120.0, None, 0.8)
 
 
-def test_materials_of_ones_own():
+def test_custom_materials_need_all_required_keys():
     spec = Spec(
         {
             "silicone": {
@@ -219,14 +204,14 @@ def test_materials_of_ones_own():
     assert spec.section(FibreSettings).material == Fibre("silvered yarn", 0.2)
 
 
-def test_the_default_silicone_is_that_of_the_published_pads_whose_moulds_were_as_large():
+def test_default_materials_are_those_of_the_published_pads():
     assert SiliconeSettings().material == Silicone("EcoFlex 00-20", 1.07, (1, 1), 30, 4, 0)
     assert FibreSettings().material.diameter_mm == 0.3
     assert {grade.shrinkage for name, grade in SILICONES.items() if name != "published"} == {0.001}
 
 
 @pytest.mark.parametrize("fibre_ohm", [0.3, 1.0, 97.0, 99.0, 105.0, 9.6e4, 3.14159e6])
-def test_no_resistor_of_the_series_shows_a_change_better(fibre_ohm):
+def test_divider_ohm_is_the_most_sensitive_of_the_series(fibre_ohm):
     series = "1 1.1 1.2 1.3 1.5 1.6 1.8 2 2.2 2.4 2.7 3 3.3 3.6 3.9 4.3 4.7 5.1 5.6 6.2 6.8 7.5 8.2 9.1"
     sold = [float(f"{value}e{decade}") for value in series.split() for decade in range(-2, 8)]
 

@@ -1,14 +1,17 @@
 """Programs that lay fibres, run by machines that know their words only, and the drawing of their ways."""
 
 import re
+from collections.abc import Callable
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.export import place_fibres
-from padforge.fabricate.fibre_placement.toolpath import laying_steps
+from padforge.fabricate.export import Fabrication, build
+from padforge.fabricate.fibre_placement.gcode import gcode
+from padforge.fabricate.fibre_placement.toolpath import plan_toolpath
+from padforge.fabricate.fibre_placement.urscript import urscript
 from padforge.fabricate.outputs.drawings import toolpath_svg
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
@@ -25,6 +28,10 @@ PLANS = {
     "shrunk": lambda: Plan(Morphology.straight(1), with_settings(silicone={"shrinkage": 0.03})),
     "many levels": lambda: Plan(level_pad(1.8, 1.2)),
 }
+
+
+def program(plan: Plan, language: Callable[..., str]) -> str:
+    return language(plan, Fabrication(plan, [], []).toolpath)
 
 
 def require_laid(plan: Plan, run: Run, limit_mm: float, shift: tuple[float, float]) -> None:
@@ -50,29 +57,28 @@ def require_travels_above(plan: Plan, run: Run) -> None:
                 assert not sideways or start[2] == end[2] == plan.settings.dispenser.travel_height_mm
 
 
-LANGUAGES = {"gcode": ("laying.gcode", run_gcode, 0.006), "urscript": ("laying.script", run_urscript, 0.011)}
+LANGUAGES = {"gcode": (gcode, run_gcode, 0.006), "urscript": (urscript, run_urscript, 0.011)}
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize(
     "name", [*PLANS, *(pytest.param(name, marks=pytest.mark.slow) for name in ("1para", "5para_dis", "20para"))]
 )
-def test_every_fibre_is_laid_along_its_course(request, language, name):
+def test_programs_place_every_fibre_along_its_path(request, language, name):
     if name in PLANS:
         plan = PLANS[name]()
     else:
         plan = Plan(Morphology.load(request.getfixturevalue("published") / f"{name}.mat"))
-    file, machine, limit_mm = LANGUAGES[language]
-    run = machine(place_fibres(plan, [language]).texts[file])
+    write, machine, limit_mm = LANGUAGES[language]
+    run = machine(program(plan, write))
     require_laid(plan, run, limit_mm, plan.settings.dispenser.origin_mm if language == "gcode" else (0, 0))
     require_travels_above(plan, run)
 
 
-def test_the_person_is_asked_in_the_order_of_the_work():
+def test_pauses_are_in_the_order_of_the_work():
     plan = Plan(level_pad(1.8, 1.2))  # three layers
-    texts = place_fibres(plan, ["gcode", "urscript"]).texts
-    asked = run_gcode(texts["laying.gcode"]).asked
-    assert asked[1:] == run_urscript(texts["laying.script"]).asked[2:]  # one more: the place of the pad is unknown
+    asked = run_gcode(program(plan, gcode)).asked
+    assert asked[1:] == run_urscript(program(plan, urscript)).asked[2:]  # one more: the pad's pose is unknown
     words = [re.sub(r".*?(fasten|cut|seal|zero).*", r"\1", message) for message in asked]
     fibre = ["fasten", "cut"]
     layers = [len(step) for step in laying_document(plan, 1.0)["laying_order"]]
@@ -80,33 +86,31 @@ def test_the_person_is_asked_in_the_order_of_the_work():
     assert asked[-1].startswith(f"layer {len(layers)} of {len(layers)}, 0.4 mm deep: seal")
 
 
-def test_nothing_that_a_firmware_would_misread():
-    texts = place_fibres(Plan(Morphology.straight(4)), ["gcode", "urscript"]).texts
-    assert all(text.isascii() for text in texts.values())
-    waits = [line for line in texts["laying.gcode"].splitlines() if line.startswith("M0")]
+def test_gcode_has_nothing_that_a_firmware_misreads():
+    plan = Plan(Morphology.straight(4))
+    lines = program(plan, gcode).splitlines()
+    assert all(line.isascii() for line in (*lines, program(plan, urscript)))
+    waits = [line for line in lines if line.startswith("M0")]
     assert len(waits) == 1 + 2 * 8 + 2
     for line in waits:
         assert re.fullmatch(r"M0 \([^();]+\)", line)
         assert not re.search(r"[sSpP]\s*\d", line)
-    assert max(len(line) for line in texts["laying.gcode"].splitlines() if line[0] in "GM") < 80
+    assert max(len(line) for line in lines if line[0] in "GM") < 80
 
 
-def test_what_is_asked_for_is_made_and_the_same_again():
-    plan = Plan(Morphology.random(1, 2, seed=1))
-    assert place_fibres(plan, ["stl", "png"]).texts == {}
-    assert not place_fibres(plan, ["stl", "png"]).findings
-    both = place_fibres(plan, ["urscript", "gcode"])
-    assert list(both.texts) == ["laying.gcode", "laying.script", "toolpath.svg"]
-    assert list(place_fibres(plan, ["urscript"]).texts) == ["laying.script", "toolpath.svg"]
-    assert place_fibres(Plan(Morphology.random(1, 2, seed=1)), ["gcode", "urscript"]).texts == both.texts
-    assert {finding.name for finding in both.findings} == {"dispenser_box", "dispenser_tip"}
+def test_build_writes_a_program_in_each_language_and_one_drawing(tmp_path):
+    pad = Morphology.random(1, 2, seed=1)
+    document = build(pad, tmp_path, ["urscript", "gcode"])
+    assert document["files"] == ["laying.gcode", "laying.script", "toolpath.svg"]
+    assert [finding["name"] for finding in document["findings"][-2:]] == ["dispenser_box", "dispenser_tip"]
+    assert (tmp_path / "laying.gcode").read_text() == program(Plan(pad), gcode) == program(Plan(pad), gcode)
 
 
-def test_the_fibre_of_the_settings_sets_depth_and_pace():
+def test_fibre_settings_set_depth_and_speed():
     pad = Morphology.random(1, 3, seed=2)
 
     def seconds(**fibre: object) -> float:
-        run = run_gcode(place_fibres(Plan(pad, with_settings(fibre=fibre)), ["gcode"]).texts["laying.gcode"])
+        run = run_gcode(program(Plan(pad, with_settings(fibre=fibre)), gcode))
         ways = [way for _, way in run.laid()]
         assert ways[0].corners[:, 2] == pytest.approx(float(str(fibre.get("diameter_mm", 0.3))) - 1.2)
         return sum((np.linalg.norm(np.diff(way.corners, axis=0), axis=1) / way.speeds).sum() for way in ways)
@@ -115,10 +119,10 @@ def test_the_fibre_of_the_settings_sets_depth_and_pace():
     assert seconds(diameter_mm=0.2) < seconds(diameter_mm=0.39)
 
 
-def test_gcode_has_the_places_speeds_and_height_of_the_settings():
+def test_gcode_has_positions_speeds_and_height_of_the_settings():
     dispenser = {"origin_mm": [50.0, -20.0], "travel_height_mm": 7.5, "feed_mm_s": 6.0}
     plan = Plan(Morphology.straight(1), with_settings(dispenser=dispenser))
-    text = place_fibres(plan, ["gcode"]).texts["laying.gcode"]
+    text = program(plan, gcode)
     code = [line for line in text.splitlines() if not line.startswith(";")]
     assert code[:2] == ["G21", "G90"]
     assert [line[:4] for line in code[2:5]] == ["M0 (", "G1 Z", "G1 X"]  # a lift before anything goes sideways
@@ -135,16 +139,16 @@ def test_gcode_has_the_places_speeds_and_height_of_the_settings():
 
 def script(**keys: object) -> list[str]:
     plan = Plan(Morphology.random(1, 2, seed=3), with_settings(dispenser=keys))
-    return [line.strip() for line in place_fibres(plan, ["urscript"]).texts["laying.script"].splitlines()]
+    return [line.strip() for line in program(plan, urscript).splitlines()]
 
 
-def test_an_arm_that_does_not_know_where_the_pad_lies_stands_still():
+def test_urscript_halts_while_the_pose_is_unknown():
     lines = script()
     assert lines.index("halt") < min(i for i, line in enumerate(lines) if line.startswith("move"))
     assert "[dispenser] arm_pose" in lines[lines.index("halt") - 1]
 
 
-def test_a_script_is_one_program_with_the_pose_speeds_and_accelerations_of_the_settings_in_metres():
+def test_urscript_has_pose_speeds_and_accelerations_in_metres():
     pose = [0.4, -0.25, 0.1, 0.0, 0.0, 1.5]
     lines = script(arm_pose=pose, feed_mm_s=8.0, travel_mm_s=40.0, acceleration_mm_s2=250.0)
     assert "pad = p[0.4, -0.25, 0.1, 0, 0, 1.5]" in lines
@@ -169,9 +173,9 @@ def points(path: ElementTree.Element) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pad", [Morphology.random(2, 3, seed=2), level_pad(1.8, 1.2)], ids=["random", "levels"])
-def test_the_drawing_shows_every_fibre_as_it_is_laid_with_its_number_turn_and_depth(pad):
+def test_toolpath_svg_shows_every_fibre_with_its_number_turn_and_depth(pad):
     plan = Plan(pad)
-    steps = laying_steps(plan, 0.3)
+    steps = plan_toolpath(plan, 0.3)
     root = ElementTree.fromstring(toolpath_svg(plan, steps))
     left, top, width, height = map(float, root.attrib["viewBox"].split())
     assert (f"{width:g}mm", f"{height:g}mm") == (root.get("width"), root.get("height"))

@@ -8,14 +8,14 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design.morphology import Morphology, assemble_knots
-from padforge.fabricate.fibre_placement.toolpath import Stroke, check_course, laying_steps
+from padforge.fabricate.fibre_placement.toolpath import Stroke, check_toolpath, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import with_settings
 
 
 def strokes(plan: Plan, stretch: float = math.inf) -> list[Stroke]:
-    return [stroke for step in laying_steps(plan, 0.3, stretch) for stroke in step.strokes]
+    return [stroke for step in plan_toolpath(plan, 0.3, stretch) for stroke in step.strokes]
 
 
 def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
@@ -36,7 +36,7 @@ def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("stretch", [math.inf, 0.3])
-def test_no_bend_is_taken_faster_than_machine_and_fibre_can(stretch):
+def test_feeds_in_bends_are_within_machine_and_fibre_limits(stretch):
     plan = Plan(
         Morphology.random(2, 3, seed=6), with_settings(dispenser={"acceleration_mm_s2": 60.0, "feed_mm_s": 12.0})
     )
@@ -60,7 +60,7 @@ def test_no_bend_is_taken_faster_than_machine_and_fibre_can(stretch):
         (4.0, 9.5, 0.11, 6.0),  # the fibre bears 6.59 mm/s
     ],
 )
-def test_the_feed_in_a_bend_is_what_its_radius_allows(radius_mm, acceleration, stretch, feed):
+def test_feed_in_a_bend_follows_from_its_radius(radius_mm, acceleration, stretch, feed):
     """Leads to one side turn by quarters of a circle, of the least radius of the rules; all else here is straight."""
     settings = with_settings(
         pad={"leads": "one side"},
@@ -74,7 +74,7 @@ def test_the_feed_in_a_bend_is_what_its_radius_allows(radius_mm, acceleration, s
     assert slow_mm == pytest.approx(math.pi * radius_mm if feed < 10 else horizontal.steps_mm.sum(), abs=ends_mm)
 
 
-def test_bends_only_where_they_are_slow_a_fibre_down():
+def test_feed_is_reduced_only_near_a_bend():
     """A corner in mid-way: beyond a millimetre of it the needle is as fast as it may be, on the leads as well."""
     inner = np.zeros((2, 3, 2))
     inner[0] = [(0.6, 1.0), (1.0, 1.0), (1.02, 1.2)]
@@ -88,7 +88,7 @@ def test_bends_only_where_they_are_slow_a_fibre_down():
     assert bent.feeds_mm_s.min() < 6
 
 
-def test_a_fibre_that_bears_less_is_laid_more_slowly_never_at_rest():
+def test_less_max_strain_is_slower_but_never_at_rest():
     plan = Plan(Morphology.random(2, 4, seed=1))
     feeds = [np.concatenate([stroke.feeds_mm_s for stroke in strokes(plan, each)]) for each in (1e-6, 0.2, 5.0)]
     least, most = [each.min() for each in feeds], [each.max() for each in feeds]
@@ -98,7 +98,7 @@ def test_a_fibre_that_bears_less_is_laid_more_slowly_never_at_rest():
     assert lengths == sorted(lengths, reverse=True)
 
 
-def test_as_long_as_the_laying_page_has_it_cut():
+def test_strokes_have_the_cut_length_of_the_laying_page():
     plan = Plan(Morphology.random(2, 5, seed=3))
     cut = [fibre["cut_mm"] for fibre in laying_document(plan, 1.0)["fibres"]]
     for stroke in strokes(plan):
@@ -113,7 +113,7 @@ EDGE = 33.75 / 2 + 2 + 30
 
 def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object):
     plan = Plan(pad, with_settings(mould, dispenser=dispenser))
-    return {finding.name: finding for finding in check_course(plan, laying_steps(plan, 0.3))}
+    return {finding.name: finding for finding in check_toolpath(plan, plan_toolpath(plan, 0.3))}
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **di
         ({"travel_height_mm": 10.0, "box_mm": [0.0, 220.0, 0.0, 220.0, -5.0, 9.0]}, -1.0, None),
     ],
 )
-def test_the_box_holds_all_ways_or_it_is_told_where_not(keys, room, places):
+def test_dispenser_box_finding_has_margin_and_positions(keys, room, places):
     found = findings(**keys)["dispenser_box"]
     assert found.measured == pytest.approx(room, abs=1e-9)
     assert found.status == ("pass" if room == 0 else "fail")
@@ -145,14 +145,14 @@ def test_the_box_holds_all_ways_or_it_is_told_where_not(keys, room, places):
         (0.71, {"ridge_width_mm": 0.7}, "fail"),
     ],
 )
-def test_a_needle_wider_than_a_track_would_cut_the_silicone(tip, mould, status):
+def test_dispenser_tip_fails_if_wider_than_a_track(tip, mould, status):
     found = findings(mould, tip_mm=tip)["dispenser_tip"]
     assert (found.status, found.measured) == (status, tip)
     assert bool(found.positions_mm) == (status == "fail")
     assert all(max(map(abs, place)) < EDGE - 29 for place in found.positions_mm)  # leads lie outside
 
 
-def test_by_default_the_needle_can_go_its_way():
+def test_default_needle_passes_the_checks():
     found = findings(pad=Morphology.random(3, 5, seed=4))
     assert {finding.status for finding in found.values()} == {"pass"}
     assert 0.38 < float(str(found["dispenser_tip"].limit)) <= 0.4
