@@ -28,8 +28,9 @@ from padforge.design.common.files import (
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding, check_result
-from padforge.fabricate.checks.mesh_checks import SOUND, sound
-from padforge.fabricate.checks.plan_checks import inspect
+from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
+from padforge.fabricate.checks.plan_checks import check_plan
+from padforge.fabricate.checks.surface import TriangleMesh
 from padforge.fabricate.fibre_placement.gcode import gcode
 from padforge.fabricate.fibre_placement.toolpath import check_course, instructions, laying_steps, summary_lines
 from padforge.fabricate.fibre_placement.urscript import urscript
@@ -234,16 +235,17 @@ def _meshed(name: str, body: Body) -> Printed:
 
 
 def _checked(plan: Plan, printed: Sequence[Printed]) -> list[Finding]:
-    findings = inspect(plan, printed[0].vertices, printed[0].triangles)
+    findings = check_triangles(printed[0].vertices, printed[0].triangles, plan.settings.printer, genus=0, has_plan=True)
+    findings += check_plan(plan)
     _require_sound(printed[0], findings)
     for body in printed[1:]:
         holes = lid_holes(plan) if body.name == "lid" else 0
-        _require_sound(body, sound(body.vertices, body.triangles, genus=holes))
+        _require_sound(body, check_solid(TriangleMesh.weld(body.vertices, body.triangles), holes))
     return findings
 
 
 def _require_sound(body: Printed, findings: Sequence[Finding]) -> None:
-    broken = [f.message for f in findings if f.name in SOUND and f.status == "fail"]
+    broken = [f.message for f in findings if f.name in SOLID_CHECKS and f.status == "fail"]
     if broken:
         raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
 
@@ -318,7 +320,7 @@ def _document(
         "sizes": sizes(plan),
         "mould_volume_ml": round(printed[0].mesh.volume() / 1000, 4),
         "silicone_volume_ml": bench["silicone"]["volume_ml"],
-        "findings": [finding.document() for finding in findings],
+        "findings": [finding.to_dict() for finding in findings],
         **bench,
         **({"frame": bed_frame(plan)} if settings.mould.holder else {}),
         "settings": {

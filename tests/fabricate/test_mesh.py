@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.checks.mesh_checks import check_mesh, inspect_mesh, sound
+from padforge.fabricate.checks.mesh_checks import check_mesh, check_solid, check_triangles
+from padforge.fabricate.checks.surface import TriangleMesh
 from padforge.fabricate.mesh import read_mesh, write_3mf, write_stl
 
 BOX = trimesh.creation.box((10, 20, 5))
@@ -32,7 +33,7 @@ def written(path: Path, vertices: np.ndarray = VERTICES, triangles: np.ndarray =
 
 def require_plain(findings: list[Finding]) -> None:
     """See that JSON can hold what is said, and that each says it in one line."""
-    json.dumps([finding.document() for finding in findings], allow_nan=False)
+    json.dumps([finding.to_dict() for finding in findings], allow_nan=False)
     assert all(len(finding.message.splitlines()) == 1 for finding in findings)
 
 
@@ -164,7 +165,7 @@ def test_damaged_files_are_judged_or_refused_in_one_line(tmp_path_factory, suffi
     except InputError as error:
         require_line(error, path.name)
         return
-    require_plain(inspect_mesh(vertices, triangles))
+    require_plain(check_triangles(vertices, triangles))
 
 
 RNG = np.random.default_rng(0)
@@ -190,7 +191,7 @@ SOUND = {
 def test_broken_meshes_of_any_size_have_findings_that_say_so(name):
     vertices, triangles = (BROKEN | SOUND)[name]
     for size in (1e-9, 1.0, 1e4):
-        found = inspect_mesh(vertices * size, triangles)
+        found = check_triangles(vertices * size, triangles)
         require_plain(found)
         statuses = {finding.name: finding.status for finding in found}
         if name in BROKEN:
@@ -205,12 +206,13 @@ def test_vertices_and_triangles_that_cannot_be_are_refused(change):
     changed[0] = change
     for vertices, triangles in ((changed, TRIANGLES), (VERTICES, TRIANGLES + 3), (VERTICES, TRIANGLES - 1)):
         with pytest.raises(InputError) as refusal:
-            inspect_mesh(vertices, triangles)
+            check_triangles(vertices, triangles)
         require_line(refusal.value)
 
 
 def test_a_heap_of_triangles_is_told_from_its_first_pairs():
-    found = sound(np.random.default_rng(0).normal(size=(30_000, 3)), np.arange(30_000).reshape(-1, 3))
+    corners = np.random.default_rng(0).normal(size=(30_000, 3))
+    found = check_solid(TriangleMesh(corners, np.arange(30_000).reshape(-1, 3)))
     failed = {finding.name: finding for finding in found if finding.status == "fail"}
     assert {"watertight", "self_intersection"} <= failed.keys()
     assert failed["self_intersection"].message.endswith("pairs of triangles and more cut through each other")

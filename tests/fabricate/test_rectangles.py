@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
-from padforge.fabricate.checks.plan_checks import check_plan, meshed
+from padforge.fabricate.checks.plan_checks import check_mould, check_plan
 from padforge.fabricate.export import build
 from padforge.fabricate.fibre_placement.toolpath import laying_steps, turned_over
 from padforge.fabricate.mesh import build_mesh, mould_mesh
@@ -46,7 +46,7 @@ def test_the_tray_is_as_wide_and_high_as_the_pad():
 
 def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
     with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
-    found = {finding.name: finding for finding in meshed(with_hole)[-1]}
+    found = {finding.name: finding for finding in check_mould(with_hole)[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
     more = mould_mesh(with_hole).volume() - mould_mesh(without).volume()
     assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
@@ -89,7 +89,7 @@ def test_the_lids_bores_keep_off_pillars():
 @pytest.mark.parametrize("leads", ["edges", "one side"])
 def test_few_fibres_have_a_mould_as_any_other(fibres, leads):
     pad = Morphology.straight(fibres, (9.0, 12.0))
-    found = {finding.name: finding for finding in meshed(Plan(pad, settings(pad, leads=leads)))[-1]}
+    found = {finding.name: finding for finding in check_mould(Plan(pad, settings(pad, leads=leads)))[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
 
 

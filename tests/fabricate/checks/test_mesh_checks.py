@@ -6,14 +6,18 @@ import shapely
 import trimesh
 from manifold3d import Manifold, OpType
 
-from padforge.fabricate.checks import surface
-from padforge.fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
-from padforge.fabricate.checks.surface import Surface
+from padforge.fabricate.checks import Finding
+from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
+from padforge.fabricate.checks.surface import TriangleMesh, compute_min_width, fill_outline, find_narrow_parts
 from padforge.fabricate.settings import PrinterSettings
 from tests.fabricate.checks.trays import CROSS, FLOOR, block, faults, inspected, line, near, prism, tray
 
 
-class TestSound:
+def check_solidity(vertices: np.ndarray, triangles: np.ndarray, genus: int | None = None) -> dict[str, Finding]:
+    return {f.name: f for f in check_solid(TriangleMesh.weld(vertices, triangles), genus)}
+
+
+class TestSolid:
     box = block(10, 20, 5)
 
     def test_a_missing_triangle(self):
@@ -23,7 +27,7 @@ class TestSound:
         assert "ridge_width" not in found
 
     def test_two_boxes_that_share_an_edge(self):
-        watertight = {f.name: f for f in sound(*_together(self.box, block(10, 20, 5, at=(10, 20, 0))))}["watertight"]
+        watertight = check_solidity(*_together(self.box, block(10, 20, 5, at=(10, 20, 0))))["watertight"]
         assert (watertight.status, watertight.measured) == ("fail", 1)
         assert near(watertight, 5, 10, 1e-6)
 
@@ -41,15 +45,15 @@ class TestSound:
         assert faults(inspected(mesh)) == {"volume": "fail"}
 
     def test_nothing(self):
-        found = inspect_mesh(np.empty((0, 3)), np.empty((0, 3), dtype=int))
+        found = check_triangles(np.empty((0, 3)), np.empty((0, 3), dtype=int))
         assert {f.name for f in found if f.status == "fail"} >= {"bodies", "volume"}
 
     def test_the_order_and_the_repetition_of_vertices_say_nothing(self):
         mesh = tray(*CROSS).to_mesh()
         corners = np.asarray(mesh.vert_properties)[np.asarray(mesh.tri_verts)][::-1].reshape(-1, 3)
-        found = sound(corners, np.arange(len(corners)).reshape(-1, 3), genus=0)
-        assert [f.name for f in found] == list(SOUND)
-        assert {f.status for f in found} == {"pass"}
+        findings = check_solidity(corners, np.arange(len(corners)).reshape(-1, 3), genus=0)
+        assert list(findings) == list(SOLID_CHECKS)
+        assert not faults(findings)
 
     @pytest.mark.parametrize(
         ("bed", "status"),
@@ -74,7 +78,7 @@ class TestSound:
 
     def test_boxes_that_cut_through_each_other(self):
         crossing = _together(self.box, block(2, 30, 2, at=(0.3, 0.2, 0.1)))
-        found = {f.name: f for f in sound(*crossing)}["self_intersection"]
+        found = check_solidity(*crossing)["self_intersection"]
         assert found.status == "fail"
         assert found.message.endswith("pairs of triangles cut through each other")
 
@@ -85,7 +89,7 @@ class TestSound:
             plate -= Manifold.cylinder(9, 2.0, 2.0, 24).translate((x, 0, -1))
         mesh = plate.to_mesh()
         for expected in (0, 1, 2):
-            found = {f.name: f for f in sound(mesh.vert_properties, mesh.tri_verts, genus=expected)}["genus"]
+            found = check_solidity(mesh.vert_properties, mesh.tri_verts, genus=expected)["genus"]
             assert (found.measured, found.limit) == (genus, expected)
             assert found.status == ("pass" if genus == expected else "fail")
 
@@ -109,16 +113,16 @@ def _hollows(count: int) -> list[trimesh.Trimesh]:
 @pytest.mark.parametrize(
     ("meshes", "status", "count", "place"),
     [
-        ([TestSound.box, block(2, 2, 2, at=(30, 7, 0))], "fail", 2, (30, 7)),
-        ([TestSound.box, _turned(block(2, 2, 2, at=(30, 7, 0)))], "fail", 2, (30, 7)),
-        ([TestSound.box, block(2, 2, 2)], "fail", 2, (0, 0)),  # one within the other
-        ([TestSound.box, _turned(block(2, 2, 2))], "warn", 1, (0, 0)),  # a hollow
+        ([TestSolid.box, block(2, 2, 2, at=(30, 7, 0))], "fail", 2, (30, 7)),
+        ([TestSolid.box, _turned(block(2, 2, 2, at=(30, 7, 0)))], "fail", 2, (30, 7)),
+        ([TestSolid.box, block(2, 2, 2)], "fail", 2, (0, 0)),  # one within the other
+        ([TestSolid.box, _turned(block(2, 2, 2))], "warn", 1, (0, 0)),  # a hollow
         (_hollows(99), "warn", 1, None),
         (_hollows(100), "fail", 101, None),  # of more than a hundred shells all are bodies
     ],
 )
 def test_bodies_are_told_from_hollows(meshes, status, count, place):
-    found = {finding.name: finding for finding in sound(*_together(*meshes))}
+    found = check_solidity(*_together(*meshes))
     assert (found["bodies"].status, found["bodies"].measured) == (status, count)
     assert place is None or near(found["bodies"], *place, within=1.5)
     assert set(faults(found)) == {"bodies"}
@@ -172,10 +176,10 @@ class TestTight:
 
 @pytest.mark.parametrize(("height", "rise"), [(1.9e-3, 1.0), (0.9e-3, 0.0)])
 def test_needles_have_no_slope(height, rise):
-    found = Surface.joined([[0, 0, 0], [2, 0, 0], [1, height, 0]], [[0, 1, 2]])
-    assert found.rise.tolist() == [rise]
-    slanted = Surface.joined([[0, 0, 0], [2, 0, 0], [0, 3, 4]], [[0, 1, 2]])
-    assert slanted.rise == pytest.approx([0.6])
+    found = TriangleMesh.weld([[0, 0, 0], [2, 0, 0], [1, height, 0]], [[0, 1, 2]])
+    assert found.normal_z.tolist() == [rise]
+    slanted = TriangleMesh.weld([[0, 0, 0], [2, 0, 0], [0, 3, 4]], [[0, 1, 2]])
+    assert slanted.normal_z == pytest.approx([0.6])
     assert slanted.areas == pytest.approx([5])
 
 
@@ -184,25 +188,24 @@ class TestAreas:
     block = shapely.box(0, 0, 10, 5)
 
     def test_a_bar_is_as_wide_as_it_is(self):
-        (patch,) = surface.too_narrow(self.bar, 0.4)
-        assert patch.area == pytest.approx(self.bar.area, rel=1e-3)
-        assert surface.least_width(self.bar, surface.too_narrow(self.bar, 0.4), 0.4) == pytest.approx(0.3, abs=0.011)
-        assert len(surface.too_narrow(self.bar, 0.31)) == 0
-        assert len(surface.too_narrow(self.block, 4.9)) == 0
-        assert surface.spare_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
+        (part,), width = find_narrow_parts(self.bar, 0.4)
+        assert part.area == pytest.approx(self.bar.area, rel=1e-3)
+        assert width == pytest.approx(0.3, abs=0.011)
+        assert len(find_narrow_parts(self.bar, 0.31)[0]) == len(find_narrow_parts(self.block, 4.9)[0]) == 0
+        assert compute_min_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
 
     @pytest.mark.parametrize(("neck", "narrow"), [(0.7, False), (1.5, True)])
     def test_what_leads_far_from_something_wider_is_no_tip(self, neck, narrow):
         """A peg 0.3 wide on a block: the tip of it up to twice the least width long, a thin wall beyond."""
         peg = shapely.union(self.block, shapely.box(4, 5, 4.3, 5 + neck))
-        assert bool(len(surface.too_narrow(peg, 0.4))) == narrow
+        assert bool(len(find_narrow_parts(peg, 0.4)[0])) == narrow
 
     def test_a_bridge_between_two_blocks_is_no_tip(self):
         bridge = shapely.union_all([self.block, shapely.box(4, 5, 4.3, 5.5), shapely.box(0, 5.5, 10, 9)])
-        assert len(surface.too_narrow(bridge, 0.4)) == 1
+        assert len(find_narrow_parts(bridge, 0.4)[0]) == 1
 
     @pytest.mark.parametrize(("slot", "closed"), [(1.9, True), (2.1, False)])
     def test_slots_up_to_two_millimetres_do_not_open_a_ring(self, slot, closed):
         ring = shapely.box(-10, -10, 10, 10).difference(shapely.box(-8, -8, 8, 8))
         cut = ring.difference(shapely.box(5, -slot / 2, 20, slot / 2))
-        assert surface.enclosed(cut).contains(shapely.Point(0, 0)) == closed
+        assert fill_outline(cut).contains(shapely.Point(0, 0)) == closed

@@ -11,8 +11,9 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import beziers, cubic
 from padforge.design.settings import RulesSettings
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.checks.mesh_checks import SOUND
-from padforge.fabricate.checks.plan_checks import check, check_plan, strains, thinner
+from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS
+from padforge.fabricate.checks.plan_checks import check, check_plan, compute_bending_strains
+from padforge.fabricate.checks.surface import find_thin_patches
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -43,7 +44,7 @@ def test_published_pad_that_was_built_shows_its_crossings(published):
 )
 def test_tangled_pads_are_measured_and_sound(grid, knots, seed):
     findings = {finding.name: finding for finding in check(Morphology.random(grid, knots, seed))}
-    assert {findings[name].status for name in SOUND} == {"pass"}
+    assert {findings[name].status for name in SOLID_CHECKS} == {"pass"}
 
 
 RESIN = {"nozzle_mm": 0.2, "resin": True}
@@ -112,7 +113,7 @@ class TestFibres:
     def test_crossings_of_one_family(self, levels, status):
         finding = found(level_pad(1.8, 1.2), "same_family_crossings", with_settings({"levels": levels}))
         assert (finding.status, finding.measured) == (status, 2)
-        assert all(isinstance(value, float) for place in finding.document()["positions_mm"] for value in place)
+        assert all(isinstance(value, float) for place in finding.to_dict()["positions_mm"] for value in place)
         assert found(level_pad(1.8, 1.2), "silicone_wall").status == "pass"  # they lie at two depths
         (left, y), (right, _) = finding.positions_mm
         assert left == pytest.approx(-right, abs=1e-3)
@@ -188,7 +189,7 @@ class TestSilicone:
     def test_corners_of_less_than_a_hundredth_of_a_square_millimetre_are_no_walls(self, length, patches):
         """A peg 0.3 mm wide on a block: 0.006 and 0.015 mm² of it are thinner than 0.4 mm."""
         block, peg = shapely.box(0, 0, 10, 5), shapely.box(4, 5, 4.3, 5 + length)
-        assert len(thinner(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
+        assert len(find_thin_patches(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
 
     @pytest.mark.parametrize(
         ("width", "length", "status"), [(0.2, 2.0, "pass"), (0.4, 2.0, "warn"), (0.4, None, "off")]
@@ -301,24 +302,24 @@ def bent(pad: Morphology, radius: float, **settings: dict[str, Any]) -> Plan:
 @pytest.mark.parametrize("radius", [5.0, 30.0])
 def test_straight_fibres_strain_as_a_bent_plate_does(radius):
     """Horizontals, 1.2 mm deep, lie 3 - 1.2 + 0.15 mm above the middle of 6 mm; verticals stay as they are."""
-    shallow, deep = strains(bent(Morphology.straight((3, 2), (8.0, 15.0)), radius))
-    assert (shallow.depth_mm, shallow.most) == (0.4, 0.0)
-    assert deep.most == pytest.approx(1.95 / (radius + 3))
+    shallow, deep = compute_bending_strains(bent(Morphology.straight((3, 2), (8.0, 15.0)), radius))
+    assert shallow[:2] == (0.4, 0.0)
+    assert deep[1] == pytest.approx(1.95 / (radius + 3))
 
 
 def test_a_fibre_at_an_angle_is_strained_by_the_square_of_its_cosine():
     knots = Morphology.straight((0, 1), 10.0).knots
     middle = np.array([[[0.7, 0.3], [1.3, 0.7]]])
     pad = Morphology(np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1), 10.0, fibres=(0, 1))
-    (found,) = strains(bent(pad, 20.0))
+    ((_, strain, _),) = compute_bending_strains(bent(pad, 20.0))
     steps = np.concatenate([np.diff(line.coords, axis=0) for line in bent(pad, 20.0).lines])
     steepest = np.abs(steps[:, 0] / steps[:, 1]).max()
-    assert found.most == pytest.approx((3 - 0.4 + 0.15) / 23 * steepest**2 / (1 + steepest**2))
+    assert strain == pytest.approx((3 - 0.4 + 0.15) / 23 * steepest**2 / (1 + steepest**2))
 
 
 def test_fibres_below_the_middle_are_pressed():
     thin = {"silicone_mm": 0.8, "shallow_ridge_height_mm": 0.6, "deep_ridge_height_mm": 0.7}
-    assert strains(bent(Morphology.straight((2, 0), 10.0), 20.0, mould=thin))[0].most < 0
+    assert compute_bending_strains(bent(Morphology.straight((2, 0), 10.0), 20.0, mould=thin))[0][1] < 0
 
 
 @pytest.mark.parametrize(("stretch", "status"), [(1.0, "pass"), (0.1, "warn"), (0.05, "fail")])

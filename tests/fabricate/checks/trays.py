@@ -8,7 +8,7 @@ from manifold3d import CrossSection, Manifold, OpType
 from shapely.geometry.base import BaseGeometry
 
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.checks.mesh_checks import inspect_mesh
+from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.plan import polygon_rings
 
 FLOOR, DEPTH, WALL, SIZE = 2.0, 6.0, 2.0, 20.0
@@ -54,7 +54,7 @@ def inspected(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[st
     else:
         mesh = solid.to_mesh()
         vertices, triangles = mesh.vert_properties, mesh.tri_verts
-    return {finding.name: finding for finding in inspect_mesh(vertices, triangles, **arguments)}  # pyright: ignore
+    return {finding.name: finding for finding in check_triangles(vertices, triangles, **arguments)}  # pyright: ignore
 
 
 def faults(found: dict[str, Finding]) -> dict[str, str]:
