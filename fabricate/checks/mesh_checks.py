@@ -16,7 +16,6 @@ from padforge.fabricate.checks import Finding, Status, check_result
 from padforge.fabricate.checks.surface import (
     SPECK_MM2,
     FaceMask,
-    Shapes,
     Slab,
     TriangleMesh,
     build_slabs,
@@ -246,11 +245,7 @@ def _find_narrowest(areas: Sequence[tuple[BaseGeometry, BaseGeometry | None]], l
     """Find the least width below `limit` of areas, clipped to others, and the positions of all narrow parts."""
     parts, widths = zip(*(find_narrow_parts(area, limit, within) for area, within in areas), strict=True)
     merged = shapely.get_parts(shapely.union_all(np.concatenate(parts)))  # some lie in several slabs
-    return min(widths), _positions_in(merged)
-
-
-def _positions_in(parts: Shapes) -> Array:
-    return _deduplicate(shapely.get_coordinates(shapely.point_on_surface(parts)))
+    return min(widths), _deduplicate(shapely.get_coordinates(shapely.point_on_surface(merged)))
 
 
 def _check_wall_thickness(cast: Sequence[Slab], printer: PrinterSettings, size: float) -> Finding:
@@ -260,12 +255,12 @@ def _check_wall_thickness(cast: Sequence[Slab], printer: PrinterSettings, size: 
         return Finding("wall_thickness", "pass", size, limit, "it has no walls around a casting")
     rim = cast[-1]
     area = cut_solid(rim.solid, rim.top_mm - min(printer.layer_mm, rim.top_mm - rim.bottom_mm) / 2)
-    parts, width = find_narrow_parts(area, limit)
-    if not len(parts):
+    width, positions = _find_narrowest([(area, None)], limit)
+    if not len(positions):
         width = compute_min_width(area, limit)
-    status: Status = "pass" if not len(parts) else "warn" if width > tested_width(printer.line_mm) else "fail"
+    status: Status = "pass" if not len(positions) else "warn" if width > tested_width(printer.line_mm) else "fail"
     message = f"the walls are {width:.2f} mm thick at the rim, {_WALL_LINES} lines of the printer {limit:g} mm"
-    return check_result("wall_thickness", status, width, limit, message, _positions_in(parts))
+    return check_result("wall_thickness", status, width, limit, message, positions)
 
 
 def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:

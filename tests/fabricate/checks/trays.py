@@ -1,4 +1,4 @@
-"""Trays and blocks as triangle meshes, made without a plan, and what the checks find in them."""
+"""Trays and blocks as triangle meshes, built without a plan, and their findings."""
 
 import math
 
@@ -48,7 +48,7 @@ def block(*sizes: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.
     return trimesh.creation.box(sizes, trimesh.transformations.translation_matrix(at))
 
 
-def inspected(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[str, Finding]:
+def check_body(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[str, Finding]:
     if isinstance(solid, trimesh.Trimesh):
         vertices, triangles = solid.vertices, solid.faces
     else:
@@ -57,12 +57,12 @@ def inspected(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[st
     return {finding.name: finding for finding in check_triangles(vertices, triangles, **arguments)}  # pyright: ignore
 
 
-def faults(found: dict[str, Finding]) -> dict[str, str]:
-    return {name: finding.status for name, finding in found.items() if finding.status != "pass"}
+def failures(findings: dict[str, Finding]) -> dict[str, str]:
+    return {name: finding.status for name, finding in findings.items() if finding.status != "pass"}
 
 
-def near(found: Finding, x: float, y: float, within: float = 1.0) -> bool:
-    return any(math.hypot(px - x, py - y) <= within for px, py in found.positions_mm)
+def has_position_near(finding: Finding, x: float, y: float, within: float = 1.0) -> bool:
+    return any(math.hypot(px - x, py - y) <= within for px, py in finding.positions_mm)
 
 
 CROSS = [ridge(spanning(3.0), 1.2), ridge(spanning(-3.0), 1.2), ridge(shapely.affinity.rotate(spanning(1), 90, (0, 0)))]
