@@ -357,21 +357,11 @@ def _find_thin_walls(area: BaseGeometry, width: float, tip: float) -> Shapes:
     opened = _open(area, width)
     cores = shapely.get_parts(shapely.buffer(_drop_specks(without(area, opened)), -_LINE_MM, join_style="mitre"))
     patches = _drop_specks(np.asarray(shapely.buffer(cores, _LINE_MM, join_style="mitre")))
-    rings = shapely.get_rings(shapely.get_parts(opened))
-    if not len(patches) or not len(rings):
-        return patches
-    points = [shapely.get_coordinates(ring) for ring in rings]
-    edges = np.asarray(shapely.linestrings(np.concatenate([np.stack([xy[:-1], xy[1:]], axis=1) for xy in points])))
-    around = np.asarray(shapely.buffer(patches, 2 * _LINE_MM))
-    patch, edge = shapely.STRtree(edges).query(around, predicate="intersects")
-    contacts = np.asarray(shapely.intersection(edges[edge], around[patch]))
-    walls = np.ones(len(patches), dtype=bool)
-    for i in np.unique(patch):
-        contact = shapely.union_all(shapely.buffer(contacts[patch == i], _LINE_MM))
-        if shapely.get_num_geometries(contact) == 1:
-            reach = shapely.distance(shapely.points(shapely.get_coordinates(patches[i])), contact)
-            walls[i] = reach.max() + _LINE_MM > tip
-    return patches[walls]
+    contacts = shapely.buffer(shapely.intersection(opened.boundary, shapely.buffer(patches, 2 * _LINE_MM)), _LINE_MM)
+    corners = [shapely.points(shapely.get_coordinates(patch)) for patch in patches]
+    reach = [shapely.distance(*pair).max() for pair in zip(corners, contacts, strict=True)]  # NaN without a contact
+    tips = (shapely.get_num_geometries(contacts) == 1) & (np.array(reach) + _LINE_MM <= tip)
+    return patches[~tips]
 
 
 def tested_width(limit: float) -> float:
