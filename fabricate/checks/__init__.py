@@ -37,7 +37,16 @@ class Finding:
 def check_result(
     name: str, status: Status | bool, measured: Number, limit: Number, message: str, positions: Iterable[Any] = ()
 ) -> Finding:
-    """Build a finding; `status` may be whether the check passes, `positions` (n, 2) coordinates of any kind, mm."""
+    """Build a finding.
+
+    Args:
+        name: name of the check.
+        status: its status, or whether it passes.
+        measured: measured value.
+        limit: limit of the measured value.
+        message: one sentence for the user.
+        positions: coordinates of any kind; shape (n, 2), mm.
+    """
     if not isinstance(status, str):
         status = "pass" if status else "fail"
     return Finding(name, status, measured, limit, message, tuple((float(x), float(y)) for x, y in positions))

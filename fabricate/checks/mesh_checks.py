@@ -32,7 +32,7 @@ from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 SOLID_CHECKS = ("manifold", "watertight", "self_intersection", "bodies", "volume", "genus")
 """The checks that any solid must pass."""
 _MAX_PAIRS = 1000  # number of self-intersections after which the search ends
-_MAX_SHELLS = 100  # shells that are told into bodies and hollows; more are debris, and all count as bodies
+_MAX_SHELLS = 100  # shells that are classified as bodies or hollows; more are debris, and all count as bodies
 
 
 def check_mesh(
@@ -99,7 +99,12 @@ def check_triangles(
 
 
 def check_solid(mesh: TriangleMesh, genus: int | None = None) -> list[Finding]:
-    """Run the SOLID_CHECKS, in a fraction of the time of all; `genus` is None if the number of holes is unknown."""
+    """Run the SOLID_CHECKS alone, in a fraction of the time of all.
+
+    Args:
+        mesh: the welded mesh.
+        genus: required number of through holes; None if unknown.
+    """
     status, volume = mesh.solid.status().name, float(mesh.signed_volumes.sum())
     findings = [
         check_result("manifold", status == "NoError", int(status == "NoError"), 1, f"manifold3d says {status}"),
@@ -196,10 +201,8 @@ MIN_FLOOR_MM = 0.4  # thinner floors bend when the casting is pulled out
 MIN_SILICONE_MM = 0.1  # thinner silicone does not leave the mould in one piece
 _WALL_LINES = 2  # printed lines, side by side, of a wall that holds
 _FLOOR_LAYERS = 2  # printed layers of a tight floor
-_DEPTH_STEP = 1.5
-"""Difference of ridge heights, in least silicone walls, from which tracks are at two depths and may come close."""
-_MAX_WALL_SLOPE = math.tan(math.radians(10))
-"""Lean of a wall outwards per mm of height, at most; what leans more is taken for no wall."""
+_DEPTH_STEP = 1.5  # difference of heights, in least silicone walls, above which tracks of two depths may come close
+_MAX_WALL_SLOPE = math.tan(math.radians(10))  # lean of a wall outwards per mm of height, at most
 _MAX_RIDGE_SLOPE = math.tan(math.radians(20))  # widening of a ridge on either side per mm downwards, at most
 _MIN_FLOOR_COSINE = math.cos(math.radians(10))  # cosine of the slope of a floor, at least
 _NEAR_CORNER = 0.98  # positions, from a triangle's middle to its corners, at which thickness is measured too
@@ -241,9 +244,9 @@ def _silicone_area(slab: Slab, cast: Sequence[Slab], limit: float) -> BaseGeomet
     return without(slab.interior, without(slab.cross_section, feet))
 
 
-def _find_narrowest(areas: Sequence[tuple[BaseGeometry, BaseGeometry | None]], limit: float) -> tuple[float, Array]:
+def _find_narrowest(sections: Sequence[tuple[BaseGeometry, BaseGeometry | None]], limit: float) -> tuple[float, Array]:
     """Find the least width below `limit` of areas, clipped to others, and the positions of all narrow parts."""
-    parts, widths = zip(*(find_narrow_parts(area, limit, within) for area, within in areas), strict=True)
+    parts, widths = zip(*(find_narrow_parts(area, limit, within) for area, within in sections), strict=True)
     merged = shapely.get_parts(shapely.union_all(np.concatenate(parts)))  # some lie in several slabs
     return min(widths), _deduplicate(shapely.get_coordinates(shapely.point_on_surface(merged)))
 
@@ -271,7 +274,7 @@ def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Find
     """
     limit = max(MIN_FLOOR_MM, _FLOOR_LAYERS * printer.layer_mm)
     up, down = mesh.normal_z > _MIN_FLOOR_COSINE, mesh.normal_z < -_MIN_FLOOR_COSINE
-    both = zip(_measure(mesh, up, down), _measure(mesh, down, up), strict=True)
+    both = zip(_measure_thickness(mesh, up, down), _measure_thickness(mesh, down, up), strict=True)
     thicknesses, points = map(np.concatenate, both)
     thickness = float(thicknesses.min(initial=mesh.bounds[1, 2] - mesh.bounds[0, 2]))
     thin = thicknesses < tested_width(limit)
@@ -280,7 +283,7 @@ def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Find
     return check_result("floor_thickness", passed, thickness, limit, message, _deduplicate(points[thin]))
 
 
-def _measure(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tuple[Array, Array]:
+def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tuple[Array, Array]:
     """Measure the solid upright from triangles `start` (m,) to triangles `end`: (k,) mm, and positions (k, 2)."""
     corners, middles = mesh.corners[start], mesh.centroids[start][:, None]
     points = np.concatenate([middles, middles + _NEAR_CORNER * (corners - middles)], axis=1).reshape(-1, 3)
@@ -344,10 +347,10 @@ def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     before = np.zeros(len(mesh.triangles), dtype=bool)
     floor = shapely.contains_xy(lowest.base, x, y)
     for index in largest:
-        level = height == index
-        area = cut_solid(mesh.solid, float(z[level].min()))
-        enclosed = shapely.contains_xy(fill_outline(area), x[level], y[level])
-        before[faces[level]] = enclosed & ~shapely.contains_xy(area, x[level], y[level]) & floor[level]
+        selected = height == index
+        area = cut_solid(mesh.solid, float(z[selected].min()))
+        enclosed = shapely.contains_xy(fill_outline(area), x[selected], y[selected])
+        before[faces[selected]] = enclosed & ~shapely.contains_xy(area, x[selected], y[selected]) & floor[selected]
     return before
 
 

@@ -88,8 +88,7 @@ def check_plan(plan: Plan) -> list[Finding]:
     return findings + _check_fibre_strain(plan)
 
 
-_SLENDER, _MAX_SLENDERNESS = 5.0, 10.0
-"""Ratios of height and width above which ridges may break off in demoulding, and do not print upright."""
+_SLENDER, _MAX_SLENDERNESS = 5.0, 10.0  # ratios of height and width above which ridges may break, and do not print
 _FINE_MM, _FOLD_TURN = 3e-4, 0.05  # tolerance of fibres, and turn between points, rad, at which folds are looked for
 _BEND_TURN, _BEND_SLACK = 2.5e-3, 1e-3  # turn between points of a bend, rad; leads bend as tightly as allowed
 _MAX_KINK = 0.5  # turn of a fibre in one point, rad, that the rule for bends lets pass
@@ -191,8 +190,7 @@ def _check_common_tracks(plan: Plan) -> list[Finding]:
         f"tracks lie over deeper ones for {worst.length_mm:.2f} mm at most, fibre {worst.shallow + 1} over"
         f" {worst.deep + 1} at ({worst.position_mm[0]:.1f}, {worst.position_mm[1]:.1f}) mm"
     )
-    status = "warn" if positions else "pass"
-    return [check_result("common_tracks", status, worst.length_mm, limit, message, positions)]
+    return [check_result("common_tracks", "warn" if positions else "pass", worst.length_mm, limit, message, positions)]
 
 
 def _check_silicone_wall(plan: Plan) -> Finding:
@@ -247,8 +245,8 @@ def _check_cover(plan: Plan) -> Finding:
     message = f"{cover:g} mm of silicone lie beyond the deepest tracks"
     if thickness > nominal:
         message += f"; for {len(plan.heights_mm)} depths the pad is {thickness:g} mm thick, not {nominal:g}"
-    warn = cover < COVER_MM - 1e-9 or thickness > nominal
-    return Finding("cover", "warn" if warn else "pass", cover, COVER_MM, message)
+    status: Status = "warn" if cover < COVER_MM - 1e-9 or thickness > nominal else "pass"
+    return Finding("cover", status, cover, COVER_MM, message)
 
 
 def _check_fibre_bend(plan: Plan) -> Finding:

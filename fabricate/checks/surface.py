@@ -169,8 +169,7 @@ class TriangleMesh:
 PENETRATION_MM = 1e-3  # triangles that penetrate less only touch: a thousand times the rounding of an STL
 _PLANE_ULPS = 4  # distance from a plane, in float32 steps, up to which corners lie in it: the precision of an STL
 _DEGENERATE_MM = 1e-6  # triangles of less height have no plane and no area to intersect
-_PARALLEL = 1e-16
-"""Squared sine below which edges are parallel: their cross product is noise, and other axes separate them."""
+_PARALLEL = 1e-16  # squared sine below which edges are parallel: their cross product is noise
 
 
 @njit(cache=True, error_model="numpy")
@@ -234,15 +233,12 @@ def _sweep(corners: Any, edges: Any, normals: Any, low: Any, high: Any, toleranc
     return count
 
 
-_MIN_SLABS, _MAX_SLABS = 8, 12
-"""Numbers of slabs; moulds of up to ten layers are cut between all their horizontal faces."""
+_MIN_SLABS, _MAX_SLABS = 8, 12  # moulds of up to ten layers are cut between all their horizontal faces
 _FLAT_MM = 1e-3  # faces of less rise are horizontal, and heights that differ by less are equal
 _SLOT_MM = 2.0  # narrower gaps in a wall do not open what it encloses
-SPECK_MM2 = 0.01
-"""Smaller areas are corners and the width of a line, not walls or faces."""
+SPECK_MM2 = 0.01  # smaller areas are corners and the width of a line, not walls or faces
 _LINE_MM = 0.01  # narrower strips lie between two outlines of one curve, and are no walls
-_TIP = 2.0
-"""Length of a tip, limits: what narrows to a point within it is a corner, as where strips cross at 29 degrees."""
+_TIP = 2.0  # length of a tip, limits: what narrows to a point within it is a corner, as of strips at 29 degrees
 _PRECISION = 0.02  # relative precision of widths, or `_LINE_MM` if that is more
 
 

@@ -76,12 +76,6 @@ class TestSolid:
         assert findings["genus"].measured == 0
         assert check_body(block(10.002, 20.01, 5))["bed"].message.startswith("10.01 x 20.01 x 5 mm")  # never less
 
-    def test_intersecting_boxes_fail(self):
-        crossing = _together(self.box, block(2, 30, 2, at=(0.3, 0.2, 0.1)))
-        finding = check_solidity(*crossing)["self_intersection"]
-        assert finding.status == "fail"
-        assert finding.message.endswith("pairs of triangles cut through each other")
-
     @pytest.mark.parametrize("genus", [0, 1, 2])
     def test_genus_counts_through_holes(self, genus):
         plate = prism(shapely.box(-12, -5, 12, 5), 0, 3)
