@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
-from padforge.fabricate.cad.model import FITS_MM, body_solid, mould_model
+from padforge.fabricate.cad.model import FITS_MM, body_solid, build_mould_model
 from padforge.fabricate.cad.step_file import write_step
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.mould import mould_body
@@ -51,7 +51,7 @@ def trials() -> Iterator[BenchTrial]:
                         f"N={knots}", way, 1000 * tolerance_mm, partial(work, plan), partial(evaluate, plan)
                     )
         plan = partial(_plan, pad)
-        work = partial(lambda plan: mould_model(plan(), "mould").shape, plan)
+        work = partial(lambda plan: build_mould_model(plan(), "mould").shape, plan)
         yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FITS_MM[0], work, partial(_evaluate_solid, plan))
 
 

@@ -269,11 +269,11 @@ def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
     Raises:
         InputError: a CAD solid is not valid, or not of its mesh.
     """
-    from padforge.fabricate.cad.model import assembly, models
+    from padforge.fabricate.cad.model import assemble, build_models
     from padforge.fabricate.cad.step_file import write_step
 
-    made = models(plan, dict(_bodies(plan)))
-    apart = [model.apart(body.mesh) for model, body in zip(made, printed, strict=True)]
+    made = build_models(plan, dict(_bodies(plan)))
+    apart = [model.compare(body.mesh) for model, body in zip(made, printed, strict=True)]
     coarse = max(1.0, plan.settings.mould.tolerance_mm / _CAD_TOLERANCE_MM)
     most_volume, most_surface = coarse * _CAD_VOLUME, coarse * _CAD_SURFACE
     for body, (volume, surface) in zip(printed, apart, strict=True):
@@ -285,7 +285,7 @@ def _cad(plan: Plan, printed: Sequence[Printed]) -> tuple[Write, Finding]:
     message += f", curves within {1000 * max(model.fit_mm for model in made):g} µm"
     measured = [round(volume, 6), round(surface, 6)]
     found = check_result("cad_solid", True, measured, [round(most_volume, 6), round(most_surface, 6)], message)
-    return ("mould.step", partial(write_step, shape=assembly(made, plan.shrinkage_compensated))), found
+    return ("mould.step", partial(write_step, part=assemble(made, plan.shrinkage_compensated))), found
 
 
 def _drawings(plan: Plan, findings: Sequence[Finding], formats: Sequence[str]) -> Iterator[Write]:

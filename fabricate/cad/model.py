@@ -1,7 +1,11 @@
-"""The CAD model of what is printed: named and coloured parts in one assembly, of true curves.
+"""CAD models of what is printed: named and coloured parts with exact curves, in one assembly.
 
-Importing this module loads the CAD kernel, which takes seconds: import it where it is used.
+A mould is built face by face from its plan, without Boolean operations. A lid or holder, which has few faces, is built
+by build123d. Importing this module loads the CAD kernel (OCP), which takes half a second: import it where it is used.
 """
+
+# pyright: reportAttributeAccessIssue=false
+# The CAD kernel's modules come without types.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from build123d import Color, Compound, Face, Location, Plane, Solid, Vector, Wire
+from OCP.BRepCheck import BRepCheck_Analyzer
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure
@@ -19,13 +23,6 @@ from shapely.geometry.base import BaseGeometry
 from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.fabricate.cad.curves import arc_through
-from padforge.fabricate.cad.planar_map import HORIZONTAL_TRACKS as HORIZONTAL_TRACKS
-from padforge.fabricate.cad.planar_map import TRAY
-from padforge.fabricate.cad.planar_map import VERTICAL_TRACKS as VERTICAL_TRACKS
-from padforge.fabricate.cad.planar_map import contact_mm2 as contact_area_mm2
-from padforge.fabricate.cad.planar_map import fill_cells as fill_cells
-from padforge.fabricate.cad.solids import solids
 from padforge.fabricate.mould import (
     COLOURS,
     INTO_FLOOR_MM,
@@ -38,205 +35,235 @@ from padforge.fabricate.mould import (
 from padforge.fabricate.plan import Plan, polygon_rings
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
+from .curves import fit_arc
+from .planar_map import HORIZONTAL_TRACKS, TRAY, VERTICAL_TRACKS, compute_contact_area, fill_cells
+from .solids import build_solids
+from .step_file import CadPart
+
 if TYPE_CHECKING:
+    from build123d import Compound, Solid
     from manifold3d import Manifold
 
-_MIN_CIRCLE_CORNERS = 32
-"""A polygon of fewer corners is meant as one."""
-
-
-def body_solid(body: Body) -> Any:
-    """A body as a build123d `Solid`, or a `Compound` of several; lengths in mm."""
-    solid: Any
-    solid, *more = prism_solids(body.base)
-    if more:
-        solid = solid.fuse(*more)
-    if body.cuts:
-        solid = solid.cut(*prism_solids(body.cuts))
-    return solid.fuse(*prism_solids(body.adds)) if body.adds else solid
-
-
-def prism_solids(prisms: Iterable[Prism]) -> list[Solid]:
-    """One solid for every polygon of every prism."""
-    return [solid for prism in prisms for solid in _solids(prism)]
-
-
-def _solids(prism: Prism) -> list[Solid]:
-    polygons = polygon_rings(prism.area)
-    if len(polygons) == 1 and len(polygons[0]) == 1 and (circle := _circle(polygons[0][0])):
-        return [_round(prism, *circle)]
-    if not prism.flare_mm:
-        up = Vector(0, 0, prism.top_mm - prism.bottom_mm)
-        wires = [[_wire(ring, prism.bottom_mm) for ring in rings] for rings in polygons]
-        return [Solid.extrude(Face(outer, holes), up) for outer, *holes in wires]
-    low, high = np.reshape(prism.area.bounds, (2, 2))
-    x, y = 1 + 2 * prism.flare_mm / (high - low)
-    grown = affinity.scale(prism.area, x, y, origin=tuple((low + high) / 2))
-    (((bottom,),), ((top,),)) = polygons, polygon_rings(grown)
-    return [Solid.make_loft([_wire(bottom, prism.bottom_mm), _wire(top, prism.top_mm)], ruled=True)]
-
-
-def _circle(ring: np.ndarray) -> tuple[float, float, float] | None:
-    """Middle and radius of the circle that a ring of many corners is drawn for."""
-    arc = arc_through(ring) if len(ring) >= _MIN_CIRCLE_CORNERS else None
-    return arc[:3] if arc else None
-
-
-def _round(prism: Prism, x: float, y: float, radius: float) -> Solid:
-    height, foot = prism.top_mm - prism.bottom_mm, Plane((x, y, prism.bottom_mm))
-    if prism.flare_mm:
-        return Solid.make_cone(radius, radius + prism.flare_mm, height, foot)
-    return Solid.make_cylinder(radius, height, foot)
-
-
-def _wire(ring: np.ndarray, z: float) -> Wire:
-    return Wire.make_polygon([Vector(x, y, z) for x, y in ring.tolist()], close=True)
-
-
-# pyright: reportAttributeAccessIssue=false
-# The CAD kernel's modules come without types.
-
-
 FITS_MM = (2e-3, 5e-4, 1e-4)
-"""How near curves are to the exact outlines; where the kernel finds a solid invalid, it is tried with the next.
+"""Tolerances of curves against the exact outlines; the next is tried where the kernel finds a solid invalid.
 
-Curves that hardly cross may do so in another order than what they stand for, which finer ones do not.
+Curves that hardly cross may meet in another order than the outlines they replace; finer ones do not.
 """
-_TRACKS = {HORIZONTAL_TRACKS: HORIZONTAL, VERTICAL_TRACKS: VERTICAL}
+_PART_COLOURS = {TRAY: COLOURS["mould"], HORIZONTAL_TRACKS: HORIZONTAL, VERTICAL_TRACKS: VERTICAL}
 _GREY = "#5D6B7A"
-_ROUND = 512
-"""Sides of the polygons that stand for circles until they become arcs: cut anywhere, also on a chord, they do."""
-_APART_MM = 10.0
-"""Between bodies that stand side by side."""
-_EXACT = 1e-2
-"""Error asked for of volumes and surfaces, as a share: what comes is a million times better, unlike without asking."""
+_WELL_SIDES = 512
+"""Sides of the polygons that stand for the round wells until these become arcs."""
+_MIN_CIRCLE_CORNERS = 32
+"""Polygons of fewer corners are no circles."""
+_SPACING_MM = 10.0
+"""Distance between bodies that stand side by side."""
+_INTEGRATION_TOLERANCE = 1e-2
+"""Relative error asked for of volumes and surfaces: the adaptive integration it selects is a million times better."""
 
 
 @dataclass(frozen=True)
-class Model:
-    """A body in CAD.
+class CadModel:
+    """CAD model of a printed body.
 
     Attributes:
-        shape: its named parts, which touch and do not overlap. contact_mm2: the area where they touch.
-        fit_mm: how near its curves are to the exact outlines; 0 where it has none.
+        part: body, or assembly of its parts, which touch and do not overlap.
+        contact_mm2: area where parts touch.
+        fit_mm: tolerance of curves against the exact outlines; 0 without curves.
     """
 
-    shape: Compound
+    part: CadPart
     contact_mm2: float = 0.0
     fit_mm: float = 0.0
 
-    def apart(self, mesh: "Manifold") -> tuple[float, float]:
-        """How far volume and surface lie from those of a mesh of the same body, as shares of them."""
+    @property
+    def shape(self) -> "Compound":
+        """The model as a build123d `Compound` with labels and colours."""
+        return _to_build123d(self.part)
+
+    def compare(self, mesh: "Manifold") -> tuple[float, float]:
+        """Return the relative deviations of volume and surface area from those of a mesh of the same body."""
         volumes, surfaces = GProp_GProps(), GProp_GProps()
-        BRepGProp.VolumeProperties_s(self.shape.wrapped, volumes, _EXACT)
-        BRepGProp.SurfaceProperties_s(self.shape.wrapped, surfaces, _EXACT)
+        BRepGProp.VolumeProperties_s(self.part.compound, volumes, _INTEGRATION_TOLERANCE)
+        BRepGProp.SurfaceProperties_s(self.part.compound, surfaces, _INTEGRATION_TOLERANCE)
         surface_mm2 = surfaces.Mass() - 2 * self.contact_mm2
         return abs(volumes.Mass() / mesh.volume() - 1), abs(surface_mm2 / mesh.surface_area() - 1)
 
 
-def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> Compound:
-    """The mould in CAD: tray, horizontal tracks, vertical tracks, numbers and pins, each named and coloured.
+def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> "Compound":
+    """Build the CAD model of a mould: tray, horizontal tracks, vertical tracks, numbers and pins, named and coloured.
 
     Args:
-        pad: the fibres.
+        pad: fibres.
         settings: tray, ridges and fibre.
 
     Returns:
-        An assembly of closed solids, mm, which touch and do not overlap.
+        Assembly of closed solids, mm, which touch and do not overlap.
 
     Raises:
         InputError: settings that contradict each other or refuse this pad, or no valid solid comes out.
     """
     plan = Plan(pad, settings)
     plan.require_levels()
-    return mould_model(plan.shrinkage_compensated, "mould").shape
+    return build_mould_model(plan.shrinkage_compensated, "mould").shape
 
 
-def mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> Model:
-    """The mould of a plan.
+def build_mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> CadModel:
+    """Build the CAD model of the mould of a plan.
 
     Args:
-        wells: outlines that belong to the ridges of each level; none for a pad whose fibres are laid.
+        plan: plan of what is printed.
+        name: name of the model.
+        wells: outlines that belong to the ridges of each layer; empty for a pad whose fibres are placed.
 
     Raises:
-        InputError: the CAD kernel finds a solid invalid, however fine its curves.
+        InputError: the CAD kernel finds a solid invalid at every tolerance.
     """
     for fit_mm in FITS_MM:
-        drawing, parts = fill_cells(plan, fit_mm, wells)
-        together = _valid({part.name: partial(solids, drawing, part.spans) for part in parts})
-        if together:
+        cells, fills = fill_cells(plan, fit_mm, wells)
+        solids = _build_valid({fill.name: partial(build_solids, cells, fill.z_ranges) for fill in fills})
+        if solids:
             break
     else:
         raise InputError(f"{name}: the CAD kernel finds a solid invalid; leave step out of the formats")
-    colours = {TRAY: COLOURS["mould"], **_TRACKS}
-    children = [_part(part, own, colours.get(part, _GREY)) for part, own in together.items()]
-    contact = contact_area_mm2(drawing, parts)
+    parts = [CadPart(part, _PART_COLOURS.get(part, _GREY), shapes) for part, shapes in solids.items()]
+    contact = compute_contact_area(cells, fills)
     if plan.settings.mould.pins:
-        standing = [replace(pin, bottom_mm=pin.bottom_mm + INTO_FLOOR_MM) for pin in registration_pins(plan)]
-        children.append(_part("pins", prism_solids(standing), _GREY))
-        contact += sum(pin.area.area for pin in standing)
-    return Model(Compound(label=name, children=children), contact, fit_mm)
+        pins = [replace(pin, bottom_mm=pin.bottom_mm + INTO_FLOOR_MM) for pin in registration_pins(plan)]
+        parts.append(CadPart("pins", _GREY, tuple(solid.wrapped for solid in prism_solids(pins))))
+        contact += sum(pin.area.area for pin in pins)
+    return CadModel(CadPart(name, children=tuple(parts)), contact, fit_mm)
 
 
-def body_model(body: Body, name: str) -> Model:
-    """A body of few prisms: a lid, a holder.
+def build_body_model(body: Body, name: str) -> CadModel:
+    """Build the CAD model of a body of few prisms: a lid or a holder.
+
+    Args:
+        body: prisms of the body.
+        name: one of `COLOURS`.
 
     Raises:
         InputError: the CAD kernel finds the solid invalid.
     """
-    own = _valid({name: lambda: body_solid(body).solids()})
-    if not own:
+    solids = _build_valid({name: lambda: [solid.wrapped for solid in body_solid(body).solids()]})
+    if not solids:
         raise InputError(f"{name}: the CAD kernel finds the solid invalid; leave step out of the formats")
-    return Model(_part(name, own[name], COLOURS[name]))
+    return CadModel(CadPart(name, COLOURS[name], solids[name]))
 
 
-def _valid(makes: Mapping[str, Callable[[], Iterable[Solid]]]) -> dict[str, list[Solid]] | None:
-    """The solids of every part, or None if the kernel finds one invalid or cannot make it."""
-    try:
-        together = {part: list(make()) for part, make in makes.items()}
-        return together if all(solid.is_valid for own in together.values() for solid in own) else None
-    except (Standard_Failure, RuntimeError, ValueError):  # the kernel's own, and build123d's of what it was given
-        return None
-
-
-def models(plan: Plan, bodies: Mapping[str, Body]) -> list[Model]:
-    """All bodies of a pad in CAD, in their order: the moulds from their plans, the others from what they are made of.
+def build_models(plan: Plan, bodies: Mapping[str, Body]) -> list[CadModel]:
+    """Build the CAD models of all bodies of a pad, in their order.
 
     Args:
-        plan: of the pad as used.
+        plan: plan of the pad as used.
+        bodies: bodies by name; moulds are built from the plan instead.
 
     Raises:
         InputError: the CAD kernel finds a solid invalid.
     """
-    made = []
+    models = []
     for name, body in bodies.items():
         if name == "mould":
-            made.append(mould_model(plan.shrinkage_compensated, name))
+            models.append(build_mould_model(plan.shrinkage_compensated, name))
         elif name == "conductive":
             second = conductive_plan(plan).shrinkage_compensated
-            made.append(mould_model(second, name, well_outlines(second, sides=_ROUND)))
+            models.append(build_mould_model(second, name, well_outlines(second, sides=_WELL_SIDES)))
         else:
-            made.append(body_model(body, name))
-    return made
+            models.append(build_body_model(body, name))
+    return models
 
 
-def assembly(models: Sequence[Model], plan: Plan) -> Compound:
-    """All that is printed for a pad: the lid on the rim of the mould, which is of a plan, and the others beside it."""
+def assemble(models: Sequence[CadModel], plan: Plan) -> CadPart:
+    """Return the assembly of all bodies of a pad: the lid on the rim of the mould, the others side by side.
+
+    Args:
+        models: models of the bodies, the mould first.
+        plan: plan of the mould.
+    """
     if len(models) == 1:
-        return models[0].shape
-    beside, children = 0.0, []
-    for model in models:
-        box = model.shape.bounding_box()
-        if model.shape.label == "lid":
-            place = (0.0, 0.0, plan.settings.mould.floor_mm + plan.silicone_mm)
+        return models[0].part
+    x_mm, parts = 0.0, []
+    for part in (model.part for model in models):
+        x_min, x_max = _x_range(part)
+        if part.name == "lid":
+            position = (0.0, 0.0, plan.settings.mould.floor_mm + plan.silicone_mm)
         else:
-            place = (beside - box.min.X if children else 0.0, 0.0, 0.0)
-            beside = place[0] + box.max.X + _APART_MM
-        children.append(model.shape.locate(Location(place)))
-    return Compound(label="moulds of the pad", children=children)
+            position = (x_mm - x_min if parts else 0.0, 0.0, 0.0)
+            x_mm = position[0] + x_max + _SPACING_MM
+        parts.append(replace(part, position_mm=position))
+    return CadPart("moulds of the pad", children=tuple(parts))
 
 
-def _part(name: str, own: Iterable[Solid], colour: str) -> Any:
-    part = Compound(list(own), label=name)
-    part.color = Color(colour)
-    return part
+def _build_valid(builders: Mapping[str, Callable[[], Iterable[Any]]]) -> dict[str, tuple[Any, ...]] | None:
+    """Return the solids of every part, or None if the kernel finds one invalid or cannot build it."""
+    try:
+        solids = {part: tuple(build()) for part, build in builders.items()}
+    except (Standard_Failure, RuntimeError, ValueError):  # the kernel's, and build123d's about what it was given
+        return None
+    return solids if is_valid(CadPart("", solids=sum(solids.values(), ())).compound) else None
+
+
+def is_valid(shape: Any) -> bool:
+    """Tell whether the CAD kernel finds a shape valid: closed, with faces within their tolerances."""
+    return BRepCheck_Analyzer(shape, True, True).IsValid()
+
+
+def _x_range(part: CadPart) -> tuple[float, float]:
+    from OCP.Bnd import Bnd_Box
+    from OCP.BRepBndLib import BRepBndLib
+
+    box = Bnd_Box()
+    BRepBndLib.AddOptimal_s(part.compound, box)
+    return box.CornerMin().X(), box.CornerMax().X()
+
+
+def _to_build123d(part: CadPart) -> "Compound":
+    from build123d import Color, Compound, Location, Solid
+
+    shape = Compound([Solid(solid) for solid in part.solids]) if part.solids else Compound()
+    shape.label = part.name
+    shape.children = [_to_build123d(child) for child in part.children]
+    if part.colour:
+        shape.color = Color(part.colour)
+    return shape.locate(Location(part.position_mm))
+
+
+def body_solid(body: Body) -> Any:
+    """Build the `Solid` of a body by Boolean operations of its prisms, or the `Compound` of several; mm."""
+    solid: Any
+    solid, *others = prism_solids(body.base)
+    if others:
+        solid = solid.fuse(*others)
+    if body.cuts:
+        solid = solid.cut(*prism_solids(body.cuts))
+    return solid.fuse(*prism_solids(body.adds)) if body.adds else solid
+
+
+def prism_solids(prisms: Iterable[Prism]) -> list["Solid"]:
+    """Build one `Solid` for every polygon of every prism; circles become cylinders and cones."""
+    return [solid for prism in prisms for solid in _prism_solids(prism)]
+
+
+def _prism_solids(prism: Prism) -> list["Solid"]:
+    from build123d import Face, Plane, Solid, Vector, Wire
+
+    def wire(ring: np.ndarray, z: float) -> Wire:
+        return Wire.make_polygon([Vector(x, y, z) for x, y in ring.tolist()], close=True)
+
+    polygons, height = polygon_rings(prism.area), prism.top_mm - prism.bottom_mm
+    arc = None
+    if len(polygons) == 1 and len(polygons[0]) == 1 and len(polygons[0][0]) >= _MIN_CIRCLE_CORNERS:
+        arc = fit_arc(polygons[0][0])
+    if arc:
+        x, y, radius = arc[:3]
+        base = Plane((x, y, prism.bottom_mm))
+        if prism.flare_mm:
+            return [Solid.make_cone(radius, radius + prism.flare_mm, height, base)]
+        return [Solid.make_cylinder(radius, height, base)]
+    if not prism.flare_mm:
+        wires = [[wire(ring, prism.bottom_mm) for ring in rings] for rings in polygons]
+        return [Solid.extrude(Face(outer, holes), Vector(0, 0, height)) for outer, *holes in wires]
+    low, high = np.reshape(prism.area.bounds, (2, 2))
+    scale = 1 + 2 * prism.flare_mm / (high - low)
+    flared = affinity.scale(prism.area, *scale, origin=tuple((low + high) / 2))
+    (((bottom,),), ((top,),)) = polygons, polygon_rings(flared)
+    return [Solid.make_loft([wire(bottom, prism.bottom_mm), wire(top, prism.top_mm)], ruled=True)]

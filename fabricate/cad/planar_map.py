@@ -1,7 +1,8 @@
-"""Which part of a mould fills every cell of its drawing, from what height to what height.
+"""Plan of a mould as a planar map: outlines divide it into cells, and each part fills some cells between two heights.
 
-Parts touch and do not overlap: tracks and numbers stand on the tray, and where tracks cross the taller one goes
-through. Lengths are mm, z = 0 is the underside of the tray.
+The outlines are drawn finely enough for Shapely to find what meets what. Which smooth curve every drawn edge belongs to
+is remembered, so that exact curves take its place and meet in common nodes. Lengths are mm; z = 0 is the underside of
+the tray.
 """
 
 import math
@@ -18,97 +19,108 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from shapely.geometry.base import BaseGeometry
 
-from padforge.fabricate.cad.curves import FINE_MM, OutlineCurve, joints, outline_pieces, straight_pieces, with_joints
 from padforge.fabricate.mould import terraces
 from padforge.fabricate.plan import Plan, polygon_rings
 
+from .curves import FINE_MM, OutlineCurve, edge_curves, find_joints, insert_joints, outline_curves
+
 Array = NDArray[np.float64]
 Vertex = tuple[int, int]
-"""A place on the grid, in steps of it."""
-MapEdge = tuple[Vertex, Vertex]
+"""Position on the grid, in grid steps."""
+GridEdge = tuple[Vertex, Vertex]
+Wire = list[tuple[int, bool]]
+"""Closed loop of edges of a planar map, the face to its left: index of each, and whether it runs along its curve."""
 
 GRID_MM = 1e-6
-"""Grid that the vertices of the drawing are moved to."""
-_THIN_MM = 5e-6
-"""Cells no wider than this come of moving vertices to the grid."""
+"""Grid to which vertices of outlines are snapped."""
+_SLIVER_MM = 5e-6
+"""Cells no wider come from snapping."""
+_END_MM = 5e-6
+"""Distance from the end of a curve within which an edge ends there."""
+_SHORT_MM = 1e-5
+"""Shorter edges come from snapping, or vanish where exact curves meet."""
+_GAP_MM, _VANISHING_MM = 1e-6, 0.02
+"""If curves miss each other by more than the first, an edge shorter than the second may vanish: they meet beyond it."""
+_MAX_SHIFT_MM = 0.1
+"""Exact curves meet no farther from where their drawings do."""
+_NEWTON_STEPS = 12
+
+FLOOR, RIM = -1, -2
+"""Numbers of the floor and the rim among those of the walls' planes."""
+PARTS = TRAY, HORIZONTAL_TRACKS, VERTICAL_TRACKS, NUMBERS = (
+    "tray",
+    "horizontal tracks",
+    "vertical tracks",
+    "numbers",
+)
 
 
 class Subdivision:
-    """Lines that divide the plane.
+    """Subdivision of the plane by lines.
 
     Args:
-        lines: all of them, however they cross. pieces: what they were drawn from.
+        lines: all lines, however they cross.
+        curves: smooth curves that the lines were drawn from.
 
     Attributes:
-        cells: (C,) polygons. middles: (C, 2) a place within each.
-        edges: every edge between or around cells once. sides: (E, 2) the cells to the left and right of each, -1 for
-            none. pieces_of: (E,) number of the piece each was drawn from.
+        cells: polygons; shape (C,).
+        interior_points: a point within each cell; shape (C, 2).
+        edges: every edge between or around cells once; length E.
+        sides: cells to the left and right of each edge, -1 for none; shape (E, 2).
+        curve_of_edge: number of the curve that each edge was drawn from; shape (E,).
     """
 
-    def __init__(self, lines: Sequence[BaseGeometry], pieces: Sequence[OutlineCurve]) -> None:
-        self.pieces = pieces
-        drawn = shapely.union_all(lines, grid_size=GRID_MM)
-        self.cells = shapely.get_parts(shapely.polygonize(shapely.get_parts(drawn)))
-        self.middles = shapely.get_coordinates(shapely.point_on_surface(self.cells))
-        left = {
-            edge: number
-            for number, cell in enumerate(self.cells)
-            for ring in polygon_rings(cell)[0]
-            for edge in edges(ring)
-        }
+    def __init__(self, lines: Sequence[BaseGeometry], curves: Sequence[OutlineCurve]) -> None:
+        self.curves = curves
+        noded = shapely.union_all(lines, grid_size=GRID_MM)
+        self.cells = shapely.get_parts(shapely.polygonize(shapely.get_parts(noded)))
+        self.interior_points = shapely.get_coordinates(shapely.point_on_surface(self.cells))
+        rings, cell_of_ring = shapely.get_rings(shapely.orient_polygons(self.cells), return_index=True)
+        coordinates, ring = shapely.get_coordinates(rings, return_index=True)
+        vertices, same_ring = _snap(coordinates), (ring[1:] == ring[:-1]).tolist()
+        cells = cell_of_ring[ring].tolist()
+        left = {(vertices[i], vertices[i + 1]): cells[i] for i, within in enumerate(same_ring) if within}
         self.edges = [edge for edge in left if edge[0] < edge[1] or edge[::-1] not in left]
         self.sides = np.array([(left[a, b], left.get((b, a), -1)) for a, b in self.edges])
-        self.pieces_of = _pieces_of(self.edges, pieces)
+        self.curve_of_edge = _nearest_curves(self.edges, curves)
 
-    def thin(self) -> dict[int, int]:
-        """Cells that are there by rounding only, each with the cell it shares most of its boundary with."""
-        thin = np.append(2 * shapely.area(self.cells) < _THIN_MM * shapely.length(self.cells), False)
-        shared: dict[int, dict[int, float]] = {cell: {} for cell in np.flatnonzero(thin).tolist()}
-        for k in np.flatnonzero(thin[self.sides].sum(axis=1) == 1):
-            cell, beside = self.sides[k].tolist() if thin[self.sides[k, 0]] else self.sides[k, ::-1].tolist()
-            if beside >= 0:
-                shared[cell][beside] = shared[cell].get(beside, 0.0) + math.dist(*self.edges[k])
-        return {cell: max(beside, key=beside.__getitem__) for cell, beside in shared.items() if beside}
-
-
-def edges(ring: Array) -> Iterator[MapEdge]:
-    """The edges of a ring (n, 2), on the grid."""
-    vertices = list(map(tuple, np.rint(ring / GRID_MM).astype(np.int64).tolist()))
-    return zip(vertices, vertices[1:] + vertices[:1], strict=True)
+    def find_slivers(self) -> dict[int, int]:
+        """Return the cells that exist by snapping only, each with the cell it shares most of its boundary with."""
+        sliver = np.append(2 * shapely.area(self.cells) < _SLIVER_MM * shapely.length(self.cells), False)
+        shared: dict[int, dict[int, float]] = {cell: {} for cell in np.flatnonzero(sliver).tolist()}
+        for k in np.flatnonzero(sliver[self.sides].sum(axis=1) == 1):
+            cell, neighbour = self.sides[k].tolist() if sliver[self.sides[k, 0]] else self.sides[k, ::-1].tolist()
+            if neighbour >= 0:
+                shared[cell][neighbour] = shared[cell].get(neighbour, 0.0) + math.dist(*self.edges[k])
+        return {cell: max(lengths, key=lengths.__getitem__) for cell, lengths in shared.items() if lengths}
 
 
-def _pieces_of(drawn: Sequence[MapEdge], pieces: Sequence[OutlineCurve]) -> NDArray[np.intp]:
-    middles = shapely.points(GRID_MM * np.array(drawn, dtype=float).mean(axis=1))
-    ends = [np.stack([piece.points[:-1], piece.points[1:]], axis=1) for piece in pieces]
-    owner = np.repeat(np.arange(len(pieces)), [len(each) for each in ends])
-    tree = shapely.STRtree(np.asarray(shapely.linestrings(np.concatenate(ends))))
-    nearest = tree.query_nearest(middles, all_matches=False)
-    return owner[nearest[1]]
+def _snap(points: Array) -> list[Vertex]:
+    return list(map(tuple, np.rint(points / GRID_MM).astype(np.int64).tolist()))
 
 
-Array = NDArray[np.float64]
-BorderWire = list[tuple[int, bool]]
-"""A closed round of chains, the face to its left: number of each, and whether it runs along its piece."""
-
-_AT_END_MM = 5e-6
-_SHORT_MM = 1e-5
-"""Runs shorter than this come of moving vertices to the grid, or are none where curves meet."""
-_LOOSE_MM, _HARDLY_MM = 1e-6, 0.02
-"""Where curves stay further apart than the first, a run shorter than the second may be none: they meet beyond it."""
-_MEET_MM = 0.1
-"""Curves meet no further than this from where their drawings do."""
-_STEPS = 12
+def _nearest_curves(edges: Sequence[GridEdge], curves: Sequence[OutlineCurve]) -> NDArray[np.intp]:
+    midpoints = shapely.points(GRID_MM * np.array(edges, dtype=float).mean(axis=1))
+    chords = [np.stack([curve.points[:-1], curve.points[1:]], axis=1) for curve in curves]
+    owner = np.repeat(np.arange(len(curves)), [len(ends) for ends in chords])
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(np.concatenate(chords))))
+    return owner[tree.query_nearest(midpoints, all_matches=False)[1]]
 
 
 @dataclass(frozen=True)
-class BorderEdge:
-    """A stretch of a piece between two nodes, from length `start` along it to `end`, `start` < `end`.
+class MapEdge:
+    """Part of a curve between two nodes of a planar map.
 
     Attributes:
-        left, right: the cells beside it, -1 for none.
+        curve: number of the curve.
+        start: arc length along the curve where the edge begins.
+        end: arc length where it ends, more than `start`.
+        nodes: numbers of its nodes.
+        left: cell to its left, -1 for none.
+        right: cell to its right, -1 for none.
     """
 
-    piece: int
+    curve: int
     start: float
     end: float
     nodes: tuple[int, int]
@@ -118,186 +130,192 @@ class BorderEdge:
 
 @dataclass(frozen=True)
 class _Run:
-    """Edges of the drawing from node to node, along their piece, and the lengths along it where they begin and end."""
+    """Drawn edges from node to node along one curve, and the arc lengths at its ends."""
 
-    piece: int
+    curve: int
     vertices: list[Vertex]
-    reach: tuple[float, float]
+    ends: tuple[float, float]
 
 
 class PlanarMap:
-    """Some cells of a drawing and what is between them.
+    """Some cells of a subdivision and the exact curves between them.
 
     Args:
-        kinds: of every cell, None for those left out; there is no border between neighbours of one kind.
+        subdivision: cells and drawn edges.
+        kinds: kind of every cell, None for those left out; neighbours of one kind have no border between them.
 
     Attributes:
-        nodes: (V, 2) places, mm. slack_mm: (V,) how far the curves that meet in a node stay away from it.
+        nodes: positions of the nodes; shape (V, 2), mm.
+        tolerance_mm: distance by which the curves that meet in a node miss it; shape (V,).
+        edges: borders between nodes.
     """
 
-    def __init__(self, drawing: Subdivision, kinds: Sequence[Hashable | None]) -> None:
-        self._cells, self.pieces = drawing.cells, drawing.pieces
+    def __init__(self, subdivision: Subdivision, kinds: Sequence[Hashable | None]) -> None:
+        self._cells, self.curves = subdivision.cells, subdivision.curves
+        sides = subdivision.sides
         codes: dict[Hashable | None, int] = {None: -1}
-        kind = np.array([*(codes.setdefault(each, len(codes)) for each in kinds), -1])
-        between = np.flatnonzero(kind[drawing.sides[:, 0]] != kind[drawing.sides[:, 1]]).tolist()
-        sides = np.where(kind[drawing.sides] < 0, -1, drawing.sides)
-        left = {drawing.edges[k]: cell for k, cell in zip(between, sides[between, 0].tolist(), strict=True)}
-        left |= {drawing.edges[k][::-1]: cell for k, cell in zip(between, sides[between, 1].tolist(), strict=True)}
-        runs = _forward(_runs({drawing.edges[k]: int(drawing.pieces_of[k]) for k in between}), drawing.pieces)
-        none = np.array([run.reach[1] - run.reach[0] < _SHORT_MM for run in runs])
+        code = np.array([*(codes.setdefault(kind, len(codes)) for kind in kinds), -1])
+        border = np.flatnonzero(code[sides[:, 0]] != code[sides[:, 1]]).tolist()
+        cells = np.where(code[sides] < 0, -1, sides)
+        left = {subdivision.edges[k]: cell for k, cell in zip(border, cells[border, 0].tolist(), strict=True)}
+        left |= {subdivision.edges[k][::-1]: cell for k, cell in zip(border, cells[border, 1].tolist(), strict=True)}
+        curve_of_edge = {subdivision.edges[k]: int(subdivision.curve_of_edge[k]) for k in border}
+        runs = _orient_runs(_join_runs(curve_of_edge), subdivision.curves)
+        # Runs that vanish where exact curves meet are contracted, which may move other meetings: until none is left
+        contracted = np.array([run.ends[1] - run.ends[0] < _SHORT_MM for run in runs])
         while True:
-            ends = _end_nodes(runs, none)
-            self.nodes, self.slack_mm, reached = self._met(runs, ends)
-            over = _over(ends, reached, self.slack_mm)
-            if not over:
+            nodes = _number_nodes(runs, contracted)
+            self.nodes, self.tolerance_mm, ends = self._intersect(runs, nodes)
+            vanished = _find_vanished(nodes, ends, self.tolerance_mm)
+            if not vanished:
                 break
-            none[over] = True
-        self.chains: list[BorderEdge] = []
-        self._first: dict[MapEdge, tuple[int, bool]] = {}
-        self._counts: dict[MapEdge, int] = {}
-        for run, (a, b), reach in zip(runs, ends, reached, strict=True):
-            there, back = (run.vertices[0], run.vertices[1]), (run.vertices[-1], run.vertices[-2])
-            self._counts[there] = self._counts[back] = len(run.vertices) - 1
+            contracted[vanished] = True
+        self.edges: list[MapEdge] = []
+        self._edge_at: dict[GridEdge, tuple[int, bool]] = {}
+        self._run_length: dict[GridEdge, int] = {}
+        for run, (a, b), s in zip(runs, nodes, ends, strict=True):
+            forward, backward = (run.vertices[0], run.vertices[1]), (run.vertices[-1], run.vertices[-2])
+            self._run_length[forward] = self._run_length[backward] = len(run.vertices) - 1
             if a != b:
-                self._first[there], self._first[back] = (len(self.chains), True), (len(self.chains), False)
-                self.chains.append(BorderEdge(run.piece, *reach, (a, b), left[there], left[there[::-1]]))
+                self._edge_at[forward], self._edge_at[backward] = (len(self.edges), True), (len(self.edges), False)
+                self.edges.append(MapEdge(run.curve, *s, (a, b), left[forward], left[forward[::-1]]))
 
-    def faces(self, cells: Sequence[int]) -> Iterator[list[BorderWire]]:
-        """Every connected part of cells taken together, as its loops, the outer one first."""
+    def faces(self, cells: Sequence[int]) -> Iterator[list[Wire]]:
+        """Yield every connected region of the union of cells as its wires, the outer one first."""
         for rings in polygon_rings(shapely.coverage_union_all(self._cells[list(cells)])):
-            outer, *holes = (self._loop(list(edges(ring))) for ring in rings)
-            if len(outer) > 1:  # a loop of fewer has shrunk to a node
+            outer, *holes = (self._wire(_snap(ring)) for ring in rings)
+            if len(outer) > 1:  # a wire of fewer edges has shrunk to a node
                 yield [outer, *(hole for hole in holes if len(hole) > 1)]
 
-    def _loop(self, steps: list[MapEdge]) -> BorderWire:
-        at = next(i for i, step in enumerate(steps) if step in self._counts)
-        loop, end = [], at + len(steps)
-        while at < end:
-            step = steps[at % len(steps)]
-            if step in self._first:
-                loop.append(self._first[step])
-            at += self._counts[step]
-        return loop
+    def _wire(self, vertices: list[Vertex]) -> Wire:
+        steps = list(zip(vertices, vertices[1:] + vertices[:1], strict=True))
+        i = next(i for i, step in enumerate(steps) if step in self._run_length)
+        wire, end = [], i + len(steps)
+        while i < end:
+            step = steps[i % len(steps)]
+            if step in self._edge_at:
+                wire.append(self._edge_at[step])
+            i += self._run_length[step]
+        return wire
 
-    def _met(
-        self, runs: Sequence[_Run], ends: Sequence[tuple[int, int]]
+    def _intersect(
+        self, runs: Sequence[_Run], nodes: Sequence[tuple[int, int]]
     ) -> tuple[Array, Array, list[tuple[float, float]]]:
-        """Where curves meet: places of nodes, how far curves stay away from them, and where every run ends."""
-        at_node: dict[int, dict[int, float]] = defaultdict(dict)
-        for run, nodes in zip(runs, ends, strict=True):
-            for node, s in zip(nodes, run.reach, strict=True):
-                if nodes[0] != nodes[1]:
-                    at_node[node].setdefault(run.piece, s)
-        met = [self._meet(at_node[node]) for node in range(1 + max(map(max, ends)))]
-        reached = [
-            (at_node[a][run.piece], at_node[b][run.piece]) if a != b else run.reach
-            for run, (a, b) in zip(runs, ends, strict=True)
+        """Positions of the nodes, their tolerances, and the arc lengths at the ends of every run."""
+        lengths: dict[int, dict[int, float]] = defaultdict(dict)  # node -> curve -> arc length
+        for run, ends in zip(runs, nodes, strict=True):
+            for node, s in zip(ends, run.ends, strict=True):
+                if ends[0] != ends[1]:
+                    lengths[node].setdefault(run.curve, s)
+        met = [self._intersect_curves(lengths[node]) for node in range(1 + max(map(max, nodes)))]
+        ends = [
+            (lengths[a][run.curve], lengths[b][run.curve]) if a != b else run.ends
+            for run, (a, b) in zip(runs, nodes, strict=True)
         ]
-        return np.array([place for place, _ in met]), np.array([slack for _, slack in met]), reached
+        return np.array([point for point, _ in met]), np.array([tolerance for _, tolerance in met]), ends
 
-    def _meet(self, lengths: dict[int, float]) -> tuple[Array, float]:
-        """Where pieces meet near the given lengths along them, which are put right, and how far they stay away."""
+    def _intersect_curves(self, lengths: dict[int, float]) -> tuple[Array, float]:
+        """Common point of curves near the given arc lengths, which are corrected, and the largest distance from it."""
         if not lengths:
             return np.zeros(2), 0.0
-        inner = [piece for piece, s in lengths.items() if 0 < s < self.pieces[piece].length]
+        inner = [curve for curve, s in lengths.items() if 0 < s < self.curves[curve].length]
         if inner and len(lengths) > 1:
             self._cross(lengths, inner)
-        points = [self.pieces[piece].run(s)[:2] for piece, s in lengths.items()]
-        place = np.mean(points, axis=0)
-        return place, max(math.dist(point, place) for point in points)
+        points = [self.curves[curve].evaluate(s)[:2] for curve, s in lengths.items()]
+        mean = np.mean(points, axis=0)
+        return mean, max(math.dist(point, mean) for point in points)
 
     def _cross(self, lengths: dict[int, float], inner: list[int]) -> None:
-        """Move lengths to the common point of the two pieces that cross most steeply, by Newton's method."""
-        runs = {piece: self.pieces[piece].run(s) for piece, s in lengths.items()}
+        """Move the arc lengths of the two curves that cross most steeply to their intersection, by Newton's method."""
+        values = {curve: self.curves[curve].evaluate(s) for curve, s in lengths.items()}
         pairs = [(a, b) for a in inner for b in lengths if a != b]
-        first, second = max(pairs, key=lambda pair: abs(_turn(runs[pair[0]], runs[pair[1]])))
-        a, b = self.pieces[first], self.pieces[second]
-        s, u = begun = lengths[first], lengths[second]
-        for _ in range(_STEPS):
-            x, y, ax, ay = a.run(s)
-            other_x, other_y, bx, by = b.run(u)
+        first, second = max(pairs, key=lambda pair: abs(_sine(values[pair[0]], values[pair[1]])))
+        a, b = self.curves[first], self.curves[second]
+        s, u = guess = lengths[first], lengths[second]
+        for _ in range(_NEWTON_STEPS):
+            x, y, ax, ay = a.evaluate(s)
+            other_x, other_y, bx, by = b.evaluate(u)
             det = bx * ay - ax * by
             if abs(det) < 1e-6:
                 return
-            away_x, away_y = other_x - x, other_y - y
-            forth, back = (bx * away_y - by * away_x) / det, (ax * away_y - ay * away_x) / det
-            s, u = min(max(s + forth, 0), a.length), min(max(u + back, 0), b.length)
-            if max(abs(forth), abs(back)) < 1e-12:
+            dx, dy = other_x - x, other_y - y
+            ds, du = (bx * dy - by * dx) / det, (ax * dy - ay * dx) / det
+            s, u = min(max(s + ds, 0), a.length), min(max(u + du, 0), b.length)
+            if max(abs(ds), abs(du)) < 1e-12:
                 break
-        if math.dist(a.run(s)[:2], b.run(u)[:2]) < 1e-9 and max(abs(s - begun[0]), abs(u - begun[1])) < _MEET_MM:
+        gap = math.dist(a.evaluate(s)[:2], b.evaluate(u)[:2])
+        if gap < 1e-9 and max(abs(s - guess[0]), abs(u - guess[1])) < _MAX_SHIFT_MM:
             lengths[first], lengths[second] = s, u
 
 
-def _turn(a: tuple[float, ...], b: tuple[float, ...]) -> float:
-    """Sine of the angle between two pieces, from how they run."""
+def _sine(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Sine of the angle between two curves, from points with derivatives."""
     return (a[2] * b[3] - a[3] * b[2]) / math.hypot(*a[2:]) / math.hypot(*b[2:])
 
 
-def _runs(pieces: dict[MapEdge, int]) -> list[tuple[int, list[Vertex]]]:
-    """Edges joined to runs of one piece each, as far as no third edge and no other piece meets them."""
-    beside: dict[Vertex, list[tuple[Vertex, int]]] = defaultdict(list)
-    for (a, b), piece in pieces.items():
-        beside[a].append((b, piece))
-        beside[b].append((a, piece))
-    through = {v for v, others in beside.items() if len(others) == 2 and others[0][1] == others[1][1]}
+def _join_runs(curve_of_edge: dict[GridEdge, int]) -> list[tuple[int, list[Vertex]]]:
+    """Join edges to runs of one curve each that no third edge and no other curve meets."""
+    neighbours: dict[Vertex, list[tuple[Vertex, int]]] = defaultdict(list)
+    for (a, b), curve in curve_of_edge.items():
+        neighbours[a].append((b, curve))
+        neighbours[b].append((a, curve))
+    passing = {v for v, ends in neighbours.items() if len(ends) == 2 and ends[0][1] == ends[1][1]}
     runs, done = [], set()
-    for start in beside:
-        if start in through:
+    for start in neighbours:
+        if start in passing:
             continue
-        for second, piece in beside[start]:
+        for second, curve in neighbours[start]:
             if (start, second) in done:
                 continue
             run = [start, second]
-            while run[-1] in through:
-                (a, _), (b, _) = beside[run[-1]]
+            while run[-1] in passing:
+                (a, _), (b, _) = neighbours[run[-1]]
                 run.append(b if a == run[-2] else a)
             done |= {(run[0], run[1]), (run[-1], run[-2])}
-            runs.append((piece, run))
+            runs.append((curve, run))
     return runs
 
 
-def _forward(runs: list[tuple[int, list[Vertex]]], pieces: Sequence[OutlineCurve]) -> list[_Run]:
-    """The runs along their pieces."""
-    lines = np.array([shapely.LineString(piece.points) for piece in pieces])[[piece for piece, _ in runs]]
+def _orient_runs(runs: list[tuple[int, list[Vertex]]], curves: Sequence[OutlineCurve]) -> list[_Run]:
+    """Turn runs to run along their curves."""
+    lines = np.array([shapely.LineString(curve.points) for curve in curves])[[curve for curve, _ in runs]]
     ends = [shapely.points(GRID_MM * np.array([run[i] for _, run in runs], dtype=float)) for i in (0, -1)]
-    lengths = np.stack([shapely.line_locate_point(lines, each) for each in ends], axis=1)
-    whole = np.array([pieces[piece].length for piece, _ in runs])[:, None]
-    lengths = np.where(lengths < _AT_END_MM, 0, np.where(lengths > whole - _AT_END_MM, whole, lengths))
+    s = np.stack([shapely.line_locate_point(lines, points) for points in ends], axis=1)
+    length = np.array([curves[curve].length for curve, _ in runs])[:, None]
+    s = np.where(s < _END_MM, 0, np.where(s > length - _END_MM, length, s))
     return [
-        _Run(piece, run, (a, b)) if a <= b else _Run(piece, run[::-1], (b, a))
-        for (piece, run), (a, b) in zip(runs, lengths.tolist(), strict=True)
+        _Run(curve, run, (a, b)) if a <= b else _Run(curve, run[::-1], (b, a))
+        for (curve, run), (a, b) in zip(runs, s.tolist(), strict=True)
     ]
 
 
-def _over(ends: Sequence[tuple[int, int]], reached: Sequence[tuple[float, float]], slack_mm: Array) -> list[int]:
-    """Runs that end where they have hardly begun: others meet in the other order, or beyond them."""
-    lengths = np.array([end - start if a != b else np.inf for (a, b), (start, end) in zip(ends, reached, strict=True)])
-    loose = [any(slack_mm[node] > _LOOSE_MM for node in nodes) for nodes in ends]
-    return np.flatnonzero((lengths < _SHORT_MM) | (loose & (lengths < _HARDLY_MM))).tolist()
-
-
-def _end_nodes(runs: Sequence[_Run], none: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The nodes at the ends of every run, one for both where the run is marked as none."""
+def _number_nodes(runs: Sequence[_Run], contracted: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Numbers of the nodes at the ends of every run, one for both ends of a contracted run."""
     numbers: dict[Vertex, int] = {}
     ends = np.array([[numbers.setdefault(run.vertices[i], len(numbers)) for i in (0, -1)] for run in runs])
-    a, b = ends[none].T
+    a, b = ends[contracted].T
     links = coo_array((np.ones(len(a)), (a, b)), shape=(len(numbers), len(numbers)))
     return list(map(tuple, connected_components(links, directed=False)[1][ends].tolist()))
 
 
-Array = NDArray[np.float64]
-
-FLOOR, RIM = -1, -2
-"""The floor between the walls, and the rim on top of them, among the numbers of the walls' planes."""
+def _find_vanished(
+    nodes: Sequence[tuple[int, int]], ends: Sequence[tuple[float, float]], tolerance_mm: Array
+) -> list[int]:
+    """Runs that vanish between exact curves: these meet in the other order, or beyond the run."""
+    length = np.array([end - start if a != b else np.inf for (a, b), (start, end) in zip(nodes, ends, strict=True)])
+    loose = [any(tolerance_mm[node] > _GAP_MM for node in pair) for pair in nodes]
+    return np.flatnonzero((length < _SHORT_MM) | (loose & (length < _VANISHING_MM))).tolist()
 
 
 @dataclass(frozen=True, eq=False)
 class TrayWalls:
-    """The tray's floor and its leaning walls, as a height over every place.
+    """Floor and flared walls of a tray, as a height over every point.
 
-    Args:
-        hollows: (k, 4) least x and y and greatest x and y, on the floor, of the rectangles the silicone fills.
-        floor_mm: height of the floor. depth_mm: of the rim above it. flare_mm: how far walls lean outwards up to there.
+    Attributes:
+        hollows: rectangles on the floor that the silicone fills, as x_min, y_min, x_max, y_max; shape (k, 4).
+        floor_mm: height of the floor.
+        depth_mm: height of the rim above the floor.
+        flare_mm: distance by which walls lean outwards up to the rim.
     """
 
     hollows: Array
@@ -305,51 +323,57 @@ class TrayWalls:
     depth_mm: float
     flare_mm: float
 
-    def sheets(self, places: Array) -> NDArray[np.intp]:
-        """(n,) what lies under places (n, 2): `FLOOR`, `RIM` or the number of a wall's plane."""
-        beyond = self._beyond(places)
-        hollow = beyond.max(axis=2).argmin(axis=1)
-        nearest = beyond[np.arange(len(places)), hollow]
-        away = nearest.max(axis=1)
-        return np.where(away <= 0, FLOOR, np.where(away >= self.flare_mm, RIM, 4 * hollow + nearest.argmax(axis=1)))
+    @classmethod
+    def from_plan(cls, plan: Plan) -> "TrayWalls":
+        """Return the walls of a plan's tray."""
+        hollows = np.array([shapely.bounds(hollow) for hollow in (plan.cavity, *plan.exits)])
+        return cls(hollows, plan.settings.mould.floor_mm, plan.silicone_mm, plan.flare_mm)
 
-    def heights(self, places: Array) -> Array:
-        """(n,) heights of what lies under places (n, 2), mm."""
-        away = self._beyond(places).max(axis=2).min(axis=1)
-        rise = np.clip(away / self.flare_mm, 0, 1) if self.flare_mm else away > 0
-        return self.floor_mm + self.depth_mm * rise
+    def planes(self, points: Array) -> NDArray[np.intp]:
+        """Return what lies below points (n, 2): `FLOOR`, `RIM` or the number of a wall's plane; shape (n,)."""
+        distances = self._distances(points)
+        hollow = distances.max(axis=2).argmin(axis=1)
+        nearest = distances[np.arange(len(points)), hollow]
+        distance = nearest.max(axis=1)
+        wall = 4 * hollow + nearest.argmax(axis=1)
+        return np.where(distance <= 0, FLOOR, np.where(distance >= self.flare_mm, RIM, wall))
+
+    def heights(self, points: Array) -> Array:
+        """Return the heights of what lies below points (n, 2); shape (n,), mm."""
+        distance = self._distances(points).max(axis=2).min(axis=1)
+        fraction = np.clip(distance / self.flare_mm, 0, 1) if self.flare_mm else distance > 0
+        return self.floor_mm + self.depth_mm * fraction
 
     @property
     def slope(self) -> float:
-        """How steeply walls that lean rise, mm for every mm outwards."""
+        """Rise of flared walls per mm outwards."""
         return self.depth_mm / self.flare_mm
 
-    def plane(self, sheet: int, places: Array) -> Array:
-        """(n,) heights of a wall's plane over places (n, 2), mm."""
-        hollow, side = divmod(sheet, 4)
-        return self.floor_mm + self.slope * self._beyond(places)[:, hollow, side]
+    def plane_heights(self, plane: int, points: Array) -> Array:
+        """Return the heights of a wall's plane over points (n, 2); shape (n,), mm."""
+        hollow, side = divmod(plane, 4)
+        return self.floor_mm + self.slope * self._distances(points)[:, hollow, side]
 
-    def normal(self, sheet: int) -> tuple[float, float, float]:
-        """Upward normal of a wall's plane, not of unit length."""
-        side = sheet % 4
+    def normal(self, plane: int) -> tuple[float, float, float]:
+        """Return the upward normal of a wall's plane, not of unit length."""
+        side = plane % 4
         along = self.slope if side < 2 else -self.slope
         return (along, 0.0, 1.0) if side % 2 == 0 else (0.0, along, 1.0)
 
     def outline(self, z: float) -> shapely.Polygon:
-        """What is open at a height, seen from above."""
-        ring = self._floor_ring
-        return shapely.Polygon(ring + (z - self.floor_mm) / self.depth_mm * self.flare_mm * self._outward)
+        """Return the opening between the walls at a height."""
+        return shapely.Polygon(self._floor_ring + (z - self.floor_mm) / self.depth_mm * self.flare_mm * self._outward)
 
     def creases(self) -> list[shapely.LineString]:
-        """Lines between the planes: the floor's outline and where two walls meet."""
+        """Return the lines between planes: the floor's outline, and where two walls meet."""
         ring, top = self._floor_ring, self._floor_ring + self.flare_mm * self._outward
         corners = [shapely.LineString(ends) for ends in zip(ring, top, strict=True)] if self.flare_mm else []
         return [self.outline(self.floor_mm).exterior, *corners]
 
-    def _beyond(self, places: Array) -> Array:
-        """(n, k, 4) how far places lie beyond every side of every hollow."""
+    def _distances(self, points: Array) -> Array:
+        """Signed distances of points beyond every side of every hollow; shape (n, k, 4)."""
         low, high = self.hollows[:, :2], self.hollows[:, 2:]
-        return np.concatenate([low - places[:, None], places[:, None] - high], axis=2)
+        return np.concatenate([low - points[:, None], points[:, None] - high], axis=2)
 
     @cached_property
     def _floor_ring(self) -> Array:
@@ -358,25 +382,18 @@ class TrayWalls:
 
     @cached_property
     def _outward(self) -> Array:
-        """(n, 2) how the corners of the floor's outline move for 1 mm of lean; its edges are upright or level."""
+        """Shift of the floor's corners for 1 mm of flare; its edges are parallel to the axes."""
         edges = np.roll(self._floor_ring, -1, axis=0) - self._floor_ring
-        away = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
-        return away + np.roll(away, 1, axis=0)
-
-
-def walls_of(plan: Plan) -> TrayWalls:
-    """The walls of a plan's tray."""
-    hollows = np.array([shapely.bounds(each) for each in (plan.cavity, *plan.exits)])
-    return TrayWalls(hollows, plan.settings.mould.floor_mm, plan.silicone_mm, plan.flare_mm)
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
+        return normals + np.roll(normals, 1, axis=0)
 
 
 Surface = float | tuple[TrayWalls, int]
-"""A height, mm, or one of the walls' planes."""
-TRAY, HORIZONTAL_TRACKS, VERTICAL_TRACKS, NUMBERS = PARTS = ("tray", "horizontal tracks", "vertical tracks", "numbers")
+"""A height, mm, or a plane of the walls."""
 
 
 class ZRange(NamedTuple):
-    """What bounds a part below and above."""
+    """Surfaces that bound a part below and above."""
 
     bottom: Surface
     top: Surface
@@ -384,101 +401,110 @@ class ZRange(NamedTuple):
 
 @dataclass(frozen=True)
 class PartFill:
-    """A named part: of every cell of the drawing what it fills, None for nothing."""
+    """A named part.
+
+    Attributes:
+        name: one of `PARTS`.
+        z_ranges: what the part fills of every cell; None for nothing.
+    """
 
     name: str
-    spans: Sequence[ZRange | None]
+    z_ranges: Sequence[ZRange | None]
 
 
-class _Standing(NamedTuple):
-    """What stands on the floor: of which part, up to where, and its outline."""
+class _Prism(NamedTuple):
+    """What stands on the floor."""
 
     part: str
     top_mm: float
     outline: BaseGeometry
-    pieces: list[OutlineCurve]
+    curves: list[OutlineCurve]
 
 
 def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) -> tuple[Subdivision, list[PartFill]]:
-    """The drawing of a mould and its parts.
+    """Divide the plan of a mould into cells, and fill them with its parts.
+
+    Parts touch and do not overlap: tracks and numbers stand on the tray, and the taller track passes through at a
+    crossing.
 
     Args:
-        fit_mm: how near splines stay to the finely drawn outlines.
-        wells: outlines that belong to the ridges of each level; none for a pad whose fibres are laid.
+        plan: plan of what is printed.
+        fit_mm: tolerance of splines against the finely drawn outlines.
+        wells: outlines that belong to the ridges of each layer; empty for a pad whose fibres are placed.
     """
-    walls = walls_of(plan)
+    walls = TrayWalls.from_plan(plan)
     rim_mm = walls.floor_mm + walls.depth_mm
-    standing = sorted([*_ridges(plan, fit_mm, wells), *_numbers(plan)], key=lambda each: -each.top_mm)
-    opened = [walls.outline(z).boundary for z in sorted({*(each.top_mm for each in standing), rim_mm})]
-    straight = [plan.tray.boundary, *opened, *walls.creases(), plan.pillars.boundary]
-    pieces = [piece for line in straight for piece in straight_pieces(line)]
-    pieces += [piece for each in standing for piece in each.pieces]
-    drawing = Subdivision([*straight, *(each.outline.boundary for each in standing)], pieces)
+    prisms = sorted([*_ridge_prisms(plan, fit_mm, wells), *_number_prisms(plan)], key=lambda prism: -prism.top_mm)
+    openings = [walls.outline(z).boundary for z in sorted({*(prism.top_mm for prism in prisms), rim_mm})]
+    straight = [plan.tray.boundary, *openings, *walls.creases(), plan.pillars.boundary]
+    curves = [curve for line in straight for curve in edge_curves(line)]
+    curves += [curve for prism in prisms for curve in prism.curves]
+    cells = Subdivision([*straight, *(prism.outline.boundary for prism in prisms)], curves)
 
-    sheets = walls.sheets(drawing.middles).tolist()
-    under: list[Surface] = [walls.floor_mm if k == FLOOR else rim_mm if k == RIM else (walls, k) for k in sheets]
-    heights = walls.heights(drawing.middles)
-    for cell in np.flatnonzero(shapely.contains_xy(plan.pillars, drawing.middles)):
-        under[cell] = heights[cell] = rim_mm
-    spans: dict[str, list[ZRange | None]] = {name: [None] * len(under) for name in PARTS}
-    free = np.ones(len(under), dtype=bool)
-    for each in standing:
-        shapely.prepare(each.outline)
-        for cell in np.flatnonzero(free & shapely.contains_xy(each.outline, drawing.middles) & (heights < each.top_mm)):
-            spans[each.part][cell] = ZRange(under[cell], each.top_mm)
+    points, planes = cells.interior_points, walls.planes(cells.interior_points).tolist()
+    heights = walls.heights(points)
+    ground: list[Surface] = [walls.floor_mm if k == FLOOR else rim_mm if k == RIM else (walls, k) for k in planes]
+    for cell in np.flatnonzero(shapely.contains_xy(plan.pillars, points)):
+        ground[cell] = heights[cell] = rim_mm
+    fills: dict[str, list[ZRange | None]] = {name: [None] * len(ground) for name in PARTS}
+    free = np.ones(len(ground), dtype=bool)
+    for prism in prisms:
+        shapely.prepare(prism.outline)
+        for cell in np.flatnonzero(free & shapely.contains_xy(prism.outline, points) & (heights < prism.top_mm)):
+            fills[prism.part][cell] = ZRange(ground[cell], prism.top_mm)
             free[cell] = False
-    for cell in np.flatnonzero(shapely.contains_xy(plan.tray, drawing.middles)):
-        spans[TRAY][cell] = ZRange(0.0, under[cell])
-    for thin, beside in drawing.thin().items():
-        for each in spans.values():
-            each[thin] = each[beside]
-    return drawing, [PartFill(name, each) for name, each in spans.items() if any(each)]
+    for cell in np.flatnonzero(shapely.contains_xy(plan.tray, points)):
+        fills[TRAY][cell] = ZRange(0.0, ground[cell])
+    for sliver, neighbour in cells.find_slivers().items():
+        for z_ranges in fills.values():
+            z_ranges[sliver] = z_ranges[neighbour]
+    return cells, [PartFill(name, z_ranges) for name, z_ranges in fills.items() if any(z_ranges)]
 
 
-def _ridges(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_Standing]:
-    """The terraces of the ridges of every level."""
-    families = {level: plan.family(fibre) for fibre, level in enumerate(plan.layer_indices)}
-    for level, height_mm in enumerate(plan.heights_mm):
+def _ridge_prisms(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_Prism]:
+    """Yield the terraces of the ridges of every layer."""
+    mould = plan.settings.mould
+    families = {layer: plan.family(fibre) for fibre, layer in enumerate(plan.layer_indices)}
+    for layer, height_mm in enumerate(plan.heights_mm):
         for down_mm in terraces(height_mm, plan.settings.terrace_mm):
-            outline = plan.outline(level, down_mm, FINE_MM)
+            outline = plan.outline(layer, down_mm, FINE_MM)
             if wells and not down_mm:
-                outline = shapely.union_all([outline, wells[level]], grid_size=GRID_MM)
-            at = joints(plan, level, plan.settings.mould.ridge_width_mm / 2 + down_mm * plan.settings.ridge_slope)
-            outline = with_joints(outline, at)
-            top = plan.settings.mould.floor_mm + height_mm - down_mm
-            yield _Standing(
-                (HORIZONTAL_TRACKS, VERTICAL_TRACKS)[families[level]],
-                top,
-                outline,
-                outline_pieces(outline, at, (plan.settings.mould.floor_mm, top), fit_mm),
-            )
+                outline = shapely.union_all([outline, wells[layer]], grid_size=GRID_MM)
+            joints = find_joints(plan, layer, mould.ridge_width_mm / 2 + down_mm * plan.settings.ridge_slope)
+            outline = insert_joints(outline, joints)
+            top = mould.floor_mm + height_mm - down_mm
+            curves = outline_curves(outline, joints, (mould.floor_mm, top), fit_mm)
+            yield _Prism((HORIZONTAL_TRACKS, VERTICAL_TRACKS)[families[layer]], top, outline, curves)
 
 
-def _numbers(plan: Plan) -> Iterator[_Standing]:
+def _number_prisms(plan: Plan) -> Iterator[_Prism]:
     top = plan.settings.mould.floor_mm + plan.settings.mould.shallow_ridge_height_mm
     for outline in plan.numbers:
         if outline is not None:
-            yield _Standing(NUMBERS, top, outline, straight_pieces(outline.boundary))
+            yield _Prism(NUMBERS, top, outline, edge_curves(outline.boundary))
 
 
-def contact_mm2(drawing: Subdivision, parts: Sequence[PartFill]) -> float:
-    """The area where parts touch each other: undersides of what stands, crossings, ends at upright walls."""
+def compute_contact_area(cells: Subdivision, fills: Sequence[PartFill]) -> float:
+    """Return the area where parts touch, mm²: undersides, crossings, ends at upright walls."""
     area = 0.0
-    owner = np.full(len(drawing.cells) + 1, -1)  # the last stands for no cell
-    low, top = np.zeros(len(owner)), np.zeros(len(owner))
-    for number, part in enumerate(sorted(parts, key=lambda part: part.name != TRAY)):  # what stands on it hides it
-        for cell, span in enumerate(part.spans):
-            if span is not None:
-                owner[cell], low[cell], top[cell] = number, _level(span.bottom), _level(span.top)
-                if part.name != TRAY:
-                    lean = math.hypot(*span.bottom[0].normal(span.bottom[1])) if isinstance(span.bottom, tuple) else 1.0
-                    area += lean * drawing.cells[cell].area
-    between = (owner[drawing.sides] >= 0).all(axis=1) & (owner[drawing.sides[:, 0]] != owner[drawing.sides[:, 1]])
-    (left, right), edges = drawing.sides[between].T, np.array(drawing.edges, dtype=float)[between]
-    long = GRID_MM * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
-    return area + float(long @ np.maximum(0, np.minimum(top[left], top[right]) - np.maximum(low[left], low[right])))
+    owner = np.full(len(cells.cells) + 1, -1)  # the last entry stands for no cell
+    bottom, top = np.zeros(len(owner)), np.zeros(len(owner))
+    for number, fill in enumerate(
+        sorted(fills, key=lambda fill: fill.name != TRAY)
+    ):  # what stands on the tray hides it
+        for cell, z_range in enumerate(fill.z_ranges):
+            if z_range is not None:
+                owner[cell], bottom[cell], top[cell] = number, _base_height(z_range.bottom), _base_height(z_range.top)
+                if fill.name != TRAY:
+                    ground = z_range.bottom
+                    lean = math.hypot(*ground[0].normal(ground[1])) if isinstance(ground, tuple) else 1.0
+                    area += lean * cells.cells[cell].area
+    between = (owner[cells.sides] >= 0).all(axis=1) & (owner[cells.sides[:, 0]] != owner[cells.sides[:, 1]])
+    (a, b), edges = cells.sides[between].T, np.array(cells.edges, dtype=float)[between]
+    length = GRID_MM * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    return area + float(length @ np.maximum(0, np.minimum(top[a], top[b]) - np.maximum(bottom[a], bottom[b])))
 
 
-def _level(surface: Surface) -> float:
-    """The height of a surface, mm; of a leaning wall its foot."""
+def _base_height(surface: Surface) -> float:
+    """Height of a surface, mm; of a flared wall its foot."""
     return surface[0].floor_mm if isinstance(surface, tuple) else surface

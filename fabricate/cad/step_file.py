@@ -1,150 +1,242 @@
-"""STEP files that say everything once.
+"""STEP files in which each point, curve, surface and style stands once.
 
-The CAD kernel writes a curve anew for every edge on it, with points and directions of its own. Said once, they take
-less than half of the file, and whoever reads it finds the same shape.
+The CAD kernel writes the whole curve of every edge anew. Without the copies a file has less than half the size, and
+readers find the same shapes.
+
+Importing this module loads the CAD kernel (OCP): import it where it is used.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# The CAD kernel's modules come without types.
+
 import re
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
+from OCP.BRep import BRep_Builder
+from OCP.gp import gp_Trsf, gp_Vec
+from OCP.IFSelect import IFSelect_ReturnStatus
+from OCP.Interface import Interface_Static
+from OCP.Message import Message, Message_Gravity
+from OCP.Quantity import Quantity_Color
+from OCP.STEPCAFControl import STEPCAFControl_Writer
+from OCP.STEPControl import STEPControl_StepModelType
+from OCP.TCollection import TCollection_ExtendedString, TCollection_HAsciiString
+from OCP.TDataStd import TDataStd_Name
+from OCP.TDocStd import TDocStd_Document
+from OCP.TopLoc import TopLoc_Location
+from OCP.TopoDS import TopoDS_Compound
+from OCP.XCAFApp import XCAFApp_Application
+from OCP.XCAFDoc import XCAFDoc_ColorType, XCAFDoc_DocumentTool
+from OCP.XSControl import XSControl_WorkSession
 
 from padforge.design.common.files import temporary_folder
 
-if TYPE_CHECKING:
-    from build123d import Compound
-
-_EPOCH = "2000-01-01T00:00:00"
-"""The time written into STEP files, which must carry one."""
+_TIMESTAMP = "2000-01-01T00:00:00"
+"""STEP files must carry a time; this one makes their bytes reproducible."""
 _DIGITS = 6
-"""Of coordinates in mm, after the point: a nanometre."""
-_ROUNDED = ("CARTESIAN_POINT", "B_SPLINE")
-_ONCE = frozenset(
-    {
-        *("CARTESIAN_POINT", "DIRECTION", "VECTOR", "LINE", "CIRCLE", "ELLIPSE", "PLANE", "AXIS2_PLACEMENT_3D"),
-        *("CYLINDRICAL_SURFACE", "CONICAL_SURFACE", "B_SPLINE_CURVE_WITH_KNOTS", "B_SPLINE_SURFACE_WITH_KNOTS"),
-        *("COLOUR_RGB", "CURVE_STYLE", "DRAUGHTING_PRE_DEFINED_CURVE_FONT", "FILL_AREA_STYLE"),
-        *("FILL_AREA_STYLE_COLOUR", "SURFACE_STYLE_FILL_AREA", "SURFACE_SIDE_STYLE", "SURFACE_STYLE_USAGE"),
-        "PRESENTATION_STYLE_ASSIGNMENT",
-    }
+"""Decimals of coordinates in mm: a nanometre."""
+_SHARED = (
+    *("CARTESIAN_POINT", "DIRECTION", "COLOUR_RGB", "DRAUGHTING_PRE_DEFINED_CURVE_FONT", "VECTOR"),
+    *("AXIS2_PLACEMENT_3D", "LINE", "CIRCLE", "ELLIPSE", "PLANE", "CYLINDRICAL_SURFACE", "CONICAL_SURFACE"),
+    *("B_SPLINE_CURVE_WITH_KNOTS", "B_SPLINE_SURFACE_WITH_KNOTS", "CURVE_STYLE", "FILL_AREA_STYLE_COLOUR"),
+    *("FILL_AREA_STYLE", "SURFACE_STYLE_FILL_AREA", "SURFACE_SIDE_STYLE", "SURFACE_STYLE_USAGE"),
+    "PRESENTATION_STYLE_ASSIGNMENT",
 )
-"""Geometry and styles; edges and faces stay one each, also where they coincide."""
-_OCCURRENCE = "NEXT_ASSEMBLY_USAGE_OCCURRENCE"
-_COLOURED = "MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION"
-_STYLES = (
-    *(_COLOURED, "OVER_RIDING_STYLED_ITEM", "STYLED_ITEM", "CURVE_STYLE", "FILL_AREA_STYLE", "SURFACE_STYLE"),
-    *("SURFACE_SIDE_STYLE", "PRESENTATION_STYLE", "COLOUR_", "DRAUGHTING_"),
-)
-_PLAIN, _WORD = re.compile(r"\w*"), re.compile("\0(\\d+)")
-"""Words in quotes that nothing here mistakes for something else, and what stands for the others meanwhile."""
+"""Types of entities that stand once, each after those it refers to. Edges and faces that coincide stay apart."""
+_ROUNDED = ("CARTESIAN_POINT", "B_SPLINE_CURVE_WITH_KNOTS", "B_SPLINE_SURFACE_WITH_KNOTS")
+_ENTITY = re.compile(r"#(\d+) ?= ?(.*?);\n", re.DOTALL)
 _REFERENCE = re.compile(r"#(\d+)")
 _LONG_NUMBER = re.compile(rf"-?\d+\.(?:\d{{{_DIGITS + 1},}}(?:E[-+]?\d+)?|\d*E[-+]?\d+)")
+_STYLE = re.compile(
+    "MECHANICAL_DESIGN_GEOMETRIC|OVER_RIDING_STYLED|STYLED_ITEM|CURVE_STYLE|FILL_AREA_STYLE|SURFACE_STYLE|SURFACE_SIDE_"
+    "|PRESENTATION_STYLE|COLOUR_|DRAUGHTING_"
+)
+_STYLED_SHAPES = "MECHANICAL_DESIGN_GEOMETRIC_PRESENTATION_REPRESENTATION"
 
 
-def write_step(path: Path, shape: "Compound") -> None:
-    """Write an assembly with its names and colours as a STEP file, mm; the same bytes for the same shape.
+@dataclass(frozen=True)
+class CadPart:
+    """Named part of an assembly, or an assembly.
+
+    Attributes:
+        name: as CAD programs show it.
+        colour: "#rrggbb", empty for an assembly.
+        solids: the CAD kernel's solids (`TopoDS_Solid`), mm; none for an assembly.
+        children: parts of an assembly.
+        position_mm: x, y and z by which the part is moved within its assembly.
+    """
+
+    name: str
+    colour: str = ""
+    solids: tuple[Any, ...] = ()
+    children: tuple["CadPart", ...] = ()
+    position_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def compound(self) -> TopoDS_Compound:
+        """All solids as one shape of the kernel, children where they are by themselves."""
+        compound, builder = TopoDS_Compound(), BRep_Builder()
+        builder.MakeCompound(compound)
+        for shape in (*self.solids, *(child.compound for child in self.children)):
+            builder.Add(compound, shape)
+        return compound
+
+
+def write_step(path: Path, part: CadPart) -> None:
+    """Write an assembly with its names and colours as a STEP file, mm; the same bytes for the same shapes.
+
+    Args:
+        path: file to write.
+        part: assembly.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
-    from build123d import export_step
-
     with temporary_folder(path.parent) as folder:
-        whole = folder / "whole.step"
-        try:
-            written = export_step(shape, whole, write_pcurves=False, timestamp=_EPOCH)
-        except RuntimeError:
-            written = False
-        if not written:
+        raw = folder / "raw.step"
+        if not export_xcaf(raw, part):
             raise OSError("the CAD kernel could not write it: is the disk full?")
-        text = whole.read_text(encoding="utf-8")
-    path.write_bytes(said_once(text).encode("utf-8"))
+        text = raw.read_text(encoding="utf-8")
+    path.write_bytes(deduplicate(text).encode("utf-8"))
 
 
-def said_once(text: str) -> str:
-    """A STEP file in which each point, direction, curve, surface and style stands once, in few digits."""
-    head, _, rest = text.partition("DATA;")
-    data, _, tail = rest.rpartition("ENDSEC;")
-    quoted = data.split("'")  # every second part is inside of quotes
-    words = quoted[1::2]
-    quoted[1::2] = [word if _PLAIN.fullmatch(word) else f"\0{place}" for place, word in enumerate(words)]
-    parts = _parts("".join("'".join(quoted).split()))
-    geometry = {number for number, own in parts.items() if own[0].partition("(")[0] in _ONCE}
-    # the placements of an assembly's parts are told apart by being several
-    one = {
-        other: other for number in parts.keys() - geometry for other in parts[number][1::2] if _placement(parts[other])
-    }
-    first: dict[tuple[str, ...], str] = {}
+def export_xcaf(path: Path, part: CadPart) -> bool:
+    """Write a STEP file by the CAD kernel's XCAF document; return whether it could be written."""
+    for printer in Message.DefaultMessenger_s().Printers():
+        printer.SetTraceLevel(Message_Gravity.Message_Fail)  # it reports its progress on stdout
+    document = TDocStd_Document(_text("XmlOcaf"))
+    XCAFApp_Application.GetApplication_s().NewDocument(_text("MDTV-XCAF"), document)
+    XCAFDoc_DocumentTool.SetLengthUnit_s(document, 1e-3)
+    shapes, colours = (
+        XCAFDoc_DocumentTool.ShapeTool_s(document.Main()),
+        XCAFDoc_DocumentTool.ColorTool_s(document.Main()),
+    )
+    shapes.SetAutoNaming_s(False)
 
-    def settled(number: str) -> str:
-        """The entity that stands for one, once the same is known of all it refers to."""
-        if number not in one:
-            own, one[number] = parts[number], number
-            if number in geometry:
-                own[1::2] = map(settled, own[1::2])
-                one[number] = first.setdefault(tuple(own), number)
-        return one[number]
+    def add(part: CadPart) -> Any:
+        label = shapes.NewShape() if part.children else shapes.AddShape(part.compound, False)
+        TDataStd_Name.Set_s(label, _text(part.name))
+        for child in part.children:
+            move = gp_Trsf()
+            move.SetTranslation(gp_Vec(*child.position_mm))
+            component = shapes.AddComponent(label, add(child), TopLoc_Location(move))
+            TDataStd_Name.Set_s(component, _text(child.name))
+            if child.colour:
+                colours.SetColor(component, _colour(child.colour), XCAFDoc_ColorType.XCAFDoc_ColorGen)
+        if part.colour:
+            colours.SetColor(label, _colour(part.colour), XCAFDoc_ColorType.XCAFDoc_ColorGen)
+        return label
 
-    occurrences = (own for own in parts.values() if own[0].startswith(_OCCURRENCE))
-    for place, own in enumerate(occurrences, 1):  # the kernel goes on counting from file to file
-        own[0] = re.sub(r"'\d+'", f"'{place}'", own[0], count=1)
-    for number in parts:
-        parts[number][1::2] = map(settled, parts[number][1::2])
-    order = _in_order({number: own for number, own in parts.items() if settled(number) == number})
-    places = {number: f"#{place}" for place, number in enumerate(order, 1)}
-    lines = []
-    for number in order:
-        own = parts[number]
-        own[1::2] = map(places.__getitem__, own[1::2])
-        lines.append(f"{places[number]}={''.join(own)};\n")
-    said = _WORD.sub(lambda found: words[int(found.group(1))], "".join(lines))
-    return f"{head}DATA;\n{said}ENDSEC;{tail}"
-
-
-def _parts(data: str) -> dict[str, list[str]]:
-    """Every entity by its number: what it says, every second part the number of another one, points in few digits."""
-    parts = {}
-    short: dict[str, str] = {}
-    for entity in data.split(";")[:-1]:
-        number, _, content = entity.partition("=")
-        if content.startswith(_ROUNDED):
-            if content not in short:
-                short[content] = _LONG_NUMBER.sub(_rounded, content)
-            content = short[content]
-        parts[number[1:]] = _REFERENCE.split(content) if "#" in content else [content]
-    return parts
+    add(part)
+    shapes.UpdateAssemblies()
+    writer = STEPCAFControl_Writer(XSControl_WorkSession(), False)
+    header = APIHeaderSection_MakeHeader(0)
+    header.Apply(writer.Writer().Model())
+    header.SetName(TCollection_HAsciiString(part.name))
+    header.SetTimeStamp(TCollection_HAsciiString(_TIMESTAMP))
+    header.SetOriginatingSystem(TCollection_HAsciiString("padforge"))
+    Interface_Static.SetIVal_s("write.surfacecurve.mode", 0)  # curves in the parameters of surfaces double the size
+    writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs)
+    return writer.Write(str(path)) == IFSelect_ReturnStatus.IFSelect_RetDone
 
 
-def _in_order(parts: dict[str, list[str]]) -> list[str]:
-    """The numbers of entities: shapes as they come, then what says their colours in the order of the shapes.
+def deduplicate(text: str) -> str:
+    """Return a STEP file in which each entity of geometry and style stands once, its coordinates in few digits.
 
-    The kernel writes colours in an order that differs from run to run.
+    Args:
+        text: file as the CAD kernel writes it, without brackets, semicolons or # in names.
+
+    Returns:
+        File of the same shapes; shapes in their order, then styles in the order of the shapes.
     """
-    order = {
-        number: place for place, number in enumerate(n for n, own in parts.items() if not own[0].startswith(_STYLES))
-    }
+    head, _, rest = text.partition("DATA;\n")
+    data, _, tail = rest.rpartition("ENDSEC;")
+    entities: dict[str, str] = {}
+    by_type: dict[str, list[str]] = {name: [] for name in _SHARED}
+    for number, content in _ENTITY.findall(data):
+        entities[number] = content = re.sub(r"\s*\n\s*", "", content) if "\n" in content else content
+        numbers = by_type.get(content[: content.find("(")])
+        if numbers is not None:
+            numbers.append(number)
 
-    def shown(number: str) -> list[int]:
-        """The places of the shapes that a colour is for."""
-        return [order[other] for other in parts[number][1::2] if other in order]
+    first: dict[str, str] = {}  # content -> number of the first entity that has it
+    shared: dict[str, str] = {}  # number -> number of the entity that replaces it
+    placements = _assembly_placements(entities)
+
+    def replace(match: re.Match[str]) -> str:
+        return "#" + shared.get(match[1], match[1])
+
+    for name, numbers in by_type.items():
+        short: dict[str, str] = {}
+        for number in numbers:
+            content = entities[number]
+            if name in _ROUNDED and content not in short:
+                short[content] = _LONG_NUMBER.sub(_round, content)
+            content = short.get(content, content)
+            if "#" in content:
+                content = _REFERENCE.sub(replace, content)
+            entities[number] = content
+            if number not in placements:
+                shared[number] = first.setdefault(content, number)
+    for number in [number for number, other in shared.items() if number != other]:
+        del entities[number]
+
+    order = _in_order(entities, shared)
+    numbers = {number: f"#{position}" for position, number in enumerate(order, 1)}
+    lines = "".join(f"#{number}={entities[number]};\n" for number in order)
+    lines = _REFERENCE.sub(lambda match: numbers[shared.get(match[1], match[1])], lines)
+    occurrences = iter(range(1, len(order)))  # the kernel counts them on from file to file
+    lines = re.sub(r"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\()'\d+'", lambda match: f"{match[1]}'{next(occurrences)}'", lines)
+    return f"{head}DATA;\n{lines}ENDSEC;{tail}"
+
+
+def _assembly_placements(entities: dict[str, str]) -> set[str]:
+    """Numbers of the placements of an assembly's parts, which must stay several though they are equal."""
+    users = re.compile(r"(?:SHAPE_REPRESENTATION|ITEM_DEFINED_TRANSFORMATION|ADVANCED_BREP_SHAPE_REPRESENTATION)\(")
+    return {number for content in entities.values() if users.match(content) for number in _REFERENCE.findall(content)}
+
+
+def _in_order(entities: dict[str, str], shared: dict[str, str]) -> list[str]:
+    """Return the numbers of entities: shapes as written, then styles, which the kernel writes in no fixed order."""
+    order: dict[str, None] = dict.fromkeys(number for number in entities if not _STYLE.match(entities[number]))
+    rank = {number: position for position, number in enumerate(order)}
+
+    def references(number: str) -> list[str]:
+        return [shared.get(other, other) for other in _REFERENCE.findall(entities[number])]
+
+    def shapes(number: str) -> list[int]:
+        return [rank[other] for other in references(number) if other in rank]
 
     def add(number: str) -> None:
         if number not in order:
-            order[number] = len(order)
-            for other in parts[number][1::2]:
+            order[number] = None
+            for other in references(number):
                 add(other)
 
-    groups = [number for number, own in parts.items() if own[0].startswith(_COLOURED)]
-    for group in sorted(groups, key=shown):
-        *items, context = parts[group][1::2]
-        parts[group][1::2] = [*sorted(items, key=lambda item: (parts[item][0], shown(item))), context]
+    groups = [number for number, content in entities.items() if content.startswith(_STYLED_SHAPES)]
+    for group in sorted(groups, key=shapes):
+        *items, context = references(group)
+        items.sort(key=lambda item: (entities[item].partition("(")[0], shapes(item)))
+        entities[group] = f"{_STYLED_SHAPES}('',({','.join('#' + item for item in items)}),#{context})"
         add(group)
     return list(order)
 
 
-def _placement(own: list[str]) -> bool:
-    return own[0].startswith("AXIS2_PLACEMENT_3D")
-
-
-def _rounded(found: re.Match[str]) -> str:
-    short = f"{float(found.group()):.{_DIGITS}f}".rstrip("0")
+def _round(match: re.Match[str]) -> str:
+    short = f"{float(match[0]):.{_DIGITS}f}".rstrip("0")
     return "0." if short in ("-0.", "0.") else short
+
+
+def _colour(colour: str) -> Quantity_Color:
+    """A colour "#rrggbb" as the kernel has it, in linear RGB."""
+    result = Quantity_Color()
+    Quantity_Color.ColorFromHex_s(colour, result)
+    return result
+
+
+def _text(name: str) -> TCollection_ExtendedString:
+    return TCollection_ExtendedString(name)

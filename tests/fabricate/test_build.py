@@ -18,7 +18,8 @@ from padforge.design.common.files import sha256
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import export
-from padforge.fabricate.cad import model
+from padforge.fabricate.cad import model, step_file
+from padforge.fabricate.cad.step_file import CadPart
 from padforge.fabricate.export import FORMATS, build
 from padforge.fabricate.mesh import COLOURS
 from padforge.fabricate.mould import Body, Prism
@@ -210,12 +211,14 @@ def test_what_stops_the_needle_is_told(tmp_path):
 
 def other_solid(monkeypatch, body: str) -> None:
     """Plant a box in place of a body's CAD model."""
-    for makes in ("mould_model", "body_model"):
+    for makes in ("build_mould_model", "build_body_model"):
         right = getattr(model, makes)
 
         def other(of, name, *rest, right=right):
             made = right(of, name, *rest)
-            return replace(made, shape=Solid.make_box(1, 1, 1)) if name == body else made
+            return (
+                replace(made, part=CadPart(name, solids=(Solid.make_box(1, 1, 1).wrapped,))) if name == body else made
+            )
 
         monkeypatch.setattr(model, makes, other)
 
@@ -223,10 +226,6 @@ def other_solid(monkeypatch, body: str) -> None:
 def in_pieces(monkeypatch, body: str) -> None:
     pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
     monkeypatch.setattr(export, body, lambda plan: pieces)
-
-
-def full_step(*_, **__):
-    raise RuntimeError("Failed to write STEP file")  # what build123d makes of a full disk
 
 
 @pytest.mark.parametrize(
@@ -238,9 +237,13 @@ def full_step(*_, **__):
         (partial(in_pieces, body="lid_body"), ["stl"], r"^lid: .*the mesh has 2 bodies.*nothing was written"),
         (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid is not of its mesh \(.*written"),
         (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
-        (lambda m: m.setattr(Solid, "is_valid", False), ["step"], "mould: the CAD kernel finds a solid invalid"),
         (
-            lambda m: m.setattr("build123d.export_step", full_step),
+            lambda m: m.setattr(model, "is_valid", lambda shape: False),
+            ["step"],
+            "mould: the CAD kernel finds a solid invalid",
+        ),
+        (
+            lambda m: m.setattr(step_file, "export_xcaf", lambda path, part: False),
             ["stl", "step"],
             r"mould\.step: cannot be written \(the CAD kernel could not write it",
         ),

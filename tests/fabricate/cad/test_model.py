@@ -8,7 +8,7 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
-from build123d import Compound, GeomType, Solid, import_step
+from build123d import Compound, GeomType, import_step
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure
@@ -18,7 +18,15 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.fabricate.cad import model as of_model
-from padforge.fabricate.cad.model import FITS_MM, Model, assembly, body_model, build_mould, models, mould_model
+from padforge.fabricate.cad.model import (
+    FITS_MM,
+    CadModel,
+    assemble,
+    build_body_model,
+    build_models,
+    build_mould,
+    build_mould_model,
+)
 from padforge.fabricate.cad.step_file import write_step
 from padforge.fabricate.mesh import build_mesh
 from padforge.fabricate.mould import conductive_plan, holder_body, lid_body, mould_body, well_outlines
@@ -32,16 +40,16 @@ SOFT = winding_pad((0.3, 1.0), (0.6, 1.5), (0.9, 1.35), (1.3, 0.6), (1.7, 1.0))
 """A fibre without tight bends that leaves the pad straight on."""
 
 
-def part(model: Model, name: str) -> Compound:
+def part(model: CadModel, name: str) -> Compound:
     (found,) = (child for child in model.shape.children if child.label == name)
     return found
 
 
-def judged(plan: Plan, **wells) -> Model:
+def judged(plan: Plan, **wells) -> CadModel:
     """The model of a plan's mould, valid and as large as its mesh."""
-    model = mould_model(plan.shrinkage_compensated, "mould", **wells)
+    model = build_mould_model(plan.shrinkage_compensated, "mould", **wells)
     assert all(solid.is_valid for solid in model.shape.solids())
-    apart = model.apart(build_mesh(mould_body(plan.shrinkage_compensated, **wells)))
+    apart = model.compare(build_mesh(mould_body(plan.shrinkage_compensated, **wells)))
     assert max(apart) < 2e-4, apart
     return model
 
@@ -62,7 +70,7 @@ def test_a_straight_pad_has_the_volumes_and_contact_that_arithmetic_gives(draft_
     expected = {"tray": tray, f"{deep} tracks": deeper, f"{other} tracks": shallow}
     assert volumes == pytest.approx(expected, rel=1e-9)
     assert build_mould(plan.pad, plan.settings).volume == pytest.approx(sum(expected.values()), rel=1e-9)
-    assert max(model.apart(build_mesh(mould_body(plan)))) < 1e-7
+    assert max(model.compare(build_mesh(mould_body(plan)))) < 1e-7
     assert all(face.geom_type == GeomType.PLANE for face in model.shape.faces())
     footprint = 2 * (inner + inner - 2 * ridge) * ridge
     crossings, ends = 4 * 2 * ridge * 0.4, 2 * 2 * ridge * (1.2 + 0.4) * math.hypot(1, slope)
@@ -97,7 +105,7 @@ def test_edges_of_tracks_are_half_a_width_from_the_exact_fibres(pad, mould):
     """Thousands of places on the kernel's own curves, on the floor, against scipy's own PCHIP."""
     plan = Plan(pad, with_settings(PLAIN | mould))
     points = []
-    for edge in part(mould_model(plan, "mould"), "horizontal tracks").edges():
+    for edge in part(build_mould_model(plan, "mould"), "horizontal tracks").edges():
         if edge.geom_type != GeomType.LINE and abs(edge.center().Z - 2.0) < 1e-9:
             points += [(p.X, p.Y) for p in edge.positions(np.linspace(0, 1, 200).tolist())]
     inside = np.array(points)
@@ -172,7 +180,7 @@ def test_published_pads(published, name):
 def test_the_second_mould_has_its_wells():
     plan = conductive_plan(Plan(SOFT, with_settings({"conductive": True, "pins": True})))
     model = judged(plan, wells=well_outlines(plan, sides=512))
-    plain = mould_model(plan, "mould")
+    plain = build_mould_model(plan, "mould")
     for name in ("horizontal tracks", "vertical tracks"):  # the wells belong to their tracks
         assert part(model, name).volume > part(plain, name).volume + 2 * 0.3 * math.pi * 1.5**2
     assert part(model, "numbers").volume == pytest.approx(part(plain, "numbers").volume)
@@ -181,7 +189,7 @@ def test_the_second_mould_has_its_wells():
 
 
 def test_parts_are_named_coloured_touch_and_do_not_overlap():
-    model = mould_model(Plan(SOFT, with_settings({"pins": True})), "mould")
+    model = build_mould_model(Plan(SOFT, with_settings({"pins": True})), "mould")
     assert model.shape.label == "mould"
     children = list(model.shape.children)
     assert [child.label for child in children] == ["tray", "horizontal tracks", "vertical tracks", "numbers", "pins"]
@@ -191,7 +199,7 @@ def test_parts_are_named_coloured_touch_and_do_not_overlap():
         for a, b in product(one.solids(), other.solids()):
             shared = a.intersect(b)
             assert sum(each.volume for each in shared.solids()) < 1e-6 if shared else True
-    without = mould_model(Plan(SOFT, with_settings(PLAIN)), "mould").shape
+    without = build_mould_model(Plan(SOFT, with_settings(PLAIN)), "mould").shape
     assert [child.label for child in without.children] == ["tray", "horizontal tracks", "vertical tracks"]
 
 
@@ -211,19 +219,20 @@ def test_all_that_is_printed_stands_side_by_side_with_the_lid_on():
     wells = conductive_plan(plan)
     second = mould_body(wells, well_outlines(wells, sides=512))
     bodies = {"mould": mould_body(plan), "lid": lid_body(plan), "conductive": second, "holder": holder_body(wells)}
-    made = models(plan, bodies)
+    made = build_models(plan, bodies)
     for name, model in zip(bodies, made, strict=True):
-        assert max(model.apart(build_mesh(bodies[name]))) < 5e-4  # a lid's mesh has polygons for circles
-    whole = assembly(made, plan)
-    assert [child.label for child in whole.children] == list(bodies)
-    low = {child.label: [*child.bounding_box().min] for child in whole.children}
-    high = {child.label: [*child.bounding_box().max] for child in whole.children}
+        assert max(model.compare(build_mesh(bodies[name]))) < 5e-4  # a lid's mesh has polygons for circles
+    whole = assemble(made, plan)
+    assert [child.name for child in whole.children] == list(bodies)
+    shapes = {child.name: CadModel(child).shape for child in whole.children}
+    low = {name: [*shape.bounding_box().min] for name, shape in shapes.items()}
+    high = {name: [*shape.bounding_box().max] for name, shape in shapes.items()}
     assert low["lid"][2] == pytest.approx(8.0)
     assert high["mould"][2] == pytest.approx(10.0)
     assert low["lid"][:2] == pytest.approx(low["mould"][:2])
     assert low["conductive"][0] == pytest.approx(high["mould"][0] + 10)
     assert low["holder"][0] == pytest.approx(high["conductive"][0] + 10)
-    assert whole.is_valid
+    assert CadModel(whole).shape.is_valid
 
 
 def test_a_small_pitch_is_no_matter_without_a_second_mould():
@@ -231,34 +240,37 @@ def test_a_small_pitch_is_no_matter_without_a_second_mould():
     plan = Plan(Morphology.straight(1, pitch_mm=5.0))
     with pytest.raises(InputError, match="exit_width_mm"):
         conductive_plan(plan)
-    (made,) = models(plan, {"mould": mould_body(plan)})
+    (made,) = build_models(plan, {"mould": mould_body(plan)})
     assert made.shape.is_valid
 
 
 @pytest.mark.parametrize("failure", [None, Standard_Failure(""), ValueError("")])
-def test_a_solid_that_is_invalid_or_cannot_be_made_is_tried_with_finer_curves(monkeypatch, failure):
-    tried, right = [], of_model.solids
+def test_mould_models_are_built_with_finer_curves_until_solids_are_valid(monkeypatch, failure):
+    tries, build, valid = [], of_model.fill_cells, of_model.is_valid
 
-    def failing(drawing, spans):
-        tried.append(len(tried))
-        if failure and len(tried) <= fails:
-            raise failure
-        return right(drawing, spans)
+    def fill(plan, fit_mm, wells):
+        tries.append(fit_mm)
+        if failure and len(tries) <= failures:
+            monkeypatch.setattr(of_model, "build_solids", lambda *_: (_ for _ in ()).throw(failure))
+        else:
+            monkeypatch.setattr(of_model, "build_solids", solids)
+        return build(plan, fit_mm, wells)
 
-    monkeypatch.setattr(of_model, "solids", failing)
+    solids = of_model.build_solids
+    monkeypatch.setattr(of_model, "fill_cells", fill)
     if failure is None:
-        monkeypatch.setattr(Solid, "is_valid", property(lambda solid: len(tried) > fails))
-    fails = 1 if failure else 4  # of the parts that are made before the first look at them
-    assert mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == FITS_MM[1]
-    fails = 1000
+        monkeypatch.setattr(of_model, "is_valid", lambda shape: len(tries) > failures and valid(shape))
+    failures = 1
+    assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == FITS_MM[1]
+    failures = 1000
     with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
-        mould_model(Plan(Morphology.straight(1)), "second")
+        build_mould_model(Plan(Morphology.straight(1)), "second")
 
 
 def test_an_invalid_body_is_named(monkeypatch):
-    monkeypatch.setattr(Solid, "is_valid", False)
+    monkeypatch.setattr(of_model, "is_valid", lambda shape: False)
     with pytest.raises(InputError, match="lid: the CAD kernel finds the solid invalid; leave step out"):
-        body_model(lid_body(Plan(Morphology.straight(1))), "lid")
+        build_body_model(lid_body(Plan(Morphology.straight(1))), "lid")
 
 
 def test_a_mild_pad_is_a_small_file_of_true_curves(tmp_path):
@@ -266,7 +278,7 @@ def test_a_mild_pad_is_a_small_file_of_true_curves(tmp_path):
     pad = mild_pad(1, 8, seed=2)
     plan = Plan(pad)
     model = judged(plan)
-    write_step(tmp_path / "mould.step", model.shape)
+    write_step(tmp_path / "mould.step", model.part)
     assert (tmp_path / "mould.step").stat().st_size < 1.5e6
     read = import_step(tmp_path / "mould.step")
     assert read.is_valid

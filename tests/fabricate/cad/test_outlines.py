@@ -14,16 +14,16 @@ from scipy.spatial import KDTree
 from padforge.design.morphology import Morphology
 from padforge.fabricate.cad.curves import (
     FINE_MM,
-    MOST_SPANS,
+    MAX_SPANS,
     OutlineCurve,
-    arc_through,
-    breaks,
-    joints,
-    lengths,
-    ring_pieces,
-    spline,
-    stretch,
-    with_joints,
+    arc_lengths,
+    find_joints,
+    fit_arc,
+    fit_spline,
+    insert_joints,
+    ring_curves,
+    split_parameters,
+    trim_spline,
 )
 from padforge.fabricate.plan import Plan, polygon_rings
 from tests.fabricate.planted import exact_fibre, with_settings
@@ -38,33 +38,46 @@ FINE = 64
 """Segments of a quarter of a circle: the rings are drawn within FINE_MM of circles of a few mm."""
 
 
+def values(piece: OutlineCurve, s: Array | float) -> Array:
+    """Points and derivatives at arc lengths (...,), shape (..., 4)."""
+    return np.array([piece.evaluate(float(each)) for each in np.ravel(s)]).reshape(*np.shape(s), 4)
+
+
+def at(piece: OutlineCurve, s: Array | float) -> Array:
+    return values(piece, s)[..., :2]
+
+
+def tangent(piece: OutlineCurve, s: Array | float) -> Array:
+    return values(piece, s)[..., 2:]
+
+
 def ring(area: shapely.Polygon) -> Array:
     return polygon_rings(area)[0][0]
 
 
 def turns(pieces: list[OutlineCurve]) -> Array:
     """Degrees that the direction turns by where one piece follows another, all round."""
-    ends = np.array([piece.tangent(piece.length) for piece in pieces])
-    starts = np.array([piece.tangent(0) for piece in [*pieces[1:], pieces[0]]])
+    ends = np.array([tangent(piece, piece.length) for piece in pieces])
+    starts = np.array([tangent(piece, 0) for piece in [*pieces[1:], pieces[0]]])
     cross = ends[:, 0] * starts[:, 1] - ends[:, 1] * starts[:, 0]
     return np.degrees(np.abs(np.arctan2(cross, (ends * starts).sum(axis=1))))
 
 
 def gaps(pieces: list[OutlineCurve]) -> Array:
-    ends = np.array([piece.at(piece.length) for piece in pieces])
-    return np.linalg.norm(ends - [piece.at(0) for piece in [*pieces[1:], pieces[0]]], axis=1)
+    ends = np.array([at(piece, piece.length) for piece in pieces])
+    return np.linalg.norm(ends - [at(piece, 0) for piece in [*pieces[1:], pieces[0]]], axis=1)
 
 
 def walls(plan: Plan, level: int, fit_mm: float = FIT_MM) -> list[list[OutlineCurve]]:
     """The pieces of every ring of the tracks of a level."""
-    at = joints(plan, level, plan.settings.mould.ridge_width_mm / 2)
-    outline = with_joints(plan.outline(level, 0.0, FINE_MM), at)
-    return [list(ring_pieces(each, at, fit_mm)) for rings in polygon_rings(outline) for each in rings]
+    at = find_joints(plan, level, plan.settings.mould.ridge_width_mm / 2)
+    outline = insert_joints(plan.outline(level, 0.0, FINE_MM), at)
+    return [list(ring_curves(each, at, fit_mm)) for rings in polygon_rings(outline) for each in rings]
 
 
 def deviation(plan: Plan, level: int, fit_mm: float = FIT_MM) -> tuple[float, int]:
     """How far walls stray from half a width beside the nearest fibre, mm, and at how many places that was looked at."""
-    sampled = [piece.at(np.linspace(0, piece.length, 400)) for own in walls(plan, level, fit_mm) for piece in own]
+    sampled = [at(piece, np.linspace(0, piece.length, 400)) for own in walls(plan, level, fit_mm) for piece in own]
     points = np.concatenate(sampled)
     clear = plan.cavity.bounds[2] - 1.0  # near the walls ends of tracks are square
     points = points[np.abs(points).max(axis=1) < clear]
@@ -76,7 +89,7 @@ def deviation(plan: Plan, level: int, fit_mm: float = FIT_MM) -> tuple[float, in
 @pytest.mark.parametrize("clockwise", [False, True])
 def test_a_circle_is_two_arcs(clockwise):
     drawn = ring(shapely.Point(3, 4).buffer(2.0, quad_segs=FINE))
-    pieces = list(ring_pieces(drawn[::-1] if clockwise else drawn, {}, FIT_MM))
+    pieces = list(ring_curves(drawn[::-1] if clockwise else drawn, {}, FIT_MM))
     assert len(pieces) == 2
     for piece in pieces:
         assert piece.arc is not None
@@ -89,9 +102,9 @@ def test_a_circle_is_two_arcs(clockwise):
 def test_a_polygon_is_its_edges(corners):
     polygon = shapely.Point(0, 0).buffer(5.0).boundary.interpolate(np.arange(corners) / corners, normalized=True)
     drawn = shapely.Polygon(polygon.tolist())
-    pieces = list(ring_pieces(ring(drawn), {}, FIT_MM))
+    pieces = list(ring_curves(ring(drawn), {}, FIT_MM))
     assert len(pieces) == corners
-    assert all(piece.arc is None and piece.curve is None for piece in pieces)
+    assert all(piece.arc is None and piece.spline is None for piece in pieces)
     assert sum(piece.length for piece in pieces) == pytest.approx(drawn.length)
     assert sorted(turns(pieces)) == pytest.approx([360 / corners] * corners, abs=0.5)
 
@@ -99,10 +112,10 @@ def test_a_polygon_is_its_edges(corners):
 def test_a_smooth_ring_that_is_no_circle_is_splines_that_close():
     t = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
     drawn = np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1)
-    pieces = list(ring_pieces(drawn, {}, FIT_MM))
-    assert all(piece.curve for piece in pieces)
+    pieces = list(ring_curves(drawn, {}, FIT_MM))
+    assert all(piece.spline for piece in pieces)
     for piece in pieces:
-        x, y = piece.at(np.linspace(0, piece.length, 500)).T
+        x, y = at(piece, np.linspace(0, piece.length, 500)).T
         slope = np.hypot(x / 64, y / 9)
         assert np.abs((x**2 / 64 + y**2 / 9 - 1) / 2 / slope).max() < FIT_MM + FINE_MM
     assert gaps(pieces).max() < 1e-9
@@ -115,18 +128,18 @@ def test_at_and_tangent_belong_together(clockwise):
     area = shapely.LineString([(0, 0), (9, 0)]).buffer(1.5, quad_segs=FINE)
     t = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
     ellipse = np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1)
-    for piece in [*ring_pieces(ring(area)[::way], {}, FIT_MM), *ring_pieces(ellipse[::way], {}, FIT_MM)]:
+    for piece in [*ring_curves(ring(area)[::way], {}, FIT_MM), *ring_curves(ellipse[::way], {}, FIT_MM)]:
         s = np.linspace(0, piece.length, 50)[1:-1]
-        assert (piece.at(s + 1e-6) - piece.at(s - 1e-6)) / 2e-6 == pytest.approx(piece.tangent(s), abs=1e-5)
-        assert piece.at(np.array([0, piece.length])) == pytest.approx(piece.points[[0, -1]], abs=FIT_MM)
-        assert piece.at(0).shape == piece.tangent(0).shape == (2,)
+        assert (at(piece, s + 1e-6) - at(piece, s - 1e-6)) / 2e-6 == pytest.approx(tangent(piece, s), abs=1e-5)
+        assert at(piece, np.array([0, piece.length])) == pytest.approx(piece.points[[0, -1]], abs=FIT_MM)
+        assert at(piece, 0).shape == tangent(piece, 0).shape == (2,)
 
 
 @given(st.floats(-50, 50), st.floats(0.2, 80), st.floats(0.2, 6), st.integers(6, 300), st.booleans())
 @settings(max_examples=30)
 def test_an_arc_is_found_from_its_vertices(x, radius, sweep, count, clockwise):
     angles = 1 + (-sweep if clockwise else sweep) * np.linspace(0, 1, count)
-    found = arc_through(np.stack([x + radius * np.cos(angles), 2 + radius * np.sin(angles)], axis=1))
+    found = fit_arc(np.stack([x + radius * np.cos(angles), 2 + radius * np.sin(angles)], axis=1))
     assert found is not None
     assert found[:3] == pytest.approx((x, 2, radius), rel=1e-6, abs=1e-6)
     if sweep < 5 * (count - 1) / 2:  # less than half a turn an edge
@@ -135,9 +148,9 @@ def test_an_arc_is_found_from_its_vertices(x, radius, sweep, count, clockwise):
 
 def test_what_is_no_arc_or_too_few_vertices_to_tell():
     x = np.linspace(-1, 1, 50)
-    assert arc_through(np.stack([x, x**2], axis=1)) is None
+    assert fit_arc(np.stack([x, x**2], axis=1)) is None
     angles = np.linspace(0, 1, 4)
-    assert arc_through(np.stack([np.cos(angles), np.sin(angles)], axis=1)) is None
+    assert fit_arc(np.stack([np.cos(angles), np.sin(angles)], axis=1)) is None
 
 
 @pytest.mark.parametrize(("knots", "seed"), [(1, 0), (8, 2), pytest.param(20, 3, marks=pytest.mark.slow)])
@@ -183,7 +196,10 @@ HALF_MM = PLAN.settings.mould.ridge_width_mm / 2
 
 def test_two_joints_a_knot_half_a_width_away_across_the_fibre():
     for level in range(len(PLAN.heights_mm)):
-        found, fibres = joints(PLAN, level, HALF_MM), [f for f, own in enumerate(PLAN.layer_indices) if own == level]
+        found, fibres = (
+            find_joints(PLAN, level, HALF_MM),
+            [f for f, own in enumerate(PLAN.layer_indices) if own == level],
+        )
         assert len(found) == 2 * PLAN.pad.knots.shape[1] * len(fibres)
         for fibre in fibres:
             travel, knots = PLAN.family(fibre), PLAN.pad.to_mm(PLAN.pad.knots[fibre])
@@ -224,9 +240,9 @@ def splines(draw: st.DrawFn) -> BSpline:
 def test_a_spline_is_near_what_is_drawn_with_few_spans(fit_mm, count):
     t = np.linspace(0, 6, count)
     points = wave(t)
-    curve = spline(points, [wave_along(0), wave_along(6)], fit_mm)
+    curve = fit_spline(points, [wave_along(0), wave_along(6)], fit_mm)
     first, last = curve.t[0], curve.t[-1]
-    assert (first, last) == pytest.approx((0, lengths(points)[-1]))
+    assert (first, last) == pytest.approx((0, arc_lengths(points)[-1]))
     found = curve(np.linspace(first, last, 5000))
     along = np.stack([np.ones(len(found)), 2 * np.cos(2 * found[:, 0])], axis=1)
     off = np.abs(found[:, 1] - np.sin(2 * found[:, 0])) / np.linalg.norm(along, axis=1)
@@ -240,7 +256,7 @@ def test_a_spline_is_near_what_is_drawn_with_few_spans(fit_mm, count):
 def test_ends_and_their_directions_are_exact(waves, high, count, fit_mm):
     points = wave(np.linspace(0, 4, count), waves, high)
     tangents = [wave_along(0, waves, high), wave_along(4, waves, high)]
-    curve = spline(points, tangents, fit_mm)
+    curve = fit_spline(points, tangents, fit_mm)
     first, last = curve.t[[0, -1]]
     assert curve([first, last]) == pytest.approx(points[[0, -1]], abs=1e-12)
     for s, along in zip((first, last), tangents, strict=True):
@@ -257,7 +273,7 @@ def test_a_spline_strays_nowhere_along_far_vertices(far):
     run = bend[-1] + np.outer(np.cumsum(far), out) + np.outer([1e-3, 1.5e-3, 0][: len(far)], aside)
     points = np.vstack([bend, run])
     end = (points[-1] - points[-2]) / np.linalg.norm(points[-1] - points[-2])
-    curve = spline(points, [np.array([1.0, 0.0]), end], 2e-3)
+    curve = fit_spline(points, [np.array([1.0, 0.0]), end], 2e-3)
     places = shapely.points(curve(np.linspace(curve.t[0], curve.t[-1], 5000)))
     assert shapely.distance(places, shapely.LineString(points)).max() <= 2.2e-3
 
@@ -266,12 +282,12 @@ def test_a_spline_strays_nowhere_along_far_vertices(far):
 @settings(max_examples=20)
 def test_no_part_between_breaks_has_more_spans_than_allowed(curve):
     knots = np.unique(curve.t)
-    cuts = [knots[0], *breaks(curve), knots[-1]]
+    cuts = [knots[0], *split_parameters(curve), knots[-1]]
     assert cuts == sorted(set(cuts))
     assert set(cuts) <= set(knots.tolist())
     spans = [int(((knots >= a) & (knots < b)).sum()) for a, b in pairwise(cuts)]
-    assert max(spans) <= MOST_SPANS
-    assert len(spans) == -(-(len(knots) - 1) // MOST_SPANS)
+    assert max(spans) <= MAX_SPANS
+    assert len(spans) == -(-(len(knots) - 1) // MAX_SPANS)
 
 
 @given(splines(), st.floats(0, 1), st.floats(0, 1))
@@ -281,7 +297,7 @@ def test_a_stretch_is_the_curve_itself(curve, low, high):
     start, end = sorted(whole[0] + np.array([low, high]) * (whole[1] - whole[0]))
     if end - start < 1e-6:
         start, end = whole
-    part = stretch(curve, start, end)
+    part = trim_spline(curve, start, end)
     assert part.t[[0, -1]] == pytest.approx([start, end], abs=1e-9)
     assert (part.t[:4] == part.t[0]).all()
     assert (part.t[-4:] == part.t[-1]).all()

@@ -14,10 +14,10 @@ from scipy.special import ellipe
 from shapely.geometry.base import BaseGeometry
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.cad.curves import ring_pieces, straight_pieces
+from padforge.fabricate.cad.curves import edge_curves, ring_curves
 from padforge.fabricate.cad.model import body_solid, prism_solids
 from padforge.fabricate.cad.planar_map import FLOOR, RIM, Subdivision, Surface, TrayWalls, ZRange
-from padforge.fabricate.cad.solids import solids
+from padforge.fabricate.cad.solids import build_solids
 from padforge.fabricate.mesh import build_mesh as body_mesh
 from padforge.fabricate.mould import Body, Prism, cylinder, holder_body, lid_body, registration_pins, sizes
 from padforge.fabricate.plan import Plan, polygon_rings
@@ -32,7 +32,7 @@ def drawn(*areas: BaseGeometry) -> Subdivision:
     pieces = []
     for area in areas:
         for ring in polygon_rings(area)[0]:
-            pieces += ring_pieces(ring, {}, 2e-3) if len(ring) > 100 else straight_pieces(shapely.LinearRing(ring))
+            pieces += ring_curves(ring, {}, 2e-3) if len(ring) > 100 else edge_curves(shapely.LinearRing(ring))
     return Subdivision([area.boundary for area in areas], pieces)
 
 
@@ -40,10 +40,14 @@ def built(areas: Sequence[BaseGeometry], top: Callable[[set[int]], float | None]
     """The solids over z = 0 up to a height that is given for the set of areas which cover a cell."""
     drawing = drawn(*areas)
     spans: list[ZRange | None] = []
-    for place in drawing.middles:
+    for place in drawing.interior_points:
         height = top({k for k, area in enumerate(areas) if area.contains(shapely.Point(place))})
         spans.append(None if height is None else ZRange(0.0, height))
-    return list(solids(drawing, spans))
+    return wrapped(drawing, spans)
+
+
+def wrapped(drawing: Subdivision, spans: Sequence[ZRange | None]) -> list[Solid]:
+    return [Solid(solid) for solid in build_solids(drawing, spans)]
 
 
 def kinds(solid: Solid) -> dict[str, int]:
@@ -110,21 +114,21 @@ BOWL = TrayWalls(np.array([[-3.0, -2.0, 3.0, 2.0]]), floor_mm=1.0, depth_mm=4.0,
 
 def surfaces(drawing: Subdivision) -> list[Surface]:
     rim = BOWL.floor_mm + BOWL.depth_mm
-    sheets = BOWL.sheets(drawing.middles).tolist()
+    sheets = BOWL.planes(drawing.interior_points).tolist()
     return [BOWL.floor_mm if k == FLOOR else rim if k == RIM else (BOWL, k) for k in sheets]
 
 
 def bowl_drawn(*areas: BaseGeometry) -> Subdivision:
     lines = [shapely.box(-5, -4, 5, 4).exterior, *BOWL.creases(), BOWL.outline(5.0).exterior]
     lines += [BOWL.outline(3.0).exterior] if areas else []
-    within = drawn(*areas).pieces if areas else []
-    pieces = [*(piece for line in lines for piece in straight_pieces(line)), *within]
+    within = drawn(*areas).curves if areas else []
+    pieces = [*(piece for line in lines for piece in edge_curves(line)), *within]
     return Subdivision([*lines, *(area.boundary for area in areas)], pieces)
 
 
 def test_a_tray_with_walls_that_lean():
     drawing = bowl_drawn()
-    (solid,) = solids(drawing, [ZRange(0.0, top) for top in surfaces(drawing)])
+    (solid,) = wrapped(drawing, [ZRange(0.0, top) for top in surfaces(drawing)])
     assert solid.is_valid
     hollow = 4 * (6 * 4 + 4 * 6.8 * 4.8 + 7.6 * 5.6) / 6
     assert solid.volume == pytest.approx(10 * 8 * 5 - hollow, rel=1e-9)
@@ -139,12 +143,12 @@ def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
     """It ends where the wall comes out of its top; wherever it stands, its volume is that above what is below."""
     round_ = disc(x, y, 0.5)
     drawing = bowl_drawn(round_)
-    heights = BOWL.heights(drawing.middles)
+    heights = BOWL.heights(drawing.interior_points)
     spans = [
         ZRange(under, 3.0) if round_.contains(shapely.Point(place)) and height < 3.0 else None
-        for under, place, height in zip(surfaces(drawing), drawing.middles, heights, strict=True)
+        for under, place, height in zip(surfaces(drawing), drawing.interior_points, heights, strict=True)
     ]
-    (solid,) = solids(drawing, spans)
+    (solid,) = wrapped(drawing, spans)
     assert solid.is_valid
     grid = (np.arange(1000) + 0.5) / 1000 - 0.5
     places = np.stack(np.meshgrid(x + grid, y + grid), axis=-1).reshape(-1, 2)
@@ -159,18 +163,18 @@ def test_a_curve_that_strays_past_its_top_on_a_wall_ends_at_it():
     away = (0.5 + short) / math.sqrt(2)
     round_ = disc(1.4 - away, 2.4 - away, 0.5)
     lines = [*walls.creases(), walls.outline(3.0).exterior]
-    pieces = [*(piece for line in lines for piece in straight_pieces(line)), *drawn(round_).pieces]
+    pieces = [*(piece for line in lines for piece in edge_curves(line)), *drawn(round_).curves]
     drawing = Subdivision([*lines, round_.boundary], pieces)
     for number, piece in enumerate(pieces):
         if piece.arc is not None:
             x, y, radius, *angles = piece.arc
             pieces[number] = replace(piece, arc=(x, y, radius + astray, *angles))
-    sheets = walls.sheets(drawing.middles).tolist()
+    sheets = walls.planes(drawing.interior_points).tolist()
     spans = [
         ZRange(walls.floor_mm if k == FLOOR else (walls, k), 3.0) if round_.contains(shapely.Point(place)) else None
-        for k, place in zip(sheets, drawing.middles, strict=True)
+        for k, place in zip(sheets, drawing.interior_points, strict=True)
     ]
-    (solid,) = solids(drawing, spans)
+    (solid,) = wrapped(drawing, spans)
     assert solid.is_valid
     assert max(vertex.Z for vertex in solid.vertices()) == pytest.approx(3.0, abs=1e-9)
 
@@ -186,7 +190,7 @@ def test_any_drums_and_blocks(seed, count):
     assert all(solid.is_valid for solid in found)
     drawing = drawn(*areas)
     volume = 0.0
-    for cell, place in zip(drawing.cells, drawing.middles, strict=True):
+    for cell, place in zip(drawing.cells, drawing.interior_points, strict=True):
         within = [top for area, top in zip(areas, tops, strict=True) if area.contains(shapely.Point(place))]
         volume += cell.area * max(within, default=0.0)
     assert sum(solid.volume for solid in found) == pytest.approx(volume, rel=1e-5)
