@@ -199,12 +199,12 @@ def _build_valid(builders: Mapping[str, Callable[[], Iterable[Any]]]) -> dict[st
         solids = {part: tuple(build()) for part, build in builders.items()}
     except (Standard_Failure, RuntimeError, ValueError):  # the kernel's, and build123d's about what it was given
         return None
-    return solids if is_valid(CadPart("", solids=sum(solids.values(), ())).compound) else None
+    return solids if all(is_valid(solid) for part in solids.values() for solid in part) else None
 
 
-def is_valid(shape: Any) -> bool:
-    """Tell whether the CAD kernel finds a shape valid: closed, with faces within their tolerances."""
-    return BRepCheck_Analyzer(shape, True, True).IsValid()
+def is_valid(solid: Any) -> bool:
+    """Tell whether the CAD kernel finds a solid valid: closed, with faces within their tolerances."""
+    return BRepCheck_Analyzer(solid, True, True).IsValid()
 
 
 def _x_range(part: CadPart) -> tuple[float, float]:

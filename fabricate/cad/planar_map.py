@@ -79,9 +79,9 @@ class Subdivision:
         coordinates, ring = shapely.get_coordinates(rings, return_index=True)
         vertices, same_ring = _snap(coordinates), (ring[1:] == ring[:-1]).tolist()
         cells = cell_of_ring[ring].tolist()
-        left = {(vertices[i], vertices[i + 1]): cells[i] for i, within in enumerate(same_ring) if within}
-        self.edges = [edge for edge in left if edge[0] < edge[1] or edge[::-1] not in left]
-        self.sides = np.array([(left[a, b], left.get((b, a), -1)) for a, b in self.edges])
+        cell_beside = {(vertices[i], vertices[i + 1]): cells[i] for i, within in enumerate(same_ring) if within}
+        self.edges = [edge for edge in cell_beside if edge[0] < edge[1] or edge[::-1] not in cell_beside]
+        self.sides = np.array([(cell_beside[a, b], cell_beside.get((b, a), -1)) for a, b in self.edges])
         self.curve_of_edge = _nearest_curves(self.edges, curves)
 
     def find_slivers(self) -> dict[int, int]:
@@ -116,16 +116,16 @@ class MapEdge:
         start: arc length along the curve where the edge begins.
         end: arc length where it ends, more than `start`.
         nodes: numbers of its nodes.
-        left: cell to its left, -1 for none.
-        right: cell to its right, -1 for none.
+        left_cell: cell to its left, -1 for none.
+        right_cell: cell to its right, -1 for none.
     """
 
     curve: int
     start: float
     end: float
     nodes: tuple[int, int]
-    left: int
-    right: int
+    left_cell: int
+    right_cell: int
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,10 @@ class PlanarMap:
         code = np.array([*(codes.setdefault(kind, len(codes)) for kind in kinds), -1])
         border = np.flatnonzero(code[sides[:, 0]] != code[sides[:, 1]]).tolist()
         cells = np.where(code[sides] < 0, -1, sides)
-        left = {subdivision.edges[k]: cell for k, cell in zip(border, cells[border, 0].tolist(), strict=True)}
-        left |= {subdivision.edges[k][::-1]: cell for k, cell in zip(border, cells[border, 1].tolist(), strict=True)}
+        cell_beside = {subdivision.edges[k]: cell for k, cell in zip(border, cells[border, 0].tolist(), strict=True)}
+        cell_beside |= {
+            subdivision.edges[k][::-1]: cell for k, cell in zip(border, cells[border, 1].tolist(), strict=True)
+        }
         curve_of_edge = {subdivision.edges[k]: int(subdivision.curve_of_edge[k]) for k in border}
         runs = _orient_runs(_join_runs(curve_of_edge), subdivision.curves)
         # Runs that vanish where exact curves meet are contracted, which may move other meetings: until none is left
@@ -178,7 +180,7 @@ class PlanarMap:
             self._run_length[forward] = self._run_length[backward] = len(run.vertices) - 1
             if a != b:
                 self._edge_at[forward], self._edge_at[backward] = (len(self.edges), True), (len(self.edges), False)
-                self.edges.append(MapEdge(run.curve, *s, (a, b), left[forward], left[forward[::-1]]))
+                self.edges.append(MapEdge(run.curve, *s, (a, b), cell_beside[forward], cell_beside[forward[::-1]]))
 
     def faces(self, cells: Sequence[int]) -> Iterator[list[Wire]]:
         """Yield every connected region of the union of cells as its wires, the outer one first."""

@@ -78,7 +78,7 @@ def build_solids(subdivision: Subdivision, z_ranges: Sequence[ZRange | None]) ->
     group_of_cell = {cell: k for k, cells in enumerate(groups) for cell in cells}
     borders: list[list[int]] = [[] for _ in groups]
     for k, edge in enumerate(planar_map.edges):
-        borders[group_of_cell[max(edge.left, edge.right)]].append(k)
+        borders[group_of_cell[max(edge.left_cell, edge.right_cell)]].append(k)
     for cells, edges in zip(groups, borders, strict=True):
         yield _build_solid(planar_map, cells, edges, z_ranges)
 
@@ -102,7 +102,7 @@ class _WallFace:
     edge: int
     bottom: Surface
     top: Surface
-    solid_is_left: bool
+    faces_right: bool
 
 
 def _build_solid(planar_map: PlanarMap, cells: list[int], edges: list[int], z_ranges: Sequence[Any]) -> Any:
@@ -127,14 +127,17 @@ def _build_solid(planar_map: PlanarMap, cells: list[int], edges: list[int], z_ra
 def _wall_faces(shell: "_Shell", k: int, z_ranges: Sequence[Any]) -> Iterator[_WallFace]:
     """Yield the upright faces over an edge: where one side is solid and the other is not."""
     edge = shell.planar_map.edges[k]
-    for cell, neighbour, is_left in ((edge.left, edge.right, True), (edge.right, edge.left, False)):
+    for cell, neighbour, faces_right in (
+        (edge.left_cell, edge.right_cell, True),
+        (edge.right_cell, edge.left_cell, False),
+    ):
         if cell < 0:
             continue
         bottom, top = z_ranges[cell]
         if neighbour >= 0:
             bottom = max(bottom, z_ranges[neighbour].top, key=lambda surface: shell.steps(k, surface))
         if shell.steps(k, bottom) < shell.steps(k, top):
-            yield _WallFace(k, bottom, top, is_left)
+            yield _WallFace(k, bottom, top, faces_right)
 
 
 class _Shell:
@@ -157,7 +160,7 @@ class _Shell:
         for k in edges:
             edge = self.planar_map.edges[k]
             nodes = list(edge.nodes)
-            for bottom, top in {z_ranges[cell] for cell in (edge.left, edge.right) if cell >= 0}:
+            for bottom, top in {z_ranges[cell] for cell in (edge.left_cell, edge.right_cell) if cell >= 0}:
                 for surface in (bottom, top):
                     if not isinstance(surface, tuple):
                         self.steps(k, surface)  # level heights come first, sloped ones are matched to them
@@ -225,7 +228,7 @@ class _Shell:
         for side, vertical in ((1, rising), (0, falling)):
             for edge, z in vertical:
                 self._add_pcurve(edge, wall.vertical_pcurve(side, z), surface)
-        self._add_face(surface, [self._make_wire(wire)], face.solid_is_left != wall.normal_is_right)
+        self._add_face(surface, [self._make_wire(wire)], face.faces_right != wall.normal_is_right)
 
     def add_horizontal_face(self, surface: Surface, wires: list[Wire], upward: bool) -> None:
         """Add a face above (upward) or below; wires counter-clockwise seen from above, the outer one first."""

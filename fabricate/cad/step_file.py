@@ -153,8 +153,8 @@ def deduplicate(text: str) -> str:
     Returns:
         File of the same shapes; shapes in their order, then styles in the order of the shapes.
     """
-    head, _, rest = text.partition("DATA;\n")
-    data, _, tail = rest.rpartition("ENDSEC;")
+    head, _, body = text.partition("DATA;\n")
+    data, _, tail = body.rpartition("ENDSEC;")
     entities: dict[str, str] = {}
     by_type: dict[str, list[str]] = {name: [] for name in _SHARED}
     for number, content in _ENTITY.findall(data):

@@ -1,13 +1,16 @@
-"""The ways of the needle as a drawing of true size, 1 unit = 1 mm, as whoever stands before the machine sees them."""
+"""Drawings of a pad at true size, 1 unit = 1 mm: its tracks as SVG and DXF, its orientation, the needle's toolpath."""
+
+# pyright: reportPrivateImportUsage=false
+# ezdxf does not mark what its manual imports as exported.
 
 import io
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -20,38 +23,82 @@ from padforge.design.paths.curves import beziers
 from padforge.fabricate.fibre_placement.toolpath import Step, turned_over
 from padforge.fabricate.plan import COLOURS, FAMILIES, Plan, fibre_layers, fibre_name, polygon_rings
 
-if TYPE_CHECKING:
-    from ezdxf.document import Drawing
-    from ezdxf.layouts import Modelspace
+Point = Sequence[float] | Array
+Bounds = tuple[float, float, float, float]
+
+_NAMESPACES = {
+    "xmlns": "http://www.w3.org/2000/svg",
+    "xmlns:xlink": "http://www.w3.org/1999/xlink",
+    "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape",
+}
+_TO_SVG = np.array([1, -1])
+"""Turns plan coordinates into SVG coordinates, whose y runs downwards."""
+_EDGE, _NOTE = "#888", "#555555"
+"""Colours of outlines and of notes."""
+
+
+@dataclass(frozen=True)
+class _SvgWriter:
+    """Writer of SVG elements in SVG coordinates, mm.
+
+    Attributes:
+        decimals: decimal places of all numbers.
+    """
+
+    decimals: int
+
+    def number(self, value: float) -> str:
+        return f"{round(float(value), self.decimals) + 0.0:.10g}"  # + 0.0 turns -0.0 into 0.0
+
+    def pair(self, point: Point) -> str:
+        return f"{self.number(point[0])},{self.number(point[1])}"
+
+    def path(self, points: Sequence[Point] | Array) -> str:
+        """Return the path data of a polyline through points (n, 2)."""
+        return "M" + "L".join(map(self.pair, points))
+
+    def outline(self, area: BaseGeometry, mirrored: bool = False) -> str:
+        """Return the path data of an area in plan coordinates, or of its mirror image in x."""
+        scale = _TO_SVG * (-1 if mirrored else 1, 1)
+        return "".join(f"{self.path(ring * scale)}Z" for polygon in polygon_rings(area) for ring in polygon)
+
+    def element(self, tag: str, *content: str, **attributes: str | float) -> str:
+        """Return an element; `_` in an attribute's name stands for `-`, and numbers are rounded."""
+        texts = {k: v if isinstance(v, str) else self.number(v) for k, v in attributes.items()}
+        start = " ".join([tag, *(f"{name.replace('_', '-')}={quoteattr(text)}" for name, text in texts.items())])
+        inner = "\n".join(content)
+        return f"<{start}>{inner}</{tag}>" if content else f"<{start}/>"
+
+    def text(self, text: str, position: Point, anchor: str = "middle", fill: str = INK, **style: str | float) -> str:
+        x, y = map(float, position)  # dy centres it vertically in every viewer
+        return self.element("text", escape(text), x=x, y=y, dy="0.35em", text_anchor=anchor, fill=fill, **style)
+
+    def document(self, bounds: Bounds, title: str, font_size: float, content: Sequence[str]) -> str:
+        """Return an SVG document that shows x, y, width and height `bounds`."""
+        size = dict(zip(("width", "height"), (f"{self.number(side)}mm" for side in bounds[2:]), strict=True))
+        style = {"fill": "none", "font-family": "sans-serif", "font-size": font_size}
+        frame = {**_NAMESPACES, **size, "viewBox": " ".join(map(self.number, bounds))}
+        return self.element("svg", self.element("title", title), *content, **frame, **style) + "\n"
+
+
+# Orientation
 
 ORIENTATION_FILE = "orientation.svg"
+ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
+ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"
+"""The drawing on a page that lies beside it."""
+TURN_DEG = 20.0
+"""Angle of the pad in use under the arm: an example."""
 _TURNED = (
     "The casting is turned over, left to right, and stays so: the face with the tracks and their numbers lies up, to be"
     " laid and then to be pressed; y runs as in the mould and x the other way (mirrored = true in [rig]); "
 )
-_COUNTED = ("count from near to far and start", "count from right to left and start")
+_NUMBERING = ("count from near to far and start", "count from right to left and start")
 _STARTS = {
     "edges": ("on the right", "at the near side"),
     "one side": ("right of the pad, the first next to it", "within its width"),
 }
-ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
-ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"
-"""The drawing on a page that lies beside it."""
-
-
-def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
-    """Which way round a pad of (H, V) fibres lies, whose leads are those of `[pad] leads`."""
-    ways = [f"{way} {start}" for way, start in zip(_COUNTED, _STARTS[leads], strict=True)]
-    fibres = f"horizontal fibres {ways[0]}, vertical ones {ways[1]}"
-    if 0 in counts:
-        family = int(counts[0] == 0)
-        fibres = f"all fibres are {FAMILIES[family]}: they {ways[family]}"
-    return _TURNED + ("all leads leave at the near side: " if leads == "one side" else "") + fibres + "."
-
-
-TURN_DEG = 20.0
-"""By which the pad in use is turned under the arm: as an example."""
-_WIDE_MM, _TALL_MM, _HALF_MM = 64.0, 56.0, 21.0
+_WIDTH_MM, _HEIGHT_MM, _HALF_MM = 64.0, 56.0, 21.0
 """Width and height of a panel, and half the side of the mould in it."""
 _PANELS = (
     ("1  In the mould", "tracks down, numbers mirrored"),
@@ -59,20 +106,40 @@ _PANELS = (
     ("3  In use", "tracks up: this face is pressed"),
 )
 _TITLE_MM, _LABEL_MM, _LABEL_LINE_MM = 3.2, 2.6, 4.0
-_ABOVE_MM, _BESIDE_MM = 11.0, 1.2
-"""Room for a panel's title, and between an edge and the number beside it."""
+_HEAD_MM, _BESIDE_MM = 11.0, 1.2
+"""Height of a panel's title, and gap between an edge and the number beside it."""
 _SLAB_MM, _TRACK_MM, _FLOOR_MM, _WALL_MM = 6.0, 1.6, 1.5, 2.0
-"""In the views from the side, whose heights are of no scale: pad, track, and floor and wall of the mould."""
-_LETTERS = 135
-"""In a line of the sentence, at most."""
+"""Pad, track, and floor and wall of the mould in the side views, which are not to scale."""
+_MAX_LETTERS = 135
+"""Letters in a line of the sentence."""
+_SVG = _SvgWriter(decimals=2)
+
+
+def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
+    """Return the sentence on the orientation of a pad and of the numbers of its fibres.
+
+    Args:
+        counts: numbers of horizontal and vertical fibres.
+        leads: `leads` of `[pad]`.
+    """
+    rules = [f"{numbering} {start}" for numbering, start in zip(_NUMBERING, _STARTS[leads], strict=True)]
+    fibres = f"horizontal fibres {rules[0]}, vertical ones {rules[1]}"
+    if 0 in counts:
+        family = int(counts[0] == 0)
+        fibres = f"all fibres are {FAMILIES[family]}: they {rules[family]}"
+    return _TURNED + ("all leads leave at the near side: " if leads == "one side" else "") + fibres + "."
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """A way for the pad to lie on the drawing, seen from above.
+    """A view of the pad from above.
 
     Attributes:
-        x, y: of the pad's middle on the drawing, mm. scale: of the plan. mirrored, turn_deg: as the pad lies.
+        x: of the pad's centre on the drawing, mm.
+        y: of the pad's centre on the drawing, mm.
+        scale: of the plan.
+        mirrored: whether the pad is turned over.
+        turn_deg: angle of the pad, counter-clockwise.
     """
 
     x: float
@@ -83,187 +150,146 @@ class _Panel:
 
     @property
     def transform(self) -> str:
-        """What takes the plan, y downwards as SVG has it, to its place."""
-        across = -self.scale if self.mirrored else self.scale
-        return (
-            f"translate({_mm(self.x)} {_mm(self.y)}) rotate({_mm(-self.turn_deg)}) scale({across:.5g} {self.scale:.5g})"
-        )
+        """SVG transform from the plan, y downwards, to the drawing."""
+        scale_x = -self.scale if self.mirrored else self.scale
+        rotation = f"rotate({_SVG.number(-self.turn_deg)}) scale({scale_x:.5g} {self.scale:.5g})"
+        return f"translate({_SVG.number(self.x)} {_SVG.number(self.y)}) {rotation}"
 
-    def at(self, places: Array) -> Array:
-        """(n, 2) places on the drawing of (n, 2) mm on the plan."""
+    def project(self, points: Array) -> Array:
+        """Return the points (n, 2) on the drawing of points (n, 2) of the plan, mm."""
         cos, sin = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
-        lying = self.scale * np.asarray(places) * [-1 if self.mirrored else 1, 1]
-        return (self.x, self.y) + lying @ np.array([[cos, -sin], [-sin, -cos]])
+        scaled = self.scale * np.asarray(points) * [-1 if self.mirrored else 1, 1]
+        return (self.x, self.y) + scaled @ np.array([[cos, -sin], [-sin, -cos]])
 
 
 def orientation_svg(plan: Plan) -> str:
-    """The pad from above and from the near side: in the mould, turned over, and in use under an arm; 1 unit = 1 mm."""
-    scale, middle = _HALF_MM / np.abs(plan.tray.bounds).max(), _ABOVE_MM + _TALL_MM / 2
-    tray, over, used = (
-        _Panel((number + 0.5) * _WIDE_MM, middle, scale, mirrored, turn_deg)
-        for number, (mirrored, turn_deg) in enumerate(((False, 0.0), (True, 0.0), (True, TURN_DEG)))
-    )
-    said = orientation_sentence(plan.pad.layout.counts, plan.settings.pad.leads)
-    lines = textwrap.wrap(said, _LETTERS)
-    side_y = _ABOVE_MM + _TALL_MM + 6
-    text_y = side_y + _SLAB_MM + 2 * _LABEL_LINE_MM + 2
-    width, height = 3 * _WIDE_MM, text_y + (len(lines) - 0.5) * _LABEL_LINE_MM
-    xlink = 'xmlns:xlink="http://www.w3.org/1999/xlink"'
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" {xlink} width="{_mm(width)}mm" height="{_mm(height)}mm"'
-            f' viewBox="0 0 {_mm(width)} {_mm(height)}" fill="none" font-family="sans-serif" font-size="{_LABEL_MM}">',
-            f"<title>{ORIENTATION_CAPTION}</title>",
-            f"<desc>{escape(said)}</desc>",
-            f'<rect width="{_mm(width)}" height="{_mm(height)}" fill="white"/>',
-            f'<defs><g id="pad">{"".join(_pad(plan, scale))}</g></defs>',
-            *_above(plan, "mould", tray, plan.tray),
-            *_above(plan, "turned", over, plan.silicone),
-            *_above(plan, "used", used, plan.silicone),
-            *_arm(used),
-            *_sides(plan, (tray, over, used), side_y),
-            *_titles(),
-            *(_orientation_text(line, 4, text_y + row * _LABEL_LINE_MM, "start") for row, line in enumerate(lines)),
-            "</svg>\n",
-        ]
-    )
+    """Draw the pad from above and from the near side: in the mould, turned over, and in use under an arm."""
+    scale, y = _HALF_MM / np.abs(plan.tray.bounds).max(), _HEAD_MM + _HEIGHT_MM / 2
+    poses = ((False, 0.0), (True, 0.0), (True, TURN_DEG))
+    panels = [_Panel((column + 0.5) * _WIDTH_MM, y, scale, *pose) for column, pose in enumerate(poses)]
+    sentence = orientation_sentence(plan.pad.layout.counts, plan.settings.pad.leads)
+    lines = textwrap.wrap(sentence, _MAX_LETTERS)
+    sides_y = _HEAD_MM + _HEIGHT_MM + 6
+    text_y = sides_y + _SLAB_MM + 2 * _LABEL_LINE_MM + 2
+    width, height = 3 * _WIDTH_MM, text_y + (len(lines) - 0.5) * _LABEL_LINE_MM
+    content = [
+        _SVG.element("desc", sentence),
+        _SVG.element("rect", width=width, height=height, fill="white"),
+        _SVG.element("defs", _SVG.element("g", *_draw_pad(plan, scale), id="pad")),
+    ]
+    for name, panel in zip(("mould", "turned", "used"), panels, strict=True):
+        content.append(_SVG.element("g", *_draw_panel(plan, panel), id=name))
+    content.append(_SVG.element("g", *_draw_arm(panels[2]), id="arm"))
+    content.append(_SVG.element("g", *_draw_sides(plan, panels, sides_y), id="sides"))
+    for column, (title, note) in enumerate(_PANELS):
+        x = column * _WIDTH_MM + 4
+        content.append(_SVG.text(title, (x, 4), "start", font_size=_TITLE_MM, font_weight="bold"))
+        content.append(_SVG.text(note, (x, 4 + _LABEL_LINE_MM), "start"))
+    content += [_SVG.text(line, (4, text_y + row * _LABEL_LINE_MM), "start") for row, line in enumerate(lines)]
+    return _SVG.document((0, 0, width, height), ORIENTATION_CAPTION, _LABEL_MM, content)
 
 
-def _pad(plan: Plan, scale: float) -> Iterator[str]:
-    """The silicone's edge, the tracks and the numbers cast in, mm of the plan, y downwards, to be drawn so large."""
-    yield f'<path d="{_rings(plan.silicone)}" fill="{PAPER}" stroke="#888" stroke-width="{_mm(0.2 / scale)}"/>'
-    width = _mm(0.35 / scale)
+def _draw_pad(plan: Plan, scale: float) -> Iterator[str]:
+    """Draw the silicone's edge, the tracks and the numbers cast in, mm of the plan; strokes as wide at any scale."""
+    yield _SVG.element("path", d=_SVG.outline(plan.silicone), fill=PAPER, stroke=_EDGE, stroke_width=0.2 / scale)
     for layer in fibre_layers(plan):
         for fibre in layer.fibres:
-            points = shapely.get_coordinates(plan.lines[fibre].simplify(0.05)) * (1, -1)
-            path = " ".join(f"{_mm(x)},{_mm(y)}" for x, y in points.tolist())
-            yield f'<polyline points="{path}" stroke="{layer.colour}" stroke-width="{width}"/>'
+            points = shapely.get_coordinates(plan.lines[fibre].simplify(0.05)) * _TO_SVG
+            yield _SVG.element("path", d=_SVG.path(points), stroke=layer.colour, stroke_width=0.35 / scale)
     for fibre, number in enumerate(plan.numbers):
         if number is not None:
-            yield f'<path class="cast" d="{_rings(number)}" fill="{COLOURS[plan.family(fibre)]}"/>'
+            fill = COLOURS[plan.family(fibre)]
+            yield _SVG.element("path", **{"class": "cast"}, d=_SVG.outline(number), fill=fill)
 
 
-def _above(plan: Plan, name: str, panel: _Panel, shown: BaseGeometry) -> Iterator[str]:
-    """The pad in a panel with its axes, and the number of each fibre beside its start, beyond what is shown."""
-    yield f'<g id="{name}">'
+def _draw_panel(plan: Plan, panel: _Panel) -> Iterator[str]:
+    """Draw the pad in a panel with its axes, and every fibre's number outside the pad beside its start."""
     if not panel.mirrored:
-        yield f'<path d="{_rings(plan.tray)}" fill="{FAINT}" transform="{panel.transform}"/>'
-    yield f'<use xlink:href="#pad" transform="{panel.transform}"/>'
+        yield _SVG.element("path", d=_SVG.outline(plan.tray), fill=FAINT, transform=panel.transform)
+    yield _SVG.element("use", **{"xlink:href": "#pad"}, transform=panel.transform)
+    bounds = (plan.silicone if panel.mirrored else plan.tray).bounds
     size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * panel.scale)
     for fibre, lead in enumerate(plan.ends(0)):
         start = lead.turned_mm.copy()
-        start[lead.axis] = -((_BESIDE_MM + size / 2) / panel.scale - shown.bounds[lead.axis])
-        colour = COLOURS[plan.family(fibre)]
-        yield _orientation_text(str(fibre + 1), *panel.at(start[None])[0], colour=colour, size=size, bold=True)
-    reach = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
-    for axis, tip in zip("xy", np.eye(2) * reach, strict=True):
-        start, end, beyond = panel.at(np.array([0 * tip, tip, 1.2 * tip]))
-        yield _arrow(start, end)
-        yield _orientation_text(axis, *beyond, halo=True)
-    yield "</g>"
+        start[lead.axis] = bounds[lead.axis] - (_BESIDE_MM + size / 2) / panel.scale
+        style = {"fill": COLOURS[plan.family(fibre)], "font_size": size, "font_weight": "bold"}
+        yield _SVG.text(str(fibre + 1), panel.project(start[None])[0], **style)
+    length = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
+    for axis, tip in zip("xy", np.eye(2) * length, strict=True):
+        start, end, label = panel.project(np.array([0 * tip, tip, 1.2 * tip]))
+        yield from _draw_arrow(start, end)
+        yield _SVG.text(axis, label, paint_order="stroke", stroke="white", stroke_width=0.8)
 
 
-def _arm(panel: _Panel) -> Iterator[str]:
-    """The axes of the arm's base, beside the pad in use and through its middle, and the angle between."""
-    corner = np.array([panel.x - _WIDE_MM / 2 + 4, panel.y + _TALL_MM / 2 - 2])
-    yield '<g id="arm">'
-    for axis, way in zip("xy", ((9.0, 0.0), (0.0, -9.0)), strict=True):
-        yield _arrow(corner, corner + way)
-        yield _orientation_text(axis, *(corner + 1.2 * np.array(way)))
-    yield _orientation_text("arm", corner[0] + 2, corner[1] - 2.5, "start")
-    up = panel.y - 1.25 * _HALF_MM
-    parallel = f"M{_mm(panel.x)},{_mm(panel.y)}V{_mm(up)}"
-    yield f'<path d="{parallel}" stroke="{INK}" stroke-width="0.25" stroke-dasharray="1 1"/>'
-    yield _orientation_text("pad_angle_deg", panel.x + 1, up, "start")
-    yield "</g>"
+def _draw_arm(panel: _Panel) -> Iterator[str]:
+    """Draw the axes of the arm's base beside the pad in use, and the pad's angle to them."""
+    corner = np.array([panel.x - _WIDTH_MM / 2 + 4, panel.y + _HEIGHT_MM / 2 - 2])
+    for axis, tip in zip("xy", np.array([(9.0, 0.0), (0.0, -9.0)]), strict=True):
+        yield from _draw_arrow(corner, corner + tip)
+        yield _SVG.text(axis, corner + 1.2 * tip)
+    yield _SVG.text("arm", (corner[0] + 2, corner[1] - 2.5), "start")
+    top = panel.y - 1.25 * _HALF_MM
+    parallel = _SVG.path([(panel.x, panel.y), (panel.x, top)])
+    yield _SVG.element("path", d=parallel, stroke=INK, stroke_width=0.25, stroke_dasharray="1 1")
+    yield _SVG.text("pad_angle_deg", (panel.x + 1, top), "start")
 
 
-def _sides(plan: Plan, panels: tuple[_Panel, _Panel, _Panel], top: float) -> Iterator[str]:
-    """The three from the near side, cut where fibres start there; heights are of no scale."""
-    tray, over, used = panels
-    low, half = top + _SLAB_MM, plan.cavity.bounds[2] * tray.scale
-    floor = low + _FLOOR_MM
-    yield '<g id="sides">'
-    yield _box(tray.x - half - _WALL_MM, top, 2 * (half + _WALL_MM), floor - top, FAINT)
+def _draw_sides(plan: Plan, panels: Sequence[_Panel], top: float) -> Iterator[str]:
+    """Draw cross-sections of all panels at the near side, where fibres start; heights are not to scale."""
+    bottom, half = top + _SLAB_MM, plan.cavity.bounds[2] * panels[0].scale
+    floor = bottom + _FLOOR_MM
+
+    def box(x: float, y: float, width: float, height: float, fill: str) -> str:
+        style = {"fill": fill, "stroke": _EDGE, "stroke_width": 0.15}
+        return _SVG.element("rect", x=x, y=y, width=width, height=height, **style)
+
+    yield box(panels[0].x - half - _WALL_MM, top, 2 * (half + _WALL_MM), floor - top, FAINT)
     for panel in panels:
-        yield _box(panel.x - half, top, 2 * half, _SLAB_MM, PAPER)
+        yield box(panel.x - half, top, 2 * half, _SLAB_MM, PAPER)
     starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
-    size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * tray.scale)
-    for panel, y, fill in ((tray, low - _TRACK_MM, FAINT), (over, top, "white"), (used, top, "")):
+    size = min(_LABEL_MM, 0.6 * plan.least_pitch_mm * panels[0].scale)
+    for panel, y, fill in zip(panels, (bottom - _TRACK_MM, top, top), (FAINT, "white", ""), strict=True):
         for fibre, x_mm in starts:
             x = panel.x + (-x_mm if panel.mirrored else x_mm) * panel.scale
             colour = COLOURS[plan.family(fibre)]
-            yield _box(x - 0.4, y, 0.8, _TRACK_MM, fill or colour)
-            yield _orientation_text(str(fibre + 1), x, floor + size, colour=colour, size=size)
-    yield f'<path id="probe" d="M{_mm(used.x - 2)},{_mm(top - 7)}v4a2,2 0 0 0 4,0v-4z" fill="{INK}"/>'
-    table = f"M{_mm(used.x - half - 6)},{_mm(low)}h{_mm(2 * half + 12)}"
-    yield f'<path d="{table}" stroke="{INK}" stroke-width="0.4"/>'
-    yield "</g>"
+            yield box(x - 0.4, y, 0.8, _TRACK_MM, fill or colour)
+            yield _SVG.text(str(fibre + 1), (x, floor + size), fill=colour, font_size=size)
+    x = panels[2].x
+    yield _SVG.element("path", id="probe", d=f"M{_SVG.pair((x - 2, top - 7))}v4a2,2 0 0 0 4,0v-4z", fill=INK)
+    table = f"M{_SVG.pair((x - half - 6, bottom))}h{_SVG.number(2 * half + 12)}"
+    yield _SVG.element("path", d=table, stroke=INK, stroke_width=0.4)
 
 
-def _box(x: float, y: float, width: float, height: float, fill: str) -> str:
-    size = f'width="{_mm(width)}" height="{_mm(height)}"'
-    return f'<rect x="{_mm(x)}" y="{_mm(y)}" {size} fill="{fill}" stroke="#888" stroke-width="0.15"/>'
-
-
-def _titles() -> Iterator[str]:
-    for number, (title, what) in enumerate(_PANELS):
-        x = number * _WIDE_MM + 4
-        yield _orientation_text(title, x, 4, "start", size=_TITLE_MM, bold=True)
-        yield _orientation_text(what, x, 4 + _LABEL_LINE_MM, "start")
-
-
-def _orientation_text(
-    text: str,
-    x: float,
-    y: float,
-    anchor: str = "middle",
-    *,
-    colour: str = INK,
-    size: float = _LABEL_MM,
-    bold: bool = False,
-    halo: bool = False,
-) -> str:
-    weight = ' font-weight="bold"' * bold + ' paint-order="stroke" stroke="white" stroke-width="0.8"' * halo
-    place = f'x="{_mm(x)}" y="{_mm(y)}" dy="0.35em" font-size="{_mm(size)}"'
-    return f'<text {place} text-anchor="{anchor}" fill="{colour}"{weight}>{escape(text)}</text>'
-
-
-def _arrow(start: Array, end: Array) -> str:
-    """An axis, with a white rim that keeps it off what it lies on."""
+def _draw_arrow(start: Array, end: Array) -> Iterator[str]:
+    """Draw an arrow with a white rim, which sets it off from its background."""
     along = (end - start) / np.hypot(*(end - start))
     across = along @ np.array([[0, 1], [-1, 0]])
-    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = start, end, end - 2 * along + across, end - 2 * along - across
-    path = f"M{_mm(x0)},{_mm(y0)}L{_mm(x1)},{_mm(y1)}M{_mm(x2)},{_mm(y2)}L{_mm(x1)},{_mm(y1)}L{_mm(x3)},{_mm(y3)}"
-    return f'<path d="{path}" stroke="white" stroke-width="1.2"/><path d="{path}" stroke="{INK}" stroke-width="0.5"/>'
+    path = _SVG.path([start, end]) + _SVG.path([end - 2 * along + across, end, end - 2 * along - across])
+    for colour, width in (("white", 1.2), (INK, 0.5)):
+        yield _SVG.element("path", d=path, stroke=colour, stroke_width=width)
 
 
-def _rings(area: BaseGeometry) -> str:
-    """The outline of an area as the data of a path, y downwards."""
-    rings = [ring * (1, -1) for polygon in polygon_rings(area) for ring in polygon]
-    return "".join(f"M{'L'.join(f'{_mm(x)},{_mm(y)}' for x, y in ring.tolist())}Z" for ring in rings)
-
-
-def _mm(value: float) -> str:
-    return f"{round(float(value), 2) + 0.0:g}"
-
-
-Point = tuple[float, float]
+# Tracks
 
 SCALE_MM = 10.0
-"""Length of the scale bar: whoever prints a drawing measures it."""
+"""Length of the scale bar, which verifies the size of a print."""
 _TEXT_MM = 2.5
-"""Height of writing, as drawing standards have it; less where the pitch is narrow."""
-_ASIDE_MM = 1.0
-"""Between the silicone and the writing beside it."""
-NOTE = "as it lies in the tray, seen from above"
+"""Text height by drawing standards; less where the pitch is narrow."""
+_GAP_MM = 1.0
+"""Gap between the silicone and the text beside it."""
 _LETTER_MM = 0.6
-"""Width of a letter, at most and on average, for a height of 1."""
+"""Width of a letter for a text height of 1, on average."""
+_VIEW = "as it lies in the tray, seen from above"
+_DESCRIPTION = (
+    "True size, 1 unit = 1 mm. Seen from above as the pad lies in the tray, tracks down: the mould's ridges lie as"
+    " drawn. {} Layers are in laying order, the deepest first."
+)
+_ACI = (5, 30)
+"""Blue and orange of the AutoCAD Color Index, for readers without true colour."""
 
 
-@dataclass(frozen=True)
-class Writing:
-    """Writing at (x, y) mm: `anchor` "end" ends there, "middle" has its middle there, "start" begins there."""
+class _Label(NamedTuple):
+    """A line of text, aligned to (x, y) mm by `anchor`: "start", "middle" or "end"."""
 
     text: str
     x: float
@@ -272,224 +298,141 @@ class Writing:
     colour: str
 
 
-@dataclass(frozen=True)
-class TrackSheet:
-    """Where everything is on a drawing, mm, y upwards."""
+class _TrackSheet:
+    """Layout of the drawing of the tracks, mm, y upwards.
 
-    plan: Plan
+    Attributes:
+        text_mm: text height.
+        sentence: on the orientation.
+        spans: Bezier control points of every fibre and its leads; shape (n, 4, 2).
+        ends: start and end of every fibre at the silicone's edge; shape (F, 2, 2).
+        numbers: the fibres' numbers outside the silicone, at the starts, and at the ends of leads to one side.
+        scale_bar: segments of the scale bar; shape (4, 2, 2).
+        notes: text beside the scale bar and below it.
+        frame: x_min, y_min, x_max and y_max of the drawing.
+    """
 
-    @cached_property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """Left, low, right and high of the silicone."""
-        return self.plan.silicone.bounds
-
-    @cached_property
-    def text_mm(self) -> float:
-        """Height of the writing."""
-        return min(_TEXT_MM, 0.6 * self.plan.least_pitch_mm)
-
-    @cached_property
-    def frame(self) -> tuple[float, float, float, float]:
-        """Left, low, right and high of the drawing; the scale bar and the numbers lie outside of the silicone."""
-        left, _, _, high = self.bounds
-        digits = len(str(self.plan.pad.layout.fibres))
-        left -= 2 * _ASIDE_MM + digits * self.text_mm
-        low = self.scale_y - 3 * _ASIDE_MM - len(self.said) * self.line_mm
-        return left, low, self.bounds[0] + self.room_mm + 2 * _ASIDE_MM, high + 2 * _ASIDE_MM
-
-    @cached_property
-    def spans(self) -> list[Array]:
-        """Of every fibre (n, 4, 2) Bezier control points, those of the bends of its leads too."""
-        return [
-            np.concatenate([start.spans[::-1, ::-1], self.plan.pad.to_mm(curve), end.spans])
-            for (start, end), curve in zip(self.plan.leads.pairs, beziers(self.plan.pad), strict=True)
+    def __init__(self, plan: Plan) -> None:
+        layout, pairs = plan.pad.layout, plan.leads.pairs
+        x_min, y_min, x_max, y_max = plan.silicone.bounds
+        self.text_mm = min(_TEXT_MM, 0.6 * plan.least_pitch_mm)
+        self.sentence = orientation_sentence(layout.counts, plan.settings.pad.leads)
+        self.spans = [
+            np.concatenate([start.spans[::-1, ::-1], plan.pad.to_mm(curve), end.spans])
+            for (start, end), curve in zip(pairs, beziers(plan.pad), strict=True)
         ]
+        self.ends = np.array([[lead.beyond(plan.settings.mould.exit_mm) for lead in pair] for pair in pairs])
 
-    @cached_property
-    def ends(self) -> Array:
-        """(F, 2, 2) where every fibre enters and leaves the silicone."""
-        past = self.plan.settings.mould.exit_mm
-        return np.array([[lead.beyond(past) for lead in pair] for pair in self.plan.leads.pairs])
+        self.numbers: list[_Label] = []
+        for ends in self.ends.swapaxes(0, 1)[: 1 + (plan.settings.pad.leads == "one side")].tolist():
+            for fibre, (x, y) in enumerate(ends):
+                below = pairs[fibre][0].axis == 1
+                position = (x, y - _GAP_MM - self.text_mm / 2) if below else (x - _GAP_MM, y)
+                anchor, colour = "middle" if below else "end", COLOURS[plan.family(fibre)]
+                self.numbers.append(_Label(str(fibre + 1), *position, anchor, colour))
 
-    @cached_property
-    def numbers(self) -> list[Writing]:
-        """The number of every fibre, outside of the silicone where it starts, and where it ends if that is beside."""
-        one_side = self.plan.settings.pad.leads == "one side"
-        texts = []
-        for fibre, (x, y) in [each for end in range(1 + one_side) for each in enumerate(self.ends[:, end].tolist())]:
-            below = self.plan.leads.pairs[fibre][0].axis == 1
-            place = (x, y - _ASIDE_MM - self.text_mm / 2) if below else (x - _ASIDE_MM, y)
-            anchor, colour = "middle" if below else "end", COLOURS[self.plan.family(fibre)]
-            texts.append(Writing(str(fibre + 1), *place, anchor, colour))
-        return texts
+        bar_y = y_min - 4 * _GAP_MM - self.text_mm
+        ticks = [(x_min + share * SCALE_MM, bar_y + mm) for share, mm in ((0, 1.5), (0.5, 0.8), (1, 1.5))]
+        bar = [((x_min, bar_y), (x_min + SCALE_MM, bar_y)), *(((x, bar_y), (x, y)) for x, y in ticks)]
+        self.scale_bar = np.array(bar)
+        # The notes are as wide as the silicone, or as the scale bar with the two texts beside it.
+        width = max(x_max - x_min, SCALE_MM + _GAP_MM + (5 + _LETTER_MM * len(_VIEW)) * self.text_mm)
+        lines, line_mm = textwrap.wrap(self.sentence, int(width / (_LETTER_MM * self.text_mm))), 1.4 * self.text_mm
+        x, y, first_y = x_min + SCALE_MM + _GAP_MM, bar_y + self.text_mm / 4, bar_y - _GAP_MM - line_mm / 2
+        texts = [(f"{SCALE_MM:g} mm", x, y), (_VIEW, x + 5 * self.text_mm, y)]
+        texts += [(line, x_min, first_y - row * line_mm) for row, line in enumerate(lines)]
+        self.notes = [_Label(*text, "start", _NOTE) for text in texts]
 
-    @cached_property
-    def scale_y(self) -> float:
-        """Height of the scale bar."""
-        return self.bounds[1] - 4 * _ASIDE_MM - self.text_mm
-
-    @cached_property
-    def scale(self) -> list[tuple[Point, Point]]:
-        """The strokes of the scale bar."""
-        left, y = self.bounds[0], self.scale_y
-        ticks = [(left + share * SCALE_MM, tick) for share, tick in ((0, 1.5), (0.5, 0.8), (1, 1.5))]
-        return [((left, y), (left + SCALE_MM, y)), *(((x, y), (x, y + tick)) for x, tick in ticks)]
-
-    @cached_property
-    def line_mm(self) -> float:
-        """From one line of writing to the next."""
-        return 1.4 * self.text_mm
-
-    @cached_property
-    def room_mm(self) -> float:
-        """For writing: as wide as the silicone, or as the scale bar with its two texts."""
-        left, _, right, _ = self.bounds
-        return max(right - left, SCALE_MM + _ASIDE_MM + (5 + _LETTER_MM * len(NOTE)) * self.text_mm)
-
-    @property
-    def sentence(self) -> str:
-        """Which way round."""
-        return orientation_sentence(self.plan.pad.layout.counts, self.plan.settings.pad.leads)
-
-    @cached_property
-    def said(self) -> list[str]:
-        """Which way round, in lines as long as there is room for."""
-        return textwrap.wrap(self.sentence, int(self.room_mm / (_LETTER_MM * self.text_mm)))
-
-    @cached_property
-    def notes(self) -> list[Writing]:
-        """What is written beside the scale bar and below it."""
-        left, x, y = self.bounds[0], self.bounds[0] + SCALE_MM + _ASIDE_MM, self.scale_y + self.text_mm / 4
-        beside = [(f"{SCALE_MM:g} mm", x, y), (NOTE, x + 5 * self.text_mm, y)]
-        first = self.scale_y - _ASIDE_MM - self.line_mm / 2
-        below = [(line, left, first - row * self.line_mm) for row, line in enumerate(self.said)]
-        return [Writing(*text, "start", "#555555") for text in (*beside, *below)]
-
-
-# pyright: reportPrivateImportUsage=false
-# ezdxf does not mark what its own manual imports as exported.
-
-
-_DESCRIPTION = (
-    "True size, 1 unit = 1 mm. Seen from above as the pad lies in the tray, tracks down: the mould's ridges lie as"
-    " drawn. {} Layers are in laying order, the deepest first."
-)
-_ACI = (5, 30)
-"""Blue and orange of the old CAD colour index, for readers that know no others."""
+        numbers_mm = 2 * _GAP_MM + len(str(layout.fibres)) * self.text_mm
+        y_low = bar_y - 3 * _GAP_MM - len(lines) * line_mm
+        self.frame: Bounds = (x_min - numbers_mm, y_low, x_min + width + 2 * _GAP_MM, y_max + 2 * _GAP_MM)
 
 
 def tracks_svg(plan: Plan) -> str:
-    """The fibres as an SVG of true size; every PCHIP span is one cubic Bezier segment.
+    """Draw the fibres as an SVG of true size, every PCHIP span as one cubic Bezier segment.
 
-    Each depth is a layer, each fibre a path that runs straight on from its ends through border and exit to the
+    Every depth is a layer, every fibre a path that runs straight on from its ends through border and exit to the
     silicone's edge. Further layers hold that edge, the sensor numbers beside the starts, and a scale bar.
     """
-    sheet = TrackSheet(plan)
-    left, low, right, high = sheet.frame
-    size = f"{_number(right - left)}mm", f"{_number(high - low)}mm"
-    view = " ".join(map(_number, (left, -high, right - left, high - low)))
-    return "\n".join(
-        [
-            '<svg xmlns="http://www.w3.org/2000/svg" xmlns:inkscape="http://www.inkscape.org/namespaces/inkscape"',
-            f' width="{size[0]}" height="{size[1]}" viewBox="{view}" fill="none">',
-            f"<title>Fibre tracks of a pad, {NOTE}</title>",
-            f"<desc>{_DESCRIPTION.format(sheet.sentence)}</desc>",
-            *_svg_layer("silicone", "silicone's edge", 'stroke="#888" stroke-width="0.2"', _svg_silicone(plan)),
-            *_svg_tracks(sheet),
-            *_svg_layer("numbers", "sensor numbers", _svg_writing(sheet), map(_svg_text, sheet.numbers)),
-            *_svg_layer("scale", f"scale bar, {SCALE_MM:g} mm", _svg_writing(sheet), _svg_scale(sheet)),
-            "</svg>\n",
-        ]
-    )
+    sheet, svg = _TrackSheet(plan), _SvgWriter(decimals=4)  # a tenth of a micrometre, far below any printer
+
+    def layer(name: str, label: str, content: Sequence[str], **style: str) -> str:
+        inkscape = {"inkscape:groupmode": "layer", "inkscape:label": label}
+        return svg.element("g", *content, id=name, **inkscape, **style)
+
+    def labels(labels: Sequence[_Label]) -> list[str]:
+        return [svg.text(label.text, (label.x, -label.y), label.anchor, label.colour) for label in labels]
+
+    edge = svg.element("path", id="edge", d=svg.outline(plan.silicone))
+    content = [
+        svg.element("desc", _DESCRIPTION.format(sheet.sentence)),
+        layer("silicone", "silicone's edge", [edge], stroke=_EDGE, stroke_width="0.2"),
+    ]
+    for depth in fibre_layers(plan):
+        paths = []
+        for fibre in depth.fibres:
+            start, end = map(svg.pair, sheet.ends[fibre] * _TO_SVG)
+            spans = [list(map(svg.pair, span)) for span in sheet.spans[fibre] * _TO_SVG]
+            curves = "".join(f"C{' '.join(span[1:])}" for span in spans)
+            name = fibre_name(plan, fibre).replace(" ", "-")
+            paths.append(svg.element("path", id=name, d=f"M{start}L{spans[0][0]}{curves}L{end}"))
+        style = {"stroke": depth.colour, "stroke_width": f"{plan.settings.fibre.material.diameter_mm:g}"}
+        content.append(layer(depth.name, f"{FAMILIES[depth.family]}, {depth.depth_mm:g} mm deep", paths, **style))
+    content.append(layer("numbers", "sensor numbers", labels(sheet.numbers)))
+    bar = svg.element("path", d="".join(map(svg.path, sheet.scale_bar * _TO_SVG)), stroke=_NOTE, stroke_width=0.2)
+    content.append(layer("scale", f"scale bar, {SCALE_MM:g} mm", [bar, *labels(sheet.notes)]))
+    x_min, y_min, x_max, y_max = sheet.frame
+    bounds = (x_min, -y_max, x_max - x_min, y_max - y_min)
+    return svg.document(bounds, f"Fibre tracks of a pad, {_VIEW}", sheet.text_mm, content)
 
 
 def tracks_dxf(plan: Plan) -> str:
-    """The fibres as a DXF R2010 in mm; every fibre is one cubic spline whose spans are the PCHIP's.
+    """Draw the fibres as a DXF R2010 in mm, every fibre as one cubic spline whose spans are the PCHIP's.
 
-    Layers as in the SVG. The same plan gives the same bytes.
+    Layers are those of the SVG. The same plan gives the same bytes.
     """
     import ezdxf
-    from ezdxf import units
+    from ezdxf.colors import RGB
+    from ezdxf.enums import TextEntityAlignment as Alignment
 
-    sheet = TrackSheet(plan)
-    with _fixed_dates():
-        document = ezdxf.new("R2010", units=units.MM)
+    anchors = {"start": Alignment.MIDDLE_LEFT, "middle": Alignment.MIDDLE_CENTER, "end": Alignment.MIDDLE_RIGHT}
+    sheet, stream = _TrackSheet(plan), io.StringIO()
+    with ExitStack() as stack:  # keeps the time and random ids out of the file
+        fixed = "write_fixed_meta_data_for_testing"
+        stack.callback(setattr, ezdxf.options, fixed, getattr(ezdxf.options, fixed))
+        setattr(ezdxf.options, fixed, True)
+        document = ezdxf.new("R2010", units=ezdxf.units.MM)
         space = document.modelspace()
-        _dxf_silicone(document, space, plan)
-        _dxf_tracks(document, space, sheet)
-        _dxf_writing(document, space, sheet)
-        left, low, right, high = sheet.frame
-        space.reset_extents((left, low, 0), (right, high, 0))
-        document.set_modelspace_vport(height=high - low, center=((left + right) / 2, (low + high) / 2))
-        for kind in sorted(document.entitydb.dxf_types_in_use()):  # else in the order of a set, which varies
+        document.layers.add("silicone", color=8)
+        for ring in (ring for polygon in polygon_rings(plan.silicone) for ring in polygon):
+            space.add_lwpolyline(np.round(ring, 6).tolist(), close=True, dxfattribs={"layer": "silicone"})
+        for layer in fibre_layers(plan):
+            document.layers.add(layer.name, color=_ACI[layer.family]).rgb = RGB.from_hex(layer.colour)
+            for fibre in layer.fibres:
+                points = _spline_points(sheet, fibre)
+                n_spans = len(points) // 3
+                # A step of 1 for every span, however short: some readers merge knots that nearly coincide.
+                knots = [0, *np.repeat(np.arange(n_spans + 1), 3).tolist(), n_spans]
+                space.add_open_spline(np.round(points, 6).tolist(), knots=knots, dxfattribs={"layer": layer.name})
+        for name, labels in (("numbers", sheet.numbers), ("scale", sheet.notes)):
+            document.layers.add(name, color=7)
+            for label in labels:
+                attributes = {"layer": name, "height": 0.72 * sheet.text_mm}  # CAD measures the height of capitals
+                text = space.add_text(label.text, dxfattribs=attributes)
+                text.set_placement((label.x, label.y), align=anchors[label.anchor])
+        for start, end in sheet.scale_bar.tolist():
+            space.add_line(start, end, dxfattribs={"layer": "scale"})
+        x_min, y_min, x_max, y_max = sheet.frame
+        space.reset_extents((x_min, y_min, 0), (x_max, y_max, 0))
+        document.set_modelspace_vport(height=y_max - y_min, center=((x_min + x_max) / 2, (y_min + y_max) / 2))
+        for kind in sorted(document.entitydb.dxf_types_in_use()):  # in the order of a set otherwise, which varies
             document.classes.add_class(kind)
-        stream = io.StringIO()
         document.write(stream)
     return stream.getvalue()
 
 
-def _svg_layer(name: str, label: str, style: str, content: Iterator[str]) -> list[str]:
-    """A group that drawing programs show as a layer."""
-    marks = f'id={quoteattr(name)} inkscape:groupmode="layer" inkscape:label={quoteattr(label)}'
-    return [f"<g {marks} {style}>", *content, "</g>"]
-
-
-def _svg_silicone(plan: Plan) -> Iterator[str]:
-    rings = [f"M{'L'.join(map(_pair, ring))}Z" for polygon in polygon_rings(plan.silicone) for ring in polygon]
-    yield f'<path id="edge" d="{"".join(rings)}"/>'
-
-
-def _svg_tracks(sheet: TrackSheet) -> Iterator[str]:
-    width = f'stroke-width="{sheet.plan.settings.fibre.material.diameter_mm:g}"'
-    for layer in fibre_layers(sheet.plan):
-        label = f"{FAMILIES[layer.family]}, {layer.depth_mm:g} mm deep"
-        paths = (_svg_path(sheet, fibre) for fibre in layer.fibres)
-        yield from _svg_layer(layer.name, label, f'stroke="{layer.colour}" {width}', paths)
-
-
-def _svg_path(sheet: TrackSheet, fibre: int) -> str:
-    spans, (start, end) = sheet.spans[fibre], sheet.ends[fibre]
-    curves = "".join(f"C{_pair(a)} {_pair(b)} {_pair(c)}" for _, a, b, c in spans)
-    name = fibre_name(sheet.plan, fibre).replace(" ", "-")
-    return f'<path id="{name}" d="M{_pair(start)}L{_pair(spans[0, 0])}{curves}L{_pair(end)}"/>'
-
-
-def _svg_scale(sheet: TrackSheet) -> Iterator[str]:
-    strokes = "".join(f"M{_pair(start)}L{_pair(end)}" for start, end in sheet.scale)
-    yield f'<path d="{strokes}" stroke="#555555" stroke-width="0.2"/>'
-    yield from map(_svg_text, sheet.notes)
-
-
-def _svg_writing(sheet: TrackSheet) -> str:
-    return f'font-family="sans-serif" font-size="{_number(sheet.text_mm)}"'
-
-
-def _svg_text(text: Writing) -> str:
-    place = f'x="{_number(text.x)}" y="{_number(-text.y)}" dy="0.35em"'  # its middle, in every viewer
-    return f'<text {place} text-anchor="{text.anchor}" fill="{text.colour}">{text.text}</text>'
-
-
-def _dxf_silicone(document: "Drawing", space: "Modelspace", plan: Plan) -> None:
-    document.layers.add("silicone", color=8)
-    for ring in (ring for polygon in polygon_rings(plan.silicone) for ring in polygon):
-        space.add_lwpolyline(np.round(ring, 6).tolist(), close=True, dxfattribs={"layer": "silicone"})
-
-
-def _dxf_tracks(document: "Drawing", space: "Modelspace", sheet: TrackSheet) -> None:
-    from ezdxf.colors import RGB
-
-    for layer in fibre_layers(sheet.plan):
-        document.layers.add(layer.name, color=_ACI[layer.family]).rgb = RGB.from_hex(layer.colour)
-        for fibre in layer.fibres:
-            points = _spline_points(sheet, fibre)
-            spans = len(points) // 3
-            # a step of 1 a span, however short it is: knots that nearly coincide are merged by some readers
-            knots = [0, *np.repeat(np.arange(spans + 1), 3).tolist(), spans]
-            space.add_open_spline(np.round(points, 6).tolist(), knots=knots, dxfattribs={"layer": layer.name})
-
-
-def _spline_points(sheet: TrackSheet, fibre: int) -> Array:
-    """(3 n + 1, 2) control points of a fibre's n spans, with the straight ones at its ends if there are any."""
+def _spline_points(sheet: _TrackSheet, fibre: int) -> Array:
+    """Return the control points (3 n + 1, 2) of a fibre's n spans, with the straight ones at its ends, if any."""
     spans, (start, end) = sheet.spans[fibre], sheet.ends[fibre]
     points = np.vstack([spans[0, :1], *spans[:, 1:]])
     if (start == points[0]).all():
@@ -498,138 +441,70 @@ def _spline_points(sheet: TrackSheet, fibre: int) -> Array:
     return np.vstack([start + thirds * (points[0] - start), points, end + thirds[::-1] * (points[-1] - end)])
 
 
-def _dxf_writing(document: "Drawing", space: "Modelspace", sheet: TrackSheet) -> None:
-    from ezdxf.enums import TextEntityAlignment as Alignment
+# Toolpath
 
-    at = {"start": Alignment.MIDDLE_LEFT, "middle": Alignment.MIDDLE_CENTER, "end": Alignment.MIDDLE_RIGHT}
-    for name, texts in (("numbers", sheet.numbers), ("scale", sheet.notes)):
-        document.layers.add(name, color=7)
-        for text in texts:
-            attributes = {"layer": name, "height": 0.72 * sheet.text_mm}  # of capitals, as CAD has it
-            space.add_text(text.text, dxfattribs=attributes).set_placement((text.x, text.y), align=at[text.anchor])
-    for start, end in sheet.scale:
-        space.add_line(start, end, dxfattribs={"layer": "scale"})
-
-
-@contextmanager
-def _fixed_dates() -> Iterator[None]:
-    """Keep the time and random ids out of DXF files that are made and written inside."""
-    import ezdxf
-
-    before = ezdxf.options.write_fixed_meta_data_for_testing
-    ezdxf.options.write_fixed_meta_data_for_testing = True
-    try:
-        yield
-    finally:
-        ezdxf.options.write_fixed_meta_data_for_testing = before
-
-
-def _pair(place: Array | Point) -> str:
-    """A place as SVG has it, y downwards."""
-    return f"{_number(place[0])},{_number(-place[1])}"
-
-
-def _number(value: float) -> str:
-    """To a tenth of a micrometre, far below any printer."""
-    return f"{round(float(value), 4) + 0.0:.10g}"
-
-
-_ROOM_MM = 6.0
-"""Around the ways, for the numbers."""
-_TOOLPATH_TEXT_MM, _TOOLPATH_LINE_MM = 2.5, 4.5
-"""Height of writing, and from one line of the legend to the next."""
-_LEAST_MM = 90.0
-"""Width that the legend takes."""
+_MARGIN_MM = 6.0
+"""Margin around the toolpath, for the numbers."""
+_LEGEND_LINE_MM, _MIN_LEGEND_MM = 4.5, 90.0
+"""Line spacing and width of the legend."""
 
 
 def toolpath_svg(plan: Plan, steps: Sequence[Step]) -> str:
-    """The pad turned over with every fibre as it is laid, the ways between them, and the order.
+    """Draw the toolpath of the needle on the pad turned over, and the order of the fibres.
 
-    A ring is where a fibre is fastened, beside it its number; a dot is where it is cut, beside it when its turn came.
-    Dashed are the ways above the pad, red is the box, where it is near.
+    A ring with the fibre's number marks where it is fastened, a dot with its turn where it is cut. Travel moves above
+    the pad are dashed, and the needle's box is red.
+
+    Args:
+        plan: of the mould.
+        steps: the toolpath, by layer.
     """
+    svg = _SvgWriter(decimals=3)
     strokes = [stroke for step in steps for stroke in step.strokes]
-    places = np.vstack([stroke.positions_mm for stroke in strokes])
-    (left, low), (right, high) = places.min(axis=0) - _ROOM_MM, places.max(axis=0) + _ROOM_MM
-    right = max(right, left + _LEAST_MM)
-    ends = np.stack([stroke.positions_mm[[0, -1]] for stroke in strokes])
-    legend = list(_legend(plan, steps))
-    width, height = right - left, high - low + _TOOLPATH_LINE_MM * (len(legend) + 1)
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{_um(width)}mm" height="{_um(height)}mm"'
-            f' viewBox="{" ".join(map(_um, (left, -high, width, height)))}" fill="none"'
-            f' font-family="sans-serif" font-size="{_TOOLPATH_TEXT_MM}">',
-            "<title>The ways of the needle, from above: the pad turned over, tracks up</title>",
-            f'<clipPath id="above-legend"><rect x="{_um(left)}" y="{_um(-high)}" width="{_um(width)}"'
-            f' height="{_um(high - low)}"/></clipPath>',
-            *_ground(plan),
-            *_travels(ends),
-            *_laid(steps),
-            *_marks(plan, ends, [stroke.fibre for stroke in strokes]),
-            *(
-                _toolpath_text((left + 1, low - _TOOLPATH_LINE_MM * n), "start", text, colour)
-                for n, (text, colour) in enumerate(legend, 1)
-            ),
-            "</svg>\n",
-        ]
-    )
-
-
-def _ground(plan: Plan) -> Iterator[str]:
-    """The silicone, and the box that the needle may not leave."""
-    rings = [turned_over(ring) for polygon in polygon_rings(plan.silicone) for ring in polygon]
-    yield f'<path id="silicone" stroke="#888" stroke-width="0.2" d="{"".join(_path(ring) + "Z" for ring in rings)}"/>'
-    (x0, x1, y0, y1), (x, y) = plan.settings.dispenser.box_mm[:4], plan.settings.dispenser.origin_mm
-    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) - (x, y)
-    clip = 'clip-path="url(#above-legend)"'
-    yield f'<path id="box" stroke="{ALARM}" stroke-width="0.4" {clip} d="{_path(corners)}Z"/>'
-    yield f'<path id="middle" stroke="{INK}" stroke-width="0.2" d="M-2,0L2,0M0,-2L0,2"/>'
-
-
-def _travels(ends: Array) -> Iterator[str]:
-    """From where each fibre (k, 2, 2) is cut to where the next is fastened."""
-    ways = "".join(_path(np.stack([end, start])) for end, start in zip(ends[:-1, 1], ends[1:, 0], strict=True))
-    yield f'<path id="travel" stroke="{FAINT}" stroke-width="0.2" stroke-dasharray="1 1" d="{ways}"/>'
-
-
-def _laid(steps: Sequence[Step]) -> Iterator[str]:
-    for step in steps:
-        yield f'<g id="{step.layer.name}" stroke="{step.layer.colour}" stroke-width="0.3">'
-        for stroke in step.strokes:
-            yield f'<path id="fibre-{stroke.fibre + 1}" d="{_path(stroke.positions_mm)}"/>'
-        yield "</g>"
-
-
-def _marks(plan: Plan, ends: Array, fibres: Sequence[int]) -> Iterator[str]:
-    for turn, (fibre, (start, end)) in enumerate(zip(fibres, ends, strict=True), 1):
-        off, beyond = (2.5 * turned_over(lead.outward) for lead in plan.leads.pairs[fibre])
-        (x, y), (u, v) = start, end
-        yield f'<circle cx="{_um(x)}" cy="{_um(-y)}" r="0.8" stroke="{INK}" stroke-width="0.2"/>'
-        yield f'<circle cx="{_um(u)}" cy="{_um(-v)}" r="0.5" fill="{INK}"/>'
-        yield _toolpath_text(start + off, "middle", str(fibre + 1), INK)
-        yield _toolpath_text(end + beyond, "middle", f"{turn}.", INK)
-
-
-def _legend(plan: Plan, steps: Sequence[Step]) -> Iterator[tuple[str, str]]:
-    """Lines of text and their colours."""
+    points = np.vstack([stroke.positions_mm for stroke in strokes])
+    (x_min, y_min), (x_max, y_max) = points.min(axis=0) - _MARGIN_MM, points.max(axis=0) + _MARGIN_MM
+    x_max = max(x_max, x_min + _MIN_LEGEND_MM)
+    dispenser, legend = plan.settings.dispenser, []
     for number, step in enumerate(steps, 1):
-        layer, z = step.layer, _um(step.strokes[0].z_mm)
-        yield f"{number}. {FAMILIES[layer.family]}, {layer.depth_mm:.3g} mm deep, needle at z = {z} mm", layer.colour
-    height = plan.settings.dispenser.travel_height_mm
-    yield f"The pad lies turned over, tracks up, seen from above. Dashed: at z = {height:g} mm.", INK
-    yield "Ring: number of the fibre, fasten it. Dot: its turn, cut it.", INK
+        layer, z = step.layer, svg.number(step.strokes[0].z_mm)
+        text = f"{number}. {FAMILIES[layer.family]}, {layer.depth_mm:.3g} mm deep, needle at z = {z} mm"
+        legend.append((text, layer.colour))
+    travel_z = f"z = {dispenser.travel_height_mm:g} mm"
+    legend.append((f"The pad lies turned over, tracks up, seen from above. Dashed: at {travel_z}.", INK))
+    legend.append(("Ring: number of the fibre, fasten it. Dot: its turn, cut it.", INK))
+    width, height = x_max - x_min, y_max - y_min + _LEGEND_LINE_MM * (len(legend) + 1)
 
-
-def _path(places: Array) -> str:
-    return "M" + "L".join(f"{_um(x)},{_um(-y)}" for x, y in places.tolist())
-
-
-def _toolpath_text(place: Array | tuple[float, float], anchor: str, text: str, colour: str) -> str:
-    at = f'x="{_um(place[0])}" y="{_um(-place[1])}" dy="0.35em"'
-    return f'<text {at} text-anchor="{anchor}" fill="{colour}">{text}</text>'
-
-
-def _um(value: float) -> str:
-    """To a micrometre; no -0."""
-    return f"{round(float(value), 3) + 0.0:.10g}"
+    clip = svg.element("rect", x=x_min, y=-y_max, width=width, height=y_max - y_min)
+    box_x, box_y, _ = np.reshape(dispenser.box_mm, (3, 2))
+    box = (np.array([box_x[[0, 1, 1, 0]], box_y[[0, 0, 1, 1]]]).T - dispenser.origin_mm) * _TO_SVG
+    box_style = {"stroke": ALARM, "stroke_width": 0.4, "clip_path": "url(#above-legend)"}
+    travels = "".join(
+        svg.path(np.array([cut.positions_mm[-1], fastened.positions_mm[0]]) * _TO_SVG)
+        for cut, fastened in pairwise(strokes)
+    )
+    content = [
+        svg.element("clipPath", clip, id="above-legend"),
+        svg.element("path", id="silicone", stroke=_EDGE, stroke_width=0.2, d=svg.outline(plan.silicone, mirrored=True)),
+        svg.element("path", id="box", **box_style, d=f"{svg.path(box)}Z"),
+        svg.element("path", id="middle", stroke=INK, stroke_width=0.2, d="M-2,0L2,0M0,-2L0,2"),
+        svg.element("path", id="travel", stroke=FAINT, stroke_width=0.2, stroke_dasharray="1 1", d=travels),
+    ]
+    for step in steps:
+        paths = [
+            svg.element("path", id=f"fibre-{stroke.fibre + 1}", d=svg.path(stroke.positions_mm * _TO_SVG))
+            for stroke in step.strokes
+        ]
+        content.append(svg.element("g", *paths, id=step.layer.name, stroke=step.layer.colour, stroke_width=0.3))
+    for turn, stroke in enumerate(strokes, 1):
+        start, end = stroke.positions_mm[[0, -1]] * _TO_SVG
+        before, after = (2.5 * turned_over(lead.outward) * _TO_SVG for lead in plan.leads.pairs[stroke.fibre])
+        content += [
+            svg.element("circle", cx=start[0], cy=start[1], r=0.8, stroke=INK, stroke_width=0.2),
+            svg.element("circle", cx=end[0], cy=end[1], r=0.5, fill=INK),
+            svg.text(str(stroke.fibre + 1), start + before),
+            svg.text(f"{turn}.", end + after),
+        ]
+    for row, (text, colour) in enumerate(legend, 1):
+        content.append(svg.text(text, (x_min + 1, _LEGEND_LINE_MM * row - y_min), "start", colour))
+    title = "The needle's toolpath, from above: the pad turned over, tracks up"
+    return svg.document((x_min, -y_max, width, height), title, _TEXT_MM, content)

@@ -1,8 +1,8 @@
-"""What a report has to say of a mould, and of the making of a pad with it."""
+"""Sections of a report on a mould, with a view of it in three dimensions, and on making the pad with it."""
 
 import base64
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -24,20 +24,20 @@ from padforge.design.common.page import (
 )
 from padforge.design.common.validation import InputError
 from padforge.fabricate.mesh import read_mesh
-from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION as ORIENTATION_CAPTION
-from padforge.fabricate.outputs.drawings import ORIENTATION_FILE as ORIENTATION_FILE
-from padforge.fabricate.outputs.drawings import ORIENTATION_LINK as ORIENTATION_LINK
+from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION, ORIENTATION_FILE, ORIENTATION_LINK
 from padforge.fabricate.outputs.laying_page import laying_page
 from padforge.fabricate.plan import COLOURS, FAMILIES
 
-MOST_BYTES = 3_000_000
-"""A packed mesh takes no more: base64 makes 4 MB of it, half of what a page may have."""
+MAX_BYTES = 3_000_000
+"""Size of a packed mesh: base64 makes 4 MB of it, half of the maximum of a page."""
 _STEPS = np.iinfo(np.uint16).max
-"""Places along a side of the box around a mesh."""
+"""Steps of a coordinate along a side of the box around a mesh."""
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)
-"""How far a mesh that is too large may be off, one after the other; the last is half of a common nozzle."""
-_MOST_LEVELS = 64
-"""So many heights get a colour: graphics chips have room for few numbers that all pixels share."""
+"""Tolerances to simplify a large mesh to, the last half of a common nozzle."""
+_MAX_TOPS = 64
+"""Heights with a colour: graphics chips have room for few uniforms."""
+_PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE)
+_MAX_POSITIONS = 3
 _VIEW = """\
 <figure class="view" id="mould-view" hidden>
 <canvas tabindex="0" role="application" aria-label="{label}"></canvas>
@@ -58,14 +58,15 @@ _HELP = (
 
 
 @dataclass(frozen=True)
-class Packed:
-    """A mesh as a page holds it.
+class PackedMesh:
+    """A mesh in the form that a page embeds.
 
     Attributes:
-        low_mm, size_mm: (3,) corner and sides of the box around it.
-        vertices: (n, 3) places in the box, 0 to 65535 along each side.
-        triangles: (m, 3) vertex numbers, of two bytes where they fit, else of four.
-        tolerance_mm: how far it may be off for having been made coarser; 0 if it was not.
+        low_mm: corner of the box around it; shape (3,).
+        size_mm: sides of the box around it; shape (3,).
+        vertices: positions in the box, 0 to 65535 along each side; shape (n, 3).
+        triangles: vertex indices, of two bytes if these suffice, else of four; shape (m, 3).
+        tolerance_mm: tolerance that it was simplified to; 0 if it was not.
     """
 
     low_mm: NDArray[np.float64]
@@ -76,180 +77,147 @@ class Packed:
 
     @property
     def nbytes(self) -> int:
-        """How many bytes it takes."""
         return self.vertices.nbytes + self.triangles.nbytes
 
 
-def packed(path: Path, most_bytes: int = MOST_BYTES) -> Packed | None:
-    """The mesh of a file in at most so many bytes, made coarser as far as that takes; None where that does not do.
+def pack_mesh(path: Path) -> PackedMesh | None:
+    """Pack the mesh of a file into `MAX_BYTES`, simplified as far as necessary; None if that does not suffice.
+
+    Args:
+        path: of an STL or 3MF file.
 
     Raises:
         InputError: the file is missing, or holds no mesh.
     """
     corners, triangles = read_mesh(path)
     # An STL lists the corners of each triangle anew.
-    vertices, numbers = np.unique(corners, axis=0, return_inverse=True)
-    triangles = numbers.ravel()[triangles]
-    mesh = _packed(vertices, triangles, 0.0)
-    if mesh.nbytes > most_bytes:
-        coarser = (_packed(*each) for each in _coarser(vertices, triangles))
-        return next((each for each in coarser if each.nbytes <= most_bytes), None)
-    return mesh
+    vertices, indices = np.unique(corners, axis=0, return_inverse=True)
+    triangles = indices.ravel()[triangles]
+    packed = _pack(vertices, triangles, 0.0)
+    if packed.nbytes <= MAX_BYTES:
+        return packed
+
+    from manifold3d import Error, Manifold, Mesh
+
+    solid = Manifold(Mesh(vertices.astype(np.float32), triangles.astype(np.uint32)))
+    for tolerance_mm in _TOLERANCES_MM if solid.status() == Error.NoError else ():  # a closed mesh only
+        mesh = solid.simplify(tolerance_mm).to_mesh()
+        packed = _pack(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), tolerance_mm)
+        if packed.nbytes <= MAX_BYTES:
+            return packed
+    return None
 
 
-def view(mesh: Packed, document: Mapping[str, Any]) -> str:
-    """The view, for a page that has `script`; it is seen only where a browser can draw it.
+def _pack(vertices: NDArray[np.floating], triangles: NDArray[np.integer], tolerance_mm: float) -> PackedMesh:
+    low, size = vertices.min(axis=0).astype(np.float64), np.ptp(vertices, axis=0).astype(np.float64)
+    steps = np.rint((vertices - low) / np.where(size > 0, size, 1.0) * _STEPS).astype("<u2")
+    indices = triangles.astype("<u2" if len(vertices) <= _STEPS + 1 else "<u4")
+    return PackedMesh(low, size, steps, indices, tolerance_mm)
 
-    Args:
-        document: that of the fabrication, whose fibres and floor say which heights get which colour.
 
-    Raises:
-        KeyError, TypeError, ValueError: the document is not as padforge writes it.
-    """
+def _draw_view(mesh: PackedMesh, document: Mapping[str, Any]) -> str:
+    """Return the HTML of the view, which is visible only in a browser that can draw it."""
     size = " x ".join(f"{side:.4g}" for side in mesh.size_mm)
-    coarser = f" Drawn to {mesh.tolerance_mm:g} mm, to be light enough." if mesh.tolerance_mm else ""
-    caption = f"The mould, {size} mm. {_colours(document)}{coarser} {_HELP}"
+    simplified = f" Simplified to {mesh.tolerance_mm:g} mm, to limit the size of the page." if mesh.tolerance_mm else ""
+    caption = f"The mould, {size} mm. {_colour_key(document)}{simplified} {_HELP}"
     label = (
         f"The mould in three dimensions, {size} mm. Arrow keys turn it, with Shift they move it; plus and minus zoom;"
         " 0 resets."
     )
+    # Tops of the ridges of every layer: height, and red, green and blue of the family's colour, 0 to 1
+    floor_mm = float(mesh.low_mm[2]) + float(document["settings"]["mould"]["floor_mm"])
+    tops = {}
+    for fibre in document["fibres"]:
+        colour = COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
+        tops[float(fibre["ridge_mm"])] = [part / 255 for part in bytes.fromhex(colour[1:])]
     data = {
         "low": mesh.low_mm.tolist(),
         "size": mesh.size_mm.tolist(),
-        "tops": _tops(document, float(mesh.low_mm[2])),
+        "tops": [[floor_mm + ridge_mm, *colour] for ridge_mm, colour in sorted(tops.items())][:_MAX_TOPS],
         "wide": mesh.triangles.itemsize == 4,
-        "vertices": _base64(mesh.vertices),
-        "triangles": _base64(mesh.triangles),
+        "vertices": base64.b64encode(mesh.vertices.tobytes()).decode(),
+        "triangles": base64.b64encode(mesh.triangles.tobytes()).decode(),
     }
     return _VIEW.format(label=escape(label), caption=escape(caption), mesh=json.dumps(data, allow_nan=False))
 
 
-def script() -> str:
-    """JavaScript that draws the view of a page and turns it."""
-    return read_resource("padforge.fabricate.outputs", "mould_view.js")
-
-
-def _packed(vertices: NDArray[np.floating], triangles: NDArray[np.integer], tolerance_mm: float) -> Packed:
-    low, size = vertices.min(axis=0).astype(np.float64), np.ptp(vertices, axis=0).astype(np.float64)
-    steps = np.rint((vertices - low) / np.where(size > 0, size, 1.0) * _STEPS).astype("<u2")
-    numbers = triangles.astype("<u2" if len(vertices) <= _STEPS + 1 else "<u4")
-    return Packed(low, size, steps, numbers, tolerance_mm)
-
-
-def _coarser(
-    vertices: NDArray[np.float64], triangles: NDArray[np.integer]
-) -> Iterator[tuple[NDArray[np.floating], NDArray[np.integer], float]]:
-    """The same mesh with ever fewer triangles, and how far each is off, mm; none of a mesh that is not closed."""
-    from manifold3d import Error, Manifold, Mesh
-
-    solid = Manifold(Mesh(vertices.astype(np.float32), triangles.astype(np.uint32)))
-    for tolerance_mm in _TOLERANCES_MM if solid.status() == Error.NoError else ():
-        mesh = solid.simplify(tolerance_mm).to_mesh()
-        yield np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), tolerance_mm
-
-
-def _colours(document: Mapping[str, Any]) -> str:
-    """A sentence that says what the colours mean."""
+def _colour_key(document: Mapping[str, Any]) -> str:
+    """Return a sentence that explains the colours."""
     shallow = document["fibres"][-1 if document["settings"]["pad"]["deep_family"] == FAMILIES[0] else 0]
     numbers = " and the numbers" if document["settings"]["mould"]["number_mm"] else ""
+    families = {fibre["fibre"].split()[0] for fibre in document["fibres"]}
+    if len(families) == 1:
+        return f"Tops of ridges{numbers} are {'blue' if FAMILIES[0] in families else 'orange'}."
     first, second = (numbers if shallow["fibre"].startswith(family) else "" for family in FAMILIES)
-    there = {fibre["fibre"].split()[0] for fibre in document["fibres"]}
-    if len(there) == 1:
-        return f"Tops of ridges{numbers} are {'blue' if FAMILIES[0] in there else 'orange'}."
     return f"Tops of {FAMILIES[0]} ridges{first} are blue, of {FAMILIES[1]} ones{second} orange."
 
 
-def _tops(document: Mapping[str, Any], ground_mm: float) -> list[list[float]]:
-    """Height of the ridges of every level, mm, and its family's colour: red, green and blue from 0 to 1."""
-    floor_mm = ground_mm + float(document["settings"]["mould"]["floor_mm"])
-    found = {}
-    for fibre in document["fibres"]:
-        colour = COLOURS[FAMILIES.index(fibre["fibre"].split()[0])]
-        found[float(fibre["ridge_mm"])] = [part / 255 for part in bytes.fromhex(colour[1:])]
-    return [[floor_mm + ridge_mm, *colour] for ridge_mm, colour in sorted(found.items())][:_MOST_LEVELS]
-
-
-def _base64(values: NDArray[Any]) -> str:
-    return base64.b64encode(values.tobytes()).decode()
-
-
-_SHOWN = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE)
-_SHOWN_PLACES = 3
-
-
 def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """The mould of a `fabrication.json` in `folder` with what the checks found, and how to make the pad with it.
+    """Build the sections on a mould with its checks, and on making the pad with it.
+
+    Args:
+        folder: of the fabrication's files.
+        document: its `fabrication.json`.
 
     Raises:
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: the mesh or a picture that was written with it is another one now.
+        InputError: the mesh or a picture has changed since it was written with the document.
     """
-    shown = _written_with(folder, document)
-    return [_mould(folder, shown, document), _bench(folder, shown, document)]
+    digests = {name: document["sha256"][name] for name in _PICTURES if name in document["sha256"]}
+    unchanged = find_unchanged(folder, digests)
+    for name in digests.keys() - unchanged:
+        if (folder / name).exists():
+            raise InputError(f"{folder / name}: is not the one fabrication.json was written with; fabricate again")
+    return [_mould_section(folder, unchanged, document), _bench_section(folder, unchanged, document)]
 
 
-def _mould(folder: Path, shown: Collection[str], document: Mapping[str, Any]) -> PageSection:
-    """The mould to be turned, its pictures, and the checks."""
+def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
+    """Build the section of the view of the mould, its pictures and checks; `names` are those of files to show."""
     solid = folder / "mould.stl"
-    mesh = packed(solid) if solid.name in shown else None
+    mesh = pack_mesh(solid) if solid.name in names else None
     findings = document["findings"]
     size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     passed = [finding for finding in findings if finding["status"] == "pass"]
-    remarks = sorted((each for each in findings if each["status"] != "pass"), key=lambda each: each["status"])
-    large = f"{solid.name} is too large to be turned on this page, also when made coarser; the pictures show it."
+    remarks = sorted((f for f in findings if f["status"] != "pass"), key=lambda finding: finding["status"])
+    large = f"{solid.name} is too large to be turned on this page, also if simplified; the pictures show it."
     captions = {
-        "mould.png": f"The mould from above, {size} mm: colour tells family and height.",
+        "mould.png": f"The mould from above, {size} mm: colour stands for family and height.",
         "tracks.png": "The fibres as they lie in the mould; the deeper one interrupts the other.",
-        "toolpath.svg": "The ways of a needle that lays the fibres, the pad turned over.",
+        "toolpath.svg": "The toolpath of a needle that lays the fibres, the pad turned over.",
     }
     return PageSection(
         "Mould",
         [
-            *([view(mesh, document)] if mesh else [paragraph(large)] if solid.name in shown else []),
-            figures([(folder / name, caption) for name, caption in captions.items() if name in shown]),
+            *([_draw_view(mesh, document)] if mesh else [paragraph(large)] if solid.name in names else []),
+            figures([(folder / name, caption) for name, caption in captions.items() if name in names]),
             heading("Printability"),
             paragraph(f"{len(passed)} of {len(findings)} checks pass."),
-            *([_checks(remarks)] if remarks else []),
-            *([collapsible("Checks that pass", [_checks(passed)])] if passed else []),
+            *([_findings_table(remarks)] if remarks else []),
+            *([collapsible("Checks that pass", [_findings_table(passed)])] if passed else []),
         ],
         [
             (f"{len(passed)} / {len(findings)}", "mould checks pass"),
             (f"{document['silicone_volume_ml']:.1f} ml", "silicone to cast"),
         ],
-        script() if mesh else "",
+        read_resource("padforge.fabricate.outputs", "mould_view.js") if mesh else "",
     )
 
 
-def _written_with(folder: Path, document: Mapping[str, Any]) -> set[str]:
-    """Names of the mesh and the pictures in a folder that were written with its fabrication document.
-
-    Raises:
-        InputError: one of them is another one now.
-    """
-    digests = {name: document["sha256"][name] for name in _SHOWN if name in document["sha256"]}
-    own = find_unchanged(folder, digests)
-    for name in digests.keys() - own:
-        if (folder / name).exists():
-            raise InputError(f"{folder / name}: is not the one fabrication.json was written with; fabricate again")
-    return own
-
-
-def _bench(folder: Path, shown: Collection[str], document: Mapping[str, Any]) -> PageSection:
-    """How to make the pad, as `laying.md` has it: what to print and to mix, lengths to cut, the order of laying."""
-    guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section has in full
+def _bench_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
+    """Build the section of `laying.md`, with the drawing of the orientation where the page links it."""
+    guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section lists in full
     before, _, after = guide.partition(ORIENTATION_LINK)
-    drawing = [figures([(folder / ORIENTATION_FILE, ORIENTATION_CAPTION)])] if ORIENTATION_FILE in shown else []
+    drawing = [figures([(folder / ORIENTATION_FILE, ORIENTATION_CAPTION)])] if ORIENTATION_FILE in names else []
     return PageSection("Making the pad", [*render_markdown(before), *drawing, *render_markdown(after)])
 
 
-def _checks(findings: Sequence[Mapping[str, Any]]) -> str:
-    """Findings as a table, with their first places if they have any."""
-    rows = [[each["name"].replace("_", " "), each["status"], each["message"], _places(each)] for each in findings]
+def _findings_table(findings: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of findings, with their first positions if they have any."""
+    rows = []
+    for finding in findings:
+        positions = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
+        more = f" and {len(positions) - _MAX_POSITIONS} more" if len(positions) > _MAX_POSITIONS else ""
+        name, where = finding["name"].replace("_", " "), " ".join(positions[:_MAX_POSITIONS]) + more
+        rows.append([name, finding["status"], finding["message"], where])
     columns = 4 if any(row[-1] for row in rows) else 3
-    return table(["check", "verdict", "finding", "where (mm)"][:columns], [row[:columns] for row in rows])
-
-
-def _places(finding: Mapping[str, Any]) -> str:
-    places = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
-    more = f" and {len(places) - _SHOWN_PLACES} more" if len(places) > _SHOWN_PLACES else ""
-    return " ".join(places[:_SHOWN_PLACES]) + more
+    return table(["check", "result", "finding", "where (mm)"][:columns], [row[:columns] for row in rows])

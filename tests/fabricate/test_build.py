@@ -238,7 +238,7 @@ def in_pieces(monkeypatch, body: str) -> None:
         (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid is not of its mesh \(.*written"),
         (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
         (
-            lambda m: m.setattr(model, "is_valid", lambda shape: False),
+            lambda m: m.setattr(model, "is_valid", lambda solid: False),
             ["step"],
             "mould: the CAD kernel finds a solid invalid",
         ),

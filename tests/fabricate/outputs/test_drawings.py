@@ -28,7 +28,7 @@ TONGUES = [{"exit_mm": 0.0}, {}, {"border_mm": 2.0}]
 
 
 def numbers_in(text: str) -> np.ndarray:
-    """The coordinates of an SVG path, (n, 2), y upwards."""
+    """Return the coordinates of an SVG path; shape (n, 2), y upwards."""
     return np.array(re.findall(r"-?\d+(?:\.\d+)?", text), dtype=float).reshape(-1, 2) * (1, -1)
 
 
@@ -37,24 +37,24 @@ def svg_groups(plan: Plan) -> dict[str, ElementTree.Element]:
 
 
 def bezier_points(control: np.ndarray) -> np.ndarray:
-    """(n, 2) points of Bezier segments (s, 4, 2)."""
+    """Return points (n, 2) of Bezier segments (s, 4, 2)."""
     u = np.linspace(0, 1, 25)[:, None, None]
     a, b, c, d = np.moveaxis(control, 1, 0)
     return ((1 - u) ** 3 * a + 3 * (1 - u) ** 2 * u * b + 3 * (1 - u) * u**2 * c + u**3 * d).reshape(-1, 2)
 
 
 def assert_on_curve(plan: Plan, fibre: int, positions_mm: np.ndarray) -> None:
-    """Places (n, 2) mm lie within 0.1 µm of the fibre as scipy has it, and cover it from end to end."""
+    """Assert that positions (n, 2) lie within 0.1 µm of scipy's curve of a fibre, and cover it from end to end."""
     axis, knots = plan.family(fibre), plan.pad.to_mm(plan.pad.knots[fibre])
     curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
-    travel = np.clip(positions_mm[:, axis], knots[0, axis], knots[-1, axis])
-    off = np.abs(positions_mm[:, 1 - axis] - curve(travel)) / np.hypot(1, curve(travel, 1))
-    assert off.max() < 1e-4
-    assert np.ptp(travel) == pytest.approx(plan.pad.layout.size_mm[0])
+    along = np.clip(positions_mm[:, axis], knots[0, axis], knots[-1, axis])
+    error = np.abs(positions_mm[:, 1 - axis] - curve(along)) / np.hypot(1, curve(along, 1))
+    assert error.max() < 1e-4
+    assert np.ptp(along) == pytest.approx(plan.pad.layout.size_mm[0])
 
 
 def assert_ends(plan: Plan, fibre: int, ends_mm: np.ndarray) -> None:
-    """The fibre begins and ends at the edge of the silicone, level with its own ends."""
+    """Assert that a fibre starts and ends at the edge of the silicone, level with its knots."""
     axis, mould = plan.family(fibre), plan.settings.mould
     edge = plan.pad.layout.size_mm[0] / 2 + mould.border_mm + mould.exit_mm
     assert ends_mm[:, axis] == pytest.approx([-edge, edge], abs=1e-4)
@@ -63,7 +63,7 @@ def assert_ends(plan: Plan, fibre: int, ends_mm: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("mould", TONGUES)
-def test_svg_holds_the_exact_curves(mould):
+def test_tracks_svg_has_exact_curves(mould):
     plan = Plan(PAD, with_settings(mould))
     paths = {path.get("id"): path for group in svg_groups(plan).values() for path in group.findall(f"{SVG}path")}
     for fibre in range(6):
@@ -74,7 +74,7 @@ def test_svg_holds_the_exact_curves(mould):
         assert_on_curve(plan, fibre, bezier_points(np.stack([points[1 + 3 * i : 5 + 3 * i] for i in range(4)])))
 
 
-def test_svg_has_a_layer_for_every_depth_in_laying_order():
+def test_tracks_svg_has_layer_for_every_depth_in_laying_order():
     groups = svg_groups(Plan(Morphology.straight(4)))
     assert list(groups) == ["silicone", "horizontal-1.2", "vertical-0.4", "numbers", "scale"]
     assert {group.get(f"{INKSCAPE}groupmode") for group in groups.values()} == {"layer"}
@@ -84,14 +84,14 @@ def test_svg_has_a_layer_for_every_depth_in_laying_order():
     assert list(deep)[1:3] == ["vertical-1.2", "horizontal-0.4"]
 
 
-def test_fibres_of_one_family_that_cross_are_on_layers_of_their_own():
+def test_tracks_svg_separates_crossing_fibres_of_one_family():
     groups = svg_groups(Plan(level_pad(1.8, 1.2)))
     assert [name for name in groups if name.startswith("horizontal")] == ["horizontal-2", "horizontal-1.2"]
     strokes = {groups[name].get("stroke") for name in ("horizontal-2", "horizontal-1.2", "vertical-0.4")}
     assert len(strokes) == 3
 
 
-def test_svg_is_of_true_size_and_nothing_is_cut_off():
+def test_tracks_svg_has_true_size_and_contains_everything():
     plan = Plan(PAD)
     root = ElementTree.fromstring(tracks_svg(plan))
     left, top, width, height = map(float, root.get("viewBox", "").split())
@@ -108,21 +108,21 @@ def test_svg_is_of_true_size_and_nothing_is_cut_off():
     assert groups["scale"][1].text == "10 mm"
 
 
-def test_svg_numbers_stand_beside_the_starts_outside_the_silicone():
+def test_tracks_svg_numbers_are_beside_starts_outside_silicone():
     plan = Plan(PAD)
     texts = svg_groups(plan)["numbers"]
     assert [text.text for text in texts] == list("123456")
     for text, line in zip(texts, plan.lines, strict=True):
-        place = shapely.Point(float(text.get("x", "")), -float(text.get("y", "")))
-        assert not place.intersects(plan.silicone)
-        assert place.distance(shapely.Point(line.coords[0])) < 3
+        position = shapely.Point(float(text.get("x", "")), -float(text.get("y", "")))
+        assert not position.intersects(plan.silicone)
+        assert position.distance(shapely.Point(line.coords[0])) < 3
     root = ElementTree.fromstring(tracks_svg(plan))
     assert "as it lies in the tray" in (root.findtext(f"{SVG}title") or "")
     assert orientation_sentence((4, 4), "edges") in (root.findtext(f"{SVG}desc") or "")
 
 
 @pytest.mark.parametrize("pad", [Morphology.straight(1, pitch_mm=4.0), PAD, Morphology.straight(10)])
-def test_both_drawings_say_which_way_round_and_have_room_for_it(pad, tmp_path):
+def test_tracks_svg_and_dxf_have_room_for_orientation(pad, tmp_path):
     plan = Plan(pad)
     beside, *texts = svg_groups(plan)["scale"].findall(f"{SVG}text")[1:]
     assert " ".join(text.text or "" for text in texts) == orientation_sentence((4, 4), "edges")
@@ -145,7 +145,7 @@ def read_dxf(text: str, folder: Path) -> Drawing:
 
 
 @pytest.mark.parametrize("mould", TONGUES)
-def test_dxf_splines_are_the_exact_curves(mould, tmp_path):
+def test_tracks_dxf_has_exact_splines(mould, tmp_path):
     plan = Plan(PAD, with_settings(mould))
     document = read_dxf(tracks_dxf(plan), tmp_path)
     drawn = [list(document.modelspace().query(f'SPLINE[layer=="{layer.name}"]')) for layer in fibre_layers(plan)]
@@ -164,7 +164,7 @@ def test_dxf_splines_are_the_exact_curves(mould, tmp_path):
             assert_on_curve(plan, fibre, np.vstack([ends, points[inside]]))
 
 
-def test_dxf_is_sound_and_complete(tmp_path):
+def test_tracks_dxf_is_valid_and_complete(tmp_path):
     plan = Plan(level_pad(1.8, 1.2))
     document = read_dxf(tracks_dxf(plan), tmp_path)
     audit = document.audit()
@@ -187,16 +187,16 @@ def test_dxf_is_sound_and_complete(tmp_path):
 
 
 @pytest.mark.slow
-def test_dxf_is_the_same_in_every_process():
+def test_tracks_dxf_is_same_in_every_process():
     script = (
         "import sys; from padforge.design.morphology import Morphology; from padforge.fabricate.plan import Plan;"
         " from padforge.fabricate.outputs import drawings; assert 'ezdxf' not in sys.modules;"
         " sys.stdout.write(drawings.tracks_dxf(Plan(Morphology.random(3, 3, seed=7))))"
     )
     folder, before = Path(__file__).resolve().parents[3], ezdxf.options.write_fixed_meta_data_for_testing
-    here = tracks_dxf(Plan(PAD))
+    text = tracks_dxf(Plan(PAD))
     assert ezdxf.options.write_fixed_meta_data_for_testing == before
-    environment = {**os.environ, "PYTHONHASHSEED": "1"}  # sets of strings have an order of their own with each
+    environment = {**os.environ, "PYTHONHASHSEED": "1"}  # the order of sets of strings
     command = [sys.executable, "-c", script]
-    there = subprocess.run(command, check=True, cwd=folder, env=environment, capture_output=True, text=True)
-    assert there.stdout == here
+    other = subprocess.run(command, check=True, cwd=folder, env=environment, capture_output=True, text=True)
+    assert other.stdout == text

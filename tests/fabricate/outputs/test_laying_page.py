@@ -1,4 +1,4 @@
-"""The page for the bench: what to mix, cut, lay and wire, by integration and by the curves, and what it says of it."""
+"""`laying.md` and its sections of `fabrication.json`: amounts and lengths by integration, and the texts."""
 
 import math
 import re
@@ -12,14 +12,21 @@ from scipy.integrate import quad
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import build
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.outputs import drawings, laying_page
+from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, orientation_sentence
+from padforge.fabricate.outputs.laying_page import (
+    PRINT_SETTINGS_HEAD,
+    laying_document,
+    laying_page,
+    pad_document,
+    print_settings_rows,
+)
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 
 
-def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
-    """A fabrication document as far as the page reads it."""
+def fabrication_document(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
+    """Return the parts of a fabrication document that the page reads."""
     volume = mould_mesh(plan.shrinkage_compensated).volume()
     return {
         "files": ["mould.stl"],
@@ -29,14 +36,14 @@ def whole(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
         "settings": {
             "mould": plan.settings.mould.model_dump(),
             "printer": plan.settings.printer.model_dump(),
-            "pad": laying_page.pad_document(plan),
+            "pad": pad_document(plan),
         },
-        **laying_page.laying_document(plan, volume),
+        **laying_document(plan, volume),
     }
 
 
 def straight_volume_mm3(draft_deg: float) -> float:
-    """What fills the default mould of the straight pad of 4 + 4 without numbers, by integration over its height."""
+    """Integrate the default mould of the straight pad of 4 + 4 without numbers over its height."""
     lean, half, height = math.tan(math.radians(draft_deg)), 28.125, 6.0
 
     def layer(z: float) -> float:
@@ -50,25 +57,25 @@ def straight_volume_mm3(draft_deg: float) -> float:
 
 
 @pytest.mark.parametrize("draft_deg", [0.0, 2.0, 10.0])
-def test_silicone_of_a_straight_pad(draft_deg):
+def test_silicone_fills_straight_pad(draft_deg):
     plan = Plan(Morphology.straight(4), with_settings({"wall_draft_deg": draft_deg, "number_mm": 0.0}))
-    silicone = laying_page.laying_document(plan, mould_mesh(plan).volume())["silicone"]
+    silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
     expected = straight_volume_mm3(draft_deg) / 1000
     assert silicone["volume_ml"] == pytest.approx(expected, abs=1e-3)
     assert silicone["mass_g"] == pytest.approx(expected * 1.07 * 1.1, abs=0.02)
     assert silicone["part_a_g"] == silicone["part_b_g"] == pytest.approx(silicone["mass_g"] / 2)
     other = with_settings(plan.settings.mould.model_dump(), silicone={"density_g_per_ml": 1.3, "parts": [10.0, 1.0]})
-    mixed = laying_page.laying_document(Plan(plan.pad, other), mould_mesh(plan).volume())["silicone"]
+    mixed = laying_document(Plan(plan.pad, other), mould_mesh(plan).volume())["silicone"]
     assert mixed["mass_g"] == pytest.approx(expected * 1.3 * 1.1, abs=0.02)
     assert mixed["part_a_g"] == pytest.approx(10 * mixed["part_b_g"], abs=0.06)
 
 
-def test_pins_take_no_silicone_and_a_thicker_pad_takes_more(tmp_path):
+def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
     volumes = [build(pad, tmp_path, [], with_settings({"pins": pins}))["silicone_volume_ml"] for pins in (True, False)]
     assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
     plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
-    silicone = laying_page.laying_document(plan, mould_mesh(plan).volume())["silicone"]
+    silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
     assert silicone["thickness_mm"] == plan.silicone_mm == 3.0
     empty = plan.silicone.area * 3
     tracks = sum(area.area * height for area, height in zip(plan.ridges, plan.heights_mm, strict=True))
@@ -76,18 +83,18 @@ def test_pins_take_no_silicone_and_a_thicker_pad_takes_more(tmp_path):
 
 
 @pytest.mark.parametrize("mould", [{}, {"border_mm": 1.5, "exit_mm": 0.0, "lead_mm": 12.5}])
-def test_lengths_are_those_of_the_curves(mould):
+def test_lengths_match_curves(mould):
     plan = Plan(Morphology.random(3, 4, seed=3), with_settings(mould))
     tongue = plan.settings.mould.border_mm + plan.settings.mould.exit_mm
-    for fibre, entry in enumerate(laying_page.laying_document(plan, 1.0)["fibres"]):
-        course = shapely.LineString(exact_fibre(plan.pad, fibre)).length
-        assert entry["in_pad_mm"] == pytest.approx(course + 2 * tongue, abs=0.006)
+    for fibre, entry in enumerate(laying_document(plan, 1.0)["fibres"]):
+        length = shapely.LineString(exact_fibre(plan.pad, fibre)).length
+        assert entry["in_pad_mm"] == pytest.approx(length + 2 * tongue, abs=0.006)
         assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
 
 
-def test_a_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(published):
+def test_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
-    document = laying_page.laying_document(plan, 1.0)
+    document = laying_document(plan, 1.0)
     assert [fibre["number"] for fibre in document["fibres"]] == list(range(1, 9))
     assert [fibre["fibre"] for fibre in document["fibres"]][::7] == ["horizontal 1", "vertical 4"]
     depths = [{document["fibres"][n - 1]["depth_mm"] for n in step} for step in document["laying_order"]]
@@ -100,7 +107,7 @@ def test_a_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(p
     assert all(len(row) == len(crossings["columns"]) for row in crossings["table"])
     for *_, first_mm, second_mm, gap in crossings["table"]:
         assert gap == pytest.approx(abs(first_mm - second_mm) - 0.3)
-    table = rows(laying_page.laying_page(whole(plan)), "depths")  # so many crossings are counted by depth
+    table = rows(laying_page(fabrication_document(plan)), "depths")  # more than 24 crossings are counted by depth
     assert sum(int(count) for *_, count in table) == 30
     assert table[0] == ["2.8 and 2 mm", "0.5 mm", "4"]
 
@@ -109,41 +116,41 @@ def test_a_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(p
     ("settings", "gap"),
     [(DEFAULTS, 0.5), (with_settings(fibre={"diameter_mm": 1.0}), -0.2), (with_settings({"levels": "two"}), -0.3)],
 )
-def test_fibres_that_touch_are_told(settings: FabricationSettings, gap: float):
-    crossings = laying_page.laying_document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
+def test_gap_of_touching_fibres_is_not_positive(settings: FabricationSettings, gap: float):
+    crossings = laying_document(Plan(level_pad(1.8, 1.2), settings), 1.0)["crossings"]
     assert crossings["gap_mm"] == pytest.approx(gap)
     assert crossings["same_family"] == 2
 
 
-def test_tracks_over_each_other_are_listed_from_twice_a_right_angled_crossing_on():
+def test_common_tracks_are_listed_from_twice_a_right_angled_crossing_on():
     """Straight ones have 0.8 mm in common; a vertical that crosses at 25 degrees 1.9 mm, at 35 degrees 1.4 mm."""
-    assert laying_page.laying_document(Plan(Morphology.straight(4)), 1.0)["common_tracks"] == []
-    assert "over a deeper one" not in laying_page.laying_page(whole(Plan(Morphology.straight(4))))
+    assert laying_document(Plan(Morphology.straight(4)), 1.0)["common_tracks"] == []
+    assert "over a deeper one" not in laying_page(fabrication_document(Plan(Morphology.straight(4))))
     for angle_deg, listed in ((25, True), (35, False)):
         shift = 0.2 / 3 / math.tan(math.radians(angle_deg))
         vertical = [[1, 0], [1 - shift, 0.9], [1 + shift, 1.1], [1, 2]]
         pad = Morphology(np.array([[[0, 1], [0.5, 1], [1.5, 1], [2, 1]], vertical]), 20.0)
-        document = whole(Plan(pad))
+        document = fabrication_document(Plan(pad))
         assert bool(document["common_tracks"]) == listed
         if listed:
-            (shared,) = document["common_tracks"]
-            assert (shared["shallow"], shared["deep"]) == (2, 1)
-            assert shared["position_mm"] == pytest.approx([0, 0], abs=1e-3)
-            ((tracks, *_, length),) = rows(laying_page.laying_page(document), "tracks")
-            assert (tracks, length) == ("2 over 1", f"{shared['length_mm']:.1f} mm")
+            (track,) = document["common_tracks"]
+            assert (track["shallow"], track["deep"]) == (2, 1)
+            assert track["position_mm"] == pytest.approx([0, 0], abs=1e-3)
+            ((tracks, *_, length),) = rows(laying_page(document), "tracks")
+            assert (tracks, length) == ("2 over 1", f"{track['length_mm']:.1f} mm")
 
 
 @pytest.mark.parametrize("draft_deg", [0.0, 5.0])
-def test_adhesive_fills_the_tracks(draft_deg):
+def test_adhesive_fills_tracks(draft_deg):
     plan = Plan(Morphology.straight(4), with_settings({"ridge_draft_deg": draft_deg}))
-    steps = laying_page.laying_document(plan, 1.0)["adhesive"]["steps_ml"]
+    steps = laying_document(plan, 1.0)["adhesive"]["steps_ml"]
     for step, height in zip(steps, (1.2, 0.4), strict=True):
         width = 0.4 + height * math.tan(math.radians(draft_deg))
         assert 1000 * step == pytest.approx(4 * 60.25 * width * height, abs=0.06)
 
 
 def rows(page: str, head: str) -> list[list[str]]:
-    """The rows of the table whose first column is called `head`."""
+    """Return the rows of the table whose first column has the heading `head`."""
     lines = page.splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith(f"| {head} "))
     body = lines[start + 2 :]
@@ -151,10 +158,10 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in body[:end]]
 
 
-def test_the_page_has_what_to_mix_and_to_cut():
+def test_page_lists_masses_and_cut_lengths():
     plan = Plan(level_pad(1.8, 1.2))
-    document = whole(plan)
-    page = laying_page.laying_page(document)
+    document = fabrication_document(plan)
+    page = laying_page(document)
     ((_, a, b, _),) = rows(page, "EcoFlex 00-20")
     assert a == b == f"{document['silicone']['part_a_g']:.1f} g"
     table = rows(page, "step")
@@ -167,15 +174,15 @@ def test_the_page_has_what_to_mix_and_to_cut():
     assert "4 hours" in page
 
 
-def test_every_fibre_has_its_resistance_by_its_length_and_its_resistor():
+def test_page_lists_resistance_and_fixed_resistor_of_every_fibre():
     plan = Plan(Morphology.random(2, 3, seed=5), with_settings(fibre={"ohm_per_mm": 130.0, "min_bend_radius_mm": 2.5}))
-    document = whole(plan)
-    page = laying_page.laying_page(document)
+    document = fabrication_document(plan)
+    page = laying_page(document)
     table = rows(page.partition("## Wire")[2], "number")
     assert [row[:2] for row in table] == [[str(f["number"]), f["fibre"]] for f in document["fibres"]]
-    for fibre, (*_, shown, fixed) in zip(document["fibres"], table, strict=True):
+    for fibre, (*_, resistance, fixed) in zip(document["fibres"], table, strict=True):
         assert fibre["resistance_ohm"] == pytest.approx(130 * fibre["cut_mm"], abs=130 * 0.0051)
-        assert float(shown.removesuffix(" kOhm")) == pytest.approx(fibre["resistance_ohm"] / 1e3, rel=0.005)
+        assert float(resistance.removesuffix(" kOhm")) == pytest.approx(fibre["resistance_ohm"] / 1e3, rel=0.005)
         assert float(fixed.removesuffix(" kOhm")) * 1e3 == fibre["divider_ohm"]
     assert "carbon-black TPE bears 80 % of stretch at most and bends of no less than 2.5 mm radius." in page
 
@@ -189,24 +196,24 @@ def test_every_fibre_has_its_resistance_by_its_length_and_its_resistor():
         ({"name": "EcoFlex 00-50", "cure_h": 2.5, "pot_life_min": 120}, "2 hours", "2.5 hours"),
     ],
 )
-def test_the_page_follows_the_silicone(silicone, pot_life, cure):
+def test_page_follows_silicone(silicone, pot_life, cure):
     plan = Plan(Morphology.straight(2), with_settings(silicone=silicone))
-    page = laying_page.laying_page(whole(plan))
+    page = laying_page(fabrication_document(plan))
     assert f"The pot life is {pot_life}:" in page
     assert f"Leave it for {cure} at room temperature." in page
     assert rows(page, plan.settings.silicone.material.name)
     assert ("shrinks by 0.1 %" in page) == bool(silicone)
 
 
-def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
-    plain = whole(Plan(Morphology.straight(2)))
-    page = laying_page.laying_page(plain)
+def test_page_omits_absent_parts():
+    plain = fabrication_document(Plan(Morphology.straight(2)))
+    page = laying_page(plain)
     for absent in ("holder", "machine", "the lid", "of resin", "pour through its spout"):
         assert absent not in page
-    section = page.partition("## Which way round\n")[2].partition("\n## ")[0]
-    assert drawings.orientation_sentence((2, 2), "edges") in section
+    section = page.partition("## Orientation\n")[2].partition("\n## ")[0]
+    assert orientation_sentence((2, 2), "edges") in section
     assert "Horizontal fibres are 1 to 2, vertical ones 3 to 4." in section
-    assert f"]({drawings.ORIENTATION_FILE})" in section
+    assert f"]({ORIENTATION_FILE})" in section
     wire = page.partition("## Wire")[2].partition("##")[0]
     assert {fibre["resistance_ohm"] for fibre in plain["fibres"]} == {None}
     assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
@@ -215,44 +222,47 @@ def test_the_page_says_what_is_there_and_nothing_of_what_is_not():
     table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-    page = laying_page.laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "toolpath.svg"]})
+    page = laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "toolpath.svg"]})
     assert "in `laying.gcode` and `laying.script` and drawn in `toolpath.svg`" in page.partition("## Lay\n")[2]
-    page = laying_page.laying_page(whole(Plan(Morphology.straight(4), with_settings({"holder": True}))))
+    page = laying_page(fabrication_document(Plan(Morphology.straight(4), with_settings({"holder": True}))))
     assert "tracks up; fibres 1 and 5 start at the cut corner" in page
 
 
-def test_the_page_tells_what_to_look_at_and_what_the_settings_ask_for():
+def test_page_lists_failed_checks_and_follows_settings():
     findings = (
         {"name": "bed", "status": "pass", "message": "fits", "positions_mm": []},
         {"name": "thin", "status": "warn", "message": "thin walls", "positions_mm": [[1.0, 2.0]]},
         {"name": "wall", "status": "fail", "message": "no wall", "positions_mm": []},
     )
-    lid = with_settings({"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True})
-    page = laying_page.laying_page(whole(Plan(Morphology.straight(2), lid), findings))
+    lid = with_settings(
+        {"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True, "nozzle_mm": 0.05, "layer_mm": 0.05}
+    )
+    page = laying_page(fabrication_document(Plan(Morphology.straight(2), lid), findings))
     assert "1 of 3 checks pass" in page
-    assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 place,")
+    assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 position,")
     assert "pour through its spout" in page
-    assert "of resin" in page
+    for text in ("of resin", "in layers of 0.05 mm", "A ridge is 8 pixels wide", "the floor is 2 mm, 40 layers"):
+        assert text in page
     assert "PrusaSlicer" not in page
     assert page.index("- Slice it") < page.index("- Turn anti-aliasing") < page.index("- Wash and cure")
     assert "read the right way" not in page
-    plain = laying_page.laying_page(whole(Plan(Morphology.straight(2)), findings[:1]))
+    plain = laying_page(fabrication_document(Plan(Morphology.straight(2)), findings[:1]))
     assert "1 of 1 checks pass.\n" in plain
 
 
-def found(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:
-    """The value of a setting as PrusaSlicer has it, and why."""
-    row = next(row for row in laying_page.print_settings_rows(mould, printer) if row[0].startswith(f"{name}: "))
+def print_setting(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:
+    """Return the value of a setting of PrusaSlicer, and its reason."""
+    row = next(row for row in print_settings_rows(mould, printer) if row[0].startswith(f"{name}: "))
     return row[0].removeprefix(f"{name}: "), row[-1]
 
 
-def test_every_slicer_is_told_every_setting_and_why():
-    told = list(laying_page.print_settings_rows(MouldSettings(), PrinterSettings()))
-    assert {len(row) for row in told} == {len(laying_page.PRINT_SETTINGS_HEAD)}
-    assert all(cell for row in told for cell in row)
-    for columns in zip(*told, strict=True):
-        assert len(set(columns)) == len(told)
-    for prusa, orca, cura, _ in told:  # where all give a size, it is the same one, but for its sign
+def test_every_slicer_has_every_setting_and_reason():
+    table = list(print_settings_rows(MouldSettings(), PrinterSettings()))
+    assert {len(row) for row in table} == {len(PRINT_SETTINGS_HEAD)}
+    assert all(cell for row in table for cell in row)
+    for columns in zip(*table, strict=True):
+        assert len(set(columns)) == len(table)
+    for prusa, orca, cura, _ in table:  # sizes agree, but for the sign
         sizes = [re.findall(r"([\d.]+) mm", cell) for cell in (prusa, orca, cura)]
         assert sizes[0] == sizes[1]
         assert sizes[2] in (sizes[0], [])
@@ -262,10 +272,12 @@ def test_every_slicer_is_told_every_setting_and_why():
     ("floor", "layer", "nozzle", "first"),
     [(2, 0.1, 0.4, 0.2), (2, 0.2, 0.4, 0.2), (2, 0.3, 0.4, 0.2), (2.05, 0.1, 0.4, 0.15), (0.4, 0.2, 1, 0.4)],
 )
-def test_whole_layers_are_left_of_the_floor(floor, layer, nozzle, first):
+def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
     printer = PrinterSettings(layer_mm=layer, nozzle_mm=nozzle)
-    assert found("First layer height", MouldSettings(floor_mm=floor), printer)[0] == f"{first:g} mm"
-    perimeters = [found("Perimeters", MouldSettings(wall_mm=wall), PrinterSettings())[0] for wall in (0.8, 2.0, 20.0)]
+    assert print_setting("First layer height", MouldSettings(floor_mm=floor), printer)[0] == f"{first:g} mm"
+    perimeters = [
+        print_setting("Perimeters", MouldSettings(wall_mm=wall), PrinterSettings())[0] for wall in (0.8, 2.0, 20.0)
+    ]
     assert perimeters == ["2", "3", "4"]  # walls are solid where they are thin
     assert (floor - first) / layer == pytest.approx(round((floor - first) / layer), abs=1e-9)
 
@@ -279,15 +291,6 @@ def test_whole_layers_are_left_of_the_floor(floor, layer, nozzle, first):
         (0.4, 0.6, "0.51 mm", "0.4 mm wide is narrower than the nozzle: see the checks"),
     ],
 )
-def test_a_ridge_is_whole_lines(ridge, nozzle, width, why):
+def test_ridge_is_whole_lines(ridge, nozzle, width, why):
     mould, printer = MouldSettings(ridge_width_mm=ridge), PrinterSettings(nozzle_mm=nozzle)
-    assert found("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
-
-
-def test_resin_is_told_in_pixels_and_layers():
-    text = "\n".join(
-        laying_page.resin_settings_lines(MouldSettings(), PrinterSettings(resin=True, nozzle_mm=0.05, layer_mm=0.05))
-    )
-    assert "in layers of 0.05 mm" in text
-    assert "A ridge is 8 pixels wide" in text
-    assert "the floor is 2 mm, 40 layers" in text
+    assert print_setting("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")

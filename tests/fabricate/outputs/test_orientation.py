@@ -1,4 +1,4 @@
-"""Which way round: the drawing against the frame by which an arm presses, and the sentence on every page."""
+"""Orientation: the drawing against the frame of the rig's presses, and the sentence on every page."""
 
 import re
 from pathlib import Path
@@ -14,19 +14,13 @@ from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 
-SVG, XLINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}"
-
-
+SVG = "{http://www.w3.org/2000/svg}"
 DOCS = Path(__file__).parents[3] / "docs"
-
-
-LYING = {"mould": (False, 0.0), "turned": (True, 0.0), "used": (True, TURN_DEG)}
-
-
+POSES = {"mould": (False, 0.0), "turned": (True, 0.0), "used": (True, TURN_DEG)}
 PADS = [Morphology.straight(1), Morphology.random(3, 2, seed=4), Morphology.straight(12, pitch_mm=6.0)]
 
 
-def shown(pad: Morphology) -> ElementTree.Element:
+def draw(pad: Morphology) -> ElementTree.Element:
     return ElementTree.fromstring(orientation_svg(Plan(pad)))
 
 
@@ -36,53 +30,53 @@ def panel(root: ElementTree.Element, name: str) -> ElementTree.Element:
 
 
 def matrix(transform: str) -> tuple[np.ndarray, np.ndarray]:
-    """What an SVG transform of the kind used here does: points (n, 2) -> points @ linear + shift."""
+    """Return the linear part and the shift of an SVG transform: points (n, 2) -> points @ linear + shift."""
     x, y, turn, across, down = map(float, re.findall(r"-?[\d.]+", transform))
     assert re.sub(r"[-\d. ]", "", transform) == "translate()rotate()scale()"
     cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
     return np.diag([across, down]) @ np.array([[cos, sin], [-sin, cos]]), np.array([x, y])
 
 
-@pytest.mark.parametrize("name", LYING)
+@pytest.mark.parametrize("name", POSES)
 @pytest.mark.parametrize("pad", PADS)
-def test_every_panel_has_the_pad_as_it_lies_under_an_arm(pad, name):
-    """The fibres, the axes and each number beside its start are where `Frame`, by which an arm presses, has them."""
-    plan, (mirrored, turn_deg) = Plan(pad), LYING[name]
-    group = panel(shown(pad), name)
+def test_panels_match_frame_of_rig(pad, name):
+    """Fibres, axes and numbers are drawn where `Frame`, which poses the rig's presses, has them."""
+    plan, (mirrored, turn_deg) = Plan(pad), POSES[name]
+    group = panel(draw(pad), name)
     (use,) = group.findall(f"{SVG}use")
     linear, shift = matrix(use.get("transform", ""))
     rig = RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, pad_angle_deg=turn_deg, mirrored=mirrored)
     frame, scale = Frame.of(rig), np.sqrt(abs(np.linalg.det(linear)))
     starts = np.array([line.coords[0] for line in plan.lines])
-    lying = np.array([frame.pose(start, 0.0)[:2] for start in starts])
+    expected = np.array([frame.pose(start, 0.0)[:2] for start in starts])
     drawn = starts * (1, -1) @ linear + shift
-    np.testing.assert_allclose((drawn - shift) * (1, -1) / scale, lying, atol=0.02)
+    np.testing.assert_allclose((drawn - shift) * (1, -1) / scale, expected, atol=0.02)
     texts = [
         (text.text, np.array([float(text.get("x", "")), float(text.get("y", ""))])) for text in group.iter(f"{SVG}text")
     ]
-    numbers = [place for text, place in texts if text and text.isdigit()]
+    numbers = [position for text, position in texts if text and text.isdigit()]
     assert [text for text, _ in texts if text and text.isdigit()] == [str(n + 1) for n in range(len(starts))]
-    for fibre, place in enumerate(numbers):
-        assert int(np.argmin(np.hypot(*(drawn - place).T))) == fibre
-        assert np.hypot(*(place - shift)) > np.hypot(*(drawn[fibre] - shift))
-    for axis, way in zip("xy", np.eye(2), strict=True):
-        (named,) = (place for text, place in texts if text == axis)
-        to = np.array(frame.pose(way, 0.0)[:2]) * (1, -1)
-        np.testing.assert_allclose((named - shift) / np.hypot(*(named - shift)), to, atol=0.01)
+    for fibre, position in enumerate(numbers):
+        assert int(np.argmin(np.hypot(*(drawn - position).T))) == fibre
+        assert np.hypot(*(position - shift)) > np.hypot(*(drawn[fibre] - shift))
+    for axis, unit in zip("xy", np.eye(2), strict=True):
+        (label,) = (position for text, position in texts if text == axis)
+        to = np.array(frame.pose(unit, 0.0)[:2]) * (1, -1)
+        np.testing.assert_allclose((label - shift) / np.hypot(*(label - shift)), to, atol=0.01)
 
 
-def test_from_the_near_side_the_vertical_fibres_count_as_from_above():
-    root = shown(Morphology.straight(4))
+def test_side_views_number_fibres_as_panels():
+    root = draw(Morphology.straight(4))
     by_panel: dict[int, list[tuple[float, str]]] = {0: [], 1: [], 2: []}
     for text in panel(root, "sides").iter(f"{SVG}text"):
         x = float(text.get("x", ""))
         by_panel[int(x // 64)].append((x, text.text or ""))
-    rows = ["".join(name for _, name in sorted(found)) for found in by_panel.values()]
+    rows = ["".join(name for _, name in sorted(numbers)) for numbers in by_panel.values()]
     assert rows == ["5678", "8765", "8765"]
 
 
 @pytest.mark.parametrize("pad", PADS)
-def test_the_drawing_is_small_and_says_the_sentence(pad):
+def test_orientation_svg_is_small_and_has_the_sentence(pad):
     text = orientation_svg(Plan(pad))
     assert len(text) < 40_000
     root = ElementTree.fromstring(text)
@@ -91,18 +85,18 @@ def test_the_drawing_is_small_and_says_the_sentence(pad):
         (4, 4), "edges"
     )
     width, height = map(float, root.get("viewBox", "").split()[2:])
-    for one in root.iter(f"{SVG}text"):
-        assert 0 < float(one.get("x", "")) < width
-        assert 0 < float(one.get("y", "")) < height
+    for label in root.iter(f"{SVG}text"):
+        assert 0 < float(label.get("x", "")) < width
+        assert 0 < float(label.get("y", "")) < height
 
 
-def test_without_numbers_none_are_drawn_as_cast():
+def test_orientation_svg_omits_absent_numbers():
     plan = Plan(Morphology.straight(2), with_settings({"number_mm": 0.0}))
     assert 'class="cast"' not in orientation_svg(plan)
     assert orientation_svg(Plan(Morphology.straight(2))).count('class="cast"') == 4
 
 
-def test_the_bench_page_says_the_same():
+def test_bench_page_has_orientation_sentence():
     page = " ".join((DOCS / "bench.md").read_text(encoding="utf-8").split())
     assert page.count(orientation_sentence((4, 4), "edges")) == 1
     assert page.count("with its tracks up") >= 2  # under an arm, in the holder

@@ -30,14 +30,14 @@ SMALL = 150_000
 """Bytes that a picture may have: it goes into git."""
 
 
-def finding(status, *places: tuple[float, float], name: str = "wall") -> Finding:
-    return Finding(name, status, 0.0, 1.0, "planted", places)
+def finding(status, *positions: tuple[float, float], name: str = "wall") -> Finding:
+    return Finding(name, status, 0.0, 1.0, "planted", positions)
 
 
-APART = [(-6.0, 3.0), (0.0, 4.0), (7.0, 3.0)]
-UNMARKED = finding("pass", *APART), finding("fail")
+POSITIONS = [(-6.0, 3.0), (0.0, 4.0), (7.0, 3.0)]
+UNMARKED = finding("pass", *POSITIONS), finding("fail")
 MARKED = finding("fail", (0, 0)), finding("warn", (6, -4), name="bend")
-EXCHANGED = finding("fail", (6, -4)), finding("warn", (0, 0), name="bend")
+SWAPPED = finding("fail", (6, -4)), finding("warn", (0, 0), name="bend")
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -46,14 +46,14 @@ def pixels(path: Path) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
-def where(picture: np.ndarray, colour: str) -> np.ndarray:
-    """Whether each pixel has this colour, as nearly as a palette of 256 gives it."""
+def has_colour(picture: np.ndarray, colour: str) -> np.ndarray:
+    """Return which pixels have this colour, as nearly as a palette of 256 gives it."""
     return np.abs(picture.astype(int) - list(bytes.fromhex(colour[1:]))).max(axis=2) <= 10
 
 
 @pytest.fixture(scope="module")
 def mould_picture(tmp_path_factory) -> Callable[..., np.ndarray]:
-    """What PLAN's mould looks like with findings; each picture is drawn once."""
+    """Draw PLAN's mould with findings, each picture once."""
     path = tmp_path_factory.mktemp("pictures") / "mould.png"
 
     @cache
@@ -77,101 +77,101 @@ def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
         {"border_mm": 2.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 8.0, "pins": True},
     ],
 )
-def test_the_drawn_mould_is_the_mould(mould):
+def test_mould_relief_matches_mesh(mould):
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould))
-    drawn, shown = mould_relief(plan, 300, 300)
+    drawn, classes = mould_relief(plan, 300, 300)
     meshed, _ = mesh_relief(*mesh_of(plan), 300)
     assert drawn.shape == meshed.shape
-    off = np.abs(meshed - plan.settings.mould.floor_mm - drawn)
-    assert (off > 0.01).mean() < 2e-4  # pixels whose middle lies on an edge fall on either side
-    kinds = {FLOOR, WALL, *(RIDGE + level for level in range(3))}
-    assert set(np.unique(shown)) == kinds | ({NUMBER} if plan.settings.mould.number_mm else set())
-    for level, height in enumerate(plan.heights_mm):
-        assert drawn[shown == RIDGE + level].max() == pytest.approx(height)
+    error = np.abs(meshed - plan.settings.mould.floor_mm - drawn)
+    assert (error > 0.01).mean() < 2e-4  # pixels whose middle lies on an edge fall on either side
+    kinds = {FLOOR, WALL, *(RIDGE + layer for layer in range(3))}
+    assert set(np.unique(classes)) == kinds | ({NUMBER} if plan.settings.mould.number_mm else set())
+    for layer, height in enumerate(plan.heights_mm):
+        assert drawn[classes == RIDGE + layer].max() == pytest.approx(height)
 
 
-def test_heights_of_slopes_and_of_what_lies_over_them():
+def test_mesh_relief_of_slope_and_plate_above():
     """A roof that rises along x, from 0 to 10, under a small plate at 7 in its upper left corner."""
     vertices = np.array(
         [[0, 0, 0], [10, 0, 10], [10, 10, 10], [0, 10, 0], [1, 7, 7], [3, 7, 7], [3, 9, 7], [1, 9, 7.0]]
     )
     triangles = np.array([[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 3, 2]])
-    heights, extent = mesh_relief(vertices, triangles, 100)
-    assert extent == pytest.approx((0, 10, 0, 10))
+    heights, bounds = mesh_relief(vertices, triangles, 100)
+    assert bounds == pytest.approx((0, 0, 10, 10))
     x, y = np.meshgrid(np.arange(0.05, 10, 0.1), np.arange(9.95, 0, -0.1))
     plate = (x > 1) & (x < 3) & (y > 7) & (y < 9)
     assert heights == pytest.approx(np.where(plate, 7, x))
 
 
-def test_heights_of_slivers_upright_faces_and_nothing():
+def test_mesh_relief_of_slivers_upright_faces_and_gaps():
     vertices = np.array([[0, 0, 1], [20, 0, 1], [20, 10, 3], [0, 0, 9], [20, 1e-9, 9.0]])
     triangles = np.array([[0, 1, 2], [0, 1, 3], [0, 3, 4], [0, 0, 0]])
-    heights, extent = mesh_relief(vertices, triangles, 40)
+    heights, bounds = mesh_relief(vertices, triangles, 40)
     assert heights.shape == (20, 40)
-    assert extent == pytest.approx((0, 20, 0, 10))
+    assert bounds == pytest.approx((0, 0, 20, 10))
     assert heights[-1, -1] == pytest.approx(1.05)
     assert heights[0, 0] == -np.inf
     assert heights.max() <= 3
 
 
-def test_families_and_levels_have_colours_of_their_own(mould_picture):
+def test_layers_have_different_colours(mould_picture):
     picture = mould_picture(*UNMARKED)
     for layer in fibre_layers(PLAN):
-        assert where(picture, layer.colour).mean() > 1e-3
+        assert has_colour(picture, layer.colour).mean() > 1e-3
     assert {HORIZONTAL, VERTICAL} < {layer.colour for layer in fibre_layers(PLAN)}
-    assert where(picture, PAPER).mean() > 0.3
-    assert where(picture, FAINT).mean() > 0.03
+    assert has_colour(picture, PAPER).mean() > 0.3
+    assert has_colour(picture, FAINT).mean() > 0.03
 
 
-def test_marks_are_where_the_findings_are(mould_picture):
+def test_marks_are_at_positions_of_findings(mould_picture):
     scale = 900 / (2 * PLAN.tray.bounds[2])  # pixels a mm
-    for colour, ways in ((ALARM, 1), (CARE, -1)):  # what warns is where the other picture has what fails
-        first, second = (where(mould_picture(*marks), colour) for marks in (MARKED, EXCHANGED)[::ways])
+    for colour, order in ((ALARM, 1), (CARE, -1)):  # the swapped picture warns where this one fails
+        first, second = (has_colour(mould_picture(*marks), colour) for marks in (MARKED, SWAPPED)[::order])
         middles = [np.argwhere(one & ~other).mean(axis=0) for one, other in ((first, second), (second, first))]
         assert middles[1] - middles[0] == pytest.approx(np.array([4, 6]) * scale, abs=0.7)
 
 
-def test_every_place_that_fails_or_warns_is_marked_and_no_other(mould_picture):
+def test_only_failures_and_warnings_are_marked(mould_picture):
     def marked(*findings: Finding) -> tuple[int, int]:
         picture = mould_picture(*findings)
-        return int(where(picture, ALARM).sum()), int(where(picture, CARE).sum())
+        return int(has_colour(picture, ALARM).sum()), int(has_colour(picture, CARE).sum())
 
     assert marked(*UNMARKED) == (0, 0)
-    one, three = (marked(finding("fail", *APART[:count]))[0] for count in (1, 3))
+    one, three = (marked(finding("fail", *POSITIONS[:count]))[0] for count in (1, 3))
     assert three == pytest.approx(2 * one, rel=0.15)  # one more is in the legend
     assert all(count > 0 for count in marked(*MARKED))
 
 
 @pytest.mark.slow
-def test_checks_have_marks_of_their_own(mould_picture):
+def test_checks_have_different_marks(mould_picture):
     place = (0.0, 4.0)
     both = [finding("fail", place), finding("fail", place, name="bend")]
     same = [finding("fail", place, place), finding("fail", name="bend")]
-    assert where(mould_picture(*both), ALARM).sum() > 1.3 * where(mould_picture(*same), ALARM).sum()
+    assert has_colour(mould_picture(*both), ALARM).sum() > 1.3 * has_colour(mould_picture(*same), ALARM).sum()
 
 
-def test_tracks_show_fibres_and_crossings_of_one_family(tmp_path):
+def test_tracks_have_fibres_and_crossings_of_one_family(tmp_path):
     for name, plan in (("crossed", PLAN), ("level", Plan(level_pad(1.0, 2.0)))):
         draw_tracks(plan, tmp_path / name)
         picture = pixels(tmp_path / name)
         for layer in fibre_layers(plan):
-            assert where(picture, layer.colour).mean() > 1e-3
+            assert has_colour(picture, layer.colour).mean() > 1e-3
     drawn = slice(80, 920), slice(100, 940)  # without title, axes and legend, whose ink it is as well
-    assert where(pixels(tmp_path / "crossed")[drawn], INK).sum() > 8
-    assert not where(pixels(tmp_path / "level")[drawn], INK).any()
+    assert has_colour(pixels(tmp_path / "crossed")[drawn], INK).sum() > 8
+    assert not has_colour(pixels(tmp_path / "level")[drawn], INK).any()
 
 
-def test_any_mesh_is_drawn_with_its_findings(tmp_path):
+def test_draw_findings_marks_any_mesh(tmp_path):
     vertices = np.array([[100, 50, 3], [130, 50, 3], [130, 60, 3], [100, 60, 5.0]])
     path = tmp_path / "mesh.tmp"
     counts = []
     for place in ((110.0, 55.0), (120.0, 55.0)):
         draw_findings(vertices, [[0, 1, 2], [0, 2, 3]], [finding("fail", place)], path)
-        counts.append(where(pixels(path), ALARM))
+        counts.append(has_colour(pixels(path), ALARM))
     middles = [np.argwhere(counts[i] & ~counts[1 - i]).mean(axis=0) for i in (0, 1)]
     assert middles[1] - middles[0] == pytest.approx([0, 300], abs=0.7)
-    draw_findings(vertices[:3] * (1, 0, 1), [[0, 1, 2]], [], path)  # nothing of it is seen from above
-    assert not where(pixels(path), ALARM).any()
+    draw_findings(vertices[:3] * (1, 0, 1), [[0, 1, 2]], [], path)  # invisible from above
+    assert not has_colour(pixels(path), ALARM).any()
 
 
 @pytest.mark.slow
@@ -184,15 +184,15 @@ def test_pictures_are_small(tmp_path, published):
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", ["mesh", *(pytest.param(k, marks=pytest.mark.slow) for k in ("mould", "tracks"))])
-def test_pictures_are_the_same_each_time(tmp_path, kind):
-    def draw(path: Path) -> bytes:
-        if kind == "mould":
-            draw_mould(PLAN, MARKED, path)
-        elif kind == "tracks":
-            draw_tracks(PLAN, path)
-        else:
-            draw_findings(np.eye(3), [[0, 1, 2]], MARKED, path)
-        return path.read_bytes()
+DRAWINGS = {
+    "mesh": lambda path: draw_findings(np.eye(3), [[0, 1, 2]], MARKED, path),
+    "mould": lambda path: draw_mould(PLAN, MARKED, path),
+    "tracks": lambda path: draw_tracks(PLAN, path),
+}
 
-    assert draw(tmp_path / "first") == draw(tmp_path / "second")
+
+@pytest.mark.parametrize("name", ["mesh", *(pytest.param(n, marks=pytest.mark.slow) for n in ("mould", "tracks"))])
+def test_pictures_are_reproducible(tmp_path, name):
+    for file in ("first", "second"):
+        DRAWINGS[name](tmp_path / file)
+    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from padforge.fabricate.outputs.report import Packed, packed
+from padforge.fabricate.outputs import report
+from padforge.fabricate.outputs.report import PackedMesh, pack_mesh
 from padforge.report import write_report
 from tests.helpers.chromium import SOFTWARE_GL, Chromium
 
@@ -34,32 +35,34 @@ def test_mesh_in_report_is_the_mould(made: Path, page: Path) -> None:
     assert len(vertices) < len(mould.vertices) / 4
 
 
-def test_large_mesh_uses_wide_indices(tmp_path: Path) -> None:
+def test_large_mesh_uses_wide_indices(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(report, "MAX_BYTES", 10**8)
     sphere = trimesh.creation.uv_sphere(radius=30, count=[257, 257])
     sphere.export(tmp_path / "mould.stl")
-    mesh = packed(tmp_path / "mould.stl", most_bytes=10**8)
+    mesh = pack_mesh(tmp_path / "mould.stl")
     assert mesh
     assert mesh.triangles.max() + 1 == len(mesh.vertices) > 65536
     assert volume(mesh) == pytest.approx(sphere.volume, rel=1e-4)
 
 
 def test_oversized_mesh_is_simplified_or_omitted(made: Path, pad: Path, monkeypatch) -> None:
-    whole = packed(made / "mould.stl")
-    assert whole
-    assert whole.tolerance_mm == 0
-    coarse = packed(made / "mould.stl", most_bytes=whole.nbytes * 4 // 5)
+    mould = pack_mesh(made / "mould.stl")
+    assert mould
+    assert mould.tolerance_mm == 0
+    monkeypatch.setattr(report, "MAX_BYTES", mould.nbytes * 4 // 5)
+    coarse = pack_mesh(made / "mould.stl")
     assert coarse
     assert coarse.tolerance_mm > 0
-    assert coarse.nbytes <= whole.nbytes * 4 // 5
-    assert volume(coarse) == pytest.approx(volume(whole), rel=0.01)
-    assert packed(made / "mould.stl", most_bytes=1000) is None
-    monkeypatch.setattr("padforge.fabricate.outputs.report.packed", lambda path: None)
+    assert coarse.nbytes <= report.MAX_BYTES
+    assert volume(coarse) == pytest.approx(volume(mould), rel=0.01)
+    monkeypatch.setattr(report, "MAX_BYTES", 1000)
+    assert pack_mesh(made / "mould.stl") is None
     text = write_report(pad).read_text()
     assert "mould.stl is too large to be turned" in text
     assert "<canvas" not in text
 
 
-def volume(mesh: Packed) -> float:
+def volume(mesh: PackedMesh) -> float:
     vertices = mesh.low_mm + mesh.vertices / 65535 * mesh.size_mm
     return float(trimesh.Trimesh(vertices, mesh.triangles, process=False).volume)
 
