@@ -123,17 +123,17 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     padforge fabricate check out/pad/morphology.json --picture findings.png
     """
     from padforge.design.common.files import atomic_file
-    from padforge.fabricate.checks.plan_checks import inspect_file
+    from padforge.fabricate.checks.plan_checks import check_file
     from padforge.fabricate.outputs.pictures import draw_findings
 
     from .settings import FabricationSettings
 
-    vertices, triangles, findings = inspect_file(mesh_or_morphology, FabricationSettings.from_spec(load_spec(spec)))
+    vertices, triangles, findings = check_file(mesh_or_morphology, FabricationSettings.from_spec(load_spec(spec)))
     if picture is not None:
         with atomic_file(picture) as temporary:
             draw_findings(vertices, triangles, findings, temporary)
     passed = all(finding.status != "fail" for finding in findings)
-    documents = [finding.document() for finding in findings]
+    documents = [finding.to_dict() for finding in findings]
     show_result({"passed": passed, "findings": documents}, list(map(_line, documents)), as_json)
     ctx.exit(0 if passed else 1)
 

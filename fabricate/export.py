@@ -29,8 +29,9 @@ from padforge.design.common.files import (
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding, check_result
-from padforge.fabricate.checks.mesh_checks import SOUND, sound
-from padforge.fabricate.checks.plan_checks import inspect
+from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
+from padforge.fabricate.checks.plan_checks import check_plan
+from padforge.fabricate.checks.surface import TriangleMesh
 from padforge.fabricate.fibre_placement.gcode import gcode
 from padforge.fabricate.fibre_placement.toolpath import Step, check_toolpath, plan_toolpath
 from padforge.fabricate.fibre_placement.urscript import urscript
@@ -240,13 +241,17 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
     Raises:
         InputError: a body is no closed solid.
     """
-    findings = inspect(plan, bodies[0].vertices, bodies[0].triangles)
-    for body in bodies:
+    mould, *others = bodies
+    by_body = [check_triangles(mould.vertices, mould.triangles, plan.settings.printer, genus=0, has_plan=True)]
+    for body in others:
         genus = lid_holes(plan) if body.name == "lid" else 0
-        results = findings if body is bodies[0] else sound(body.vertices, body.triangles, genus=genus)
-        if broken := [result.message for result in results if result.name in SOUND and result.status == "fail"]:
+        by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus))
+    for body, findings in zip(bodies, by_body, strict=True):
+        if broken := [
+            finding.message for finding in findings if finding.name in SOLID_CHECKS and finding.status == "fail"
+        ]:
             raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
-    return findings
+    return by_body[0] + check_plan(plan)
 
 
 def _choose_writers(fabrication: Fabrication, formats: Sequence[ExportFormat]) -> dict[str, Callable[[Path], None]]:
@@ -276,7 +281,7 @@ def _compile_document(fabrication: Fabrication, files: list[str], origin: Mappin
         "sizes": sizes(plan),
         "mould_volume_ml": round(mould.mesh.volume() / 1000, 4),
         "silicone_volume_ml": laying["silicone"]["volume_ml"],
-        "findings": [finding.document() for finding in fabrication.findings],
+        "findings": [finding.to_dict() for finding in fabrication.findings],
         **laying,
         **({"frame": bed_frame(plan)} if settings.mould.holder else {}),
         "settings": {

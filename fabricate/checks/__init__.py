@@ -1,4 +1,4 @@
-"""What a check found: one finding each, with what was measured, what is allowed and where."""
+"""Findings of the checks: name, status, measured value, limit, message and positions."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -6,20 +6,20 @@ from typing import Any, Literal
 
 Status = Literal["pass", "warn", "fail"]
 Number = float | list[float]
-Place = tuple[float, float]
+Position = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The outcome of one check.
+    """Result of one check.
 
     Attributes:
-        name: of the check.
+        name: name of the check.
         status: "pass", "warn" (it works, with care) or "fail".
-        measured, limit: in the unit the message says; mm unless it says otherwise.
-        message: one sentence for people.
-        positions_mm: where, in mm from the pad's centre (or in the frame of a mesh file); empty where a place means
-            nothing.
+        measured: measured value, in the unit of the message; mm unless it names another.
+        limit: limit of the measured value, in the same unit.
+        message: one sentence for the user.
+        positions_mm: (x, y) from the pad's centre, or in the frame of a mesh file; empty where none applies.
     """
 
     name: str
@@ -27,25 +27,31 @@ class Finding:
     measured: Number
     limit: Number
     message: str
-    positions_mm: tuple[Place, ...] = ()
+    positions_mm: tuple[Position, ...] = ()
 
-    def document(self) -> dict[str, Any]:
-        """The finding as JSON, places rounded to the micrometre."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as JSON, positions rounded to the micrometre."""
         return asdict(self) | {"positions_mm": [[round(x, 3), round(y, 3)] for x, y in self.positions_mm]}
 
 
-def grade(measured: float, limit: float) -> Status:
-    """Pass from `limit` up, warn below it, fail where nothing is left."""
-    return "pass" if measured >= limit - 1e-9 else "warn" if measured > 0 else "fail"
-
-
 def check_result(
-    name: str, passed: bool, measured: Number, limit: Number, message: str, places: Iterable[Any] = ()
+    name: str, status: Status | bool, measured: Number, limit: Number, message: str, positions: Iterable[Any] = ()
 ) -> Finding:
-    """A finding that passes or fails."""
-    return Finding(name, "pass" if passed else "fail", measured, limit, message, as_places(places))
+    """Build a finding.
+
+    Args:
+        name: name of the check.
+        status: its status, or whether it passes.
+        measured: measured value.
+        limit: limit of the measured value.
+        message: one sentence for the user.
+        positions: coordinates of any kind; shape (n, 2), mm.
+    """
+    if not isinstance(status, str):
+        status = "pass" if status else "fail"
+    return Finding(name, status, measured, limit, message, tuple((float(x), float(y)) for x, y in positions))
 
 
-def as_places(places: Iterable[Any]) -> tuple[Place, ...]:
-    """Pairs of coordinates of any kind, mm, as plain floats."""
-    return tuple((float(x), float(y)) for x, y in places)
+def grade(measured: float, limit: float) -> Status:
+    """Grade a thickness: pass from `limit` up, warn below it, fail where nothing remains."""
+    return "pass" if measured >= limit - 1e-9 else "warn" if measured > 0 else "fail"

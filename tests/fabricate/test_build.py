@@ -324,11 +324,11 @@ def test_provenance_is_of_the_input_at_the_start(tmp_path, monkeypatch):
     """A search that writes into the folder of the pad meanwhile must not make it one of the new fibres."""
     pad = tmp_path / "morphology.json"
     PAD.save(pad)
-    read, inspect = sha256(pad), export.inspect
+    read, check = sha256(pad), export.check_plan
 
     def meanwhile(*arguments):
         Morphology.straight(2).save(pad)
-        return inspect(*arguments)
+        return check(*arguments)
 
-    monkeypatch.setattr(export, "inspect", meanwhile)
+    monkeypatch.setattr(export, "check_plan", meanwhile)
     assert build(PAD, tmp_path, [], inputs=[pad])["provenance"]["inputs"] == {"morphology.json": read}

@@ -8,8 +8,9 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology, assemble_knots
-from padforge.fabricate.checks.mesh_checks import sound
+from padforge.fabricate.checks.mesh_checks import check_solid
 from padforge.fabricate.checks.plan_checks import check
+from padforge.fabricate.checks.surface import TriangleMesh
 from padforge.fabricate.mesh import build_mesh, mesh_arrays
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import Plan
@@ -69,7 +70,9 @@ def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
     except InputError as error:
         require_one_line(error)
         return
-    broken = [finding.message for finding in sound(vertices, triangles) if finding.status == "fail"]
+    broken = [
+        finding.message for finding in check_solid(TriangleMesh.weld(vertices, triangles)) if finding.status == "fail"
+    ]
     assert not broken
     size = np.ptp(vertices.astype(float), axis=0)
     assert min(size[:2]) > pad.layout.size_mm[0] + 2 * plan.settings.mould.border_mm
@@ -91,7 +94,7 @@ def test_check_judges_every_plan_in_plain_words(key):
         except InputError as error:
             require_one_line(error)
             continue
-        json.dumps([finding.document() for finding in findings], allow_nan=False)
+        json.dumps([finding.to_dict() for finding in findings], allow_nan=False)
 
 
 @pytest.mark.parametrize("key", ENDS)

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.checks.mesh_checks import check_mesh, inspect_mesh, sound
+from padforge.fabricate.checks.mesh_checks import check_mesh, check_solid, check_triangles
+from padforge.fabricate.checks.surface import TriangleMesh
 from padforge.fabricate.mesh import read_mesh, write_3mf, write_stl
 
 BOX = trimesh.creation.box((10, 20, 5))
@@ -32,7 +33,7 @@ def written(path: Path, vertices: np.ndarray = VERTICES, triangles: np.ndarray =
 
 def require_plain(findings: list[Finding]) -> None:
     """See that JSON can hold what is said, and that each says it in one line."""
-    json.dumps([finding.document() for finding in findings], allow_nan=False)
+    json.dumps([finding.to_dict() for finding in findings], allow_nan=False)
     assert all(len(finding.message.splitlines()) == 1 for finding in findings)
 
 
@@ -164,7 +165,7 @@ def test_damaged_files_are_checked_or_refused_in_one_line(tmp_path_factory, suff
     except InputError as error:
         require_line(error, path.name)
         return
-    require_plain(inspect_mesh(vertices, triangles))
+    require_plain(check_triangles(vertices, triangles))
 
 
 RNG = np.random.default_rng(0)
@@ -187,10 +188,10 @@ SOUND = {
 
 
 @pytest.mark.parametrize("name", [*BROKEN, *SOUND])
-def test_inspect_mesh_detects_broken_meshes_of_any_size(name):
+def test_check_triangles_detects_broken_meshes_of_any_size(name):
     vertices, triangles = (BROKEN | SOUND)[name]
     for size in (1e-9, 1.0, 1e4):
-        found = inspect_mesh(vertices * size, triangles)
+        found = check_triangles(vertices * size, triangles)
         require_plain(found)
         statuses = {finding.name: finding.status for finding in found}
         if name in BROKEN:
@@ -200,17 +201,18 @@ def test_inspect_mesh_detects_broken_meshes_of_any_size(name):
 
 
 @pytest.mark.parametrize("change", [np.nan, np.inf, 1e300])
-def test_inspect_mesh_refuses_invalid_vertices_and_triangles(change):
+def test_check_triangles_refuses_invalid_vertices_and_triangles(change):
     changed = np.array(VERTICES)
     changed[0] = change
     for vertices, triangles in ((changed, TRIANGLES), (VERTICES, TRIANGLES + 3), (VERTICES, TRIANGLES - 1)):
         with pytest.raises(InputError) as refusal:
-            inspect_mesh(vertices, triangles)
+            check_triangles(vertices, triangles)
         require_line(refusal.value)
 
 
-def test_sound_stops_after_the_first_self_intersections():
-    found = sound(np.random.default_rng(0).normal(size=(30_000, 3)), np.arange(30_000).reshape(-1, 3))
+def test_a_heap_of_triangles_is_told_from_its_first_pairs():
+    corners = np.random.default_rng(0).normal(size=(30_000, 3))
+    found = check_solid(TriangleMesh(corners, np.arange(30_000).reshape(-1, 3)))
     failed = {finding.name: finding for finding in found if finding.status == "fail"}
     assert {"watertight", "self_intersection"} <= failed.keys()
     assert failed["self_intersection"].message.endswith("pairs of triangles and more cut through each other")

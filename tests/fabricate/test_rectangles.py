@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
-from padforge.fabricate.checks.plan_checks import check_plan, meshed
+from padforge.fabricate.checks.plan_checks import check_mould, check_plan
 from padforge.fabricate.export import build
 from padforge.fabricate.fibre_placement.toolpath import mirror_x, plan_toolpath
 from padforge.fabricate.leads import lead_spacing
@@ -47,7 +47,7 @@ def test_tray_has_the_width_and_height_of_the_pad():
 
 def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
     with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
-    found = {finding.name: finding for finding in meshed(with_hole)[-1]}
+    found = {finding.name: finding for finding in check_mould(with_hole)[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
     more = mould_mesh(with_hole).volume() - mould_mesh(without).volume()
     assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
@@ -90,7 +90,7 @@ def test_lid_bores_are_clear_of_pillars():
 @pytest.mark.parametrize("leads", ["edges", "one side"])
 def test_mould_of_few_fibres_is_sound(fibres, leads):
     pad = Morphology.straight(fibres, (9.0, 12.0))
-    found = {finding.name: finding for finding in meshed(Plan(pad, settings(pad, leads=leads)))[-1]}
+    found = {finding.name: finding for finding in check_mould(Plan(pad, settings(pad, leads=leads)))[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
 
 

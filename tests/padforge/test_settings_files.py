@@ -144,4 +144,4 @@ def test_rules_and_moulds_handle_extreme_settings(spec: Spec, grid: int, knots: 
     except InputError as error:
         one_line(error)
         return
-    json.dumps([finding.document() for finding in findings], allow_nan=False)
+    json.dumps([finding.to_dict() for finding in findings], allow_nan=False)

@@ -65,7 +65,7 @@ def test_what_is_drawn_as_an_ellipse_has_walls_of_splines():
     half, length = 24 * math.pi / 2, 32 * float(ellipe(1 - 9 / 64))
     assert solid.volume == pytest.approx(half + 200 * 2, rel=1e-3)
     assert solid.area == pytest.approx(2 * (half + 200) + length / 2 + 2 * 60 - 6, rel=1e-3)
-    assert kinds(solid)["BSPLINE"] >= 2
+    assert kinds(solid)["EXTRUSION"] >= 2
 
 
 def test_steps_share_their_edges():

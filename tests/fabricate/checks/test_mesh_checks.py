@@ -1,4 +1,4 @@
-"""Meshes with a known fault, and what is known of a mesh and of its slices."""
+"""Solid checks and leaks on meshes with a known fault, and widths of areas."""
 
 import numpy as np
 import pytest
@@ -6,50 +6,54 @@ import shapely
 import trimesh
 from manifold3d import Manifold, OpType
 
-from padforge.fabricate.checks import surface
-from padforge.fabricate.checks.mesh_checks import SOUND, inspect_mesh, sound
-from padforge.fabricate.checks.surface import Surface
+from padforge.fabricate.checks import Finding
+from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
+from padforge.fabricate.checks.surface import TriangleMesh, compute_min_width, fill_outline, find_narrow_parts
 from padforge.fabricate.settings import PrinterSettings
-from tests.fabricate.checks.trays import CROSS, FLOOR, block, faults, inspected, line, near, prism, tray
+from tests.fabricate.checks.trays import CROSS, FLOOR, block, check_body, failures, has_position_near, line, prism, tray
 
 
-class TestSound:
+def check_solidity(vertices: np.ndarray, triangles: np.ndarray, genus: int | None = None) -> dict[str, Finding]:
+    return {f.name: f for f in check_solid(TriangleMesh.weld(vertices, triangles), genus)}
+
+
+class TestSolid:
     box = block(10, 20, 5)
 
-    def test_a_missing_triangle(self):
-        found = inspected(trimesh.Trimesh(self.box.vertices, self.box.faces[1:]))
-        assert found["manifold"].status == found["watertight"].status == "fail"
-        assert found["watertight"].measured == len(found["watertight"].positions_mm) == 3
-        assert "ridge_width" not in found
+    def test_missing_triangle_is_not_watertight(self):
+        findings = check_body(trimesh.Trimesh(self.box.vertices, self.box.faces[1:]))
+        assert findings["manifold"].status == findings["watertight"].status == "fail"
+        assert findings["watertight"].measured == len(findings["watertight"].positions_mm) == 3
+        assert "ridge_width" not in findings
 
-    def test_two_boxes_that_share_an_edge(self):
-        watertight = {f.name: f for f in sound(*_together(self.box, block(10, 20, 5, at=(10, 20, 0))))}["watertight"]
+    def test_edge_of_four_faces_is_not_watertight(self):
+        watertight = check_solidity(*_together(self.box, block(10, 20, 5, at=(10, 20, 0))))["watertight"]
         assert (watertight.status, watertight.measured) == ("fail", 1)
-        assert near(watertight, 5, 10, 1e-6)
+        assert has_position_near(watertight, 5, 10, 1e-6)
 
-    def test_one_triangle_turned_round(self):
+    def test_flipped_triangle_is_not_watertight(self):
         faces = np.array(self.box.faces)
         faces[0] = faces[0][::-1]
-        watertight = inspected(trimesh.Trimesh(self.box.vertices, faces))["watertight"]
+        watertight = check_body(trimesh.Trimesh(self.box.vertices, faces))["watertight"]
         assert (watertight.status, watertight.measured) == ("fail", 3)
         middle = self.box.triangles_center[0]
-        assert near(watertight, middle[0], middle[1], 8.0)
+        assert has_position_near(watertight, middle[0], middle[1], 8.0)
 
-    def test_inside_out(self):
+    def test_inverted_box_has_no_volume(self):
         mesh = self.box.copy()
         mesh.invert()
-        assert faults(inspected(mesh)) == {"volume": "fail"}
+        assert failures(check_body(mesh)) == {"volume": "fail"}
 
-    def test_nothing(self):
-        found = inspect_mesh(np.empty((0, 3)), np.empty((0, 3), dtype=int))
-        assert {f.name for f in found if f.status == "fail"} >= {"bodies", "volume"}
+    def test_empty_mesh_fails(self):
+        findings = check_triangles(np.empty((0, 3)), np.empty((0, 3), dtype=int))
+        assert {f.name for f in findings if f.status == "fail"} >= {"bodies", "volume"}
 
-    def test_the_order_and_the_repetition_of_vertices_say_nothing(self):
+    def test_check_solid_merges_equal_vertices(self):
         mesh = tray(*CROSS).to_mesh()
         corners = np.asarray(mesh.vert_properties)[np.asarray(mesh.tri_verts)][::-1].reshape(-1, 3)
-        found = sound(corners, np.arange(len(corners)).reshape(-1, 3), genus=0)
-        assert [f.name for f in found] == list(SOUND)
-        assert {f.status for f in found} == {"pass"}
+        findings = check_solidity(corners, np.arange(len(corners)).reshape(-1, 3), genus=0)
+        assert list(findings) == list(SOLID_CHECKS)
+        assert not failures(findings)
 
     @pytest.mark.parametrize(
         ("bed", "status"),
@@ -62,32 +66,26 @@ class TestSound:
         ],
     )
     def test_bed(self, bed, status):
-        assert inspected(self.box, printer=PrinterSettings(bed_mm=bed))["bed"].status == status
+        assert check_body(self.box, printer=PrinterSettings(bed_mm=bed))["bed"].status == status
 
-    def test_what_a_box_measures(self):
-        found = inspected(self.box, genus=0)
-        assert found["volume"].measured == pytest.approx(1000)
-        assert found["bed"].measured == pytest.approx([10, 20, 5])
-        assert found["bed"].message == "10 x 20 x 5 mm to print on a bed of 220 x 220 x 250 mm"
-        assert found["genus"].measured == 0
-        assert inspected(block(10.002, 20.01, 5))["bed"].message.startswith("10.01 x 20.01 x 5 mm")  # never less
-
-    def test_boxes_that_cut_through_each_other(self):
-        crossing = _together(self.box, block(2, 30, 2, at=(0.3, 0.2, 0.1)))
-        found = {f.name: f for f in sound(*crossing)}["self_intersection"]
-        assert found.status == "fail"
-        assert found.message.endswith("pairs of triangles cut through each other")
+    def test_measured_values_of_a_box(self):
+        findings = check_body(self.box, genus=0)
+        assert findings["volume"].measured == pytest.approx(1000)
+        assert findings["bed"].measured == pytest.approx([10, 20, 5])
+        assert findings["bed"].message == "10 x 20 x 5 mm to print on a bed of 220 x 220 x 250 mm"
+        assert findings["genus"].measured == 0
+        assert check_body(block(10.002, 20.01, 5))["bed"].message.startswith("10.01 x 20.01 x 5 mm")  # never less
 
     @pytest.mark.parametrize("genus", [0, 1, 2])
-    def test_holes_that_lead_through_are_counted(self, genus):
+    def test_genus_counts_through_holes(self, genus):
         plate = prism(shapely.box(-12, -5, 12, 5), 0, 3)
         for x in (-6, 6)[:genus]:
             plate -= Manifold.cylinder(9, 2.0, 2.0, 24).translate((x, 0, -1))
         mesh = plate.to_mesh()
         for expected in (0, 1, 2):
-            found = {f.name: f for f in sound(mesh.vert_properties, mesh.tri_verts, genus=expected)}["genus"]
-            assert (found.measured, found.limit) == (genus, expected)
-            assert found.status == ("pass" if genus == expected else "fail")
+            finding = check_solidity(mesh.vert_properties, mesh.tri_verts, genus=expected)["genus"]
+            assert (finding.measured, finding.limit) == (genus, expected)
+            assert finding.status == ("pass" if genus == expected else "fail")
 
 
 def _together(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
@@ -107,21 +105,21 @@ def _hollows(count: int) -> list[trimesh.Trimesh]:
 
 
 @pytest.mark.parametrize(
-    ("meshes", "status", "count", "place"),
+    ("meshes", "status", "count", "position"),
     [
-        ([TestSound.box, block(2, 2, 2, at=(30, 7, 0))], "fail", 2, (30, 7)),
-        ([TestSound.box, _turned(block(2, 2, 2, at=(30, 7, 0)))], "fail", 2, (30, 7)),
-        ([TestSound.box, block(2, 2, 2)], "fail", 2, (0, 0)),  # one within the other
-        ([TestSound.box, _turned(block(2, 2, 2))], "warn", 1, (0, 0)),  # a hollow
+        ([TestSolid.box, block(2, 2, 2, at=(30, 7, 0))], "fail", 2, (30, 7)),
+        ([TestSolid.box, _turned(block(2, 2, 2, at=(30, 7, 0)))], "fail", 2, (30, 7)),
+        ([TestSolid.box, block(2, 2, 2)], "fail", 2, (0, 0)),  # one within the other
+        ([TestSolid.box, _turned(block(2, 2, 2))], "warn", 1, (0, 0)),  # a hollow
         (_hollows(99), "warn", 1, None),
         (_hollows(100), "fail", 101, None),  # of more than a hundred shells all are bodies
     ],
 )
-def test_bodies_are_told_from_hollows(meshes, status, count, place):
-    found = {finding.name: finding for finding in sound(*_together(*meshes))}
-    assert (found["bodies"].status, found["bodies"].measured) == (status, count)
-    assert place is None or near(found["bodies"], *place, within=1.5)
-    assert set(faults(found)) == {"bodies"}
+def test_bodies_distinguishes_bodies_and_hollows(meshes, status, count, position):
+    findings = check_solidity(*_together(*meshes))
+    assert (findings["bodies"].status, findings["bodies"].measured) == (status, count)
+    assert position is None or has_position_near(findings["bodies"], *position, within=1.5)
+    assert set(failures(findings)) == {"bodies"}
 
 
 def _leak(width: float) -> Manifold:
@@ -137,9 +135,9 @@ def _pot(outer: float) -> Manifold:
     return Manifold.batch_boolean([tray(draft_deg=0), plate], OpType.Add) - _hole(2, 3, 3)
 
 
-class TestTight:
+class TestLeaks:
     @pytest.mark.parametrize(
-        ("solid", "status", "place"),
+        ("solid", "status", "position"),
         [
             (lambda: tray(*CROSS) - _leak(1.0), "fail", (11, 2)),
             (lambda: tray(*CROSS) - _leak(8.0), "fail", (11, 2)),
@@ -156,26 +154,26 @@ class TestTight:
             (lambda: tray(*CROSS) - Manifold.cylinder(1, 2).translate((5, 5, -0.5)), "pass", None),
         ],
     )
-    def test_openings_that_let_silicone_out(self, solid, status, place):
-        finding = inspected(solid())["tight"]
+    def test_leaks(self, solid, status, position):
+        finding = check_body(solid())["tight"]
         assert finding.status == status
-        assert place is None or near(finding, *place, within=2.5)
+        assert position is None or has_position_near(finding, *position, within=2.5)
 
-    def test_a_slot_in_the_foot_that_a_tray_stands_on_lets_nothing_out(self):
+    def test_slot_in_the_foot_is_no_leak(self):
         """What the lowest slab surrounds is below the floor; the same slot in the wall above it is a leak."""
         foot = prism(shapely.box(-9, -9, 9, 9).difference(shapely.box(-7, -7, 7, 7)), -0.5, 0.1)
         for low, high, status in ((-1.0, 0.0, "pass"), (FLOOR, FLOOR + 0.5, "fail")):
             slot = prism(line((6, 2), (14, 2), width=3.0), low, high)
             solid = Manifold.batch_boolean([tray(draft_deg=0), foot], OpType.Add) - slot
-            assert inspected(solid)["tight"].status == status
+            assert check_body(solid)["tight"].status == status
 
 
 @pytest.mark.parametrize(("height", "rise"), [(1.9e-3, 1.0), (0.9e-3, 0.0)])
-def test_needles_have_no_slope(height, rise):
-    found = Surface.joined([[0, 0, 0], [2, 0, 0], [1, height, 0]], [[0, 1, 2]])
-    assert found.rise.tolist() == [rise]
-    slanted = Surface.joined([[0, 0, 0], [2, 0, 0], [0, 3, 4]], [[0, 1, 2]])
-    assert slanted.rise == pytest.approx([0.6])
+def test_needles_have_no_normal(height, rise):
+    mesh = TriangleMesh.weld([[0, 0, 0], [2, 0, 0], [1, height, 0]], [[0, 1, 2]])
+    assert mesh.normal_z.tolist() == [rise]
+    slanted = TriangleMesh.weld([[0, 0, 0], [2, 0, 0], [0, 3, 4]], [[0, 1, 2]])
+    assert slanted.normal_z == pytest.approx([0.6])
     assert slanted.areas == pytest.approx([5])
 
 
@@ -183,26 +181,25 @@ class TestAreas:
     bar = shapely.box(0, 0, 10, 0.3)
     block = shapely.box(0, 0, 10, 5)
 
-    def test_a_bar_is_as_wide_as_it_is(self):
-        (patch,) = surface.too_narrow(self.bar, 0.4)
-        assert patch.area == pytest.approx(self.bar.area, rel=1e-3)
-        assert surface.least_width(self.bar, surface.too_narrow(self.bar, 0.4), 0.4) == pytest.approx(0.3, abs=0.011)
-        assert len(surface.too_narrow(self.bar, 0.31)) == 0
-        assert len(surface.too_narrow(self.block, 4.9)) == 0
-        assert surface.spare_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
+    def test_find_narrow_parts_measures_a_bar(self):
+        (part,), width = find_narrow_parts(self.bar, 0.4)
+        assert part.area == pytest.approx(self.bar.area, rel=1e-3)
+        assert width == pytest.approx(0.3, abs=0.011)
+        assert len(find_narrow_parts(self.bar, 0.31)[0]) == len(find_narrow_parts(self.block, 4.9)[0]) == 0
+        assert compute_min_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
 
     @pytest.mark.parametrize(("neck", "narrow"), [(0.7, False), (1.5, True)])
-    def test_what_leads_far_from_something_wider_is_no_tip(self, neck, narrow):
+    def test_find_narrow_parts_ignores_tips(self, neck, narrow):
         """A peg 0.3 wide on a block: the tip of it up to twice the least width long, a thin wall beyond."""
         peg = shapely.union(self.block, shapely.box(4, 5, 4.3, 5 + neck))
-        assert bool(len(surface.too_narrow(peg, 0.4))) == narrow
+        assert bool(len(find_narrow_parts(peg, 0.4)[0])) == narrow
 
-    def test_a_bridge_between_two_blocks_is_no_tip(self):
+    def test_find_narrow_parts_finds_bridges(self):
         bridge = shapely.union_all([self.block, shapely.box(4, 5, 4.3, 5.5), shapely.box(0, 5.5, 10, 9)])
-        assert len(surface.too_narrow(bridge, 0.4)) == 1
+        assert len(find_narrow_parts(bridge, 0.4)[0]) == 1
 
     @pytest.mark.parametrize(("slot", "closed"), [(1.9, True), (2.1, False)])
-    def test_slots_up_to_two_millimetres_do_not_open_a_ring(self, slot, closed):
+    def test_fill_outline_closes_slots_of_two_millimetres(self, slot, closed):
         ring = shapely.box(-10, -10, 10, 10).difference(shapely.box(-8, -8, 8, 8))
         cut = ring.difference(shapely.box(5, -slot / 2, 20, slot / 2))
-        assert surface.enclosed(cut).contains(shapely.Point(0, 0)) == closed
+        assert fill_outline(cut).contains(shapely.Point(0, 0)) == closed

@@ -1,4 +1,4 @@
-"""Trays and blocks as triangle meshes, made without a plan, and what the checks find in them."""
+"""Trays and blocks as triangle meshes, built without a plan, and their findings."""
 
 import math
 
@@ -8,7 +8,7 @@ from manifold3d import CrossSection, Manifold, OpType
 from shapely.geometry.base import BaseGeometry
 
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.checks.mesh_checks import inspect_mesh
+from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.plan import polygon_rings
 
 FLOOR, DEPTH, WALL, SIZE = 2.0, 6.0, 2.0, 20.0
@@ -48,21 +48,21 @@ def block(*sizes: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.
     return trimesh.creation.box(sizes, trimesh.transformations.translation_matrix(at))
 
 
-def inspected(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[str, Finding]:
+def check_body(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[str, Finding]:
     if isinstance(solid, trimesh.Trimesh):
         vertices, triangles = solid.vertices, solid.faces
     else:
         mesh = solid.to_mesh()
         vertices, triangles = mesh.vert_properties, mesh.tri_verts
-    return {finding.name: finding for finding in inspect_mesh(vertices, triangles, **arguments)}  # pyright: ignore
+    return {finding.name: finding for finding in check_triangles(vertices, triangles, **arguments)}  # pyright: ignore
 
 
-def faults(found: dict[str, Finding]) -> dict[str, str]:
-    return {name: finding.status for name, finding in found.items() if finding.status != "pass"}
+def failures(findings: dict[str, Finding]) -> dict[str, str]:
+    return {name: finding.status for name, finding in findings.items() if finding.status != "pass"}
 
 
-def near(found: Finding, x: float, y: float, within: float = 1.0) -> bool:
-    return any(math.hypot(px - x, py - y) <= within for px, py in found.positions_mm)
+def has_position_near(finding: Finding, x: float, y: float, within: float = 1.0) -> bool:
+    return any(math.hypot(px - x, py - y) <= within for px, py in finding.positions_mm)
 
 
 CROSS = [ridge(spanning(3.0), 1.2), ridge(spanning(-3.0), 1.2), ridge(shapely.affinity.rotate(spanning(1), 90, (0, 0)))]

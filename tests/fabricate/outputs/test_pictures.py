@@ -8,7 +8,7 @@ from PIL import Image
 
 from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
-from padforge.fabricate.checks import Finding, as_places
+from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.outputs.pictures import (
     CARE,
@@ -177,7 +177,7 @@ def test_draw_findings_marks_any_mesh(tmp_path):
 @pytest.mark.slow
 def test_pictures_are_small(tmp_path, published):
     plan = Plan(Morphology.load(published / "20para.mat"))
-    findings = [finding("fail", *as_places(plan.pad.to_mm([c.position for c in plan.clashes])))]
+    findings = [finding("fail", *map(tuple, plan.clash_positions_mm.tolist()))]
     draw_mould(plan, findings, tmp_path / "mould")
     draw_tracks(plan, tmp_path / "tracks")
     draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")
