@@ -16,7 +16,7 @@ from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.fabricate.cad.model import FITS_MM, body_solid, build_mould_model
-from padforge.fabricate.cad.step_file import write_step
+from padforge.fabricate.cad.step_file import CadPart, write_step
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import Plan, offset_box
@@ -73,7 +73,7 @@ def _evaluate_solid(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, fl
     points = np.vstack(list(_horizontal_edges(solid, plan.settings.mould.floor_mm)))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mould.step"
-        write_step(path, solid)
+        write_step(path, CadPart("mould", solids=tuple(part.wrapped for part in solid.solids())))
         size = path.stat().st_size
     return {"error": _max_deviation_mm(plan, points), "faces": len(solid.faces()), "file_bytes": size}
 

@@ -203,7 +203,12 @@ class Plan:
         return [shapely.LineString(path) for path in self.paths(tolerance_mm, INTO_WALL_MM)]
 
     def paths(self, tolerance_mm: float, past_mm: float) -> list[Array]:
-        """Flatten every fibre with its leads to corners (n, 2), mm, until `past_mm` past the ends of its tongues."""
+        """Flatten every fibre with its leads; corners (n, 2), mm.
+
+        Args:
+            tolerance_mm: tolerance against the curves.
+            past_mm: length by which paths go on past the ends of their tongues.
+        """
         past = self.settings.mould.exit_mm, past_mm
         curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
         paths = []
@@ -244,7 +249,11 @@ class Plan:
         return one_side_leads(ends, pad.layout, lead_spacing(self.settings, self.heights_mm[-1], self.flare_mm))
 
     def ends(self, end: int) -> list[Lead]:
-        """Return the leads of all fibres' starts, 0, or other ends, 1."""
+        """Return the leads at one end of all fibres.
+
+        Args:
+            end: 0 for the starts, 1 for the other ends.
+        """
         return [pair[end] for pair in self.leads.pairs]
 
     @cached_property
@@ -259,7 +268,11 @@ class Plan:
         return min(self.pad.layout.pitch_x_mm, self.pad.layout.pitch_y_mm)
 
     def family(self, fibre: int) -> int:
-        """Return 0 for a horizontal fibre, 1 for a vertical one."""
+        """Return 0 for a horizontal fibre, 1 for a vertical one.
+
+        Args:
+            fibre: index among all fibres.
+        """
         return self.pad.layout.family(fibre)
 
     @cached_property

@@ -12,7 +12,19 @@ from types import ModuleType
 from typing import Any
 
 HEAVY = (
-    *("build123d", "ezdxf", "h5py", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "pymoo", "rtde_control"),
+    *(
+        "OCP",
+        "build123d",
+        "ezdxf",
+        "h5py",
+        "manifold3d",
+        "matplotlib",
+        "numba",
+        "numpy",
+        "pydantic",
+        "pymoo",
+        "rtde_control",
+    ),
     *("scipy", "serial", "shapely", "torch", "trimesh"),
 )
 """Libraries whose import takes noticeable time."""
