@@ -226,7 +226,8 @@ def build(
         fabrication = Fabrication(plan, bodies, _check_bodies(plan, bodies))
     wanted = [name for name in FORMATS if name in formats]
     for check in dict.fromkeys(FORMATS[name].check for name in reversed(wanted)):  # the toolpath's before CAD's
-        fabrication.findings.extend(check(fabrication))
+        with profiling.stage("checks"):
+            fabrication.findings.extend(check(fabrication))
     writers = _choose_writers(fabrication, [FORMATS[name] for name in wanted])
     document = _compile_document(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
@@ -247,9 +248,7 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
         genus = lid_holes(plan) if body.name == "lid" else 0
         by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus))
     for body, findings in zip(bodies, by_body, strict=True):
-        if broken := [
-            finding.message for finding in findings if finding.name in SOLID_CHECKS and finding.status == "fail"
-        ]:
+        if broken := [f.message for f in findings if f.name in SOLID_CHECKS and f.status == "fail"]:
             raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
     return by_body[0] + check_plan(plan)
 
