@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
-from padforge.fabricate.cad.model import FITS_MM, body_solid, build_mould_model
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, body_solid, build_mould_model
 from padforge.fabricate.cad.step_file import CadPart, write_step
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.mould import mould_body
@@ -52,7 +52,7 @@ def trials() -> Iterator[BenchTrial]:
                     )
         plan = partial(_plan, pad)
         work = partial(lambda plan: build_mould_model(plan(), "mould").shape, plan)
-        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FITS_MM[0], work, partial(_evaluate_solid, plan))
+        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FIT_TOLERANCES_MM[0], work, partial(_evaluate_solid, plan))
 
 
 def _plan(pad: Morphology, tolerance_mm: float = DEFAULTS.mould.tolerance_mm) -> Plan:

@@ -46,12 +46,17 @@ def fabricate() -> None:
     """
 
 
-formats_option = click.option(
-    "--formats",
-    default="stl,step,svg,png",
-    show_default=True,
-    help="Which files of the mould to write, of stl, 3mf, step, svg, dxf, png, gcode, urscript.",
-)
+class _FormatsOption(click.Option):
+    """Option whose help lists the formats; they are imported only where it is shown."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        from padforge.fabricate.export import FORMATS
+
+        self.help = f"Which files of the mould to write, of {', '.join(FORMATS)}."
+        return super().get_help_record(ctx)
+
+
+formats_option = click.option("--formats", cls=_FormatsOption, default="stl,step,svg,png", show_default=True)
 
 
 def split_formats(formats: str) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Building a mould and writing its files: meshes, CAD, drawings, programs, laying page and fabrication document.
 
 The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
-appear together or not at all. A new export format is one line in `FORMATS`, and its writer.
+appear together or not at all. A new export format is a line in `FORMATS`, and its writer.
 """
 
 import math
@@ -125,9 +125,9 @@ def _check_cad(fabrication: Fabrication) -> list[Finding]:
     coarseness = max(1.0, fabrication.plan.settings.mould.tolerance_mm / _CAD_TOLERANCE_MM)
     max_volume, max_surface = coarseness * _CAD_VOLUME, coarseness * _CAD_SURFACE
     for body, (volume, surface) in zip(fabrication.bodies, differences, strict=True):
-        if volume > max_volume or surface > max_surface:
+        if not (volume <= max_volume and surface <= max_surface):  # NaN fails as well
             shares = f"volume {100 * volume:.3g} %, surface {100 * surface:.3g} %"
-            raise InputError(f"{body.name}: the CAD solid is not of its mesh ({shares} off); nothing was written")
+            raise InputError(f"{body.name}: the CAD solid does not match its mesh ({shares} off); nothing was written")
     volume, surface = (max(shares) for shares in zip(*differences, strict=True))
     message = f"volume and surface are within {100 * volume:.3f} % and {100 * surface:.3f} % of the mesh's"
     message += f", curves within {1000 * max(model.fit_mm for model in fabrication.models):g} µm"

@@ -36,7 +36,7 @@ _CORNER_RAD = 0.2
 """A sharper turn at a vertex is a corner; finely drawn curves turn less unless they hardly have a radius."""
 _STRAIGHT_MM = 1e-3
 """An edge with a larger sagitta is straight: chords of drawn curves have a several times smaller one."""
-_ARC_MM = 1e-4
+_ARC_TOLERANCE_MM = 1e-4
 """Tolerance of arcs and straight runs."""
 _SAMPLES, _SAMPLE_MM = 4, 0.1
 """A fit is checked at as many places of every edge, and at least as densely: between far vertices it might stray."""
@@ -49,10 +49,11 @@ class OutlineCurve:
     """A smooth run of an outline from s = 0 to `length`, the arc length along its vertices.
 
     Attributes:
-        points: vertices; shape (n, 2).
+        points: vertices, of a straight run its two ends; shape (n, 2).
         spline: cubic spline over s; None for lines and arcs.
         arc: arc; None for lines and splines.
         z_range: heights between which the wall of the outline stands, mm, if known.
+        length: length along the vertices.
     """
 
     points: Array
@@ -200,7 +201,7 @@ def _smooth_curves(points: Array, tangents: Sequence[Array | None], fit_mm: floa
     """Yield the curves of a smooth run of vertices (n, 2), n > 2, with the tangents at its ends where known."""
     chord = points[-1] - points[0]
     offsets = points - points[0]
-    if np.abs(chord[0] * offsets[:, 1] - chord[1] * offsets[:, 0]).max() < _ARC_MM * np.linalg.norm(chord):
+    if np.abs(chord[0] * offsets[:, 1] - chord[1] * offsets[:, 0]).max() < _ARC_TOLERANCE_MM * np.linalg.norm(chord):
         yield OutlineCurve(points[[0, -1]])
         return
     if (arc := fit_arc(points)) is not None:
@@ -211,6 +212,7 @@ def _smooth_curves(points: Array, tangents: Sequence[Array | None], fit_mm: floa
     start = _end_tangent(s, points) if start is None else start
     end = -_end_tangent(s[-1] - s[::-1], points[::-1]) if end is None else end
     curve = fit_spline(points, (start, end), fit_mm)
+    # at vertices, so that a part may have a span more where its cut lies between two
     cuts = sorted({0, *np.searchsorted(s, split_parameters(curve)).tolist(), len(s) - 1})
     for first, last in pairwise(cuts):
         part = trim_spline(curve, s[first], s[last])
@@ -231,7 +233,7 @@ def _end_tangent(s: Array, points: Array) -> Array:
 
 
 def fit_arc(points: Array) -> Arc | None:
-    """Fit a circle's arc to vertices (n, 2) by linear least squares; None if it is off by more than `_ARC_MM`."""
+    """Fit an arc to vertices (n, 2) by linear least squares; None if it is off by more than `_ARC_TOLERANCE_MM`."""
     if len(points) < 5:
         return None
     mean = points.mean(axis=0)
@@ -240,7 +242,7 @@ def fit_arc(points: Array) -> Arc | None:
     x, y, constant = np.linalg.lstsq(design_matrix, (centred**2).sum(axis=1), rcond=None)[0]
     radius = float(np.sqrt(constant + x * x + y * y))
     radial = centred - (x, y)
-    if not np.abs(np.linalg.norm(radial, axis=1) - radius).max() < _ARC_MM:
+    if not np.abs(np.linalg.norm(radial, axis=1) - radius).max() < _ARC_TOLERANCE_MM:
         return None
     angles = np.unwrap(np.arctan2(radial[:, 1], radial[:, 0]))
     return mean[0] + x, mean[1] + y, radius, float(angles[0]), float(angles[-1] - angles[0])

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from build123d import Compound, Solid
     from manifold3d import Manifold
 
-FITS_MM = (2e-3, 5e-4, 1e-4)
-"""Tolerances of curves against the exact outlines; the next is tried where the kernel finds a solid invalid.
+FIT_TOLERANCES_MM = (2e-3, 5e-4, 1e-4)
+"""Tolerances of curves against the finely drawn outlines; the next is tried where the kernel finds a solid invalid.
 
 Curves that hardly cross may meet in another order than the outlines they replace; finer ones do not.
 """
@@ -74,7 +74,7 @@ class CadModel:
     Attributes:
         part: body, or assembly of its parts, which touch and do not overlap.
         contact_mm2: area where parts touch.
-        fit_mm: tolerance of curves against the exact outlines; 0 without curves.
+        fit_mm: tolerance of curves against outlines that are drawn within `FINE_MM`; 0 without curves.
     """
 
     part: CadPart
@@ -146,7 +146,7 @@ def build_mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ())
     Raises:
         InputError: the CAD kernel finds a solid invalid at every tolerance.
     """
-    for fit_mm in FITS_MM:
+    for fit_mm in FIT_TOLERANCES_MM:
         cells, fills = fill_cells(plan, fit_mm, wells)
         solids = _build_valid({fill.name: partial(build_solids, cells, fill.z_ranges) for fill in fills})
         if solids:

@@ -57,8 +57,8 @@ _MAX_DEVIATION_MM = 5e-3
 _UP = gp_Dir(0, 0, 1)
 _ELLIPSE_SAMPLES = 65
 """Points that the parameters of an ellipse on its cylinder are interpolated through."""
-_CACHED = 256
-"""Curves and surfaces that are reused by other edges of their outline curve."""
+_CACHE_SIZE = 256
+"""Curves and surfaces kept for other edges of their outline curve."""
 
 
 def build_solids(subdivision: Subdivision, z_ranges: Sequence[ZRange | None]) -> Iterator[Any]:
@@ -466,7 +466,7 @@ def _heights(z: Height, points: Array) -> list[float]:
     return z(points).tolist() if callable(z) else [z] * len(points)
 
 
-@lru_cache(_CACHED)
+@lru_cache(_CACHE_SIZE)
 def _level_curve(spline: BSpline, z: float) -> Any:
     return _raised_curve(spline, [z] * len(spline.c))
 
@@ -478,7 +478,7 @@ def _raised_curve(spline: BSpline, heights: list[float]) -> Any:
     return Geom_BSplineCurve(poles, *_knots(spline), 3)
 
 
-@lru_cache(_CACHED)
+@lru_cache(_CACHE_SIZE)
 def _extrusion(spline: BSpline, z: float) -> Any:
     return Geom_SurfaceOfLinearExtrusion(_level_curve(spline, z), _UP)
 
@@ -491,7 +491,7 @@ def _spline_2d(spline: BSpline, poles: Array) -> Any:
     return Geom2d_BSplineCurve(points, *_knots(spline), 3)
 
 
-@lru_cache(_CACHED)
+@lru_cache(_CACHE_SIZE)
 def _knots(spline: BSpline) -> tuple[Any, Any]:
     """Knots of a spline and their multiplicities, as the kernel's arrays."""
     knots, multiplicities = np.unique(spline.t, return_counts=True)

@@ -78,7 +78,7 @@ class CadPart:
 
     @cached_property
     def compound(self) -> TopoDS_Compound:
-        """All solids as one shape of the kernel, children where they are by themselves."""
+        """All solids as one shape of the kernel, children without their `position_mm`."""
         compound, builder = TopoDS_Compound(), BRep_Builder()
         builder.MakeCompound(compound)
         for shape in (*self.solids, *(child.compound for child in self.children)):

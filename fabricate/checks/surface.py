@@ -249,8 +249,8 @@ class Slab:
     Attributes:
         bottom_mm: z of its lower end.
         top_mm: z of its upper end.
-        solid: manifold3d solid.
-        base: cross section of the solid near its underside.
+        solid: manifold3d solid that it is part of.
+        base: cross section of the solid half way up its lowest part.
     """
 
     bottom_mm: float

@@ -6,7 +6,7 @@ import pytest
 from padforge.benchmarks import mould as bench
 from padforge.design.morphology import Morphology
 from padforge.fabricate.cad.curves import FINE_MM
-from padforge.fabricate.cad.model import FITS_MM, build_mould_model
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, build_mould_model
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
@@ -27,4 +27,4 @@ def test_deviation_is_within_tolerance_and_detects_shifted_walls(monkeypatch):
     wider = MouldSettings(number_mm=0, ridge_width_mm=DEFAULTS.mould.ridge_width_mm + 0.01)
     pad = Morphology.random(1, 1, bench.SEED)
     strayed = build_mould_model(Plan(pad, replace(DEFAULTS, mould=wider)), "mould").shape
-    assert trials["curved CAD"].evaluate(strayed)["error"] == pytest.approx(0.005, abs=FITS_MM[0] + FINE_MM)
+    assert trials["curved CAD"].evaluate(strayed)["error"] == pytest.approx(0.005, abs=FIT_TOLERANCES_MM[0] + FINE_MM)

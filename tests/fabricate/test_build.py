@@ -235,8 +235,8 @@ def in_pieces(monkeypatch, body: str) -> None:
         (None, ["svg"], "2 crossings"),
         (partial(in_pieces, body="mould_body"), ["stl"], r"^mould: .*the mesh has 2 bodies.*nothing was written"),
         (partial(in_pieces, body="lid_body"), ["stl"], r"^lid: .*the mesh has 2 bodies.*nothing was written"),
-        (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid is not of its mesh \(.*written"),
-        (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid is not of its mesh"),
+        (partial(other_solid, body="mould"), ["step"], r"^mould: the CAD solid does not match its mesh \(.*written"),
+        (partial(other_solid, body="lid"), ["step"], r"^lid: the CAD solid does not match its mesh"),
         (
             lambda m: m.setattr(model, "is_valid", lambda solid: False),
             ["step"],

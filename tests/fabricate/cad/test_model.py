@@ -17,7 +17,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.fabricate.cad import model as of_model
 from padforge.fabricate.cad.model import (
-    FITS_MM,
+    FIT_TOLERANCES_MM,
     CadModel,
     assemble,
     build_body_model,
@@ -153,7 +153,7 @@ RARE = {*SETTINGS, *ODD} - {*[*SETTINGS, *ODD][::3], NARROW}
 def test_models_are_valid_and_as_large_as_their_meshes(case):
     pad, mould = ODD.get(case) or (Morphology.random(1, 3, seed=5), SETTINGS[case])
     model = judged(Plan(pad, with_settings(mould)))
-    assert case in ODD or model.fit_mm == FITS_MM[0]
+    assert case in ODD or model.fit_mm == FIT_TOLERANCES_MM[0]
 
 
 INVALID = pytest.mark.xfail(raises=InputError, reason="one piece of a track is invalid however fine its curves are")
@@ -257,7 +257,7 @@ def test_mould_models_are_built_with_finer_curves_until_solids_are_valid(monkeyp
     if failure is None:
         monkeypatch.setattr(of_model, "is_valid", lambda shape: len(tries) > failures and valid(shape))
     failures = 1
-    assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == FITS_MM[1]
+    assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == FIT_TOLERANCES_MM[1]
     failures = 1000
     with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
         build_mould_model(Plan(Morphology.straight(1)), "second")
