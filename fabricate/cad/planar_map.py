@@ -129,7 +129,7 @@ class MapEdge:
 
 
 @dataclass(frozen=True)
-class _Run:
+class _EdgeChain:
     """Drawn edges from node to node along one curve, and the arc lengths at its ends."""
 
     curve: int
@@ -201,7 +201,7 @@ class PlanarMap:
         return wire
 
     def _intersect(
-        self, runs: Sequence[_Run], nodes: Sequence[tuple[int, int]]
+        self, runs: Sequence[_EdgeChain], nodes: Sequence[tuple[int, int]]
     ) -> tuple[Array, Array, list[tuple[float, float]]]:
         """Positions of the nodes, their tolerances, and the arc lengths at the ends of every run."""
         lengths: dict[int, dict[int, float]] = defaultdict(dict)  # node -> curve -> arc length
@@ -278,7 +278,7 @@ def _join_runs(curve_of_edge: dict[GridEdge, int]) -> list[tuple[int, list[Verte
     return runs
 
 
-def _orient_runs(runs: list[tuple[int, list[Vertex]]], curves: Sequence[OutlineCurve]) -> list[_Run]:
+def _orient_runs(runs: list[tuple[int, list[Vertex]]], curves: Sequence[OutlineCurve]) -> list[_EdgeChain]:
     """Turn runs to run along their curves."""
     lines = np.array([shapely.LineString(curve.points) for curve in curves])[[curve for curve, _ in runs]]
     ends = [shapely.points(GRID_MM * np.array([run[i] for _, run in runs], dtype=float)) for i in (0, -1)]
@@ -286,12 +286,12 @@ def _orient_runs(runs: list[tuple[int, list[Vertex]]], curves: Sequence[OutlineC
     length = np.array([curves[curve].length for curve, _ in runs])[:, None]
     s = np.where(s < _END_MM, 0, np.where(s > length - _END_MM, length, s))
     return [
-        _Run(curve, run, (a, b)) if a <= b else _Run(curve, run[::-1], (b, a))
+        _EdgeChain(curve, run, (a, b)) if a <= b else _EdgeChain(curve, run[::-1], (b, a))
         for (curve, run), (a, b) in zip(runs, s.tolist(), strict=True)
     ]
 
 
-def _number_nodes(runs: Sequence[_Run], contracted: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _number_nodes(runs: Sequence[_EdgeChain], contracted: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Numbers of the nodes at the ends of every run, one for both ends of a contracted run."""
     numbers: dict[Vertex, int] = {}
     ends = np.array([[numbers.setdefault(run.vertices[i], len(numbers)) for i in (0, -1)] for run in runs])
@@ -414,7 +414,7 @@ class PartFill:
     z_ranges: Sequence[ZRange | None]
 
 
-class _Prism(NamedTuple):
+class _RaisedOutline(NamedTuple):
     """What stands on the floor."""
 
     part: str
@@ -463,7 +463,7 @@ def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) ->
     return cells, [PartFill(name, z_ranges) for name, z_ranges in fills.items() if any(z_ranges)]
 
 
-def _ridge_prisms(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_Prism]:
+def _ridge_prisms(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_RaisedOutline]:
     """Yield the terraces of the ridges of every layer."""
     mould = plan.settings.mould
     families = {layer: plan.family(fibre) for fibre, layer in enumerate(plan.layer_indices)}
@@ -476,14 +476,14 @@ def _ridge_prisms(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> I
             outline = insert_joints(outline, joints)
             top = mould.floor_mm + height_mm - down_mm
             curves = outline_curves(outline, joints, (mould.floor_mm, top), fit_mm)
-            yield _Prism((HORIZONTAL_TRACKS, VERTICAL_TRACKS)[families[layer]], top, outline, curves)
+            yield _RaisedOutline((HORIZONTAL_TRACKS, VERTICAL_TRACKS)[families[layer]], top, outline, curves)
 
 
-def _number_prisms(plan: Plan) -> Iterator[_Prism]:
+def _number_prisms(plan: Plan) -> Iterator[_RaisedOutline]:
     top = plan.settings.mould.floor_mm + plan.settings.mould.shallow_ridge_height_mm
     for outline in plan.numbers:
         if outline is not None:
-            yield _Prism(NUMBERS, top, outline, edge_curves(outline.boundary))
+            yield _RaisedOutline(NUMBERS, top, outline, edge_curves(outline.boundary))
 
 
 def compute_contact_area(cells: Subdivision, fills: Sequence[PartFill]) -> float:

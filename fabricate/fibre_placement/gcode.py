@@ -11,6 +11,7 @@ from padforge.fabricate.fibre_placement.toolpath import (
     Pause,
     Step,
     build_instructions,
+    format_mm,
     summary_lines,
 )
 from padforge.fabricate.plan import Plan
@@ -25,11 +26,12 @@ def gcode(plan: Plan, steps: Sequence[Step]) -> str:
     x, y = dispenser.origin_mm
     lines = [
         *(f"; {line}" for line in summary_lines(plan, steps)),
-        f"; the pad's middle is at X{_format(x)} Y{_format(y)}; set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
+        f"; the pad's middle is at X{format_mm(x)} Y{format_mm(y)};"
+        " set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
         "G21",
         "G90",
         "M0 (needle over the pad, zero of z is set)",
-        f"G1 Z{_format(dispenser.travel_height_mm)} F{_format_feed(dispenser.travel_mm_s)}",
+        f"G1 Z{format_mm(dispenser.travel_height_mm)} F{_format_feed(dispenser.travel_mm_s)}",
     ]
     words: dict[str, str] = {}
     for instruction in build_instructions(plan, steps):
@@ -37,7 +39,7 @@ def gcode(plan: Plan, steps: Sequence[Step]) -> str:
             lines.append(f"M0 ({instruction.message})")
             continue
         for (u, v, z), speed in _moves(instruction):
-            axes = {"X": _format(x + u), "Y": _format(y + v), "Z": _format(z)}
+            axes = {"X": format_mm(x + u), "Y": format_mm(y + v), "Z": format_mm(z)}
             target = axes | {"F": _format_feed(speed)}
             changed = [letter + number for letter, number in target.items() if words.get(letter) != number]
             if any(word[0] != "F" for word in changed):  # else the needle is there already
@@ -54,10 +56,6 @@ def _moves(instruction: Instruction) -> Iterator[tuple[tuple[float, float, float
         feeds = instruction.feeds_mm_s.tolist()
         for (x, y), feed in zip(instruction.positions_mm[1:].tolist(), feeds, strict=True):
             yield (x, y, instruction.z_mm), feed
-
-
-def _format(value: float) -> str:
-    return f"{round(value, 3) + 0.0:.10g}"
 
 
 def _format_feed(speed_mm_s: float) -> str:

@@ -236,3 +236,12 @@ def summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
     yield f"seen from above: x to the right, against the pad's, y away from you; fibre 1 starts {near}"
     yield f"z is 0 where the needle touches the upper face; it goes down to {lowest:.3f} mm"
     yield f"needle of at most {plan.settings.dispenser.tip_mm:g} mm, pad {plan.thickness_mm:.3g} mm thick"
+
+
+def format_mm(*values_mm: float) -> str:
+    """Format coordinates for a program, to a micrometre and without -0, separated by commas.
+
+    Args:
+        *values_mm: coordinates.
+    """
+    return ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values_mm)

@@ -13,6 +13,7 @@ from padforge.fabricate.fibre_placement.toolpath import (
     Pause,
     Step,
     build_instructions,
+    format_mm,
     summary_lines,
 )
 from padforge.fabricate.plan import Plan
@@ -42,7 +43,7 @@ def urscript(plan: Plan, steps: Sequence[Step]) -> str:
         "  end",
         _popup("needle over the pad, all its ways free?"),
         "  here = pose_trans(pose_inv(pad), get_actual_tcp_pose())",
-        f"  movel(at(here[0] * 1000, here[1] * 1000, {_format(dispenser.travel_height_mm)}), {dynamics})",
+        f"  movel(at(here[0] * 1000, here[1] * 1000, {format_mm(dispenser.travel_height_mm)}), {dynamics})",
         *(line for instruction in build_instructions(plan, steps) for line in _lines(instruction, dispenser)),
         "end",
         "",
@@ -54,13 +55,13 @@ def _lines(instruction: Instruction, dispenser: DispenserSettings) -> Iterator[s
     if isinstance(instruction, Pause):
         yield _popup(instruction.message)
     elif isinstance(instruction, LinearMove):
-        position = _format(*instruction.position_mm)
+        position = format_mm(*instruction.position_mm)
         yield f"  movel(at({position}), {_dynamics(instruction.speed_mm_s, dispenser)})"
     else:
         corners = np.round(instruction.positions_mm, 3)
         feeds, blends = instruction.feeds_mm_s.tolist(), _blend_radii(corners).tolist()
         for (x, y), feed, blend in zip(corners[1:].tolist(), feeds, blends, strict=True):
-            position = _format(x, y, instruction.z_mm)
+            position = format_mm(x, y, instruction.z_mm)
             yield f"  movep(at({position}), {_dynamics(feed, dispenser)}, r={blend / 1000:.7g})"
 
 
@@ -84,7 +85,3 @@ def _dynamics(speed_mm_s: float, dispenser: DispenserSettings) -> str:
 
 def _popup(message: str) -> str:
     return f'  popup("{message}", title="padforge", blocking=True)'
-
-
-def _format(*values_mm: float) -> str:
-    return ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values_mm)
