@@ -7,7 +7,7 @@ import click
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
 
-from .options import FOLDER, FibreNumbers, fibre_indices, lost_option, model_option, recording_argument, reported
+from padforge.sense.cli.options import FOLDER, FibreNumbers, fibre_indices, lost_option, model_option, recording_argument, reported
 
 
 @click.command()

@@ -8,7 +8,7 @@ import click
 
 from padforge.design.common import command_line as common
 
-from .options import FEATURES, METHODS, lost_option, model_option, read_recording, recording_argument, reported
+from padforge.sense.cli.options import FEATURES, METHODS, lost_option, model_option, read_recording, recording_argument, reported
 
 
 @click.command()

@@ -6,7 +6,7 @@ import click
 
 from padforge.design.common import command_line as common
 
-from .options import FILE, read_recording, recording_argument
+from padforge.sense.cli.options import FILE, read_recording, recording_argument
 
 
 @click.command()

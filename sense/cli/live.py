@@ -12,8 +12,8 @@ import click
 from padforge.design.common.command_line import json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
 
-from .options import drawn_anew
-from .rig import rig_option
+from padforge.sense.cli.options import drawn_anew
+from padforge.sense.cli.rig import rig_option
 
 if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel

@@ -17,7 +17,7 @@ from padforge.design.common.command_line import (
 )
 from padforge.design.common.validation import InputError
 
-from .options import FibreNumbers, fibre_indices, model_option, read_recording, recording_argument, reported
+from padforge.sense.cli.options import FibreNumbers, fibre_indices, model_option, read_recording, recording_argument, reported
 
 
 @click.command()

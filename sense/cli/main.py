@@ -2,13 +2,13 @@
 
 import click
 
-from .analysis import fibre_loss, learning_curve, recalibrate
-from .calibration import calibrate, evaluate
-from .identify import identify
-from .live import live
-from .locate import deploy, health, locate
-from .recordings import export, import_
-from .rig import doctor, record
+from padforge.sense.cli.analysis import fibre_loss, learning_curve, recalibrate
+from padforge.sense.cli.calibration import calibrate, evaluate
+from padforge.sense.cli.identify import identify
+from padforge.sense.cli.live import live
+from padforge.sense.cli.locate import deploy, health, locate
+from padforge.sense.cli.recordings import export, import_
+from padforge.sense.cli.rig import doctor, record
 
 COMMANDS = (
     *(import_, export, calibrate, evaluate, identify, locate, health, record, doctor, live),

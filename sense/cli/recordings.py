@@ -7,7 +7,7 @@ import click
 
 from padforge.design.common.command_line import out_option, pad_folder
 
-from .options import FOLDER, read_recording, recording_argument, recording_line, say_note
+from padforge.sense.cli.options import FOLDER, read_recording, recording_argument, recording_line, say_note
 
 if TYPE_CHECKING:
     from padforge.sense.recordings.formats.model_findings import ModelFindings

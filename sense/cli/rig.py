@@ -10,7 +10,7 @@ import click
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
 
-from .options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
+from padforge.sense.cli.options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology

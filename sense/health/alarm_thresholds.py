@@ -7,7 +7,7 @@ import numpy as np
 
 from padforge.sense.recordings.processing.limits import Array
 
-from .fault_likelihoods import HYPOTHESES
+from padforge.sense.health.fault_likelihoods import HYPOTHESES
 
 NEVER = 1e5
 """A height that no climb reaches."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Mask
 
-from .fibre_prediction import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
+from padforge.sense.health.fibre_prediction import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
 """Offsets of the rest that are looked for, in spreads of the residual of the rest."""

@@ -18,7 +18,7 @@ import numpy as np
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
-from .trained_model import average_in, one_cycle
+from padforge.sense.health.trained_model import average_in, one_cycle
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.alive` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`

@@ -17,11 +17,11 @@ from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array, Indices, as_numbers, stream_of
 from padforge.sense.recordings.recording import rate_of
 
-from .alarm_thresholds import Tail
-from .fault_likelihoods import HYPOTHESES, FaultLikelihoods
-from .fibre_prediction import Shapes, Weights
-from .schema import FORMAT, HealthDocument, refuse_unsound
-from .trained_model import files_of, refuse_other_pad
+from padforge.sense.health.alarm_thresholds import Tail
+from padforge.sense.health.fault_likelihoods import HYPOTHESES, FaultLikelihoods
+from padforge.sense.health.fibre_prediction import Shapes, Weights
+from padforge.sense.health.schema import FORMAT, HealthDocument, refuse_unsound
+from padforge.sense.health.trained_model import files_of, refuse_other_pad
 
 COMMANDED, DETECTED = "health", "health_live"
 """Names of the files of a model: learnt from presses as they were commanded, and as they are found in the readings."""

@@ -12,11 +12,11 @@ from padforge.design.common.validation import InputError, check_float, check_int
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask, as_numbers
 from padforge.sense.recordings.recording import Recording, rate_of
 
-from .alarm_thresholds import Tail
-from .fault_likelihoods import FaultLikelihoods
-from .fibre_prediction import MEMBERS, REST, Weights, expected, member, shapes_of, traces_of, train_predictors
-from .health_model import COMMANDED, DETECTED, FALSE_ALARMS, SETTLED, HealthModel, checked_presses
-from .schema import LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, WEAK_PRESSES
+from padforge.sense.health.alarm_thresholds import Tail
+from padforge.sense.health.fault_likelihoods import FaultLikelihoods
+from padforge.sense.health.fibre_prediction import MEMBERS, REST, Weights, expected, member, shapes_of, traces_of, train_predictors
+from padforge.sense.health.health_model import COMMANDED, DETECTED, FALSE_ALARMS, SETTLED, HealthModel, checked_presses
+from padforge.sense.health.schema import LEAST_PRESSES, MAX_FALSE_ALARMS, MOST_LOST, WEAK_PRESSES
 
 BLOCK = 50
 """Each member learns from all presses but its own fold, of blocks of successive ones: neighbours share what drifts."""

@@ -7,9 +7,9 @@ from padforge.design.common.files import resolve_exchange
 from padforge.sense.recordings.formats.assembly import FOUND
 from padforge.sense.recordings.recording import Recording
 
-from .health_model import COMMANDED, DETECTED, HealthModel
-from .monitor import FibreFault, examine
-from .trained_model import files_of
+from padforge.sense.health.health_model import COMMANDED, DETECTED, HealthModel
+from padforge.sense.health.monitor import FibreFault, examine
+from padforge.sense.health.trained_model import files_of
 
 
 def has_health(model: Path, name: str = COMMANDED) -> bool:

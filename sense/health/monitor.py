@@ -19,10 +19,10 @@ from padforge.sense.recordings.processing.limits import (
     refuse_beyond,
 )
 
-from .alarm_thresholds import climb
-from .fault_likelihoods import HYPOTHESES, MOST, noise_of
-from .fibre_prediction import RELEASED, REST, History, expected, press_ranges, press_trace
-from .health_model import SETTLED, HealthModel, checked_presses
+from padforge.sense.health.alarm_thresholds import climb
+from padforge.sense.health.fault_likelihoods import HYPOTHESES, MOST, noise_of
+from padforge.sense.health.fibre_prediction import RELEASED, REST, History, expected, press_ranges, press_trace
+from padforge.sense.health.health_model import SETTLED, HealthModel, checked_presses
 
 MISSING = 20
 """Presses on end without a reading after which a fibre is missing."""

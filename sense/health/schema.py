@@ -10,8 +10,8 @@ from pydantic import Field, JsonValue
 from padforge.design.common.settings import Settings
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ
 
-from .fault_likelihoods import HYPOTHESES, LIBRARY, STEPS
-from .fibre_prediction import COMPONENTS, HIDDEN, INPUTS, MEMBERS, TARGETS, TRACE
+from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, STEPS
+from padforge.sense.health.fibre_prediction import COMPONENTS, HIDDEN, INPUTS, MEMBERS, TARGETS, TRACE
 
 FORMAT = "padforge-health/1"
 MAX_FALSE_ALARMS = 0.1

@@ -23,7 +23,7 @@ from padforge.sense.localizer.normalization import Scaled
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
 from padforge.sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
 
-from .press_buffer import DONE, NEEDS, BufferedPress, Ring
+from padforge.sense.live.press_buffer import DONE, NEEDS, BufferedPress, Ring
 
 TRAIL = 12
 """Presses that are kept to be shown."""

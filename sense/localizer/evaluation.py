@@ -12,8 +12,8 @@ from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from .features import bridged, window_inputs
-from .localizer import Found, Localizer, Measured
+from padforge.sense.localizer.features import bridged, window_inputs
+from padforge.sense.localizer.localizer import Found, Localizer, Measured
 
 FORMAT = "padforge-calibration/1"
 CELLS = 5

@@ -17,12 +17,12 @@ from padforge.sense.health.trained_model import files_of, refuse_other_pad
 from padforge.sense.recordings.processing.limits import Array, Floats, Mask
 from padforge.sense.recordings.recording import Recording
 
-from .features import Inputs, press_inputs
-from .network import Weights, learnt, pooled, refuse_unsound
-from .normalization import Normalization, Scaled, Target
-from .response.observer import PREFIX as OBSERVER
-from .response.observer import TOLD, Observer
-from .schema import FORMAT, read_document
+from padforge.sense.localizer.features import Inputs, press_inputs
+from padforge.sense.localizer.network import Weights, learnt, pooled, refuse_unsound
+from padforge.sense.localizer.normalization import Normalization, Scaled, Target
+from padforge.sense.localizer.response.observer import PREFIX as OBSERVER
+from padforge.sense.localizer.response.observer import TOLD, Observer
+from padforge.sense.localizer.schema import FORMAT, read_document
 
 NAME = "localizer"
 """Of its files, `localizer.json` and `localizer.safetensors`."""

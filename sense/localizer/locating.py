@@ -12,7 +12,7 @@ from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.sense.health.monitor import FibreFault
 from padforge.sense.recordings.recording import Recording
 
-from .localizer import Found, Localizer
+from padforge.sense.localizer.localizer import Found, Localizer
 
 COLUMNS = ("press", "x_mm", "y_mm", "sd_x_mm", "sd_y_mm", "r50_mm", "r90_mm")
 """Press, counted from 0; place from the pad's centre; standard deviations; radii that hold 50 % and 90 % of presses.

@@ -12,8 +12,8 @@ import numpy as np
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Floats, Indices, Mask
 
-from .features import Inputs
-from .response.response_model import STEPS, ResponseModel, settled
+from padforge.sense.localizer.features import Inputs
+from padforge.sense.localizer.response.response_model import STEPS, ResponseModel, settled
 
 MAX_INPUT = 1e4
 """Greatest scaled input, in spreads: what lies further off is no press, and is held there."""

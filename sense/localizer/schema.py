@@ -18,7 +18,7 @@ from padforge.sense.recordings.processing.limits import (
 )
 from padforge.sense.settings import Features, Method, Split
 
-from .features import PASTS, PHASES, SIZES
+from padforge.sense.localizer.features import PASTS, PHASES, SIZES
 
 FORMAT = "padforge-localizer/2"
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]

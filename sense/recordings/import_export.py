@@ -8,17 +8,17 @@ from padforge.design.common.validation import InputError
 from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing.limits import Array
 
-from .block_file import read_blocks
-from .formats.csv_recording import export_csv, import_csv
-from .formats.hdf5 import export_hdf5, import_hdf5
-from .formats.lerobot import export_lerobot
-from .formats.model_findings import ModelFindings
-from .formats.published_mat import import_mat
-from .formats.ros.bags.reading import METADATA, SUFFIXES
-from .formats.ros.exporting import export_bag
-from .formats.ros.importing import import_bag
-from .recorder import START, STATE_COLUMNS, STATES
-from .recording import Recording
+from padforge.sense.recordings.block_file import read_blocks
+from padforge.sense.recordings.formats.csv_recording import export_csv, import_csv
+from padforge.sense.recordings.formats.hdf5 import export_hdf5, import_hdf5
+from padforge.sense.recordings.formats.lerobot import export_lerobot
+from padforge.sense.recordings.formats.model_findings import ModelFindings
+from padforge.sense.recordings.formats.published_mat import import_mat
+from padforge.sense.recordings.formats.ros.bags.reading import METADATA, SUFFIXES
+from padforge.sense.recordings.formats.ros.exporting import export_bag
+from padforge.sense.recordings.formats.ros.importing import import_bag
+from padforge.sense.recordings.recorder import START, STATE_COLUMNS, STATES
+from padforge.sense.recordings.recording import Recording
 
 _READERS: dict[str, Callable[[Path, str], Recording]] = {
     ".mat": import_mat,

@@ -10,7 +10,7 @@ from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_INDEX, MAX_MM, MAX_N
 
-from .block_file import open_in_place
+from padforge.sense.recordings.block_file import open_in_place
 
 
 class Press(NamedTuple):

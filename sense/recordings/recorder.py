@@ -32,8 +32,8 @@ from padforge.design.common.validation import InputError, check_int, check_mappi
 from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_INDEX, MAX_MM, Array, as_numbers
 
-from .block_file import BlockWriter, open_in_place, read_blocks, write_at
-from .press_journal import cut_torn_line, read_journal
+from padforge.sense.recordings.block_file import BlockWriter, open_in_place, read_blocks, write_at
+from padforge.sense.recordings.press_journal import cut_torn_line, read_journal
 
 FORMAT = "padforge-recording/1"
 START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"

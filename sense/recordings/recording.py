@@ -18,9 +18,9 @@ from padforge.design.common.validation import check_path as as_path
 from padforge.sense.recordings.processing import limits
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
-from .block_file import read_blocks
-from .press_journal import Press, read_journal
-from .recorder import (
+from padforge.sense.recordings.block_file import read_blocks
+from padforge.sense.recordings.press_journal import Press, read_journal
+from padforge.sense.recordings.recorder import (
     FILES,
     FORMAT,
     JOURNAL,

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 
 from padforge.design.common.plotting import ALARM, INK, add_caption, new_figure, save_figure
 
-from .fibre_loss_figure import label_losses
+from padforge.sense.report.fibre_loss_figure import label_losses
 
 
 def draw_error_map(document: Mapping[str, Any], path: Path) -> None:

@@ -65,7 +65,7 @@ def calibrate_into(
             model.save(folder, name)
         write_json(folder / "calibration.json", document)
         with stage("figures"):
-            from .calibration_figures import draw_error_by_loss, draw_error_map
+            from padforge.sense.report.calibration_figures import draw_error_by_loss, draw_error_map
 
             draw_error_map(document, folder / "error_map.png")
             draw_error_by_loss(document, folder / "error_by_loss.png")

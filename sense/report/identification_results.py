@@ -54,7 +54,7 @@ def identify_into(
     twin = found.twin(origin)
     document = identification_document(found, twin) | {"rig_mirrored": recording.mirrored, "provenance": origin}
     with atomic_files(out) as folder, stage("figures"):
-        from .identification_figures import draw_laid_plan, draw_responses
+        from padforge.sense.report.identification_figures import draw_laid_plan, draw_responses
 
         twin.save(folder / TWIN)
         check_replaceable(out / TWIN, folder / TWIN, force=force)  # the same plan, but perhaps another recording

@@ -15,7 +15,7 @@ from padforge.sense.recordings.processing.limits import MAX_FIBRES
 from padforge.sense.recordings.recorder import JOURNAL
 from padforge.sense.recordings.recording import Recording
 
-from .loss_chart import Errors, loss_chart
+from padforge.sense.report.loss_chart import Errors, loss_chart
 
 STUDY = "padforge-study-"
 """Formats of studies begin with this."""

@@ -9,8 +9,8 @@ import numpy as np
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.settings import RigSettings
 
-from .devices.protocols import Arm, Converter, RigFault
-from .safety import require_tool
+from padforge.sense.rig.devices.protocols import Arm, Converter, RigFault
+from padforge.sense.rig.safety import require_tool
 
 Status = Literal["ok", "warn", "fail"]
 

@@ -23,16 +23,16 @@ from padforge.sense.recordings.recording import Recording
 from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.settings import RigSettings
 
-from .devices.plugins import device
-from .devices.protocols import Arm, Converter, RigFault
-from .devices.serial_port import host_ports
-from .diagnostics import Diagnosis, examine_arm, examine_converter
-from .planning.adaptive_plan import Steering
-from .planning.pad_on_bed import on_bed
-from .planning.setup import Setup, kept_plan, plan_of, recorder_of
-from .safety import Limits, require_ready, require_tool
-from .session.interrupts import Interrupts
-from .session.press_loop import Report, Session, require_safe_plan
+from padforge.sense.rig.devices.plugins import device
+from padforge.sense.rig.devices.protocols import Arm, Converter, RigFault
+from padforge.sense.rig.devices.serial_port import host_ports
+from padforge.sense.rig.diagnostics import Diagnosis, examine_arm, examine_converter
+from padforge.sense.rig.planning.adaptive_plan import Steering
+from padforge.sense.rig.planning.pad_on_bed import on_bed
+from padforge.sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
+from padforge.sense.rig.safety import Limits, require_ready, require_tool
+from padforge.sense.rig.session.interrupts import Interrupts
+from padforge.sense.rig.session.press_loop import Report, Session, require_safe_plan
 
 _DRY = "padforge-dry-"
 """What folders for recordings that nobody keeps begin with, among temporary ones."""
@@ -80,7 +80,7 @@ def opened_rig(
     """
     rig = setup.rig.model_copy(update={"channels": tuple(inputs)})
     if kind == "simulated" or through_drivers:
-        from .emulators.whole_rig import RIGS
+        from padforge.sense.rig.emulators.whole_rig import RIGS
 
         if kind not in RIGS:
             raise InputError(f"--through-drivers: got --rig {kind}, allowed are {', '.join(RIGS)}")
@@ -114,7 +114,7 @@ def opened_board(setup: Setup, inputs: Sequence[int]) -> Iterator[Converter]:
 
 @contextmanager
 def _emulated_board(setup: Setup) -> Iterator[Converter]:
-    from .emulators.finger import pressed_by_finger
+    from padforge.sense.rig.emulators.finger import pressed_by_finger
 
     with pressed_by_finger(setup.pad, setup.contact, setup.rig) as (converter, _):
         yield converter

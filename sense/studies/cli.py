@@ -15,7 +15,7 @@ from padforge.design.common.validation import InputError
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
 
-    from .study import Study
+    from padforge.sense.studies.study import Study
 
 DEFAULT_PADS = ("square", "random-5", "optimised")
 
@@ -54,7 +54,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             from padforge.design.common.files import check_writable
             from padforge.design.common.parallel import cluster
 
-            from .study import run, study_lines
+            from padforge.sense.studies.study import run, study_lines
 
             check_writable(out)
             with common.progress() as bar:
@@ -91,7 +91,7 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
 
 
 def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_PADS) -> "dict[str, Morphology]":
-    from .pads import load_pads
+    from padforge.sense.studies.pads import load_pads
 
     return load_pads(names or default, seed)
 
@@ -124,7 +124,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
     """
     from padforge.design.settings import Contact
 
-    from .robustness import robustness_study
+    from padforge.sense.studies.robustness import robustness_study
 
     settings = common.load_spec(spec)
     contact = settings.section(Contact) if settings.stated(Contact) else None
@@ -138,7 +138,7 @@ def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
     \b
     padforge study sensitivity square
     """
-    from .sensitivity import sensitivity_study
+    from padforge.sense.studies.sensitivity import sensitivity_study
 
     return sensitivity_study(_pads(names, seed), seed=seed)
 
@@ -151,7 +151,7 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
     \b
     padforge study scaling optimised --grids 4,16,64
     """
-    from .scaling import scaling_study
+    from padforge.sense.studies.scaling import scaling_study
 
     return scaling_study(_pads(names, seed, ("square", "optimised")), grids=_numbers(grids), seed=seed)
 
@@ -200,7 +200,7 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     from padforge.sense.recordings.import_export import is_recording
     from padforge.sense.studies.drift.study import drift_study
 
-    from .pads import load_pads, load_recordings
+    from padforge.sense.studies.pads import load_pads, load_recordings
 
     names = names or DEFAULT_PADS
     recordings = [name for name in names if is_recording(Path(name))]

@@ -25,8 +25,8 @@ from padforge.design.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from padforge.sense.recordings.processing.limits import Array
 
-from .pads import described
-from .study import Findings, Study, Task
+from padforge.sense.studies.pads import described
+from padforge.sense.studies.study import Findings, Study, Task
 
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"

@@ -15,8 +15,8 @@ from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact
 
-from .pads import described
-from .study import Findings, Study, Task
+from padforge.sense.studies.pads import described
+from padforge.sense.studies.study import Findings, Study, Task
 
 MEMBERS = 6
 """Networks whose errors are averaged, for what one network comes to is luck."""

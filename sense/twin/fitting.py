@@ -12,9 +12,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices, Mask
 
-from .kernels.response import along_fibre
-from .laid_pad import ASIDE, AWAY, COUNTS, ELEMENTS, OWN, SENSITIVITY, SHARED, SPLINES, LaidPad, own_values
-from .responses import Responses
+from padforge.sense.twin.kernels.response import along_fibre
+from padforge.sense.twin.laid_pad import ASIDE, AWAY, COUNTS, ELEMENTS, OWN, SENSITIVITY, SHARED, SPLINES, LaidPad, own_values
+from padforge.sense.twin.responses import Responses
 
 SMOOTH = 0.3
 """Length over which ways aside and sensitivities change, as a share of the fibre."""

@@ -14,13 +14,13 @@ from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.recordings.simulation.strengths import strengths
 
-from .fitting import Fit, Freedom, fit
-from .identified_pad import Identification
-from .laid_pad import LaidPad, PadPlan
-from .responses import Responses, information, of_one_depth, responses
-from .scatter import response_scatter
-from .smooth import smooth_function
-from .wiring import Wiring, wirings
+from padforge.sense.twin.fitting import Fit, Freedom, fit
+from padforge.sense.twin.identified_pad import Identification
+from padforge.sense.twin.laid_pad import LaidPad, PadPlan
+from padforge.sense.twin.responses import Responses, information, of_one_depth, responses
+from padforge.sense.twin.scatter import response_scatter
+from padforge.sense.twin.smooth import smooth_function
+from padforge.sense.twin.wiring import Wiring, wirings
 
 LEAST_PRESSES = 60
 LEAST_SIDE = 0.5

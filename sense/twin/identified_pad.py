@@ -11,10 +11,10 @@ from padforge.design.paths.curves import lengths
 from padforge.design.twin import Twin, TwinChannel, TwinReadings, TwinScatter
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 
-from .fitting import Fit
-from .laid_pad import LaidPad
-from .responses import Responses
-from .wiring import Wiring
+from padforge.sense.twin.fitting import Fit
+from padforge.sense.twin.laid_pad import LaidPad
+from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.wiring import Wiring
 
 POINTS, FELT = 13, 0.01
 """Points of the reach in a twin, and the least weight that counts as felt."""

@@ -17,8 +17,8 @@ from padforge.design.settings import Layout, sensed_rectangle
 from padforge.design.twin import PlanTransform
 from padforge.sense.recordings.processing.limits import Array, Indices
 
-from .kernels.response import along_fibre, channel_response
-from .responses import Responses
+from padforge.sense.twin.kernels.response import along_fibre, channel_response
+from padforge.sense.twin.responses import Responses
 
 ELEMENTS = 160
 """Elements of a fibre."""

@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 from padforge.design.twin import TwinScatter
 from padforge.sense.recordings.processing.limits import Array
 
-from .laid_pad import LaidPad
-from .responses import Responses
+from padforge.sense.twin.laid_pad import LaidPad
+from padforge.sense.twin.responses import Responses
 
 MIN_PAIRS = 30
 """Pairs of presses from which a line is fitted."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .responses import Responses
+from padforge.sense.twin.responses import Responses
 
 WIDTHS = (0.4, 0.8)
 """Standard deviations of the kernels that are tried, grid units."""

@@ -14,8 +14,8 @@ from scipy.optimize import linear_sum_assignment, minimize
 from padforge.design.twin import PlanTransform
 from padforge.sense.recordings.processing.limits import Array, Mask
 
-from .laid_pad import PadPlan
-from .responses import Responses
+from padforge.sense.twin.laid_pad import PadPlan
+from padforge.sense.twin.responses import Responses
 
 WIDTH = 0.55
 """Standard deviation of the Gaussian reach that is tried first, grid units."""

@@ -12,7 +12,7 @@ from padforge.sense.recordings.processing.limits import MAX_MM, Array, as_number
 from padforge.sense.recordings.recorder import JOURNAL, START, Recorder
 from padforge.sense.rig.planning.setup import Setup, begun_source, require_same_devices, source_of
 
-from .targets import still_to_make, targets_of
+from padforge.sense.live.by_hand.targets import still_to_make, targets_of
 
 KIND = "hand"
 """Of the source of such a recording: nobody knows how deep its presses were."""

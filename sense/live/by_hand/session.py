@@ -19,9 +19,9 @@ from padforge.sense.recordings.recording import Recording
 from padforge.sense.rig.devices.protocols import Converter, RigFault
 from padforge.sense.rig.planning.setup import Setup
 
-from .judging import GONE_S, SOON_S, Judge, answers
-from .run_directory import opened
-from .turns import MOST, Phase, Place, Turns
+from padforge.sense.live.by_hand.judging import GONE_S, SOON_S, Judge, answers
+from padforge.sense.live.by_hand.run_directory import opened
+from padforge.sense.live.by_hand.turns import MOST, Phase, Place, Turns
 
 TRAIL = 12
 """Presses that are kept to be shown."""

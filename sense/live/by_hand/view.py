@@ -8,7 +8,7 @@ import numpy as np
 from padforge.design import Morphology
 from padforge.design.paths.curves import flatten
 
-from .session import WORDS
+from padforge.sense.live.by_hand.session import WORDS
 
 TOLERANCE = 0.02
 """Of the courses drawn, grid units."""

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from padforge.design.common.validation import InputError
 
-from .kernels.press_stream import RING, WINDOWS
-from .streaming import POLES
+from padforge.sense.live.deployment.kernels.press_stream import RING, WINDOWS
+from padforge.sense.live.deployment.streaming import POLES
 
 LAYERS = 3
 """Residual layers of a student."""

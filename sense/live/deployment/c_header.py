@@ -18,10 +18,10 @@ from padforge.sense.recordings.processing.limits import Array, Floats
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-from .budget import CODE, LAYERS, Budget, state_bytes, table_bytes
-from .kernels import press_stream
-from .streaming import POLES, rates
-from .student import Student, causal_beside, examine, split, teach
+from padforge.sense.live.deployment.budget import CODE, LAYERS, Budget, state_bytes, table_bytes
+from padforge.sense.live.deployment.kernels import press_stream
+from padforge.sense.live.deployment.streaming import POLES, rates
+from padforge.sense.live.deployment.student import Student, causal_beside, examine, split, teach
 
 WRAP, BACK = 2**30, 2**29
 """Readings at which the count of them goes back, and by how many: before 32 bits run over."""

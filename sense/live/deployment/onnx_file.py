@@ -17,7 +17,7 @@ from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask
 from padforge.sense.recordings.recording import Recording
 
-from .onnx_graph.localizer_graph import INPUTS, MEASURES, OUTPUTS, onnx_model
+from padforge.sense.live.deployment.onnx_graph.localizer_graph import INPUTS, MEASURES, OUTPUTS, onnx_model
 
 FORMAT = "padforge-onnx/1"
 MOST_OFF_MM = 1e-4

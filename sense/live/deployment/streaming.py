@@ -10,7 +10,7 @@ from padforge.sense.localizer.features import Inputs, bridged
 from padforge.sense.recordings.processing.limits import Array, Floats, Indices, Mask
 from padforge.sense.recordings.recording import Recording
 
-from .kernels.press_stream import LAG, WINDOWS, follow
+from padforge.sense.live.deployment.kernels.press_stream import LAG, WINDOWS, follow
 
 POLES = (2, 4, 8, 16, 32, 64, 128, 512, 2048)
 """Readings that the averages of the history go back by: each goes one such share of its way to every reading."""

@@ -21,8 +21,8 @@ from padforge.sense.recordings.processing.limits import Array, Floats, Indices, 
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-from .budget import LAYERS, Budget, widest
-from .streaming import Detector, Seen, commanded, owners, seen
+from padforge.sense.live.deployment.budget import LAYERS, Budget, widest
+from padforge.sense.live.deployment.streaming import Detector, Seen, commanded, owners, seen
 
 TRUSTED = 0.5
 """Share of what the teacher finds in what a press is taught as, beside what is known of it."""

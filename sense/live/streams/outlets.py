@@ -13,7 +13,7 @@ from padforge.design.common.server import ConnectionServer
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.recordings.formats.ros.topics import HEALTH, PRESSED, READINGS, TOUCHES
 
-from .messages import Message
+from padforge.sense.live.streams.messages import Message
 
 MOST_BEHIND = 4096
 """Lines that wait for a client; one that is further behind is let go, so that nobody else waits for it."""

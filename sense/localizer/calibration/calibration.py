@@ -24,7 +24,7 @@ from padforge.sense.localizer.response.observer import TOLD
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from .networks.training_presses import TrainingPresses
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
 
 LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
@@ -130,11 +130,11 @@ def learn(
     shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
     observer, corrector = None, {}
     if masked:
-        from .training import train_members  # torch, seconds to import, is needed here only
+        from padforge.sense.localizer.calibration.training import train_members  # torch, seconds to import, is needed here only
 
         weights, observer, corrector = train_members(shown, table, options, rng, progress, time_budget)
     else:
-        from .networks.published_training import train_published
+        from padforge.sense.localizer.calibration.networks.published_training import train_published
 
         held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], {})
         weights = train_published(shown, held, rng)

@@ -24,7 +24,7 @@ from padforge.sense.localizer.localizer import Found, Localizer
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from .calibration import learn, split_unseen
+from padforge.sense.localizer.calibration.calibration import learn, split_unseen
 
 FORMAT = "padforge-fibre-loss/1"
 ONE, MANY = "one network", "retrained"

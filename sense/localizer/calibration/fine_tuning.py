@@ -18,9 +18,9 @@ from padforge.sense.localizer.network import Weights
 from padforge.sense.localizer.response.observer import Observer
 from padforge.sense.recordings.processing.limits import Floats
 
-from .networks.masked_network import draw_alive, entries, forward, inputs_at, misses
-from .networks.training_presses import TrainingPresses
-from .training import INPUT_NOISE
+from padforge.sense.localizer.calibration.networks.masked_network import draw_alive, entries, forward, inputs_at, misses
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
+from padforge.sense.localizer.calibration.training import INPUT_NOISE
 
 STEPS, BATCH, RATE = 200, 128, 1e-4
 """Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""

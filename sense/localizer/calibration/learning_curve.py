@@ -20,7 +20,7 @@ from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from .calibration import learn, split_presses
+from padforge.sense.localizer.calibration.calibration import learn, split_presses
 
 FORMAT = "padforge-learning-curve/1"
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
@@ -100,7 +100,7 @@ def _found(
     progress: Callable[[int, int], None],
 ) -> list[Array]:
     """Places (Q, 2) that localizers trained on each of `trainings` find for the test presses."""
-    from .training import JointProgress, training_steps
+    from padforge.sense.localizer.calibration.training import JointProgress, training_steps
 
     # As many as a calibration takes for so many presses: of one short training for all, the most presses would seem to
     # bring little.

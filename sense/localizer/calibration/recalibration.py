@@ -23,7 +23,7 @@ from padforge.sense.localizer.localizer import Found, Localizer, joined
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from .affine_correction import fit_correction
+from padforge.sense.localizer.calibration.affine_correction import fit_correction
 
 FORMAT = "padforge-recalibration/1"
 LEAST_PRESSES = 10
@@ -146,8 +146,8 @@ def _changed(
 def _adapted(
     localizer: Localizer, raw: Inputs, places_mm: Array, measures: Measures, rng: np.random.Generator
 ) -> Localizer:
-    from .fine_tuning import adapt  # torch, seconds to import, is needed here only
-    from .networks.training_presses import TrainingPresses
+    from padforge.sense.localizer.calibration.fine_tuning import adapt  # torch, seconds to import, is needed here only
+    from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
 
     scaling, scaled = localizer.normalization, localizer.normalization.inputs(raw)
     found = localizer.locate(scaled).measures  # where it is not known how deep a press was, it goes on being found so

@@ -31,8 +31,8 @@ from padforge.sense.localizer.network import LEAST_LOG, MOST_LOG, OUTPUTS, Weigh
 from padforge.sense.localizer.response.observer import TOLD, Observer
 from padforge.sense.recordings.processing.limits import Floats
 
-from .networks.masked_network import draw_alive, entries, forward_fast, initial, inputs_at, misses
-from .networks.training_presses import TrainingPresses, as_unseen
+from padforge.sense.localizer.calibration.networks.masked_network import draw_alive, entries, forward_fast, initial, inputs_at, misses
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses, as_unseen
 
 LEAST_BATCHES, MOST_STEPS, LONGER = 10, 11_000, 2
 """Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths, and

@@ -16,7 +16,7 @@ import numpy as np
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array, Mask
 
-from .response_model import looked_up
+from padforge.sense.localizer.response.response_model import looked_up
 
 COMPONENTS = 6
 """Numbers that the windows of a fibre are brought down to: those in which places differ most for their scatter."""

@@ -11,8 +11,8 @@ from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array, Indices, Mask, as_numbers
 from padforge.sense.recordings.recording import Recording
 
-from .csv_table import UNKNOWN
-from .mapping import Part
+from padforge.sense.recordings.formats.csv_table import UNKNOWN
+from padforge.sense.recordings.formats.mapping import Part
 
 MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 """Quantities of which each press has one, and what they are called in a `Recording`."""

@@ -22,10 +22,10 @@ from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
 from padforge.sense.recordings.recording import Recording
 
-from .assembly import MEASURES, assembled
-from .csv_table import CsvTable
-from .mapping import Part, chosen, file_and_mapping, parse_mapping
-from .model_findings import export_path
+from padforge.sense.recordings.formats.assembly import MEASURES, assembled
+from padforge.sense.recordings.formats.csv_table import CsvTable
+from padforge.sense.recordings.formats.mapping import Part, chosen, file_and_mapping, parse_mapping
+from padforge.sense.recordings.formats.model_findings import export_path
 
 QUANTITIES = ("time", "fibres", "x", "y", "depth", "reached", "force", "press")
 """What a line can hold."""

@@ -16,9 +16,9 @@ from padforge.design.common.mat_files import open_hdf5
 from padforge.design.common.validation import InputError
 from padforge.sense.recordings.recording import Recording
 
-from .assembly import MEASURES, assembled
-from .mapping import chosen, file_and_mapping, listed, parse_mapping
-from .model_findings import export_path
+from padforge.sense.recordings.formats.assembly import MEASURES, assembled
+from padforge.sense.recordings.formats.mapping import chosen, file_and_mapping, listed, parse_mapping
+from padforge.sense.recordings.formats.model_findings import export_path
 
 FORMAT = "padforge-hdf5/1"
 _ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {key: key for key in ("presses_mm", "begun", "lifted")}

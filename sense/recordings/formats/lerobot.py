@@ -21,7 +21,7 @@ from padforge.sense.recordings.processing.limits import Indices
 from padforge.sense.recordings.recorder import refuse_existing
 from padforge.sense.recordings.recording import Recording
 
-from .model_findings import ModelFindings, export_path
+from padforge.sense.recordings.formats.model_findings import ModelFindings, export_path
 
 if TYPE_CHECKING:
     import pyarrow as pa

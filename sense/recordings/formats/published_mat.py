@@ -9,8 +9,8 @@ from padforge.design.common.validation import InputError
 from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.recordings.recording import Recording
 
-from .assembly import assembled
-from .mapping import chosen, file_and_mapping, parse_mapping
+from padforge.sense.recordings.formats.assembly import assembled
+from padforge.sense.recordings.formats.mapping import chosen, file_and_mapping, parse_mapping
 
 READINGS_PER_PRESS = 40
 """Length of the published cycle of a press, readings."""

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from padforge.design.common.parallel import map_chunks
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 
-from .kernels import clipping, total_variation_l1, total_variation_l2
-from .kernels import running_median as median_kernel
-from .limits import MAX_S, Array, Indices, as_numbers, refuse_beyond
+from padforge.sense.recordings.processing.kernels import clipping, total_variation_l1, total_variation_l2
+from padforge.sense.recordings.processing.kernels import running_median as median_kernel
+from padforge.sense.recordings.processing.limits import MAX_S, Array, Indices, as_numbers, refuse_beyond
 
 Fidelity = Literal["robust", "squares"]
 

@@ -7,8 +7,8 @@ pad live: a release that is off by one reading costs several millimetres.
 
 import numpy as np
 
-from .limits import Array, Indices
-from .press_detection import as_commanded, find_presses
+from padforge.sense.recordings.processing.limits import Array, Indices
+from padforge.sense.recordings.processing.press_detection import as_commanded, find_presses
 
 EARLY = 2
 """Readings before its command at which a press may show: commands are noted a little late."""

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from padforge.design.common.validation import InputError, check_int
 
-from .kernels.pad_state import unknown
-from .kernels.press_detection import find
-from .limits import MAX_FIBRES, Array, Indices, stream_of
+from padforge.sense.recordings.processing.kernels.pad_state import unknown
+from padforge.sense.recordings.processing.kernels.press_detection import find
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array, Indices, stream_of
 
 DOUBT, SURE = 1e-3, 1e-9
 """Chances that white noise leaves the levels for a look, and that it is taken for a change."""

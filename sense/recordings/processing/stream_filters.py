@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from padforge.design.common.validation import InputError, check_int
 
-from .filters import KERNELS, NOBODY, Fidelity, check_variation, checked_readings, median_of, window_reach
-from .kernels import clipping
-from .limits import MAX_FIBRES, Array
+from padforge.sense.recordings.processing.filters import KERNELS, NOBODY, Fidelity, check_variation, checked_readings, median_of, window_reach
+from padforge.sense.recordings.processing.kernels import clipping
+from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
 
 MOST_HELD = 100_000
 """Readings of a channel that are held back undecided, at most: two hours at 13 Hz."""

@@ -11,8 +11,8 @@ from padforge.sense.recordings.processing.limits import MAX_FIBRES, Array
 from padforge.sense.recordings.recording import Recording
 from padforge.sense.settings import RigSettings
 
-from .pad_model import Cycle, read_pad
-from .simulated_pad import SimulatedPad, measured, measured_alike, planned
+from padforge.sense.recordings.simulation.pad_model import Cycle, read_pad
+from padforge.sense.recordings.simulation.simulated_pad import SimulatedPad, measured, measured_alike, planned
 
 JITTER = 0.1
 """Spread of the interval between readings, share of its mean: the loop of the recording is no clock."""

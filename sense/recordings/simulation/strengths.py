@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V, Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from .pad_model import DELAY_S, DRIFT_S, TRAVEL_S
+from padforge.sense.recordings.simulation.pad_model import DELAY_S, DRIFT_S, TRAVEL_S
 
 LEAST_PRESSES = 100
 """Presses that can tell."""

@@ -8,7 +8,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from padforge.sense.rig.devices.protocols import RigFault
 
-from .byte_stream import POLL_S
+from padforge.sense.rig.boards.byte_stream import POLL_S
 
 SETTLE_S = 0.5
 """Blocks gathered before the first reading is given, so that its time rests on more than one arrival."""

@@ -3,7 +3,7 @@
 import errno
 from typing import Any
 
-from .protocols import RigFault
+from padforge.sense.rig.devices.protocols import RigFault
 
 
 def host_ports() -> list[Any]:

@@ -21,7 +21,7 @@ from padforge.sense.rig.boards.due.framing import (
     Status,
 )
 
-from .serial_board import OUT_BYTES, SerialBoard, Source
+from padforge.sense.rig.emulators.serial_board import OUT_BYTES, SerialBoard, Source
 
 MIN_NS_PER_CONVERSION = 6000
 MAX_PERIOD_NS = 1_000_000_000

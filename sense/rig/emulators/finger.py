@@ -15,7 +15,7 @@ from padforge.sense.rig.boards.due.driver import Arduino
 from padforge.sense.rig.devices.protocols import Converter
 from padforge.sense.settings import RigSettings
 
-from .due_board import EmulatedBoard
+from padforge.sense.rig.emulators.due_board import EmulatedBoard
 
 SCATTER_MM = 1.5
 """Standard deviation, each way, of where a press goes."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from padforge.sense.rig.boards.line.framing import ASK, LineHeader, header_line, sample_line
 
-from .serial_board import OUT_BYTES, SerialBoard, Source
+from padforge.sense.rig.emulators.serial_board import OUT_BYTES, SerialBoard, Source
 
 
 class EmulatedLineBoard(SerialBoard):

@@ -8,7 +8,7 @@ import numpy as np
 
 from padforge.sense.recordings.processing.limits import Array, Indices
 
-from .serial_device import SerialDevice
+from padforge.sense.rig.emulators.serial_device import SerialDevice
 
 Source = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the inputs of the board or more than are asked for."""

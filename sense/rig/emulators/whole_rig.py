@@ -18,11 +18,11 @@ from padforge.sense.rig.boards.line.framing import LineHeader
 from padforge.sense.rig.session.pad_frame import Frame
 from padforge.sense.settings import RigSettings
 
-from .due_board import EmulatedBoard
-from .line_board import EmulatedLineBoard
-from .printer.emulator import EmulatedPrinter
-from .serial_board import Source
-from .ur.emulator import HOST, UrEmulator
+from padforge.sense.rig.emulators.due_board import EmulatedBoard
+from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
+from padforge.sense.rig.emulators.printer.emulator import EmulatedPrinter
+from padforge.sense.rig.emulators.serial_board import Source
+from padforge.sense.rig.emulators.ur.emulator import HOST, UrEmulator
 
 STIFFNESS_N_MM = 2.0
 """Of the pad under the emulated arm, which has a force sensor: 10 N at the 5 mm of a usual press."""

@@ -19,11 +19,11 @@ from padforge.sense.rig.devices.protocols import Arm, Converter, Pose, RigFault
 from padforge.sense.rig.safety import POLL_S, Limits, require_ready, require_safe, wait_until_still, watch
 from padforge.sense.settings import RigSettings
 
-from .averaging import Averager
-from .disk_thread import DiskThread
-from .interrupts import Interrupts
-from .pad_frame import Frame
-from .retreat import retreat
+from padforge.sense.rig.session.averaging import Averager
+from padforge.sense.rig.session.disk_thread import DiskThread
+from padforge.sense.rig.session.interrupts import Interrupts
+from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.rig.session.retreat import retreat
 
 _SPARE_S = 3.0
 """A reading that is waited for may take this long."""

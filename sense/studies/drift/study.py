@@ -32,8 +32,8 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.studies.pads import described
 from padforge.sense.studies.study import Findings, Study, Task
 
-from .figure import draw
-from .text import told
+from padforge.sense.studies.drift.figure import draw
+from padforge.sense.studies.drift.text import told
 
 MEMBERS = 3
 """Networks whose errors are averaged: they differ by their first weights."""

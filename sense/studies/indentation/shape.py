@@ -19,7 +19,7 @@ from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.studies.pads import described
 from padforge.sense.studies.study import Findings, Study, Task
 
-from .force import EPOCHS, MEMBERS, committee, magnitudes, readings
+from padforge.sense.studies.indentation.force import EPOCHS, MEMBERS, committee, magnitudes, readings
 
 INDENTERS = {
     "sphere": Indenter("sphere", radius=0.7),

@@ -18,7 +18,7 @@ from padforge.sense.studies.indentation.force import COUNTS, readings
 from padforge.sense.studies.pads import described
 from padforge.sense.studies.study import Findings, Study, Task
 
-from .pairs import LABELLED, WAYS, Way, learnt, unordered_distances
+from padforge.sense.studies.multicontact.pairs import LABELLED, WAYS, Way, learnt, unordered_distances
 
 MEMBERS = 3
 EPOCHS = 100

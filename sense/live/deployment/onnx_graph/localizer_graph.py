@@ -12,8 +12,8 @@ from padforge.sense.localizer.locating import MEASURED
 from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
 from padforge.sense.localizer.normalization import MAX_INPUT
 
-from .features_graph import END, GraphNodes, PressFeatures, volts
-from .observer_graph import observed
+from padforge.sense.live.deployment.onnx_graph.features_graph import END, GraphNodes, PressFeatures, volts
+from padforge.sense.live.deployment.onnx_graph.observer_graph import observed
 
 OPSET = 18
 """Of the operators: that of ONNX 1.13, from 2022 on."""

@@ -6,7 +6,7 @@ from onnx import TensorProto
 
 from padforge.sense.localizer.response.observer import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, Observer
 
-from .features_graph import END, GraphNodes
+from padforge.sense.live.deployment.onnx_graph.features_graph import END, GraphNodes
 
 
 def observed(g: GraphNodes, observer: Observer, inputs: str, alive: str) -> tuple[str, str]:

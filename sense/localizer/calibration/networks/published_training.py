@@ -9,7 +9,7 @@ import numpy as np
 from padforge.design.networks import fit_batch
 from padforge.sense.localizer.network import Weights
 
-from .training_presses import TrainingPresses
+from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
 
 HIDDEN = 50
 """Neurons of the experiment's network."""

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from padforge.sense.recordings.formats.model_findings import ModelFindings
 from padforge.sense.recordings.recording import Recording
 
-from . import topics
-from .cdr import blank
+from padforge.sense.recordings.formats.ros import topics
+from padforge.sense.recordings.formats.ros.cdr import blank
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

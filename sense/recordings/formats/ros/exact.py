@@ -10,7 +10,7 @@ from padforge.design.common.validation import InputError, check_float
 from padforge.sense.recordings.processing.limits import MAX_S, Array
 from padforge.sense.recordings.recording import Recording
 
-from .topics import UNITS
+from padforge.sense.recordings.formats.ros.topics import UNITS
 
 FORMAT = "padforge-ros/1"
 _WHOLE = ("begun", "lifted")

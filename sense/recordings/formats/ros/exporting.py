@@ -14,10 +14,10 @@ from padforge.sense.recordings.processing.limits import Array, as_numbers
 from padforge.sense.recordings.recorder import STATE_COLUMNS
 from padforge.sense.recordings.recording import Recording
 
-from . import exact, topics
-from .bags.bag import MOST_BYTES, MOST_MESSAGES, MOST_RECORDS
-from .cdr import blank, rows_like, typestore
-from .diagnostics import health_messages
+from padforge.sense.recordings.formats.ros import exact, topics
+from padforge.sense.recordings.formats.ros.bags.bag import MOST_BYTES, MOST_MESSAGES, MOST_RECORDS
+from padforge.sense.recordings.formats.ros.cdr import blank, rows_like, typestore
+from padforge.sense.recordings.formats.ros.diagnostics import health_messages
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

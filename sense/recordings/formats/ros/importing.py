@@ -24,10 +24,10 @@ from padforge.sense.recordings.formats.published_mat import NOTE
 from padforge.sense.recordings.processing.limits import Array, Indices
 from padforge.sense.recordings.recording import Recording
 
-from . import exact, topics
-from .bags.bag import Topic
-from .bags.reading import read_bag
-from .cdr import numbers_in, typestore
+from padforge.sense.recordings.formats.ros import exact, topics
+from padforge.sense.recordings.formats.ros.bags.bag import Topic
+from padforge.sense.recordings.formats.ros.bags.reading import read_bag
+from padforge.sense.recordings.formats.ros.cdr import numbers_in, typestore
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .level_tracking import FIRST_LOOKS, advance, changes, follow, learn_unrest, restart, take
+from padforge.sense.recordings.processing.kernels.level_tracking import FIRST_LOOKS, advance, changes, follow, learn_unrest, restart, take
 
 STALL_S = 0.5
 """A change that goes no farther for so long has ended."""

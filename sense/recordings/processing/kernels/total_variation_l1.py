@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .interval_heap import HIGH, LOW, end_slot, pop, push
+from padforge.sense.recordings.processing.kernels.interval_heap import HIGH, LOW, end_slot, pop, push
 
 Message = tuple[Any, Any, Any]
 """(2,) the derivative's greatest value, which negated is its least, and its level between the queues, the least that is

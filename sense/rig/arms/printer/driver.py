@@ -17,10 +17,10 @@ from padforge.sense.rig.devices.protocols import ArmState, Array, Pose, RigFault
 from padforge.sense.rig.safety import require_numbers
 from padforge.sense.settings import RigSettings
 
-from . import marlin
-from .link import HOME, MarlinLink
-from .motion import Place, StraightMove
-from .mover import Mover
+from padforge.sense.rig.arms.printer import marlin
+from padforge.sense.rig.arms.printer.link import HOME, MarlinLink
+from padforge.sense.rig.arms.printer.motion import Place, StraightMove
+from padforge.sense.rig.arms.printer.mover import Mover
 
 CONNECT_S = 3.0
 """Longest wait for a printer that restarts as its port is opened."""

@@ -9,7 +9,7 @@ from typing import Any
 from padforge.sense.rig.devices.protocols import Cause, RigFault
 from padforge.sense.rig.devices.serial_port import open_port
 
-from . import marlin
+from padforge.sense.rig.arms.printer import marlin
 
 ANSWER_S = 1.0
 """Longest wait for an answer."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import reduce
 from operator import xor
 
-from .motion import Place
+from padforge.sense.rig.arms.printer.motion import Place
 
 FIRMWARE = "Marlin"
 HALTED = ("halted", "kill()", "STOP called", "stopped")

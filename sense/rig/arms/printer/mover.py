@@ -17,9 +17,9 @@ from typing import NoReturn
 
 from padforge.sense.rig.devices.protocols import RigFault
 
-from . import marlin
-from .link import HOME, MarlinLink
-from .motion import Place, StraightMove
+from padforge.sense.rig.arms.printer import marlin
+from padforge.sense.rig.arms.printer.link import HOME, MarlinLink
+from padforge.sense.rig.arms.printer.motion import Place, StraightMove
 
 LOOK_S = 0.03
 """Pause between two looks at the place."""

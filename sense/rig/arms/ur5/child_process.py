@@ -21,9 +21,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
-from . import rtde_frames as frames
-from .messages import Row, pack_answer, pack_row
-from .rtde_reader import Reading, RtdeReader
+from padforge.sense.rig.arms.ur5 import rtde_frames as frames
+from padforge.sense.rig.arms.ur5.messages import Row, pack_answer, pack_row
+from padforge.sense.rig.arms.ur5.rtde_reader import Reading, RtdeReader
 
 WATCHDOG_HZ = 4.0
 KICK_S = 0.04

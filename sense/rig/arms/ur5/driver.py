@@ -13,8 +13,8 @@ from padforge.sense.rig.devices.protocols import ArmState, Array, RigFault
 from padforge.sense.rig.safety import require_numbers
 from padforge.sense.settings import RigSettings
 
-from .link import ArmLink
-from .rtde_frames import stop_program
+from padforge.sense.rig.arms.ur5.link import ArmLink
+from padforge.sense.rig.arms.ur5.rtde_frames import stop_program
 
 CONNECT_S = 4.5
 MOVE_S = 1.0

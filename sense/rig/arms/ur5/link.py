@@ -13,8 +13,8 @@ from typing import Any
 from padforge.sense.rig.devices.processes import start
 from padforge.sense.rig.devices.protocols import Cause, RigFault
 
-from . import messages as wire
-from .rtde_frames import stop_program
+from padforge.sense.rig.arms.ur5 import messages as wire
+from padforge.sense.rig.arms.ur5.rtde_frames import stop_program
 
 KEPT = 300_000
 """States that are kept for `take`: 10 minutes at 500 Hz."""

@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from . import rtde_frames as frames
+from padforge.sense.rig.arms.ur5 import rtde_frames as frames
 
 VARIABLES = (
     *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),

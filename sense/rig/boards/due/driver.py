@@ -13,7 +13,7 @@ from padforge.sense.rig.boards.sample_clock import SampleClock
 from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.settings import RigSettings
 
-from .framing import (
+from padforge.sense.rig.boards.due.framing import (
     FULL_SCALE,
     MAX_AVERAGING,
     MAX_CHANNELS,
@@ -25,7 +25,7 @@ from .framing import (
     Request,
     Status,
 )
-from .serial_link import SerialLink, port_of
+from padforge.sense.rig.boards.due.serial_link import SerialLink, port_of
 
 FIRMWARE_MAJOR = 1
 """Boards with another first number of the firmware version speak another wire format."""

@@ -10,7 +10,7 @@ from padforge.sense.rig.devices.protocols import RigFault
 from padforge.sense.rig.devices.serial_port import host_ports
 from padforge.sense.settings import RigSettings
 
-from .framing import BoardSettings, DueDecoder, Frame, Request, encode
+from padforge.sense.rig.boards.due.framing import BoardSettings, DueDecoder, Frame, Request, encode
 
 BAUD = 115_200
 """Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""

@@ -15,7 +15,7 @@ from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
 from padforge.sense.rig.devices.serial_port import host_ports
 from padforge.sense.settings import RigSettings
 
-from .framing import ASK, LineDecoder, LineHeader, Sample
+from padforge.sense.rig.boards.line.framing import ASK, LineDecoder, LineHeader, Sample
 
 RESONATOR_SKEW = 5e-3
 """Small boards have a ceramic resonator in place of a quartz."""

@@ -11,7 +11,7 @@ from padforge.sense.recordings.processing.limits import Array
 from padforge.sense.rig.arms.printer.motion import Place
 from padforge.sense.rig.emulators.serial_device import SerialDevice
 
-from .firmware import Firmware
+from padforge.sense.rig.emulators.printer.firmware import Firmware
 
 _PAUSE_S = 0.005
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from padforge.sense.rig.arms.ur5.rtde_frames import PAUSED, PLAYING, RUNNING, STOPPED
 
-from .motion import Array, Motion
+from padforge.sense.rig.emulators.ur.motion import Array, Motion
 
 Series = Literal["cb3", "e"]
 RATES_HZ = {"cb3": 125, "e": 500}

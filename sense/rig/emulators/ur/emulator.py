@@ -13,8 +13,8 @@ from padforge.design.common.files import temporary_file
 from padforge.sense.rig.devices.processes import start
 from padforge.sense.rig.devices.protocols import Array, Pose, RigFault
 
-from .controller import Series
-from .truth import Truth, create
+from padforge.sense.rig.emulators.ur.controller import Series
+from padforge.sense.rig.emulators.ur.truth import Truth, create
 
 HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)

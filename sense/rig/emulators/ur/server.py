@@ -22,8 +22,8 @@ import numpy as np
 
 from padforge.sense.rig.arms.ur5 import rtde_frames as frames
 
-from .controller import RATES_HZ, VERSIONS, Controller, Series, SpringySurface
-from .truth import TruthWriter
+from padforge.sense.rig.emulators.ur.controller import RATES_HZ, VERSIONS, Controller, Series, SpringySurface
+from padforge.sense.rig.emulators.ur.truth import TruthWriter
 
 PORTS = {"rtde": frames.RTDE_PORT, "script": frames.SCRIPT_PORT, "dashboard": frames.DASHBOARD_PORT}
 MAX_BACKLOG = 1 << 16

@@ -6,7 +6,7 @@ from typing import BinaryIO
 
 from padforge.design.common.validation import InputError, short_repr
 
-from .bag import CUT, MOST_CHUNK_BYTES, Bag, Topic
+from padforge.sense.recordings.formats.ros.bags.bag import CUT, MOST_CHUNK_BYTES, Bag, Topic
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 2, 3, 4, 5, 6

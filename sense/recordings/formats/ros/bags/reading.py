@@ -12,8 +12,8 @@ from pathlib import Path
 from padforge.design.common.files import check_file, read_bytes
 from padforge.design.common.validation import InputError
 
-from .bag import CUT, Bag, Topic
-from .mcap_files import read_mcap
+from padforge.sense.recordings.formats.ros.bags.bag import CUT, Bag, Topic
+from padforge.sense.recordings.formats.ros.bags.mcap_files import read_mcap
 
 MOST_FILE_BYTES = 2**33
 """Size of the largest file that is looked at."""
@@ -43,7 +43,7 @@ def read_bag(path: Path, wanted: Callable[[str], bool]) -> tuple[dict[str, Topic
                 with file.open("rb") as stream:
                     read_mcap(stream, file.stat().st_size, bag)
             else:
-                from .sqlite_files import read_sqlite  # SQLite's library is loaded for its own files only
+                from padforge.sense.recordings.formats.ros.bags.sqlite_files import read_sqlite  # SQLite's library is loaded for its own files only
 
                 read_sqlite(file, bag)
     return {name: topic for name, topic in bag.topics.items() if len(topic)}, bag.kinds

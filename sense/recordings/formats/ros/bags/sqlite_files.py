@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 from padforge.design.common.validation import InputError
 
-from .bag import MOST_BYTES, Bag
+from padforge.sense.recordings.formats.ros.bags.bag import MOST_BYTES, Bag
 
 MOST_STEPS = 2**27
 """Most steps of SQLite's machine; a million messages take some ten million."""
