@@ -10,8 +10,8 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import linprog
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.sense.recordings.processing.filters import running_median, total_variation
-from padforge.sense.recordings.processing.limits import Array
+from padforge.sense.arrays import Array
+from padforge.sense.signals.filters import running_median, total_variation
 
 READINGS = 10_000
 LONG = (100_000, 1_000_000)

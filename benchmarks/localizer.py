@@ -14,13 +14,12 @@ from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design import Morphology
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense import settings
-from padforge.sense.localizer.calibration.networks.published_training import HIDDEN
-from padforge.sense.localizer.features import press_inputs
+from padforge.sense.arrays import Array, Floats
+from padforge.sense.localizer.features import Normalization, press_inputs
 from padforge.sense.localizer.network import learnt, pooled
-from padforge.sense.localizer.normalization import Normalization
-from padforge.sense.recordings.processing.limits import Array, Floats
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.localizer.training import HIDDEN
+from padforge.sense.recording.recording import Recording
+from padforge.sense.simulation.simulated_recording import simulate
 
 PRESSES, TEST = 1500, 300
 EPOCHS = (3, 10, 30, 100)
@@ -146,8 +145,8 @@ def _train_adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _train_masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
-    from padforge.sense.localizer.calibration.training import LEAST_BATCHES, train_members
+    from padforge.sense.localizer.features import TrainingPresses
+    from padforge.sense.localizer.training import LEAST_BATCHES, train_members
 
     presses = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
     batches = max(LEAST_BATCHES, len(inputs) // settings.LocalizerSettings().batch)

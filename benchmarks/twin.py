@@ -15,15 +15,13 @@ from padforge.design import Morphology
 from padforge.design.contact import signals
 from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import PlanTransform, Twin, TwinChannel
-from padforge.sense.localizer.response.response_model import RIDGE_PLACE, bumps
-from padforge.sense.recordings.processing.limits import Array
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.arrays import Array
+from padforge.sense.localizer.features import RIDGE_PLACE, bumps
+from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
-from padforge.sense.twin.identification import identify
-from padforge.sense.twin.identified_pad import Identification
-from padforge.sense.twin.laid_pad import PadPlan
-from padforge.sense.twin.responses import responses
+from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.twin.as_built import PadPlan, responses
+from padforge.sense.twin.identification import Identification, identify
 
 PRESSES = (150, 300, 600, 1500, 3000)
 TEST = 400

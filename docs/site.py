@@ -15,8 +15,8 @@ HOUSE = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     "CHANGELOG.md": "CHANGELOG.md",
-    "sense/rig/boards/due/firmware/padforge_due/README.md": "firmware-due.md",
-    "sense/rig/boards/line/firmware/padforge_line/README.md": "firmware-line.md",
+    "sense/rig/boards/firmware/padforge_due/README.md": "firmware-due.md",
+    "sense/rig/boards/firmware/padforge_line/README.md": "firmware-line.md",
 }
 """Pages of the site by the files that they are."""
 API = ("design", "fabricate", "sense")

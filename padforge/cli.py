@@ -16,7 +16,7 @@ from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs, split_formats
 from padforge.sense.cli.main import sense as sense_group
 from padforge.sense.cli.options import reported
-from padforge.sense.studies.cli import study as study_group
+from padforge.sense.cli.studies import study as study_group
 
 from .report import write_report
 from .run import SECTIONS, Run, check_run, run_stages, section_models

@@ -29,7 +29,7 @@ def write_report(folder: Path) -> Path:
     from padforge.design.report import contact_sections, design_sections
     from padforge.fabricate.outputs.report import fabrication_sections
     from padforge.sense.report import sections as sense
-    from padforge.sense.report.identification_results import identification_sections
+    from padforge.sense.report.identification import identification_sections
 
     folder = check_path("folder", folder)
     recover(folder)

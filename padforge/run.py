@@ -164,9 +164,9 @@ def check_run(run: Run) -> None:
     from padforge.design.settings import PadSettings
     from padforge.fabricate import FabricationSettings
     from padforge.fabricate.export import require_formats
-    from padforge.sense.localizer.calibration.calibration import split_presses
+    from padforge.sense.localizer.calibration import split_presses
     from padforge.sense.localizer.localizer import FORMAT as LOCALIZER_FORMAT
-    from padforge.sense.recordings.recording import refuse_replacing
+    from padforge.sense.recording.recording import refuse_replacing
     from padforge.sense.settings import LocalizerSettings, RigSettings
 
     for model in section_models().values():
@@ -193,7 +193,7 @@ def check_run(run: Run) -> None:
 
 def _regenerated_files() -> set[str]:
     """Return the names of the files that a run makes anew with the pad."""
-    from padforge.sense.report.calibration_results import FILES
+    from padforge.sense.report.calibration import FILES
 
     return {"fabrication.json", "recording", "contacts.json", *FILES}
 
@@ -224,8 +224,8 @@ def run_stages(
     from padforge.design.report import contact_line
     from padforge.fabricate import FabricationSettings, build
     from padforge.fabricate.cli import mould_lines
-    from padforge.sense.recordings.recording import Recording
-    from padforge.sense.report.calibration_results import FILES, calibrate_into, calibration_lines
+    from padforge.sense.recording.recording import Recording
+    from padforge.sense.report.calibration import FILES, calibrate_into, calibration_lines
     from padforge.sense.rig.operation import record_simulated
     from padforge.sense.settings import LocalizerSettings, RigSettings
 

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from padforge.design.common.files import read_json, recover, sha256
 from padforge.design.common.validation import InputError
-from padforge.sense.recordings.recording import Recording
+from padforge.sense.recording.recording import Recording
 from tools.kills import KILLED, forked, kill_at
 
 SETTINGS = """
@@ -68,7 +68,7 @@ _TOGETHER = (
 _OF_DESIGN = ("torch", "matplotlib.figure", "padforge.design.design_run")
 _OF_OTHERS = (
     *("build123d", "shapely", "trimesh", "h5py", "rosbags.rosbag2", "pyarrow", "numba"),
-    *("padforge.fabricate.export", "padforge.sense.localizer.calibration.training", "padforge.sense.report.sections"),
+    *("padforge.fabricate.export", "padforge.sense.localizer.training", "padforge.sense.report.sections"),
 )
 
 

@@ -11,17 +11,16 @@ import click
 
 from padforge.design.common.command_line import json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
-
 from padforge.sense.cli.options import drawn_anew
 from padforge.sense.cli.rig import rig_option
 
 if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel
+    from padforge.sense.live.outputs import Outlet
     from padforge.sense.live.pipeline import Event
-    from padforge.sense.live.sources import Source
-    from padforge.sense.live.streams.outlets import Outlet
     from padforge.sense.localizer.localizer import Localizer
-    from padforge.sense.rig.devices.protocols import Converter
+    from padforge.sense.rig.devices import Converter
+    from padforge.sense.rig.streams import Source
 
     Show = Callable[[dict[str, Any], Sequence[Event]], None]
     """Takes what there is to show, see `Live.view`, and what has just come to light."""
@@ -92,10 +91,8 @@ def live(
     A fibre found bad is left out from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "lost" hold indices, from 0.
     """
-    from padforge.sense.live.page_server import LivePage
+    from padforge.sense.live.outputs import LivePage, Messages, tell_all
     from padforge.sense.live.pipeline import Live
-    from padforge.sense.live.streams.messages import Messages
-    from padforge.sense.live.streams.outlets import tell_all
     from padforge.sense.localizer.localizer import Localizer
 
     localizers = [Localizer.load(model) for model in models]
@@ -127,7 +124,7 @@ def _connected(
     stack: ExitStack, rig: str, model: Path, localizer: "Localizer", spec: Path | None
 ) -> "tuple[Source, bool]":
     """The readings of a converter, until `stack` is left, and whether the pad lies with its tracks up."""
-    from padforge.sense.live.sources import connected, lies_mirrored
+    from padforge.sense.rig.streams import connected, lies_mirrored
     from padforge.sense.settings import RigSettings
 
     mirrored = lies_mirrored(model, load_spec(spec).section(RigSettings))
@@ -138,8 +135,8 @@ def _connected(
 
 def _replayed(replay: Path, speed: float) -> "tuple[Source, bool]":
     """The readings of a recording, and whether the pad lay with its tracks up."""
-    from padforge.sense.live.sources import replayed
-    from padforge.sense.recordings.import_export import open_recording
+    from padforge.sense.formats.import_export import open_recording
+    from padforge.sense.rig.streams import replayed
 
     recording = open_recording(replay)
     return replayed(recording, speed), recording.mirrored
@@ -161,7 +158,7 @@ def _outlets(
     stack: ExitStack, source: "Source", tcp: int | None, osc: str | None, lsl: str | None, host: str, token: str
 ) -> "list[Outlet]":
     """The ways out that were asked for, open until `stack` is left."""
-    from padforge.sense.live.streams.outlets import Lines, Lsl, Osc
+    from padforge.sense.live.outputs import Lines, Lsl, Osc
 
     outlets: list[Outlet] = []
     if tcp is not None:
@@ -178,10 +175,10 @@ def _outlets(
 def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None) -> "Converter":
     """The converter alone, not yet connected: whoever presses the pad, it is not the arm."""
     if rig == "simulated":
-        from padforge.sense.live.sources import simulated
+        from padforge.sense.rig.streams import simulated
 
         return simulated(model)
-    from padforge.sense.rig.devices.plugins import device
+    from padforge.sense.rig.devices import device
     from padforge.sense.settings import RigSettings
 
     options = load_spec(spec).section(RigSettings)
@@ -190,8 +187,8 @@ def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None)
 
 def _health(model: Path) -> "HealthModel | None":
     """What was learnt of a healthy pad, if it was."""
+    from padforge.sense.health.fault_detector import has_health
     from padforge.sense.health.health_model import DETECTED, HealthModel
-    from padforge.sense.health.model_folder import has_health
 
     if not has_health(model, DETECTED):
         click.echo(f"{model}: health was not learnt, so no fibre will be found bad", err=True)

@@ -2,11 +2,18 @@
 
 import click
 
-from padforge.sense.cli.analysis import fibre_loss, learning_curve, recalibrate
-from padforge.sense.cli.calibration import calibrate, evaluate
-from padforge.sense.cli.identify import identify
 from padforge.sense.cli.live import live
-from padforge.sense.cli.locate import deploy, health, locate
+from padforge.sense.cli.localizer import (
+    calibrate,
+    deploy,
+    evaluate,
+    fibre_loss,
+    health,
+    identify,
+    learning_curve,
+    locate,
+    recalibrate,
+)
 from padforge.sense.cli.recordings import export, import_
 from padforge.sense.cli.rig import doctor, record
 

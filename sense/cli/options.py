@@ -13,7 +13,8 @@ from padforge.design.common.command_line import progress
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
-    from padforge.sense.recordings.recording import Recording
+    from padforge.sense.recording.recording import Recording
+
 
 METHODS, FEATURES = ("masked", "published"), ("full", "causal", "early", "published")
 SHOWN_HZ = 15
@@ -52,7 +53,7 @@ def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:
 
 def read_recording(path: Path) -> "Recording":
     """The recording in a folder or file, with a line on stderr where its end is torn off or cut off."""
-    from padforge.sense.recordings.import_export import open_recording
+    from padforge.sense.formats.import_export import open_recording
 
     recording = open_recording(path)
     if recording.torn_presses:

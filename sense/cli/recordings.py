@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 import click
 
 from padforge.design.common.command_line import out_option, pad_folder
-
 from padforge.sense.cli.options import FOLDER, read_recording, recording_argument, recording_line, say_note
 
 if TYPE_CHECKING:
-    from padforge.sense.recordings.formats.model_findings import ModelFindings
-    from padforge.sense.recordings.recording import Recording
+    from padforge.sense.formats.annotations import ModelFindings
+    from padforge.sense.recording.recording import Recording
+
 
 _PATH = click.Path(path_type=Path)
 
@@ -58,9 +58,9 @@ def import_(file: Path, mapping: str, out: Path | None) -> None:
     A reading goes with what was said last before it.
     """
     from padforge.design.common.files import provenance
-    from padforge.sense.recordings.formats.assembly import FOUND
-    from padforge.sense.recordings.import_export import import_file
-    from padforge.sense.recordings.recorder import refuse_existing
+    from padforge.sense.formats.columns import FOUND
+    from padforge.sense.formats.import_export import import_file
+    from padforge.sense.recording.run_directory import refuse_existing
 
     folder = out or pad_folder(file) / "recording"
     refuse_existing(folder)
@@ -100,7 +100,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
       /arm/pose       PoseStamped, of a recording made by an arm
     It needs rosbags (pip install 'padforge[ros]'), LeRobot needs pyarrow (padforge[lerobot]).
     """
-    from padforge.sense.recordings.import_export import arm_states, export_file
+    from padforge.sense.formats.import_export import arm_states, export_file
 
     opened = read_recording(recording)
     findings = _findings(model, opened) if model else None
@@ -112,10 +112,10 @@ def _findings(model: Path, recording: "Recording") -> "ModelFindings":
     """What a model says of a recording; a fibre at fault is left out from the press on since which it is."""
     import numpy as np
 
-    from padforge.sense.health.model_folder import examined, has_health
+    from padforge.sense.formats.annotations import FaultFound, ModelFindings
+    from padforge.sense.health.fault_detector import examined, has_health
+    from padforge.sense.health.locating import locate
     from padforge.sense.localizer.localizer import Localizer
-    from padforge.sense.localizer.locating import locate
-    from padforge.sense.recordings.formats.model_findings import FaultFound, ModelFindings
 
     known, faults = examined(model, recording) if has_health(model) else (None, [])
     found = locate(Localizer.load(model), recording, findings=faults)

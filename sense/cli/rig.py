@@ -9,15 +9,15 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-
 from padforge.sense.cli.options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
     from padforge.design.twin import Twin
-    from padforge.sense.recordings.recording import Recording
-    from padforge.sense.rig.planning.setup import Setup
+    from padforge.sense.recording.recording import Recording
+    from padforge.sense.rig.config import Setup
+
 
 rig_option = click.option(
     "--rig",
@@ -83,8 +83,8 @@ def record(
     """
     from padforge.design.settings import Contact, PadSettings
     from padforge.sense.rig import operation
-    from padforge.sense.rig.devices.processes import require_rig_system
-    from padforge.sense.rig.planning.setup import Setup
+    from padforge.sense.rig.config import Setup
+    from padforge.sense.rig.devices import require_rig_system
     from padforge.sense.settings import RigSettings
 
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
@@ -134,7 +134,7 @@ def _record_with(
     rig: str, setup: "Setup", model: Path | None, dry_run: bool, resume: bool, through_drivers: bool
 ) -> "Recording | None":
     """Record with an arm, or by hand."""
-    from padforge.sense.recordings.recorder import START
+    from padforge.sense.recording.run_directory import START
     from padforge.sense.rig import operation
 
     if resume and not (setup.out / START).exists():
@@ -150,11 +150,10 @@ def _record_with(
 
 def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording":
     """Show a person where to press, on a page and in the terminal, and take what is said on both."""
-    from padforge.sense.live.by_hand.session import WORDS, record_by_hand
-    from padforge.sense.live.by_hand.view import pad_view, view_lines
-    from padforge.sense.live.page_server import LivePage
-    from padforge.sense.rig.emulators.finger import pressed_by_finger
+    from padforge.sense.live.outputs import LivePage
+    from padforge.sense.rig.by_hand import WORDS, pad_view, record_by_hand, view_lines
     from padforge.sense.rig.operation import opened_board
+    from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
     words = {each["key"]: each["word"] for each in WORDS}
     with ExitStack() as stack:
@@ -219,9 +218,9 @@ def doctor(
     from dataclasses import asdict
 
     from padforge.design.settings import Contact, PadSettings
-    from padforge.sense.rig.devices.processes import require_rig_system
+    from padforge.sense.rig.config import Setup
+    from padforge.sense.rig.devices import require_rig_system
     from padforge.sense.rig.operation import look_over
-    from padforge.sense.rig.planning.setup import Setup
     from padforge.sense.settings import RigSettings
 
     require_rig_system()

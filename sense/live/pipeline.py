@@ -2,8 +2,7 @@
 
 Readings go in, in blocks of any size. Out comes what they bring to light: where each press was, first from the few
 readings that one localizer can do with, refined by others, and which fibres are bad. Those are left out from the next
-press on.
-"""
+press on."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -13,17 +12,15 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
+from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
+from padforge.sense.health.fault_detector import FibreFault, Monitor
 from padforge.sense.health.health_model import HealthModel
-from padforge.sense.health.monitor import FibreFault, Monitor
-from padforge.sense.health.trained_model import refuse_other_pad
-from padforge.sense.localizer.features import REST, SIZES, bridged, press_inputs
+from padforge.sense.health.locating import MEASURED
+from padforge.sense.localizer.features import REST, SIZES, Scaled, bridged, press_inputs
 from padforge.sense.localizer.localizer import Localizer
-from padforge.sense.localizer.locating import MEASURED
-from padforge.sense.localizer.normalization import Scaled
-from padforge.sense.recordings.processing.limits import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
-from padforge.sense.recordings.processing.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
-
-from padforge.sense.live.press_buffer import DONE, NEEDS, BufferedPress, Ring
+from padforge.sense.localizer.model_files import refuse_other_pad
+from padforge.sense.rig.streams import DONE, NEEDS, BufferedPress, Ring
+from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
 
 TRAIL = 12
 """Presses that are kept to be shown."""

@@ -9,11 +9,10 @@ import numpy as np
 
 from padforge.design.common.validation import InputError, check_int, check_type, short_repr
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.sense.recordings.processing.limits import Array, Indices
-from padforge.sense.recordings.recording import Recording
-
+from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import bridged, window_inputs
 from padforge.sense.localizer.localizer import Found, Localizer, Measured
+from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/1"
 CELLS = 5
@@ -253,4 +252,35 @@ def _measure_errors(found: Sequence[Found], measures: Mapping[str, Array] | None
                 f"{kind}_p95_{unit}": float(np.percentile(errors, 95)),
                 f"{kind}_within_r90": float(np.mean(within)),
             }
+    return out
+
+
+def calibration_lines(document: Mapping[str, Any]) -> list[str]:
+    """The errors of a calibration document as tables for people: of places, and of depth and force if learnt."""
+    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
+    of = " of a simulated pad" if document["provenance"].get("recording_kind") == "simulated" else ""
+    return [
+        f"error in mm on {document['test_presses']} presses{of} (split: {document['split']})",
+        "lost  sets   mean    std    max median    p95  in r50  in r90",
+        *(
+            f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+            f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
+            for row in document["errors"]
+        ),
+        *measure_lines(document["errors"]),
+    ]
+
+
+def measure_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Errors of depth and force as tables for people, by rows of "errors"; none where they were not learnt."""
+    out = []
+    for kind, unit in (("depth", "mm"), ("force", "N")):
+        names = (f"{kind}_mean_{unit.lower()}", f"{kind}_p95_{unit.lower()}")
+        if names[0] in rows[0]:
+            out += [f"error of {kind} in {unit}", "lost  sets   mean    p95  in r90"]
+            out += [
+                f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+                f"{row[f'{kind}_within_r90']:7.1%}"
+                for row in rows
+            ]
     return out

@@ -3,8 +3,7 @@
 Of the method "masked": masked inputs enter together with the mask, so one network serves every set of lost fibres. A
 first layer leads to residual layers h + gelu(normalised h) W + b, and a normalised last one to two coordinates, to what
 else is learnt of a press, and to the logarithms of the expected errors of all these. Members of an ensemble are stacked
-along the first axis of every array. Of the method "published": one layer of tanh neurons leads to two coordinates.
-"""
+along the first axis of every array. Of the method "published": one layer of tanh neurons leads to two coordinates."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -12,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from padforge.design.common.validation import InputError
-from padforge.sense.recordings.processing.limits import Array, Floats, Mask
+from padforge.sense.arrays import Array, Floats, Mask
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and

@@ -1,4 +1,7 @@
-"""A rig at work: its devices are opened, looked over, and made to record; or a recording is simulated at once."""
+"""Pressing where a localizer is least certain: an adaptive plan moves its presses there as the recording goes on.
+
+A rig at work: its devices are opened, looked over, and made to record; or a recording is simulated at once.
+"""
 
 import tempfile
 import time
@@ -8,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from padforge.design.common.files import provenance, temporary_folder
 from padforge.design.common.profiling import stage
@@ -16,23 +20,63 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
+from padforge.sense.arrays import Array
+from padforge.sense.health.locating import locate
 from padforge.sense.localizer.localizer import Localizer
-from padforge.sense.recordings.press_plan import PressPlan, free_of, size_of
-from padforge.sense.recordings.recorder import refuse_begun, refuse_existing
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.recordings.simulation.published_protocol import simulate
-from padforge.sense.settings import RigSettings
-
-from padforge.sense.rig.devices.plugins import device
-from padforge.sense.rig.devices.protocols import Arm, Converter, RigFault
-from padforge.sense.rig.devices.serial_port import host_ports
-from padforge.sense.rig.diagnostics import Diagnosis, examine_arm, examine_converter
-from padforge.sense.rig.planning.adaptive_plan import Steering
-from padforge.sense.rig.planning.pad_on_bed import on_bed
-from padforge.sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
+from padforge.sense.recording.press_plan import Free, PressPlan, free_of, size_of, uniform
+from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.run_directory import refuse_begun, refuse_existing
+from padforge.sense.rig.config import Setup, kept_plan, on_bed, plan_of, recorder_of
+from padforge.sense.rig.devices import Arm, Converter, RigFault, device, host_ports
+from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_converter
+from padforge.sense.rig.press_loop import Interrupts, Report, Session, require_safe_plan
 from padforge.sense.rig.safety import Limits, require_ready, require_tool
-from padforge.sense.rig.session.interrupts import Interrupts
-from padforge.sense.rig.session.press_loop import Report, Session, require_safe_plan
+from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
+
+EVERY = 20
+"""Presses between two looks at how well the localizer finds them."""
+_CANDIDATES = 500
+_NEIGHBOURS = 5
+
+
+class Steering:
+    """Chooses presses: those candidates where errors nearby, times the way to the nearest press, are largest.
+
+    Args:
+        localizer: calibrated on an earlier recording of the pad. run: run directory that is being written, synced after
+            every press. rng: of the candidates. free: which of them may be pressed.
+    """
+
+    def __init__(self, localizer: Localizer, run: Path, rng: np.random.Generator, free: Free) -> None:
+        self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
+
+    def __call__(self, plan: PressPlan, press: int) -> PressPlan:
+        """The plan with its next presses, from `press` on, moved; unchanged between two looks."""
+        if press == 0 or press % EVERY:
+            return plan
+        recording = Recording.open(self._run)
+        errors = np.linalg.norm(locate(self._localizer, recording).places_mm - recording.presses_mm, axis=1)
+        places = plan.places_mm.copy()
+        high = np.abs(plan.places_mm).max(axis=0)
+        candidates = uniform(np.array([-high, high]), _CANDIDATES, self._rng, self._free)
+        pressed = recording.presses_mm
+        for number in range(press, min(press + EVERY, len(plan))):
+            places[number] = candidates[np.argmax(uncertainty(candidates, recording.presses_mm, errors, pressed))]
+            pressed = np.vstack([pressed, places[number]])
+        return PressPlan(places, plan.depths_mm)
+
+
+def uncertainty(candidates: Array, known: Array, errors: Array, pressed: Array) -> Array:
+    """(K,) how much there is to learn at candidates (K, 2): mean error of the nearest presses times the way to any.
+
+    Args:
+        known, errors: (Q, 2) places whose errors (Q,) are known. pressed: (P, 2) all places, of which none is repeated.
+    """
+    _, near = KDTree(known).query(candidates, k=min(_NEIGHBOURS, len(known)))
+    way, _ = KDTree(pressed).query(candidates)
+    return errors[near].reshape(len(candidates), -1).mean(axis=1) * way
+
 
 _DRY = "padforge-dry-"
 """What folders for recordings that nobody keeps begin with, among temporary ones."""
@@ -80,7 +124,7 @@ def opened_rig(
     """
     rig = setup.rig.model_copy(update={"channels": tuple(inputs)})
     if kind == "simulated" or through_drivers:
-        from padforge.sense.rig.emulators.whole_rig import RIGS
+        from padforge.sense.virtual.virtual_rig import RIGS
 
         if kind not in RIGS:
             raise InputError(f"--through-drivers: got --rig {kind}, allowed are {', '.join(RIGS)}")
@@ -114,7 +158,7 @@ def opened_board(setup: Setup, inputs: Sequence[int]) -> Iterator[Converter]:
 
 @contextmanager
 def _emulated_board(setup: Setup) -> Iterator[Converter]:
-    from padforge.sense.rig.emulators.finger import pressed_by_finger
+    from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
     with pressed_by_finger(setup.pad, setup.contact, setup.rig) as (converter, _):
         yield converter

@@ -7,9 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+from padforge.sense.rig.devices import Arm, ArmState, RigFault
 from padforge.sense.settings import RigSettings
-
-from padforge.sense.rig.devices.protocols import Arm, ArmState, RigFault
 
 Vector = tuple[float, float, float]
 DOWN: Vector = (0.0, math.pi, 0.0)

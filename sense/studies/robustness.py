@@ -16,10 +16,8 @@ from padforge.design.morphology import Morphology
 from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
-from padforge.sense.recordings.processing.limits import Array
-
-from padforge.sense.studies.pads import described
-from padforge.sense.studies.study import Findings, Study, Task
+from padforge.sense.arrays import Array
+from padforge.sense.studies.study import Findings, Study, Task, described
 
 RULES = {"published": signals_quantized, "exact": signals}
 """How a pad's signals are made: by sampled fibres, as the published figures were, or exactly."""

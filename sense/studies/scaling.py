@@ -5,8 +5,7 @@ and is judged on those presses themselves. Beside it stands a way that is judged
 presses spread over the whole surface, and is given what share of its family's signal each fibre has, which makes the
 place an almost linear function of the inputs whatever the size. The third way uses that tiles are alike: where fibres
 signal most tells the tile, and one network, given the fibres of that tile and its neighbours, tells where in the tile.
-All presses teach it whatever tile they are in, so that neither its size nor its error need grow with the surface.
-"""
+All presses teach it whatever tile they are in, so that neither its size nor its error need grow with the surface."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -23,10 +22,8 @@ from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
-from padforge.sense.recordings.processing.limits import Array
-
-from padforge.sense.studies.pads import described
-from padforge.sense.studies.study import Findings, Study, Task
+from padforge.sense.arrays import Array
+from padforge.sense.studies.study import Findings, Study, Task, described
 
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"

@@ -14,9 +14,7 @@ from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact
-
-from padforge.sense.studies.pads import described
-from padforge.sense.studies.study import Findings, Study, Task
+from padforge.sense.studies.study import Findings, Study, Task, described
 
 MEMBERS = 6
 """Networks whose errors are averaged, for what one network comes to is luck."""

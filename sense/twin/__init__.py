@@ -1,1 +1,7 @@
-"""The twin of a printed pad: how it was laid, wired and turned, and what a press really does to it."""
+"""The twin: the as-built model of a printed pad, identified from a recording of presses."""
+
+from pathlib import Path
+
+from padforge.design.common.parallel import clear_stale_kernels
+
+clear_stale_kernels(Path(__file__).parent)

@@ -9,7 +9,7 @@ import pytest
 
 from padforge.cli import main
 from padforge.design import Morphology
-from padforge.sense.recordings.recording import Recording
+from padforge.sense.recording.recording import Recording
 from tests.docs.pages import BLOCK, ROOT
 
 PAGE = ROOT / "docs" / "devices.md"

@@ -21,7 +21,7 @@ from unittest.mock import patch
 
 import pytest
 
-from padforge.sense.health import fibre_prediction
+from padforge.sense.health import trace_model as fibre_prediction
 from tests.docs.pages import BLOCK, ROOT, relative
 from tests.helpers.door import call
 from tests.helpers.once import Once

@@ -13,7 +13,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number
-from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.rig.config import Frame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
 

@@ -89,7 +89,7 @@ def sense_kernels() -> None:
         simulate,
         total_variation,
     )
-    from padforge.sense.live.deployment.streaming import Detector
+    from padforge.sense.deploy.streaming import Detector
     from padforge.sense.twin.identification import identify
 
     recording = simulate(Morphology.straight(2), RigSettings(presses=60))

@@ -9,7 +9,7 @@ import pytest
 from padforge.design import Morphology
 from padforge.sense import Localizer, Recording, calibrate
 from padforge.sense import settings as sense_settings
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.once import Once
 
 QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)

@@ -38,7 +38,7 @@ LIBRARIES = (
     *(
         "rosbags.rosbag2",
         "scipy.io",
-        "padforge.sense.live.deployment.onnx_file",
+        "padforge.sense.deploy.onnx_export",
         "ezdxf",
         "lxml.etree",
         "pymoo.core.problem",

@@ -10,7 +10,7 @@ import pytest
 from padforge.design.morphology import Morphology
 from padforge.fabricate.outputs.drawings import TURN_DEG, orientation_sentence, orientation_svg
 from padforge.fabricate.plan import Plan
-from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.rig.config import Frame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 

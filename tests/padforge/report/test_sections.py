@@ -17,8 +17,8 @@ from padforge.design.morphology import Morphology
 from padforge.design.report import contact_line
 from padforge.fabricate import build
 from padforge.report import write_report
-from padforge.sense.recordings.recorder import Recorder
-from padforge.sense.recordings.recording import Recording
+from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.run_directory import Recorder
 from tests.padforge.report.documents import (
     HOSTILE,
     PAD,

@@ -11,8 +11,8 @@ import pytest
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.settings import Spec
-from padforge.sense.health import fibre_prediction
-from padforge.sense.report.calibration_results import calibrate_into
+from padforge.sense.health import trace_model as fibre_prediction
+from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
 from padforge.sense.settings import LocalizerSettings
 from tests.helpers.once import Once

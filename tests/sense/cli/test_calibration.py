@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-import padforge.sense.cli.calibration
-import padforge.sense.report.calibration_figures
-from padforge.sense.localizer.calibration import fine_tuning
+import padforge.sense.cli.localizer
+import padforge.sense.report.calibration
+from padforge.sense.localizer import training as fine_tuning
 
 
 def files_in(folder: str) -> dict[str, bytes]:
@@ -50,7 +50,7 @@ def test_interrupted_training_leaves_no_file(few, monkeypatch: pytest.MonkeyPatc
 
         yield report
 
-    monkeypatch.setattr(padforge.sense.cli.calibration, "reported", reported)
+    monkeypatch.setattr(padforge.sense.cli.localizer, "reported", reported)
     code, _, err = few("calibrate", "rec", "--out", "new")
     assert code == 130
     assert "interrupted" in err
@@ -63,7 +63,7 @@ def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkey
     def full(document: object, path: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(padforge.sense.report.calibration_figures, "draw_error_by_loss", full)
+    monkeypatch.setattr(padforge.sense.report.calibration, "draw_error_by_loss", full)
     code, _, err = few("calibrate", "rec", "--seed", "5", "--out", "model")
     assert code == 2
     assert "model: cannot be written (No space left on device)" in err.splitlines()[-1]

@@ -11,10 +11,10 @@ import pytest
 
 from padforge.sense import Localizer, Recording
 from padforge.sense.cli.live import view_lines
-from padforge.sense.live.page_server import LivePage
-from padforge.sense.live.streams import messages
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.emulators import live_pad
+from padforge.sense.live import outputs as messages
+from padforge.sense.live.outputs import LivePage
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.virtual import virtual_pad as live_pad
 from tests.sense.live.conftest import first_presses
 
 

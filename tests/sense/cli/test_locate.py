@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from padforge.sense import Localizer, Recording
-from padforge.sense.localizer.locating import locate
+from padforge.sense.health.locating import locate
 
 
 def test_places_without_the_fibres_masked(few) -> None:
@@ -82,7 +82,7 @@ def test_the_localizer_goes_elsewhere_as_a_header(few) -> None:
 
 @pytest.mark.parametrize("library", ["onnx", "onnxruntime"])
 def test_a_graph_without_its_libraries_is_one_line(few, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith("padforge.sense.live.deployment.onnx")]:
+    for name in [name for name in sys.modules if name.startswith("padforge.sense.deploy.onnx")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, library, None)
     code, out, err = few("deploy", "--model", "model", "localizer.onnx")

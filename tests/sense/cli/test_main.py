@@ -15,7 +15,7 @@ from padforge.sense.cli.options import typed_keys
 def test_importing_takes_no_torch() -> None:
     modules = (
         "padforge.sense, padforge.sense.cli.main, padforge.sense.settings, padforge.sense.localizer.localizer,"
-        " padforge.sense.localizer.calibration.calibration"
+        " padforge.sense.localizer.calibration"
     )
     code = f"import sys, {modules}; sys.exit(bool({{'torch', 'matplotlib'}} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

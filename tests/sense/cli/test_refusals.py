@@ -14,9 +14,9 @@ from padforge.design import Morphology
 from padforge.design.common.files import sha256
 from padforge.design.twin import TwinChannel
 from padforge.sense import Recording
-from padforge.sense.live.page_server import LivePage
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.live.outputs import LivePage
 from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
 
 ROWS = """
 import noise.mat --out r                        | noise.mat
@@ -162,8 +162,8 @@ def files_of(folder: Path) -> dict[Path, int]:
 def test_what_cannot_be_done_is_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
-    monkeypatch.setattr("padforge.sense.localizer.calibration.fine_tuning.STEPS", 15)
-    monkeypatch.setattr("padforge.sense.rig.boards.due.serial_link.find_ports", list)
+    monkeypatch.setattr("padforge.sense.localizer.training.STEPS", 15)
+    monkeypatch.setattr("padforge.sense.rig.boards.due.find_ports", list)
     monkeypatch.chdir(workshop)
     before = files_of(workshop)
     with LivePage(0) as page:

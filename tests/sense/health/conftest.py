@@ -7,7 +7,7 @@ from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense import Recording
 from padforge.sense import settings as sense_settings
 from padforge.sense.health.health_model import HealthModel
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.once import Once
 from tests.sense.health.pads import PRESSES, learn
 

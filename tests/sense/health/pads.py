@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.sense import Recording
-from padforge.sense.health import fibre_prediction, learning
-from padforge.sense.health.health_model import HealthModel
-from padforge.sense.health.learning import fit_health_model
-from padforge.sense.health.monitor import FibreFault, examine
+from padforge.sense.health import health_model as learning
+from padforge.sense.health import trace_model as fibre_prediction
+from padforge.sense.health.fault_detector import FibreFault, examine
+from padforge.sense.health.health_model import HealthModel, fit_health_model
 
 Array = NDArray[np.float64]
 LEARNT, PRESSES, BAD_FROM = 600, 760, 660

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from padforge.sense.health import fault_likelihoods
-from padforge.sense.health.alarm_thresholds import Tail, climb
-from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, FaultLikelihoods, noise_of
-from padforge.sense.health.fibre_prediction import COMPONENTS, REST, TARGETS, TRACE
+from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, FaultLikelihoods, Tail, climb, noise_of
+from padforge.sense.health.trace_model import COMPONENTS, REST, TARGETS, TRACE
 from tests.sense.health.pads import Array
 
 PRESSES, FIBRES = 5, 3

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from padforge.sense.health import fibre_prediction
-from padforge.sense.health.fibre_prediction import (
+from padforge.sense.health import trace_model as fibre_prediction
+from padforge.sense.health.trace_model import (
     COMPONENTS,
     INPUTS,
     MEMBERS,

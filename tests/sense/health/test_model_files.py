@@ -14,9 +14,9 @@ import pytest
 from padforge.design.common.files import read_json
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
+from padforge.sense.health.fault_detector import health_files, health_in
 from padforge.sense.health.health_model import COMMANDED, DETECTED, HealthModel
-from padforge.sense.health.model_folder import health_files, health_in
-from padforge.sense.health.trained_model import ModelFiles, files_of, one_cycle
+from padforge.sense.localizer.model_files import ModelFiles, files_of, one_cycle
 from tests.sense.health.pads import later, spoilt
 from tools.kills import killed
 

@@ -12,14 +12,20 @@ from padforge.design.common.validation import InputError
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense import Localizer, Recording, open_recording
 from padforge.sense import settings as sense_settings
-from padforge.sense.health import learning
+from padforge.sense.arrays import LEAST_SPREAD_V
+from padforge.sense.health import health_model as learning
+from padforge.sense.health.fault_detector import TEXTS, FibreFault, Monitor, examine, fault_lines
 from padforge.sense.health.fault_likelihoods import HYPOTHESES
-from padforge.sense.health.health_model import COMMANDED, DETECTED, HealthModel, checked_presses
-from padforge.sense.health.learning import dead_fibres, fit_health_model
-from padforge.sense.health.monitor import TEXTS, FibreFault, Monitor, examine, fault_lines
-from padforge.sense.health.schema import LEAST_PRESSES
-from padforge.sense.recordings.processing.limits import LEAST_SPREAD_V
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.health.health_model import (
+    COMMANDED,
+    DETECTED,
+    LEAST_PRESSES,
+    HealthModel,
+    checked_presses,
+    dead_fibres,
+    fit_health_model,
+)
+from padforge.sense.simulation.simulated_recording import simulate
 from tests.sense.health.pads import BAD_FROM, LEARNT, PRESSES, faulty, later, learn, spoilt
 
 FEW = 320

@@ -13,7 +13,7 @@ import pytest
 
 from padforge.design.common import server as local_page
 from padforge.design.common.server import HOST
-from padforge.sense.live.page_server import LivePage
+from padforge.sense.live.outputs import LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'

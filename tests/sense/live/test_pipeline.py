@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 import padforge.sense.live.pipeline
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, locate
-from padforge.sense.health.monitor import FibreFault
+from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Live
-from padforge.sense.live.press_buffer import HISTORY, SLACK, BufferedPress
-from padforge.sense.recordings.processing.press_detection import Event
+from padforge.sense.rig.streams import HISTORY, SLACK, BufferedPress
+from padforge.sense.signals.press_detection import Event
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
 

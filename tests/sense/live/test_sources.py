@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import padforge.sense.live.sources
+import padforge.sense.rig.streams
 from padforge.design import Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
 from padforge.sense import Recording
-from padforge.sense.live.sources import RECORDED, connected, lies_mirrored, replayed, simulated
-from padforge.sense.recordings.recorder import FORMAT, START
-from padforge.sense.recordings.simulation.published_protocol import simulate
-from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
-from padforge.sense.rig.emulators.live_pad import SimulatedConverter
+from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.streams import RECORDED, connected, lies_mirrored, replayed, simulated
 from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.virtual.virtual_pad import SimulatedConverter
 from tests.sense.rig.devices.fakes import Time
 
 
@@ -24,8 +24,8 @@ from tests.sense.rig.devices.fakes import Time
 def still(monkeypatch: pytest.MonkeyPatch) -> Time:
     """A clock that stands still but where somebody waits."""
     time = Time(least_s=0)
-    monkeypatch.setattr(padforge.sense.live.sources.time, "monotonic", time)
-    monkeypatch.setattr(padforge.sense.live.sources.time, "sleep", time.sleep)
+    monkeypatch.setattr(padforge.sense.rig.streams.time, "monotonic", time)
+    monkeypatch.setattr(padforge.sense.rig.streams.time, "sleep", time.sleep)
     return time
 
 

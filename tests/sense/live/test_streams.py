@@ -19,12 +19,11 @@ import pytest
 from padforge.design.common import server as listening
 from padforge.design.common.validation import InputError
 from padforge.sense import Live, Localizer, Recording
-from padforge.sense.health.monitor import FibreFault
+from padforge.sense.formats.ros_messages import HEALTH, KINDS, PRESSED, READINGS, TOUCHES, heights
+from padforge.sense.health.fault_detector import FibreFault
+from padforge.sense.live import outputs as outlets
+from padforge.sense.live.outputs import FORMAT, Lines, Message, Messages, Osc
 from padforge.sense.live.pipeline import Estimate
-from padforge.sense.live.streams import outlets
-from padforge.sense.live.streams.messages import FORMAT, Message, Messages
-from padforge.sense.live.streams.outlets import Lines, Osc
-from padforge.sense.recordings.formats.ros.topics import HEALTH, KINDS, PRESSED, READINGS, TOUCHES, heights
 
 PLACE = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "lost": []}
 TOUCH = Message(TOUCHES, {}, {"event": "touch", **PLACE})
@@ -246,7 +245,7 @@ def test_osc_goes_on_while_its_network_is_away(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_stream_whose_name_is_no_text_is_refused() -> None:
-    from padforge.sense.live.streams.outlets import Lsl
+    from padforge.sense.live.outputs import Lsl
 
     with pytest.raises(InputError, match="the name of a stream is"):
         Lsl("\udc80", 2, 13.0)
@@ -257,7 +256,7 @@ def test_lsl_tells_readings_and_touches(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "lsl.cfg").write_text("[multicast]\nResolveScope = machine\n[log]\nlevel = -3\n")
     code = """
 import pylsl
-from padforge.sense.live.streams.outlets import Lsl
+from padforge.sense.live.outputs import Lsl
 from tests.sense.live.test_streams import READING, TOUCH
 lsl = Lsl("a pad", 2, 13.0)
 found = [pylsl.resolve_byprop("name", f"a pad {what}", timeout=20)[0] for what in ("readings", "touches")]

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, evaluate, import_mat, locate
-from padforge.sense.health.monitor import FibreFault
-from padforge.sense.localizer.calibration.calibration import learnable, left_out, proven, split_presses
+from padforge.sense.health.fault_detector import FibreFault
+from padforge.sense.localizer.calibration import learnable, left_out, proven, split_presses
 from padforge.sense.localizer.network import learnt
 from padforge.sense.settings import LocalizerSettings as Options
 
@@ -175,15 +175,15 @@ def test_a_short_training_on_the_published_recording_is_already_near(published: 
 
 
 def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    import padforge.sense.localizer.calibration.training
+    import padforge.sense.localizer.training
 
-    train = padforge.sense.localizer.calibration.training.train_members
+    train = padforge.sense.localizer.training.train_members
 
     def diverged(*arguments: Any) -> Any:
         trained = train(*arguments)
         return trained._replace(weights={name: w * np.float32(np.nan) for name, w in trained.weights.items()})
 
-    monkeypatch.setattr(padforge.sense.localizer.calibration.training, "train_members", diverged)
+    monkeypatch.setattr(padforge.sense.localizer.training, "train_members", diverged)
     with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate 0.004, try a lower one"):
         calibrate(recording, SHORT)
 

@@ -9,17 +9,18 @@ from hypothesis import strategies as st
 
 from padforge.sense.localizer.features import (
     FEATURES,
+    MAX_INPUT,
     PAST,
     PASTS,
     REST,
     SIZES,
     SLOW,
     Inputs,
+    Normalization,
     bridged,
     history,
     press_inputs,
 )
-from padforge.sense.localizer.normalization import MAX_INPUT, Normalization
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
 BEGUN = 40 * np.arange(PRESSES) + 20

@@ -12,18 +12,18 @@ from matplotlib.figure import Figure
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, evaluate
-from padforge.sense.localizer.calibration import fibre_loss_study as loss_study
-from padforge.sense.localizer.calibration.fibre_loss_study import MANY, ONE, fibre_loss_study
-from padforge.sense.report import fibre_loss_figure
 from padforge.sense.settings import LocalizerSettings as Options
+from padforge.sense.studies import fibre_loss as fibre_loss_figure
+from padforge.sense.studies import fibre_loss as loss_study
+from padforge.sense.studies.fibre_loss import MANY, ONE, fibre_loss_study
 from tests.helpers.door import Ended, call
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published network of three neurons, and a coarse map of the answers, which is not what is tested."""
-    monkeypatch.setattr("padforge.sense.localizer.calibration.networks.published_training.HIDDEN", 3)
-    monkeypatch.setattr("padforge.sense.localizer.response.response_model.BUMPS", 7)
+    monkeypatch.setattr("padforge.sense.localizer.training.HIDDEN", 3)
+    monkeypatch.setattr("padforge.sense.localizer.features.BUMPS", 7)
 
 
 def mean_of(part: dict) -> float:
@@ -162,7 +162,7 @@ def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatc
 
     command = ("--retrain", "--lost", "1", "--out", "out")
     with monkeypatch.context() as broken:
-        broken.setattr("padforge.sense.report.fibre_loss_figure.draw_fibre_loss", full)
+        broken.setattr("padforge.sense.studies.fibre_loss.draw_fibre_loss", full)
         ended = loss(*command)
     assert (ended.code, len(trained)) == (2, 5), ended
     assert len(list(Path("out", "unfinished").glob("start_*.npz"))) == 5

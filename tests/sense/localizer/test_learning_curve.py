@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.localizer.calibration.learning_curve import fit_power_law, learning_curve, power_law
 from padforge.sense.settings import LocalizerSettings as Options
+from padforge.sense.studies.learning_curve import fit_power_law, learning_curve, power_law
 from tests.helpers.door import called
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
@@ -44,8 +44,8 @@ def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
 def quick() -> Iterator[None]:
     """Few resamplings, and a coarse map of the answers."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("padforge.sense.localizer.calibration.learning_curve.DRAWS", 40)
-        patched.setattr("padforge.sense.localizer.response.response_model.BUMPS", 7)
+        patched.setattr("padforge.sense.studies.learning_curve.DRAWS", 40)
+        patched.setattr("padforge.sense.localizer.features.BUMPS", 7)
         yield
 
 

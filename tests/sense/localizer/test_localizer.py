@@ -9,9 +9,9 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording
+from padforge.sense.health.locating import write_places
+from padforge.sense.localizer.features import Scaled
 from padforge.sense.localizer.localizer import UNKNOWN, Found, Measured, joined
-from padforge.sense.localizer.locating import write_places
-from padforge.sense.localizer.normalization import Scaled
 
 
 def test_a_fibre_masked_or_without_readings_does_nothing(localizer: Localizer, recording: Recording) -> None:

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.response.observer import BEFOREHAND, TOLD, Observer
+from padforge.sense.localizer.bayes import BEFOREHAND, TOLD, Observer
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Answer = Callable[[np.ndarray], np.ndarray]

@@ -10,14 +10,12 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, evaluate
-from padforge.sense.localizer.calibration import fine_tuning
-from padforge.sense.localizer.calibration.affine_correction import fit_correction
-from padforge.sense.localizer.calibration.fine_tuning import adapt
-from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
-from padforge.sense.localizer.calibration.recalibration import CrossValidation, recalibrate
+from padforge.sense.localizer import training as fine_tuning
 from padforge.sense.localizer.evaluation import distances
+from padforge.sense.localizer.features import TrainingPresses, looked_up
 from padforge.sense.localizer.localizer import Found
-from padforge.sense.localizer.response.response_model import looked_up
+from padforge.sense.localizer.recalibration import CrossValidation, fit_correction, recalibrate
+from padforge.sense.localizer.training import adapt
 from tests.helpers.door import called
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])

@@ -5,8 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses, as_unseen
-from padforge.sense.localizer.response.response_model import RIDGE_HISTORY, STEPS, ResponseModel, looked_up, settled
+from padforge.sense.localizer.features import (
+    RIDGE_HISTORY,
+    STEPS,
+    ResponseModel,
+    TrainingPresses,
+    as_unseen,
+    looked_up,
+    settled,
+)
 
 FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 9000
 Made = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

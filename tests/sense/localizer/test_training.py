@@ -9,12 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer import network
-from padforge.sense.localizer.calibration import training
-from padforge.sense.localizer.calibration.networks import masked_network
-from padforge.sense.localizer.calibration.networks.masked_network import draw_alive
-from padforge.sense.localizer.calibration.networks.training_presses import TrainingPresses
-from padforge.sense.localizer.response.response_model import looked_up
+from padforge.sense.localizer import network, training
+from padforge.sense.localizer import training as masked_network
+from padforge.sense.localizer.features import TrainingPresses, looked_up
+from padforge.sense.localizer.training import draw_alive
 from padforge.sense.settings import Features
 from padforge.sense.settings import LocalizerSettings as Options
 

@@ -9,9 +9,8 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, Recording, calibrate, evaluate, locate, recalibrate
-from padforge.sense.localizer.calibration import fine_tuning
-from padforge.sense.localizer.features import FEATURES
-from padforge.sense.localizer.response.response_model import ResponseModel
+from padforge.sense.localizer import training as fine_tuning
+from padforge.sense.localizer.features import FEATURES, ResponseModel
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
 

@@ -8,7 +8,7 @@ import pytest
 
 from padforge.design import Morphology
 from padforge.sense import Recording, RigSettings, simulate
-from padforge.sense.recordings.formats.ros.exporting import export_bag
+from padforge.sense.formats.ros_recording import export_bag
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
-from padforge.sense.recordings.block_file import BlockWriter, block_dtype, read_blocks
+from padforge.sense.recording.block_file import BlockWriter, block_dtype, read_blocks
 
 
 def write(path: Path, rows: np.ndarray, cuts: Sequence[int] = (), flush: bool = False) -> None:

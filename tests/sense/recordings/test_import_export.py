@@ -23,7 +23,7 @@ from padforge.sense import (
     open_recording,
 )
 from padforge.sense.cli.main import sense
-from padforge.sense.recordings.import_export import arm_states, export_file
+from padforge.sense.formats.import_export import arm_states, export_file
 
 
 @pytest.mark.parametrize("name", ["run", "run.csv", "run.h5", "run.mcap"])

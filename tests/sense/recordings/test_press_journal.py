@@ -8,7 +8,7 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.recordings.recorder import Recorder
+from padforge.sense.recording.run_directory import Recorder
 
 
 def test_a_torn_journal_line_and_one_that_begins_again_lose_their_press_only(
@@ -104,6 +104,6 @@ def test_presses_that_another_program_has_just_made_count(folder: Path, monkeypa
             another.append([another.last_s + 1], np.zeros((1, another.fibres)))
             another.finish(another.readings)
 
-    monkeypatch.setattr("padforge.sense.recordings.recorder.lock", last_made)
+    monkeypatch.setattr("padforge.sense.recording.run_directory.lock", last_made)
     with Recorder.resume(folder) as recorder:
         assert 9999 in recorder.done

@@ -8,7 +8,7 @@ import pytest
 from padforge.design import InputError, Morphology
 from padforge.design.common.settings import validate
 from padforge.design.settings import PadSettings
-from padforge.sense.recordings.press_plan import PressPlan, planned, read_plan
+from padforge.sense.recording.press_plan import PressPlan, planned, read_plan
 from padforge.sense.settings import RigSettings
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))

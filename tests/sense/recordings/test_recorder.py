@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording
-from padforge.sense.recordings.block_file import block_dtype
+from padforge.sense.recording.block_file import block_dtype
 from tools.kills import killed
 
 START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"

@@ -10,11 +10,11 @@ from typing import IO, Any
 
 import pytest
 
-from padforge.sense.rig.arms.ur5.driver import UR5
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.emulators import whole_rig
-from padforge.sense.rig.emulators.ur.controller import Series
-from padforge.sense.rig.emulators.ur.emulator import UrEmulator
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.virtual import virtual_rig as whole_rig
+from padforge.sense.virtual.ur5 import UrEmulator
+from padforge.sense.virtual.ur5_controller import Series
 
 WAIT_S = 180.0
 ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]

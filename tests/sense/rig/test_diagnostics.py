@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.diagnostics import examine_arm, examine_converter
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.doctor import examine_arm, examine_converter
 from tests.sense.rig.devices.fakes import FIBRES, RIG, FakeArm, FakeConverter, Time
 
 

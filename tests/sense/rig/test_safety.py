@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from padforge.sense.rig import safety
-from padforge.sense.rig.devices.protocols import ArmState, Pose, RigFault
+from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.safety import Limits, Vector, require_safe, tilt_deg, wait_until_still, watch
 from padforge.sense.settings import RigSettings
 from tests.sense.rig.devices.fakes import Time

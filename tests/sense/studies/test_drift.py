@@ -10,10 +10,10 @@ import pytest
 
 from padforge.design import InputError, Morphology
 from padforge.sense import Recording, open_recording
-from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.settings import RigSettings
-from padforge.sense.studies.drift import study as drift
-from padforge.sense.studies.drift.study import FILTERS, SCHEMES, SLOW_PRESSES, drift_study, scheme_inputs, values
+from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.studies import drift
+from padforge.sense.studies.drift import FILTERS, SCHEMES, SLOW_PRESSES, drift_study, scheme_inputs, values
 from padforge.sense.studies.study import Study, run
 
 PAD = Morphology.random(2, knots=3, seed=5)

@@ -5,8 +5,16 @@ import pytest
 
 from padforge.design import InputError, Morphology
 from padforge.design.indentation import Indenter
-from padforge.sense.studies.indentation.force import COUNTS, Learning, force_study, readings
-from padforge.sense.studies.indentation.shape import FOOTPRINTS, SETS, circumradius, shape_study
+from padforge.sense.studies.indentation import (
+    COUNTS,
+    FOOTPRINTS,
+    SETS,
+    Learning,
+    circumradius,
+    force_study,
+    readings,
+    shape_study,
+)
 from padforge.sense.studies.study import run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}

@@ -5,15 +5,16 @@ import pytest
 
 from padforge.design import Morphology, signals
 from padforge.design.common.parallel import one_torch_thread
-from padforge.sense.studies.multicontact.pairs import (
+from padforge.sense.studies.multicontact import (
+    COUNTED,
     LABELLED,
     WAYS,
     learnt,
     moments,
+    multicontact_study,
     pairs_of_moments,
     unordered_distances,
 )
-from padforge.sense.studies.multicontact.study import COUNTED, multicontact_study
 from padforge.sense.studies.study import run
 
 PAD = Morphology.random(4, 3, 0)

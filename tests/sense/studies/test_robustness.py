@@ -14,9 +14,8 @@ import pytest
 
 from padforge.design import Contact, Morphology
 from padforge.sense.studies import robustness
-from padforge.sense.studies.pads import load_pads
 from padforge.sense.studies.robustness import robustness_study
-from padforge.sense.studies.study import Study, run
+from padforge.sense.studies.study import Study, load_pads, run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 

@@ -16,16 +16,13 @@ from matplotlib.figure import Figure
 
 from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings
 from padforge.design.optimize.search import SearchResult
-from padforge.sense.recordings.simulation.published_protocol import simulate
 from padforge.sense.settings import RigSettings
-from padforge.sense.studies import scaling, sensitivity
-from padforge.sense.studies.drift import study as drift
-from padforge.sense.studies.indentation.force import Learning, force_study
-from padforge.sense.studies.indentation.shape import shape_study
-from padforge.sense.studies.multicontact.study import multicontact_study
-from padforge.sense.studies.pads import described, load_pads
+from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.studies import drift, scaling, sensitivity
+from padforge.sense.studies.indentation import Learning, force_study, shape_study
+from padforge.sense.studies.multicontact import multicontact_study
 from padforge.sense.studies.robustness import robustness_study
-from padforge.sense.studies.study import Findings, Study, Task, run, study_lines
+from padforge.sense.studies.study import Findings, Study, Task, described, load_pads, run, study_lines
 from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}

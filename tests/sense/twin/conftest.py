@@ -6,7 +6,7 @@ import pytest
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
 from padforge.design.twin import Twin
-from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.as_built import Responses
 
 PLAN = Morphology.random(2, knots=3, seed=5)
 

@@ -5,12 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from padforge.sense.twin.fitting import Freedom, fit
-from padforge.sense.twin.laid_pad import AWAY, COUNTS, LaidPad, PadPlan
-from padforge.sense.twin.responses import Responses
-from padforge.sense.twin.scatter import response_scatter
-from padforge.sense.twin.smooth import smooth_function
-from padforge.sense.twin.wiring import assigned, wirings
+from padforge.sense.twin.as_built import AWAY, COUNTS, LaidPad, PadPlan, Responses
+from padforge.sense.twin.fitting import Freedom, assigned, fit, response_scatter, smooth_function, wirings
 
 from .conftest import PLAN, responses_of
 

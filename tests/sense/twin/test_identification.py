@@ -13,13 +13,13 @@ from padforge.benchmarks.twin import printed_pad
 from padforge.design import InputError, Morphology
 from padforge.design.settings import PadSettings
 from padforge.design.twin import Twin
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.recordings.simulation.published_protocol import simulate
-from padforge.sense.report.identification_results import identification_lines
+from padforge.sense.recording.recording import Recording
+from padforge.sense.report.identification import identification_lines
 from padforge.sense.settings import RigSettings
-from padforge.sense.twin import identification, wiring
-from padforge.sense.twin.identification import identify
-from padforge.sense.twin.identified_pad import Identification
+from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.twin import fitting as wiring
+from padforge.sense.twin import identification
+from padforge.sense.twin.identification import Identification, identify
 
 from .conftest import PLAN
 

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 
 from padforge.design.twin import PlanTransform
-from padforge.sense.twin.kernels.response import along_fibre, channel_response
-from padforge.sense.twin.laid_pad import ASIDE, AWAY, OWN, SHARED, LaidPad, PadPlan, own_values
-from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.as_built import (
+    ASIDE,
+    AWAY,
+    OWN,
+    SHARED,
+    LaidPad,
+    PadPlan,
+    Responses,
+    along_fibre,
+    channel_response,
+    own_values,
+)
 
 from .conftest import PLAN
 

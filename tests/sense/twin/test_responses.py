@@ -8,7 +8,7 @@ import pytest
 from padforge.design import Morphology, Twin
 from padforge.design.twin import TwinReadings
 from padforge.sense import Recording, RigSettings, simulate
-from padforge.sense.twin.responses import information, of_one_depth, responses
+from padforge.sense.twin.as_built import information, of_one_depth, responses
 
 QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
 

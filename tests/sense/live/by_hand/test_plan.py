@@ -11,12 +11,20 @@ import pytest
 from padforge.design import Contact, Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
-from padforge.sense.live.by_hand.run_directory import opened
-from padforge.sense.live.by_hand.session import record_by_hand
-from padforge.sense.live.by_hand.targets import ROUND, in_rounds, still_to_make, targets_of
-from padforge.sense.live.by_hand.view import COLUMNS, ROWS, pad_view, view_lines
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.planning.setup import Setup
+from padforge.sense.rig.by_hand import (
+    COLUMNS,
+    ROUND,
+    ROWS,
+    in_rounds,
+    opened,
+    pad_view,
+    record_by_hand,
+    still_to_make,
+    targets_of,
+    view_lines,
+)
+from padforge.sense.rig.config import Setup
+from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings
 
 BOARD = {"name": "board", "channels": 4, "rate_hz": 1000.0}

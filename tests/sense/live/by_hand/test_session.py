@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-import padforge.sense.live.sources
+import padforge.sense.rig.streams
 from padforge.design import Contact, Morphology
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.live.by_hand import session
-from padforge.sense.live.by_hand.session import record_by_hand
-from padforge.sense.live.by_hand.targets import targets_of
-from padforge.sense.localizer.calibration.calibration import calibrate
-from padforge.sense.recordings.press_journal import read_journal
-from padforge.sense.recordings.processing.press_detection import Event, Finder
-from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
-from padforge.sense.rig.emulators.finger import SCATTER_MM, Finger
-from padforge.sense.rig.planning.setup import Setup
+from padforge.sense.localizer.calibration import calibrate
+from padforge.sense.recording.run_directory import read_journal
+from padforge.sense.rig import by_hand as session
+from padforge.sense.rig.by_hand import record_by_hand, targets_of
+from padforge.sense.rig.config import Setup
+from padforge.sense.rig.devices import ConverterSamples, RigFault
 from padforge.sense.settings import RigSettings
+from padforge.sense.signals.press_detection import Event, Finder
+from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
 from tests.sense.conftest import QUICK
 from tests.sense.rig.devices.fakes import Time
 
@@ -83,7 +82,7 @@ class Hands:
             watch(view)
 
         with pytest.MonkeyPatch.context() as patch:  # nobody else sleeps meanwhile
-            patch.setattr(padforge.sense.live.sources.time, "sleep", self.clock.sleep)
+            patch.setattr(padforge.sense.rig.streams.time, "sleep", self.clock.sleep)
             board = Board(self.finger, self.clock)
             return record_by_hand(self.setup, board, show, lambda: [*said(), *self.finger.said()], resume)
 

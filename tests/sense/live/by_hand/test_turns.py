@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from padforge.sense.live.by_hand.judging import BACK, LEARNT, Judge, answers
-from padforge.sense.live.by_hand.turns import SEEN_S, SETTLE_S, Turns
+from padforge.sense.rig.by_hand_presses import BACK, LEARNT, SEEN_S, SETTLE_S, Judge, Turns, answers
 
 PLACES = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
 REST = np.array([2.0, 1.8, 1.9])

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from padforge.sense import Localizer, Recording
-from padforge.sense.live.deployment.budget import Budget
-from padforge.sense.live.deployment.c_header import c_header
-from padforge.sense.live.deployment.student import Student, as_int8, split, teach
-from padforge.sense.recordings.processing.limits import Array, Mask
+from padforge.sense.arrays import Array, Mask
+from padforge.sense.deploy.c_header import c_header
+from padforge.sense.deploy.streaming import Budget
+from padforge.sense.deploy.student import Student, as_int8, split, teach
 from tests.sense.conftest import QUICK
 
 HERE = Path(__file__).parent

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.live.deployment import streaming
-from padforge.sense.live.deployment.budget import CODE, Budget, state_bytes, table_bytes
-from padforge.sense.live.deployment.c_header import c_header
+from padforge.sense.deploy import streaming
+from padforge.sense.deploy.c_header import c_header
+from padforge.sense.deploy.streaming import CODE, Budget, state_bytes, table_bytes
 from tests.sense.live.deployment.conftest import BUDGET, Told, compiled, program_of, tutorial
 
 OFF_MM = 1e-3

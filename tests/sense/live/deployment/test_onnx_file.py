@@ -15,8 +15,8 @@ import pytest
 
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense import Localizer, Recording, calibrate, export_csv
-from padforge.sense.live.deployment import onnx_file
-from padforge.sense.live.deployment.onnx_file import MOST_OFF_MM, Exported, export_onnx, onnx_line
+from padforge.sense.deploy import onnx_export as onnx_file
+from padforge.sense.deploy.onnx_export import MOST_OFF_MM, Exported, export_onnx, onnx_line
 from padforge.sense.localizer.features import bridged
 from padforge.sense.localizer.localizer import Found
 from tests.sense.conftest import QUICK
@@ -126,6 +126,6 @@ def test_the_script_of_the_tutorial_does_as_it_says(localizer, brief, exported, 
 def test_onnxruntime_is_kept_from_telling_its_maker_of_its_use(tmp_path: Path) -> None:
     """Where it does, it leaves a file in the folder for temporary ones."""
     environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
-    command = [sys.executable, "-c", "import padforge.sense.live.deployment.onnx_file"]
+    command = [sys.executable, "-c", "import padforge.sense.deploy.onnx_export"]
     subprocess.run(command, cwd=ROOT, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
     assert list(tmp_path.iterdir()) == []

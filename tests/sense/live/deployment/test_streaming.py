@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from padforge.sense import Recording
-from padforge.sense.live.deployment.kernels import press_stream
-from padforge.sense.live.deployment.streaming import POLES, Detector, commanded, held, owners, seen
+from padforge.sense import arrays as limits
+from padforge.sense.deploy import streaming as press_stream
+from padforge.sense.deploy.streaming import POLES, Detector, commanded, held, owners, seen
 from padforge.sense.localizer import features
-from padforge.sense.recordings.processing import limits
 
 
 @pytest.fixture

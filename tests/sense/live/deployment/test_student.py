@@ -8,11 +8,11 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Localizer, LocalizerSettings, Recording, calibrate
-from padforge.sense.live.deployment import student as students
-from padforge.sense.live.deployment.budget import CODE, STEP, Budget, state_bytes, table_bytes, widest
-from padforge.sense.live.deployment.student import Student, as_int8, examine, split, teach
-from padforge.sense.localizer.calibration import training as trainings
-from padforge.sense.recordings.import_export import open_recording
+from padforge.sense.deploy import student as students
+from padforge.sense.deploy.streaming import CODE, STEP, Budget, state_bytes, table_bytes, widest
+from padforge.sense.deploy.student import Student, as_int8, examine, split, teach
+from padforge.sense.formats.import_export import open_recording
+from padforge.sense.localizer import training as trainings
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
 

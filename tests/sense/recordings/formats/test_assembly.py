@@ -8,8 +8,7 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.recordings.formats.assembly import FOUND, assembled
-from padforge.sense.recordings.formats.mapping import Part
+from padforge.sense.formats.columns import FOUND, Part, assembled
 
 TIMES = np.arange(12) / 10
 VOLTS = np.arange(24.0).reshape(12, 2)

@@ -8,8 +8,8 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, export_csv, import_csv
-from padforge.sense.recordings.formats import csv_table
-from padforge.sense.recordings.press_plan import read_plan
+from padforge.sense.recording import csv_table
+from padforge.sense.recording.press_plan import read_plan
 
 
 def lines(rows: list[str], header: str = "time_s,a,b,x_mm,y_mm") -> str:

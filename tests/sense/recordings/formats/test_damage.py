@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, open_recording
-from padforge.sense.recordings.import_export import import_file
+from padforge.sense.formats.import_export import import_file
 
 from .ros.foreign import array, make, write_bag
 

@@ -11,10 +11,10 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.recordings.formats import lerobot
-from padforge.sense.recordings.formats.lerobot import export_lerobot
-from padforge.sense.recordings.formats.model_findings import ModelFindings
-from padforge.sense.recordings.import_export import export_file
+from padforge.sense.formats import lerobot
+from padforge.sense.formats.annotations import ModelFindings
+from padforge.sense.formats.import_export import export_file
+from padforge.sense.formats.lerobot import export_lerobot
 
 COUNTED = {"timestamp": "float32"} | dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}

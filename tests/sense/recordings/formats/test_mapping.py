@@ -3,7 +3,7 @@
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense.recordings.formats.mapping import Part, chosen, parse_mapping
+from padforge.sense.formats.columns import Part, chosen, parse_mapping
 
 NAMES = ["t_ms", "Time [s]", "ch1", "ch2", "a,b", "a:b", "px", "py", "contact"]
 

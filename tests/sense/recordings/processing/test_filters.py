@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from padforge.benchmarks.filter import admm, fibre, linear_program
 from padforge.design.common.validation import InputError
 from padforge.sense import TotalVariation, open_recording, running_median, total_variation
-from padforge.sense.recordings.processing.filters import stretches
+from padforge.sense.signals.filters import stretches
 
 STEP_V = 3.3 / 1023
 LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])

@@ -12,9 +12,8 @@ from padforge.design import Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import Counts
 from padforge.sense import Recording, RigSettings, import_mat, simulate
-from padforge.sense.recordings.processing.press_alignment import as_detected
-from padforge.sense.recordings.processing.press_detection import Finder, Presses, as_commanded, find_presses
-from padforge.sense.recordings.simulation.pad_model import Divider
+from padforge.sense.signals.press_detection import Finder, Presses, as_commanded, as_detected, find_presses
+from padforge.sense.simulation.pad_model import Divider
 
 RATE_HZ = 14.0
 SENT_DOWN_S, SENT_UP_S = 0.16, 0.08

@@ -9,7 +9,7 @@ from padforge.design import InputError, Morphology, signals, signals_quantized
 from padforge.design.contact import relative_stretch
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 from padforge.sense import RigSettings, simulate
-from padforge.sense.recordings.simulation.pad_model import (
+from padforge.sense.simulation.pad_model import (
     ADC_STEPS,
     SUPPLY_V,
     Answer,

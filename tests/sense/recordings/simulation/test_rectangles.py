@@ -9,10 +9,10 @@ import pytest
 from padforge.design import Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Localizer, Recording, calibrate, evaluate, locate
-from padforge.sense.live.sources import simulated
-from padforge.sense.recordings.press_plan import told_pad
-from padforge.sense.recordings.simulation.published_protocol import simulate
+from padforge.sense.recording.press_plan import told_pad
+from padforge.sense.rig.streams import simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))

@@ -10,8 +10,7 @@ from padforge.design import InputError, Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.twin import PlanTransform, TwinChannel, TwinReadings
 from padforge.sense import Recording, RigSettings, simulate
-from padforge.sense.recordings.simulation.simulated_pad import measured
-from padforge.sense.recordings.simulation.strengths import strengths
+from padforge.sense.simulation.simulated_recording import measured, strengths
 
 PAD = Morphology.straight(2)
 GAINS = (-0.06, -0.04, -0.05)

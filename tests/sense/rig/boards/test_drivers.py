@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense.rig.boards import block_reader
-from padforge.sense.rig.boards.due import driver as due_driver
-from padforge.sense.rig.boards.due.driver import Arduino
-from padforge.sense.rig.boards.line import driver as line_driver
-from padforge.sense.rig.boards.line.driver import LineBoard
-from padforge.sense.rig.boards.line.framing import LineHeader
-from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
-from padforge.sense.rig.emulators.due_board import EmulatedBoard
-from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
+from padforge.sense.rig.boards import board_reader as block_reader
+from padforge.sense.rig.boards import due as due_driver
+from padforge.sense.rig.boards import line_board as line_driver
+from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.boards.line_board import LineBoard
+from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard
 from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from padforge.sense.rig.boards.sample_clock import SampleClock
+from padforge.sense.rig.boards.board_reader import SampleClock
 
 SETTLE_S = 0.5
 

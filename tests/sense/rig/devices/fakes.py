@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
-from padforge.sense.recordings.recorder import STATE_COLUMNS
-from padforge.sense.recordings.simulation.pad_model import LivePad
-from padforge.sense.rig.devices.protocols import ArmState, ConverterSamples, Pose, RigFault
-from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.recording.run_directory import STATE_COLUMNS
+from padforge.sense.rig.config import Frame
+from padforge.sense.rig.devices import ArmState, ConverterSamples, Pose, RigFault
 from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.pad_model import LivePad
 
 PAD = Morphology.straight(2)
 FIBRES = 4

@@ -10,15 +10,12 @@ from types import SimpleNamespace
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense.rig.arms.ur5.driver import UR5
-from padforge.sense.rig.boards.due import serial_link as due_link
-from padforge.sense.rig.boards.due.driver import Arduino
-from padforge.sense.rig.boards.line import driver as line_driver
-from padforge.sense.rig.devices import plugins
-from padforge.sense.rig.devices.plugins import device, device_names
-from padforge.sense.rig.devices.processes import start
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.devices.serial_port import refusal
+from padforge.sense.rig import devices as plugins
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.boards import due as due_link
+from padforge.sense.rig.boards import line_board as line_driver
+from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.devices import RigFault, device, device_names, refusal, start
 from padforge.sense.settings import RigSettings
 
 serial = pytest.importorskip("serial")
@@ -48,7 +45,7 @@ def test_code_in_the_current_folder_is_not_run(
         monkeypatch.delenv("PYTHONPATH", raising=False)
     else:
         monkeypatch.setenv("PYTHONPATH", python_path)
-    process = start("padforge.sense.rig.arms.ur5.child_process", "127.0.0.1", stderr=subprocess.PIPE)
+    process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", stderr=subprocess.PIPE)
     assert os.getsid(process.pid) == process.pid, "an interrupt from the keyboard would reach it"
     _, said = process.communicate(timeout=20)  # the end of its stdin ends it
     assert not (tmp_path / "pwned").exists(), said

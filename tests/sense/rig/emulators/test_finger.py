@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology
-from padforge.sense.rig.emulators.finger import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, FingerStroke
 from padforge.sense.settings import RigSettings
+from padforge.sense.virtual.virtual_hand import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, FingerStroke
 
 RATE_HZ = 50.0
 

@@ -18,22 +18,19 @@ import pytest
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
-from padforge.sense.recordings.press_journal import read_journal
-from padforge.sense.recordings.press_plan import PressPlan, planned
-from padforge.sense.recordings.recorder import Recorder
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.recordings.simulation.pad_model import LivePad
-from padforge.sense.rig.arms.ur5.rtde_frames import RTDE_PORT
-from padforge.sense.rig.boards import block_reader
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.emulators import whole_rig
-from padforge.sense.rig.emulators.printer.emulator import EmulatedPrinter
+from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.run_directory import Recorder, read_journal
+from padforge.sense.rig.arms.rtde import RTDE_PORT
+from padforge.sense.rig.boards import board_reader as block_reader
+from padforge.sense.rig.config import Frame, Setup
+from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.operation import look_over
-from padforge.sense.rig.planning.setup import Setup
-from padforge.sense.rig.session.pad_frame import Frame
-from padforge.sense.rig.session.press_loop import Report, Session
-from padforge.sense.rig.session.retreat import HEIGHT_MM
+from padforge.sense.rig.press_loop import HEIGHT_MM, Report, Session
 from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.pad_model import LivePad
+from padforge.sense.virtual import virtual_rig as whole_rig
+from padforge.sense.virtual.printer import EmulatedPrinter
 
 pytest.importorskip("rtde_control")
 pytest.importorskip("serial")
@@ -248,7 +245,7 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
 
 
 def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("padforge.sense.rig.diagnostics.LOOK_S", 0.3)
+    monkeypatch.setattr("padforge.sense.rig.doctor.LOOK_S", 0.3)
     setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
     found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
     assert found["channel 1"].found.startswith("input 14 rests at")
@@ -259,7 +256,7 @@ def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkey
 
 PROGRAM = """
 import sys
-from padforge.sense.rig.emulators import whole_rig
+from padforge.sense.virtual import whole_rig
 whole_rig.HOST = sys.argv.pop(1)
 from padforge.cli import main
 main()

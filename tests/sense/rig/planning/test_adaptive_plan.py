@@ -1,11 +1,11 @@
 import numpy as np
 
-from padforge.sense.localizer.calibration.calibration import calibrate
-from padforge.sense.recordings.press_plan import PressPlan, planned
-from padforge.sense.recordings.recorder import Recorder
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.rig.planning.adaptive_plan import EVERY, Steering, uncertainty
-from padforge.sense.rig.session.press_loop import Session
+from padforge.sense.localizer.calibration import calibrate
+from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.run_directory import Recorder
+from padforge.sense.rig.operation import EVERY, Steering, uncertainty
+from padforge.sense.rig.press_loop import Session
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.rig.devices.fakes import FIBRES, PAD, RIG, FakeArm, FakeConverter, Time
 

@@ -11,10 +11,10 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import build
-from padforge.sense.recordings.press_plan import PressPlan, planned
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.planning.pad_on_bed import on_bed
-from padforge.sense.rig.session.press_loop import require_safe_plan
+from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.rig.config import on_bed
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.press_loop import require_safe_plan
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 

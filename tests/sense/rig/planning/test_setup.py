@@ -14,9 +14,9 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
-from padforge.sense.recordings.press_plan import planned
-from padforge.sense.recordings.recorder import START
-from padforge.sense.rig.planning.setup import Setup, kept_plan, plan_of, recorder_of
+from padforge.sense.recording.press_plan import planned
+from padforge.sense.recording.run_directory import START
+from padforge.sense.rig.config import Setup, kept_plan, plan_of, recorder_of
 from padforge.sense.settings import RigSettings
 
 PAD = Morphology.straight(2)

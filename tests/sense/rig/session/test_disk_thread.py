@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from padforge.sense.rig.session.disk_thread import DiskThread
+from padforge.sense.rig.press_loop import DiskThread
 
 
 def test_all_is_done_in_order_while_the_caller_goes_on_and_to_its_end() -> None:

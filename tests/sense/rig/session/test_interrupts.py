@@ -8,8 +8,8 @@ import pytest
 
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.rig import operation
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.planning.setup import Setup
+from padforge.sense.rig.config import Setup
+from padforge.sense.rig.devices import RigFault
 from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 from tests.sense.rig.session.test_press_loop import FOUR, run
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from padforge.design.twin import PlanTransform as TwinFrame
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.session.pad_frame import Frame
+from padforge.sense.rig.config import Frame
+from padforge.sense.rig.devices import RigFault
 from tests.sense.rig.devices.fakes import RIG
 
 

@@ -9,13 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.recordings.press_journal import read_journal
-from padforge.sense.recordings.press_plan import PressPlan
-from padforge.sense.recordings.recorder import Recorder
-from padforge.sense.recordings.recording import Recording
-from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
-from padforge.sense.rig.session.averaging import Averager
-from padforge.sense.rig.session.press_loop import Session, require_safe_plan
+from padforge.sense.recording.press_plan import PressPlan
+from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.run_directory import Recorder, read_journal
+from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.press_loop import Averager, Session, require_safe_plan
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.sense.recordings.press_plan import PressPlan
-from padforge.sense.recordings.recorder import Recorder
-from padforge.sense.rig.arms.ur5.driver import UR5
-from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.recording.press_plan import PressPlan
+from padforge.sense.recording.run_directory import Recorder
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.press_loop import FALL_S, HEIGHT_MM, SPEED_MM_S, Session, retreat
 from padforge.sense.rig.safety import Limits
-from padforge.sense.rig.session.press_loop import Session
-from padforge.sense.rig.session.retreat import FALL_S, HEIGHT_MM, SPEED_MM_S, retreat
 from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
 
 LIMITS = Limits.of(RIG)

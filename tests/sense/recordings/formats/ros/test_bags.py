@@ -15,7 +15,7 @@ import zstandard
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, import_bag
-from padforge.sense.recordings.formats.ros.bags import bag as limits
+from padforge.sense.formats import ros_bag as limits
 
 from .foreign import STORE, array, channel, chunk, make, mcap_file, message, record, text, write_bag
 

@@ -15,11 +15,10 @@ from rosbags.rosbag2 import Reader
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.recordings.formats.model_findings import FaultFound, ModelFindings
-from padforge.sense.recordings.formats.ros import exporting
-from padforge.sense.recordings.formats.ros.exporting import export_bag
-from padforge.sense.recordings.formats.ros.importing import import_bag
-from padforge.sense.recordings.import_export import export_file
+from padforge.sense.formats import ros_recording as exporting
+from padforge.sense.formats.annotations import FaultFound, ModelFindings
+from padforge.sense.formats.import_export import export_file
+from padforge.sense.formats.ros_recording import export_bag, import_bag
 
 
 def others_read(path: Path) -> tuple[dict[str, list[tuple[int, Any]]], dict[str, str]]:

@@ -11,9 +11,8 @@ from rosbags.rosbag2 import Reader
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, open_recording
-from padforge.sense.recordings.formats.ros.exporting import export_bag
-from padforge.sense.recordings.formats.ros.importing import import_bag
-from padforge.sense.recordings.import_export import import_file
+from padforge.sense.formats.import_export import import_file
+from padforge.sense.formats.ros_recording import export_bag, import_bag
 
 from .foreign import STORE, Message, array, make, pose, wrench, write_bag
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from padforge.sense.rig.arms.printer import marlin
-from padforge.sense.rig.arms.printer.motion import StraightMove
+from padforge.sense.rig.arms import printer_link as marlin
+from padforge.sense.rig.arms.printer_link import StraightMove
 
 M115 = [
     "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.sense.rig.arms.printer import marlin
-from padforge.sense.rig.arms.printer.driver import Printer
-from padforge.sense.rig.arms.printer.link import MarlinLink
-from padforge.sense.rig.boards.line.framing import LineHeader
-from padforge.sense.rig.devices.protocols import ArmState, RigFault
-from padforge.sense.rig.emulators.line_board import EmulatedLineBoard
-from padforge.sense.rig.emulators.printer import firmware
-from padforge.sense.rig.emulators.printer.emulator import EmulatedPrinter
+from padforge.sense.rig.arms import printer_link as marlin
+from padforge.sense.rig.arms.printer import Printer
+from padforge.sense.rig.arms.printer_link import MarlinLink
+from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
+from padforge.sense.virtual import printer as firmware
+from padforge.sense.virtual.boards import EmulatedLineBoard
+from padforge.sense.virtual.printer import EmulatedPrinter
 from tests.sense.rig.devices.fakes import fault_of
 
 pytest.importorskip("serial")

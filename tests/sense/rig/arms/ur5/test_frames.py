@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.arms.ur5 import messages
-from padforge.sense.rig.arms.ur5 import rtde_frames as frames
-from padforge.sense.rig.arms.ur5.rtde_reader import VARIABLES, HostClock, RtdeReader
+from padforge.sense.rig.arms import rtde as frames
+from padforge.sense.rig.arms import rtde as messages
+from padforge.sense.rig.arms.rtde import VARIABLES, HostClock, RtdeReader
 
 TYPES = [frames.type_of(name) for name in VARIABLES]
 VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.0, -25.0, 0.0, 0.0, 0.0, 7, 1, 1, 5)

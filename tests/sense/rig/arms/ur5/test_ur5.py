@@ -15,15 +15,15 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from padforge.sense.recordings.recorder import STATE_COLUMNS
-from padforge.sense.rig.arms.ur5 import driver as ur5
-from padforge.sense.rig.arms.ur5 import link as ur5_link
-from padforge.sense.rig.arms.ur5.driver import UR5
-from padforge.sense.rig.devices.protocols import ArmState, Pose, RigFault
-from padforge.sense.rig.diagnostics import examine_arm
-from padforge.sense.rig.emulators.ur.emulator import HOME, UrEmulator
+from padforge.sense.recording.run_directory import STATE_COLUMNS
+from padforge.sense.rig.arms import ur5
+from padforge.sense.rig.arms import ur5 as ur5_link
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.devices import ArmState, Pose, RigFault
+from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
+from padforge.sense.virtual.ur5 import HOME, UrEmulator
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
@@ -295,8 +295,8 @@ def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> No
 
 PARENT = f"""
 import sys, time
-from padforge.sense.rig.arms.ur5.driver import UR5
-from padforge.sense.rig.emulators.ur.controller import Series
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.virtual.ur5_controller import Series
 arm = UR5(sys.argv[1])
 arm.connect()
 arm.move({LOW}, 50, 500)

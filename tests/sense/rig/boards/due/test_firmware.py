@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.boards.due import framing
-from padforge.sense.rig.boards.due.framing import (
+from padforge.sense.rig.boards import due_framing as framing
+from padforge.sense.rig.boards.due_framing import (
     Ack,
     BoardSettings,
     DueBlock,
@@ -18,7 +18,7 @@ from padforge.sense.rig.boards.due.framing import (
     Status,
     encode,
 )
-from padforge.sense.rig.emulators.due_board import judge_settings
+from padforge.sense.virtual.boards import judge_settings
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"

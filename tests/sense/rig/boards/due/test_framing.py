@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.boards.due.driver import DueAssembler
-from padforge.sense.rig.boards.due.framing import (
+from padforge.sense.rig.boards.due import DueAssembler
+from padforge.sense.rig.boards.due_framing import (
     FULL_SCALE,
     MAX_AVERAGING,
     MAX_CHANNELS,
@@ -31,7 +31,7 @@ from padforge.sense.rig.boards.due.framing import (
     cobs_encode,
     encode,
 )
-from padforge.sense.rig.devices.protocols import RigFault
+from padforge.sense.rig.devices import RigFault
 
 U8, U16, U32 = st.integers(0, 2**8 - 1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
 NAMES = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=16)

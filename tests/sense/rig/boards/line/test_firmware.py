@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.boards.line import framing
-from padforge.sense.rig.boards.line.driver import LineAssembler, LineReader
-from padforge.sense.rig.boards.line.framing import LineDecoder, LineHeader, Sample, header_line, sample_line
-from padforge.sense.rig.devices.protocols import ConverterSamples
+from padforge.sense.rig.boards import line_framing as framing
+from padforge.sense.rig.boards.line_board import LineAssembler, LineReader
+from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, Sample, header_line, sample_line
+from padforge.sense.rig.devices import ConverterSamples
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.boards.line import framing
-from padforge.sense.rig.boards.line.driver import LineAssembler, LineReader
-from padforge.sense.rig.boards.line.framing import LineDecoder, LineHeader, Sample, header_line, sample_line
-from padforge.sense.rig.devices.protocols import ConverterSamples, RigFault
+from padforge.sense.rig.boards import line_framing as framing
+from padforge.sense.rig.boards.line_board import LineAssembler, LineReader
+from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, Sample, header_line, sample_line
+from padforge.sense.rig.devices import ConverterSamples, RigFault
 
 HEADER = LineHeader(500, 12, 3.3, 4, said=(("name", "my-board"),))
 SAMPLES = [Sample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]

@@ -1,7 +1,7 @@
 """The emulated firmware, in time that is told: it must fail as the real one does."""
 
-from padforge.sense.rig.arms.printer.marlin import numbered, place
-from padforge.sense.rig.emulators.printer.firmware import Firmware
+from padforge.sense.rig.arms.printer_link import numbered, place
+from padforge.sense.virtual.printer import Firmware
 
 HOME = (50.0, 50.0, 50.0)
 

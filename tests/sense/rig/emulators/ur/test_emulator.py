@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.arms.ur5 import rtde_frames as ur_frames
-from padforge.sense.rig.devices.protocols import RigFault
-from padforge.sense.rig.emulators.ur import controller as ur_controller
-from padforge.sense.rig.emulators.ur import truth as ur_truth
-from padforge.sense.rig.emulators.ur.controller import Controller
-from padforge.sense.rig.emulators.ur.emulator import UrEmulator
+from padforge.sense.rig.arms import rtde as ur_frames
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.virtual import ur5_controller as ur_controller
+from padforge.sense.virtual import ur5_controller as ur_truth
+from padforge.sense.virtual.ur5 import UrEmulator
+from padforge.sense.virtual.ur5_controller import Controller
 
 
 def test_the_truth_keeps_the_newest_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +84,7 @@ def test_a_program_that_a_protective_stop_has_paused_goes_on_when_a_person_plays
 
 LEFT = """
 import os, sys
-from padforge.sense.rig.emulators.ur.emulator import UrEmulator
+from padforge.sense.virtual.ur5 import UrEmulator
 with UrEmulator(host=sys.argv[1]):
     os._exit(9)
 """

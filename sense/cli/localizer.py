@@ -1,0 +1,419 @@
+"""`padforge sense calibrate` and `evaluate`: learning places, and how well it went.
+
+`padforge sense locate`, `health` and `deploy`: what a recording says of presses and fibres, here and elsewhere.
+
+`padforge sense recalibrate`, `fibre-loss`, `learning-curve`: following a pad; what fibres and presses are worth.
+
+`padforge sense identify`: the edge where a recording becomes a twin.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from padforge.design.common import command_line as common
+from padforge.design.common.command_line import (
+    json_option,
+    load_spec,
+    out_option,
+    pad_folder,
+    profile_option,
+    show_result,
+    spec_option,
+)
+from padforge.design.common.validation import InputError
+from padforge.sense.cli.options import (
+    FEATURES,
+    FILE,
+    FOLDER,
+    METHODS,
+    FibreNumbers,
+    fibre_indices,
+    lost_option,
+    model_option,
+    read_recording,
+    recording_argument,
+    reported,
+)
+
+
+@click.command()
+@recording_argument
+@click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
+@click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
+@click.option(
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test."
+)
+@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
+@common.seed_option
+@common.spec_option
+@common.out_option()
+@common.force_option
+@common.json_option
+@common.profile_option
+def calibrate(
+    recording: Path,
+    time_budget: float | None,
+    spec: Path | None,
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+    **overrides: Any,
+) -> None:
+    """Learn places from RECORDING and test on presses held back.
+
+    \b
+    padforge sense calibrate out/pad/recording --test-split chronological
+    padforge sense calibrate out/pad/recording --time-budget 600
+
+    Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
+    error_map.png and error_by_loss.png.
+    """
+    from padforge.design.common.files import locked_folder
+    from padforge.sense.localizer.evaluation import calibration_lines
+    from padforge.sense.report.calibration import calibrate_into
+    from padforge.sense.settings import LocalizerSettings
+
+    folder = out or common.pad_folder(recording)
+    with locked_folder(folder):
+        options = common.load_spec(spec).section(LocalizerSettings, **overrides)
+        presses = read_recording(recording)
+        with reported("training") as report:
+            document = calibrate_into(
+                presses,
+                folder,
+                options,
+                time_budget=time_budget,
+                progress=report,
+                warn=partial(click.echo, err=True),
+                force=force,
+            )
+    common.show_result(document, calibration_lines(document), as_json)
+
+
+@click.command()
+@model_option
+@recording_argument
+@lost_option
+@common.json_option
+@common.profile_option
+def evaluate(model: Path, recording: Path, lost: int, as_json: bool) -> None:
+    """Errors on RECORDING for every set of lost fibres.
+
+    \b
+    padforge sense evaluate --model out/pad out/later/recording --lost 1
+
+    Of the recording the model was trained on, only the presses that were held back count.
+    """
+    from padforge.sense.localizer.evaluation import calibration_lines
+    from padforge.sense.localizer.evaluation import evaluate as test
+    from padforge.sense.localizer.localizer import Localizer
+
+    localizer = Localizer.load(model)
+    levels = range(min(lost, localizer.fibres - 1) + 1)
+    document = test(localizer, read_recording(recording), levels)
+    common.show_result(document, calibration_lines(document), as_json)
+
+
+@click.command()
+@model_option
+@recording_argument
+@click.option("--mask", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1.")
+@out_option(what="CSV file for the places, places.csv", file=True)
+@profile_option
+def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path | None) -> None:
+    """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
+
+    \b
+    padforge sense locate --model out/pad out/later/recording --mask 1,4 --out places.csv
+
+    \b
+    The columns of the CSV: press (counted from 0), x_mm, y_mm, sd_x_mm, sd_y_mm (standard
+    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
+    of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
+    """
+    from padforge.sense.health import locating
+    from padforge.sense.health.fault_detector import examined, has_health
+    from padforge.sense.localizer.localizer import Localizer
+
+    file = out or pad_folder(recording) / "places.csv"
+    localizer = Localizer.load(model)
+    lost = fibre_indices(mask, localizer.fibres)
+    opened = read_recording(recording)
+    findings = examined(model, opened)[1] if has_health(model) else []
+    for finding in findings:
+        click.echo(f"{finding.text}; left out from there on", err=True)
+    found = locating.locate(localizer, opened, lost, findings)
+    locating.write_places(found, file)
+    click.echo(f"{len(found.r50_mm)} places -> {file}")
+
+
+@click.command()
+@model_option
+@recording_argument
+@json_option
+@click.pass_context
+def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
+    """Say which fibres of RECORDING are lost, damaged or drifting, from the readings alone.
+
+    \b
+    padforge sense health --model out/pad out/later/recording
+
+    Exit 1 if one is. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0.
+    """
+    from dataclasses import asdict
+
+    from padforge.sense.health.fault_detector import examined, fault_lines
+
+    opened = read_recording(recording)
+    known, findings = examined(model, opened)
+    document = {
+        "format": "padforge-findings/1",
+        "presses": len(opened.begun),
+        "dead": list(known.dead),
+        "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
+    }
+    show_result(document, fault_lines(findings, opened.fibres, known.dead), as_json)
+    context.exit(int(bool(findings)))
+
+
+class Bytes(click.ParamType):
+    """A number of bytes, as `65536`, `64k` or `1M`."""
+
+    name = "BYTES"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        found = re.fullmatch(r"(\d{1,9})([kM]?)", value)
+        if found is None:
+            self.fail(f"got {value!r}, expected bytes, as 65536, 64k or 1M", param, ctx)
+        return int(found[1]) * {"": 1, "k": 2**10, "M": 2**20}[found[2]]
+
+
+@click.command()
+@model_option
+@click.argument("files", nargs=-1, required=True, metavar="[RECORDING] OUT", type=click.Path(path_type=Path))
+@click.option("--flash", type=Bytes(), default="256k", show_default=True, help="For code and tables of a .h.")
+@click.option("--ram", type=Bytes(), default="64k", show_default=True, help="For the state of a .h.")
+@click.option("--quantize", type=click.Choice(["int8"]), help="Weights of a .h as int8, not float32.")
+@spec_option
+@profile_option
+def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize: str | None, spec: Path | None) -> None:
+    """Write the localizer for other machines: OUT is an .onnx, or a .h for microcontrollers.
+
+    \b
+    padforge sense deploy --model out/pad localizer.onnx
+    padforge sense deploy --model out/pad out/pad/recording localizer.h --flash 256k --ram 64k
+
+    An .onnx takes readings and when they were of a press, and gives places and radii. It is tried by onnxruntime
+    beside the localizer, on the presses of RECORDING or on some made up, and not written if they differ.
+
+    A .h is one C99 file that takes reading after reading. It holds a network of its own, as large as --flash and
+    --ram allow, which learns from RECORDING what is known by the end of a press. Presses that the model has not
+    learnt from tell how far off it is, beside the model and, where that looks at the release, one that does not,
+    trained for this. [localizer] says for how long they learn.
+    """
+    from padforge.design.common.files import check_writable, sha256
+    from padforge.sense.localizer.localizer import Localizer
+
+    path, recording = files[-1], files[0] if len(files) == 2 else None
+    if len(files) > 2:
+        raise InputError(f"{files[1]}: one argument too many, expected [RECORDING] OUT")
+    if path.suffix not in (".onnx", ".h"):
+        raise InputError(f"{path}: cannot be written, expected a name that ends in .onnx or .h")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: cannot be written, there is no folder {path.parent}")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: cannot be written, it is there and no file")
+    check_writable(path.parent)
+    localizer, digest = Localizer.load(model), sha256(model / "localizer.json")
+    if path.suffix == ".onnx":
+        from padforge.sense.deploy.onnx_export import export_onnx, onnx_line
+
+        opened = None if recording is None else read_recording(recording)
+        click.echo(f"{onnx_line(export_onnx(localizer, digest, path, opened))} -> {path}")
+        return
+    from padforge.sense.deploy.c_header import export_header, header_lines
+    from padforge.sense.deploy.streaming import Budget
+    from padforge.sense.settings import LocalizerSettings
+
+    if recording is None:
+        raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
+    budget, options = Budget(flash, ram, quantize == "int8"), load_spec(spec).section(LocalizerSettings)
+    opened = read_recording(recording)
+    with reported("training") as report:
+        header = export_header(localizer, digest, path, opened, budget, options, report)
+    click.echo("\n".join([*header_lines(header, budget), f"localizer -> {path}"]))
+
+
+@click.command()
+@model_option
+@recording_argument
+@common.seed_option
+@common.out_option()
+@common.force_option
+@common.json_option
+def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
+    """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
+
+    \b
+    padforge sense recalibrate --model out/pad out/later/recording
+
+    Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
+    if it did not, places are found as before. The old model is written over only where --out says so.
+    """
+    from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
+    from padforge.sense.formats.import_export import open_recording
+    from padforge.sense.health.fault_detector import health_files, health_in
+    from padforge.sense.localizer import recalibration
+    from padforge.sense.localizer.localizer import Localizer
+
+    target = out or common.pad_folder(recording)
+    if out is None and target.resolve() == model.resolve():
+        raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
+    check_writable(target)
+    old, health, opened = Localizer.load(model), health_in(model), open_recording(recording)
+    with reported("recalibrating") as report:
+        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
+    with atomic_files(target, without=health_files()) as folder:
+        localizer.save(folder)
+        replaced = target / "localizer.json"
+        check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *health_files()], force)
+        write_json(folder / "recalibration.json", document)
+        for name, known in health.items():  # it was learnt without places
+            known.save(folder, name)
+    common.show_result(document, recalibration.recalibration_lines(document), as_json)
+
+
+@click.command("fibre-loss")
+@recording_argument
+@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for every loss.")
+@click.option("--retrain", is_flag=True, help="As published: another network for every set of lost fibres.")
+@lost_option
+@click.option("--failed", type=FibreNumbers(), default=(), help="Map errors without these fibres too, from 1: as 2,5.")
+@common.seed_option
+@common.spec_option
+@common.out_option()
+@common.json_option
+def fibre_loss(
+    recording: Path,
+    model: Path | None,
+    retrain: bool,
+    lost: int,
+    failed: tuple[int, ...],
+    seed: int | None,
+    spec: Path | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Errors on RECORDING for every set of lost fibres, of one network or of networks retrained for each, or both.
+
+    \b
+    padforge sense fibre-loss out/pad/recording --model out/pad
+
+    Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
+    worst set of each size, and without those fibres that --failed names. Retrained networks that are done are
+    kept when it is broken off, and the same command goes on from them.
+    """
+    from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.design.common.parallel import Checkpoints
+    from padforge.sense.formats.import_export import open_recording
+    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.settings import LocalizerSettings
+    from padforge.sense.studies.fibre_loss import draw_fibre_loss, fibre_loss_lines, fibre_loss_study
+
+    if not (model or retrain):
+        raise InputError("neither --model nor --retrain is given, expected one of them or both")
+    target = out or common.pad_folder(recording)
+    unfinished = target / "unfinished"
+    check_writable(target)
+    localizer = Localizer.load(model) if model else None
+    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
+    with reported("networks") as report:
+        document = fibre_loss_study(
+            opened,
+            localizer,
+            retrain=retrain,
+            options=options,
+            lost=lost,
+            failed=fibre_indices(failed, opened.fibres),
+            keep_in=unfinished,
+            progress=report,
+        )
+    with atomic_files(target) as folder:
+        write_json(folder / "fibre_loss.json", document)
+        draw_fibre_loss(document, folder / "fibre_loss.png")
+    if retrain:
+        Checkpoints(unfinished, {}).clear()
+    common.show_result(document, fibre_loss_lines(document), as_json)
+
+
+@click.command("learning-curve")
+@recording_argument
+@common.seed_option
+@common.spec_option
+@common.out_option()
+@common.json_option
+def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Path | None, as_json: bool) -> None:
+    """Errors by number of presses learnt from, and what recording more of them would bring.
+
+    \b
+    padforge sense learning-curve out/pad/recording
+
+    Writes learning_curve.json and learning_curve.png.
+    """
+    from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.sense.formats.import_export import open_recording
+    from padforge.sense.settings import LocalizerSettings
+    from padforge.sense.studies import learning_curve as study
+    from padforge.sense.studies.learning_curve import draw_learning_curve
+
+    target = out or common.pad_folder(recording)
+    check_writable(target)
+    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
+    with reported("training") as report:
+        document = study.learning_curve(opened, options, progress=report)
+    with atomic_files(target) as folder:
+        write_json(folder / "learning_curve.json", document)
+        draw_learning_curve(document, folder / "learning_curve.png")
+    common.show_result(document, study.learning_curve_lines(document), as_json)
+
+
+@click.command()
+@recording_argument
+@click.option("--morphology", type=FILE, required=True, help="The pad as planned: morphology.json or published .mat.")
+@common.seed_option
+@common.out_option()
+@common.force_option
+@common.json_option
+@common.profile_option
+def identify(recording: Path, morphology: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
+    """Find from RECORDING how a printed pad was laid and wired, and what a press really does to it.
+
+    \b
+    padforge sense identify out/pad/recording --morphology out/pad/morphology.json
+
+    Writes twin.json, for padforge design --twin and padforge sense record --rig simulated --twin; identification.json,
+    twin_plan.png and twin_responses.png.
+    """
+    from padforge.design.common.files import locked_folder
+    from padforge.design.morphology import Morphology
+    from padforge.sense.report.identification import identification_lines, identify_into
+
+    folder = out or common.pad_folder(recording)
+    pad = Morphology.load(morphology)
+    with locked_folder(folder), common.progress() as bar:
+        task = bar.add_task("identify", total=None, note="")
+
+        def report(what: str, done: int, of: int) -> None:
+            bar.update(task, completed=done, total=of, note=what)
+
+        inputs = [path for path in (recording, morphology) if not path.is_dir()]
+        document = identify_into(
+            read_recording(recording), pad, folder, seed or 0, inputs=inputs, report=report, force=force
+        )
+    common.show_result(document, identification_lines(document, folder), as_json)

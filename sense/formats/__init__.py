@@ -1,0 +1,1 @@
+"""Formats of recordings: CSV, HDF5, MATLAB, ROS bags and LeRobot datasets."""

@@ -1,7 +1,0 @@
-"""Compiled kernels: pure functions on arrays of readings."""
-
-from pathlib import Path
-
-from padforge.design.common.parallel import clear_stale_kernels
-
-clear_stale_kernels(Path(__file__).parent)

@@ -1,1 +1,0 @@
-"""The localizer as nodes of an ONNX graph."""

@@ -1,1 +1,0 @@
-"""What is told of a pad to other programs, as it happens."""

@@ -1,1 +1,0 @@
-"""How a localizer is learnt, renewed and judged."""

@@ -1,0 +1,1 @@
+"""Recordings: what was read and where was pressed, on disk."""

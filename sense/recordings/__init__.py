@@ -1,1 +1,0 @@
-"""Recordings: what was read and where was pressed, on disk and simulated."""

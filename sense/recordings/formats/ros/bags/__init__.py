@@ -1,1 +1,0 @@
-"""Messages out of MCAP and SQLite files: whatever these claim, no more is unpacked or kept than is stated."""

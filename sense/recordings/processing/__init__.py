@@ -1,1 +1,0 @@
-"""Readings: filters, and presses found in them."""

@@ -1,1 +1,0 @@
-"""The simulated pad, and the recording that the published protocol makes of it."""

@@ -1,1 +1,0 @@
-"""A 3D printer with a probe clamped beside its nozzle."""

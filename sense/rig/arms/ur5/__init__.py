@@ -1,1 +1,0 @@
-"""The UR arm, in a process of its own."""

@@ -1,1 +1,0 @@
-"""The board that reads the fibres."""

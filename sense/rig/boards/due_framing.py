@@ -1,0 +1,255 @@
+"""What travels between the host and the board that reads the fibres: frames of bytes, the same both ways.
+
+On the wire a frame is `00 coded check 00`. `coded` is the payload with its zeros taken out by COBS (consistent
+overhead byte stuffing), so a zero is always the edge of a frame and a reader falls in step again at the next one. The
+zeros on both sides let a damaged edge cost one frame only. `check` is the CRC-16/CCITT-FALSE of `coded`, in three bytes
+of 2, 7 and 7 bits with the top bit set, so that it holds no zero either. It covers the coded bytes and not the payload
+because one flipped bit among the COBS counts would alter several bytes of the payload: as it is, up to three flipped
+bits and every burst of up to 16 bits are found for certain.
+
+A payload is a kind (one byte) and a body, little-endian:
+
+    01 identify, 03 start, 04 stop    to the board, without a body
+    02 settings    to the board: period of a sample u32 ns, mask of inputs u16 (bit 0 is A0), conversions a sample u8
+    81 identity    firmware version 3 x u8, bits u8, inputs u8, name 16 bytes, serial number 16 bytes
+    82 ack         kind of the command u8, status u8, settings in force as in 02
+    90 block       samples n u8, conversions a sample u8, mask u16, sequence number u16, index of the first sample u32,
+                   board time at the last sample u32 us, samples dropped by the board u32, n x C sums u16
+
+Indices, times and sequence numbers wrap around. A sum of conversions is at most 16 x 4095, so averaging loses no
+resolution."""
+
+import struct
+from binascii import crc_hqx
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+BITS = 12
+FULL_SCALE = 2**BITS - 1
+MAX_CHANNELS = 12
+MAX_SAMPLES = 16
+"""Samples in a block."""
+MAX_AVERAGING = 16
+"""Conversions summed to a sample."""
+
+
+class Kind(IntEnum):
+    """First byte of a payload."""
+
+    IDENTIFY = 0x01
+    SETTINGS = 0x02
+    START = 0x03
+    STOP = 0x04
+    IDENTITY = 0x81
+    ACK = 0x82
+    BLOCK = 0x90
+
+
+class Status(IntEnum):
+    """Answer to a command."""
+
+    OK = 0
+    BAD_SETTINGS = 1
+    TOO_FAST = 2
+    RUNNING = 3
+    HALTED = 4
+    """Not an answer: the board has stopped of itself because conversions were lost."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A command without a body: IDENTIFY, START or STOP."""
+
+    kind: Kind
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return bytes([self.kind])
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """How to sample: `period_ns` from sample to sample, inputs by bit of `mask`, `averaging` conversions a sample."""
+
+    period_ns: int
+    mask: int
+    averaging: int
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return bytes([Kind.SETTINGS]) + self.body()
+
+    def body(self) -> bytes:
+        """The payload without its kind, as it also stands in an `Ack`."""
+        return _SETTINGS.pack(self.period_ns, self.mask, self.averaging)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What the board says of itself; `name` has up to 16 ASCII characters, `serial` 16 bytes."""
+
+    firmware: tuple[int, int, int]
+    bits: int
+    channels: int
+    name: str
+    serial: bytes
+
+    def pack(self) -> bytes:
+        """The payload."""
+        fields = (*self.firmware, self.bits, self.channels, self.name.encode("ascii"), self.serial)
+        return bytes([Kind.IDENTITY]) + _IDENTITY.pack(*fields)
+
+
+@dataclass(frozen=True)
+class Ack:
+    """The answer to a command, with the settings in force after it."""
+
+    command: int
+    status: int
+    settings: BoardSettings
+
+    def pack(self) -> bytes:
+        """The payload."""
+        return bytes([Kind.ACK, self.command, self.status]) + self.settings.body()
+
+
+@dataclass(frozen=True, eq=False)
+class DueBlock:
+    """Consecutive samples.
+
+    Attributes:
+        counts: (n, C) sums of `averaging` conversions, n up to 16, one column for every bit of `mask`.
+        first: index of the first sample since the start. time_us: board time as the last sample was complete.
+        overruns: samples the board has dropped since the start. sequence: number of the block since the start.
+    """
+
+    counts: NDArray[np.uint16]
+    averaging: int
+    mask: int
+    sequence: int
+    first: int
+    time_us: int
+    overruns: int
+
+    def pack(self) -> bytes:
+        """The payload."""
+        fields = (self.averaging, self.mask, self.sequence, self.first, self.time_us, self.overruns)
+        return _BLOCK.pack(Kind.BLOCK, len(self.counts), *fields) + self.counts.astype("<u2").tobytes()
+
+
+Frame = Request | BoardSettings | Identity | Ack | DueBlock
+
+_SETTINGS = struct.Struct("<IHB")
+_IDENTITY = struct.Struct("<3BBB16s16s")
+_ACK = struct.Struct("<BBIHB")
+_BLOCK = struct.Struct("<BBBHHIII")
+_CHECK_BYTES = 3
+_MAX_PAYLOAD = _BLOCK.size + 2 * MAX_SAMPLES * MAX_CHANNELS
+_MAX_FRAME = _MAX_PAYLOAD + 2 + _CHECK_BYTES
+
+
+def encode(frame: Frame) -> bytes:
+    """The bytes of a frame on the wire, with the zeros at both ends."""
+    coded = cobs_encode(frame.pack())
+    return b"\0" + coded + _check(coded) + b"\0"
+
+
+def cobs_encode(payload: bytes) -> bytes:
+    """`payload` without zeros: every run between them with a count, 255 where a run of 254 goes on.
+
+    As the firmware does, and other than the package `cobs`, a run of 254 at the very end is followed by an empty one.
+    """
+    coded = bytearray()
+    for run in payload.split(b"\0"):
+        while len(run) >= 254:
+            coded += b"\xff" + run[:254]
+            run = run[254:]
+        coded.append(len(run) + 1)
+        coded += run
+    return bytes(coded)
+
+
+def cobs_decode(coded: bytes) -> bytes:
+    """The payload that `cobs_encode` made `coded` from; raises ValueError where there is none."""
+    payload = bytearray()
+    at = 0
+    while at < len(coded):
+        count = coded[at]
+        payload += coded[at + 1 : at + count]
+        at += count
+        if count == 0 or at > len(coded):
+            raise ValueError(f"COBS count {count} does not fit in {len(coded)} bytes")
+        if count < 255 and at < len(coded):
+            payload.append(0)
+    return bytes(payload)
+
+
+def unpack(payload: bytes) -> Frame:
+    """The frame of a payload; raises ValueError where it is none."""
+    kind = payload[0] if payload else None
+    try:
+        if kind in (Kind.IDENTIFY, Kind.START, Kind.STOP) and len(payload) == 1:
+            return Request(Kind(payload[0]))
+        if kind == Kind.SETTINGS:
+            return BoardSettings(*_SETTINGS.unpack(payload[1:]))
+        if kind == Kind.IDENTITY:
+            major, minor, patch, bits, channels, name, serial = _IDENTITY.unpack(payload[1:])
+            return Identity((major, minor, patch), bits, channels, name.rstrip(b"\0").decode("ascii"), serial)
+        if kind == Kind.ACK:
+            command, status, *settings = _ACK.unpack(payload[1:])
+            return Ack(command, status, BoardSettings(*settings))
+    except struct.error as error:
+        raise ValueError(f"kind {kind} of {len(payload)} bytes ({error})") from error
+    if kind == Kind.BLOCK:
+        return _unpack_block(payload)
+    raise ValueError(f"kind {kind} of {len(payload)} bytes, expected one of {[int(known) for known in Kind]}")
+
+
+def _unpack_block(payload: bytes) -> DueBlock:
+    if len(payload) < _BLOCK.size:
+        raise ValueError(f"a block of {len(payload)} bytes, expected at least {_BLOCK.size}")
+    _, samples, averaging, mask, *numbers = _BLOCK.unpack_from(payload)
+    channels = mask.bit_count()
+    limits = 1 <= samples <= MAX_SAMPLES and 1 <= averaging <= MAX_AVERAGING and 0 < mask < 1 << MAX_CHANNELS
+    if not limits or len(payload) != _BLOCK.size + 2 * samples * channels:
+        raise ValueError(f"a block of {len(payload)} bytes with {samples} samples of {channels} channels")
+    counts = np.frombuffer(payload, "<u2", offset=_BLOCK.size).reshape(samples, channels)
+    if counts.max() > averaging * FULL_SCALE:
+        raise ValueError(f"a count of {counts.max()}, expected at most {averaging * FULL_SCALE}")
+    return DueBlock(counts, averaging, mask, *numbers)
+
+
+class DueDecoder:
+    """Finds the frames in a stream of bytes that comes in any portions.
+
+    Attributes:
+        damaged: pieces between two zeros, so far, that were no frame.
+    """
+
+    def __init__(self) -> None:
+        self.damaged = 0
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that `data` completes, in order."""
+        *pieces, rest = (self._rest + data).split(b"\0")
+        self._rest = rest[: _MAX_FRAME + 1]  # one byte too long is damaged whatever follows
+        return [frame for piece in pieces if piece and (frame := self._frame(piece)) is not None]
+
+    def _frame(self, piece: bytes) -> Frame | None:
+        coded, check = piece[:-_CHECK_BYTES], piece[-_CHECK_BYTES:]
+        try:
+            if len(piece) > _MAX_FRAME or check != _check(coded):
+                raise ValueError("the check does not fit")
+            return unpack(cobs_decode(coded))
+        except ValueError:
+            self.damaged += 1
+            return None
+
+
+def _check(coded: bytes) -> bytes:
+    crc = crc_hqx(coded, 0xFFFF)
+    return bytes([0x80 | crc >> 14, 0x80 | crc >> 7 & 0x7F, 0x80 | crc & 0x7F])

@@ -1,1 +1,0 @@
-"""Any board that sends its samples as lines of text."""

@@ -1,1 +1,0 @@
-"""Devices that are not there: emulated board and arm, a live pad, the whole rig."""

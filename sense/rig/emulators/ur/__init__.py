@@ -1,1 +1,0 @@
-"""An emulated UR controller."""

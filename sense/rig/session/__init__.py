@@ -1,1 +1,0 @@
-"""A session of presses on a rig."""

@@ -1,0 +1,7 @@
+"""Filters and press detection: from voltages to presses."""
+
+from pathlib import Path
+
+from padforge.design.common.parallel import clear_stale_kernels
+
+clear_stale_kernels(Path(__file__).parent)

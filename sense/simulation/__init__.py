@@ -1,0 +1,1 @@
+"""The simulated pad and recordings of it."""

@@ -1,1 +1,0 @@
-"""Denoising and drift compensation."""

@@ -1,1 +1,0 @@
-"""Depth, force and shape of what presses."""
