@@ -224,8 +224,9 @@ def run_stages(
     from padforge.design.report import contact_line
     from padforge.fabricate import FabricationSettings, build
     from padforge.fabricate.cli import mould_lines
+    from padforge.sense.localizer.evaluation import calibration_lines
     from padforge.sense.recording.recording import Recording
-    from padforge.sense.report.calibration import FILES, calibrate_into, calibration_lines
+    from padforge.sense.report.calibration import FILES, calibrate_into
     from padforge.sense.rig.operation import record_simulated
     from padforge.sense.settings import LocalizerSettings, RigSettings
 
