@@ -1,7 +1,13 @@
 """A simulated recording and a quickly trained localizer, shared by the tests of sense."""
 
+import fcntl
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -9,7 +15,12 @@ import pytest
 from padforge.design import Morphology
 from padforge.sense import Localizer, Recording, calibrate
 from padforge.sense import settings as sense_settings
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.virtual import virtual_rig as whole_rig
+from padforge.sense.virtual.ur5 import UrEmulator
+from padforge.sense.virtual.ur5_controller import Series
 from tests.helpers.once import Once
 
 QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)
@@ -78,3 +89,107 @@ def folder(recording: Recording, tmp_path: Path) -> Path:
     """The run directory of a recording."""
     recording.save(tmp_path / "run", {"command": "test"})
     return tmp_path / "run"
+
+
+WAIT_S = 180.0
+ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]
+"""Of this machine: on Linux all that begin with 127, elsewhere the first alone."""
+
+FORBIDDEN = ("play", "unlock", "power", "brake", "safety")
+"""Words of orders to the dashboard that are for a person alone."""
+
+
+class Robots:
+    """One emulator at a time, kept while the next test wants the same, and the link to it while that is whole."""
+
+    def __init__(self, host: str) -> None:
+        self.host, self.series, self.robot = host, "", None
+        self.arm: UR5 | None = None
+
+    def get(self, series: Series, **settings: Any) -> UrEmulator:
+        if self.robot is None or settings or self.series != series:
+            self.free()
+            self.series, self.robot = series, UrEmulator(series, host=self.host, **settings).__enter__()
+        return self.robot
+
+    def connected(self, host: str) -> UR5:
+        """The arm by one of its names, at rest."""
+        arm = self.arm = self.arm or UR5(host)
+        try:
+            if arm.state().moving:
+                arm.stop()
+        except RigFault:
+            arm.connect()
+        return arm
+
+    def free(self) -> None:
+        if self.arm is not None:
+            self.arm.close()
+            self.arm = None
+        if self.robot is not None:
+            asked, self.series = self.robot.asked(), ""
+            self.robot.__exit__()
+            self.robot = None
+            assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
+
+
+def taken(address: str) -> IO[str] | None:
+    """The lock on an address; None where another process has it."""
+    lock = (Path(tempfile.gettempdir()) / f"padforge-ur-{address}.lock").open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return None
+    return lock
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """An address whose ports are held by one module of one test process at a time."""
+    end = time.monotonic() + WAIT_S
+    while True:
+        for address in ADDRESSES:
+            if lock := taken(address):
+                with lock:
+                    yield address
+                return
+        if time.monotonic() > end:
+            pytest.fail(f"other processes have had the emulator's ports for {WAIT_S} s")
+        time.sleep(0.1)
+
+
+@pytest.fixture(scope="module")
+def own_address(address: str) -> Iterator[None]:
+    """Whole rigs are emulated at the address."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_rig, "HOST", address)
+        yield
+
+
+@pytest.fixture(scope="module")
+def host(address: str) -> str:
+    """The address by a name for which ur-rtde asks whether the arm is in remote control."""
+    return address.replace("127.0.0.", "127.")
+
+
+@pytest.fixture(scope="module")
+def robots(address: str) -> Iterator[Robots]:
+    robots = Robots(address)
+    yield robots
+    robots.free()
+
+
+@pytest.fixture
+def series() -> Series:
+    return "cb3"
+
+
+@pytest.fixture
+def robot(robots: Robots, series: Series) -> UrEmulator:
+    return robots.get(series)
+
+
+@pytest.fixture
+def arm(robots: Robots, robot: UrEmulator, host: str) -> UR5:
+    return robots.connected(host)

@@ -17,7 +17,7 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.rig import operation
 from padforge.sense.settings import RigSettings
-from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 
 def test_a_recording_lies_in_the_folder_of_its_pad(padforge_sense) -> None:

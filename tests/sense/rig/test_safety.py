@@ -14,7 +14,7 @@ from padforge.sense.rig import safety
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.safety import Limits, Vector, require_safe, tilt_deg, wait_until_still, watch
 from padforge.sense.settings import RigSettings
-from tests.sense.rig.devices.fakes import Time
+from tests.sense.rig.fakes import Time
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
 SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)

@@ -20,7 +20,7 @@ from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.boards.line_framing import LineHeader
 from padforge.sense.rig.devices import ConverterSamples, RigFault
 from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard
-from tests.sense.rig.devices.fakes import fault_of
+from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")

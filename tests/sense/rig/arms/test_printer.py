@@ -18,7 +18,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.virtual import printer as firmware
 from padforge.sense.virtual.boards import EmulatedLineBoard
 from padforge.sense.virtual.printer import EmulatedPrinter
-from tests.sense.rig.devices.fakes import fault_of
+from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")

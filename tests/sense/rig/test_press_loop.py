@@ -14,7 +14,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig.devices import ConverterSamples, RigFault
 from padforge.sense.rig.press_loop import Averager, Session, require_safe_plan
-from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.fakes import RIG, FakeArm, FakeConverter, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
 FOUR = PressPlan(PLAN.places_mm[:4], PLAN.depths_mm[:4])

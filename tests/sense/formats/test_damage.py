@@ -13,7 +13,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, open_recording
 from padforge.sense.formats.import_export import import_file
 
-from .ros.foreign import array, make, write_bag
+from .foreign import array, make, write_bag
 
 FILES = ("plain.mat", "packed.mat", "r.csv", "r.h5", "r.mcap", "packed.mcap", "plain.db3")
 MAPPED = {"r.h5": "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"}

@@ -25,7 +25,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import Event, Finder
 from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
 from tests.sense.conftest import QUICK
-from tests.sense.rig.devices.fakes import Time
+from tests.sense.rig.fakes import Time
 
 PAD = Morphology.random(3, knots=3, seed=5)
 RIG = RigSettings(presses=6, readings_per_press=16, converter_rate_hz=40.0)

@@ -12,7 +12,7 @@ from padforge.sense.rig.devices import ConverterSamples
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"
-PAGE = Path(__file__).parents[5] / "docs" / "devices.md"
+PAGE = Path(__file__).parents[4] / "docs" / "devices.md"
 SAID = (("name", "padforge-line"),)
 HEADERS = {
     "ESP32": LineHeader(500, 12, 3.3, 16, said=(*SAID, ("serial", "a1b2c3d4e5f6"))),

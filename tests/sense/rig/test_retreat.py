@@ -17,7 +17,7 @@ from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.press_loop import FALL_S, HEIGHT_MM, SPEED_MM_S, Session, retreat
 from padforge.sense.rig.safety import Limits
-from tests.sense.rig.devices.fakes import RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.fakes import RIG, FakeArm, FakeConverter, Time
 
 LIMITS = Limits.of(RIG)
 DEEP_MM = 46.0

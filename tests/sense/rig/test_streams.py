@@ -17,7 +17,7 @@ from padforge.sense.rig.streams import RECORDED, connected, lies_mirrored, repla
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.virtual.virtual_pad import SimulatedConverter
-from tests.sense.rig.devices.fakes import Time
+from tests.sense.rig.fakes import Time
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from padforge.sense.deploy.onnx_export import MOST_OFF_MM, Exported, export_onnx
 from padforge.sense.localizer.features import bridged
 from padforge.sense.localizer.localizer import Found
 from tests.sense.conftest import QUICK
-from tests.sense.live.deployment.conftest import ROOT, tutorial
+from tests.sense.deploy.conftest import ROOT, tutorial
 
 DIGEST = "a" * 64
 

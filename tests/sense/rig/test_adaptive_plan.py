@@ -7,7 +7,7 @@ from padforge.sense.recording.run_directory import Recorder
 from padforge.sense.rig.operation import EVERY, Steering, uncertainty
 from padforge.sense.rig.press_loop import Session
 from padforge.sense.settings import LocalizerSettings
-from tests.sense.rig.devices.fakes import FIBRES, PAD, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.fakes import FIBRES, PAD, RIG, FakeArm, FakeConverter, Time
 
 
 def test_what_there_is_to_learn_is_the_mean_error_of_five_presses_times_the_way_to_the_nearest():

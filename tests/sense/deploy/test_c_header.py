@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from padforge.sense.deploy import streaming
 from padforge.sense.deploy.c_header import c_header
 from padforge.sense.deploy.streaming import CODE, Budget, state_bytes, table_bytes
-from tests.sense.live.deployment.conftest import BUDGET, Told, compiled, program_of, tutorial
+from tests.sense.deploy.conftest import BUDGET, Told, compiled, program_of, tutorial
 
 OFF_MM = 1e-3
 

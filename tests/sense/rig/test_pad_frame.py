@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from padforge.design.twin import PlanTransform as TwinFrame
 from padforge.sense.rig.config import Frame
 from padforge.sense.rig.devices import RigFault
-from tests.sense.rig.devices.fakes import RIG
+from tests.sense.rig.fakes import RIG
 
 
 @pytest.mark.parametrize(("mirrored", "y_mm"), [(False, -397), (True, -403)])

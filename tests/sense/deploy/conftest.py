@@ -19,7 +19,7 @@ from padforge.sense.deploy.student import Student, as_int8, split, teach
 from tests.sense.conftest import QUICK
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[3]
+ROOT = HERE.parents[2]
 BUDGET = Budget(40_000, 8_000)
 SHORT = QUICK.model_copy(update={"epochs": 4})
 

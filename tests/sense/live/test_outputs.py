@@ -257,7 +257,7 @@ def test_lsl_tells_readings_and_touches(tmp_path: Path, monkeypatch: pytest.Monk
     code = """
 import pylsl
 from padforge.sense.live.outputs import Lsl
-from tests.sense.live.test_streams import READING, TOUCH
+from tests.sense.live.test_outputs import READING, TOUCH
 lsl = Lsl("a pad", 2, 13.0)
 found = [pylsl.resolve_byprop("name", f"a pad {what}", timeout=20)[0] for what in ("readings", "touches")]
 readings, touches = (pylsl.StreamInlet(info) for info in found)

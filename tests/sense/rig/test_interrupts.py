@@ -10,8 +10,8 @@ from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.rig import operation
 from padforge.sense.rig.config import Setup
 from padforge.sense.rig.devices import RigFault
-from tests.sense.rig.devices.fakes import PAD, RIG, FakeArm, FakeConverter, Time
-from tests.sense.rig.session.test_press_loop import FOUR, run
+from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.test_press_loop import FOUR, run
 
 
 def interrupted(arm: FakeArm, path: Path, raises: type[BaseException]) -> None:

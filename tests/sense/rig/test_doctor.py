@@ -5,7 +5,7 @@ import pytest
 
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.doctor import examine_arm, examine_converter
-from tests.sense.rig.devices.fakes import FIBRES, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.fakes import FIBRES, RIG, FakeArm, FakeConverter, Time
 
 
 class Rig:
