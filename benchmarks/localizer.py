@@ -15,7 +15,7 @@ from padforge.design import Morphology
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats
-from padforge.sense.localizer.features import Normalization, press_inputs
+from padforge.sense.localizer.features import FeatureScaler, press_inputs
 from padforge.sense.localizer.network import learnt, pooled
 from padforge.sense.localizer.training import HIDDEN
 from padforge.sense.recording.recording import Recording
@@ -30,7 +30,7 @@ PASSES = (30, 100, 300)
 """Passes of Adam through batches of BATCH presses."""
 STEPS = (50, 200, 800, 3200)
 """Steps of the masked networks."""
-FEATURES = ("published", "full")
+FEATURES = ("published", "press_and_release")
 MARQUARDT = ("published",)
 """Features for Levenberg-Marquardt: with F times as many, each step takes F^2 to F^3 as long."""
 BATCH, ADAM_RATE = 128, 3e-3
@@ -50,7 +50,7 @@ def trials() -> Iterator[BenchTrial]:
         _, table, inputs, targets = _scaled(FEATURES[-1])
         masked = _train_masked(inputs[:-TEST], targets[:-TEST], table, 1)
         press = inputs[:1].reshape(1, -1).astype(np.float64)
-        yield BenchTrial("one press", "masked", 0, partial(masked, press))
+        yield BenchTrial("one press", "ensemble", 0, partial(masked, press))
 
 
 @cache
@@ -65,25 +65,25 @@ def _trainings(features: str) -> Iterator[BenchTrial]:
     x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
 
     def evaluate(predict: Predict) -> Mapping[str, float]:
-        error_mm = scaling.places_mm(predict(flat[-TEST:]).astype(np.float32)) - recorded().presses_mm[-TEST:]
+        error_mm = scaling.positions_mm(predict(flat[-TEST:]).astype(np.float32)) - recorded().presses_mm[-TEST:]
         return {"error": float(np.hypot(*error_mm.T).mean())}
 
     ways: dict[str, tuple[tuple[int, ...], Callable[[int], Predict]]] = {
         "LM": (EPOCHS if features in MARQUARDT else (), partial(_train_marquardt, x, y)),
         "L-BFGS": (ITERATIONS, partial(_train_lbfgs, x, y)),
         "Adam": (PASSES, partial(_train_adam, x, y)),
-        "masked": (STEPS, partial(_train_masked, inputs[:-TEST], targets[:-TEST], table)),
+        "ensemble": (STEPS, partial(_train_masked, inputs[:-TEST], targets[:-TEST], table)),
     }
     for way, (sizes, train) in ways.items():
         for size in sizes:
             yield BenchTrial(features, way, size, partial(train, size), evaluate)
 
 
-def _scaled(features: str) -> tuple[Normalization, Floats, Floats, Floats]:
+def _scaled(features: str) -> tuple[FeatureScaler, Floats, Floats, Floats]:
     """Return the scaling and the table of the training presses, and the inputs and targets of all presses."""
     recording = recorded()
-    raw = press_inputs(recording.readings, recording.begun, recording.lifted, features)
-    scaling, table = Normalization.fit(raw[:-TEST], recording.presses_mm[:-TEST])
+    raw = press_inputs(recording.readings, recording.down_command, recording.up_command, features)
+    scaling, table = FeatureScaler.fit(raw[:-TEST], recording.presses_mm[:-TEST])
     return scaling, table, scaling.inputs(raw).inputs, scaling.targets(recording.presses_mm)
 
 
@@ -156,7 +156,9 @@ def _train_masked(inputs: Floats, targets: Floats, table: Floats, steps: int) ->
     def predict(x: Array) -> Array:
         features = x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)
         mask = np.ones(features.shape[:2], dtype=bool)
-        members = learnt(trained.weights, features, mask, observer=trained.observer, corrector=trained.corrector)
+        members = learnt(
+            trained.weights, features, mask, bayes=trained.bayes, residual_network=trained.residual_network
+        )
         return pooled(members)[0].astype(np.float64)
 
     return predict
@@ -167,7 +169,7 @@ BENCH = Bench(
     trials,
     "mean error (mm)",
     reference=("LM", EPOCHS[-1]),
-    default=("masked", STEPS[1]),
+    default=("ensemble", STEPS[1]),
     baselines=("published", "L-BFGS", "Adam"),
     prepare=lambda: [train(np.zeros((4, 1)), np.zeros((4, 2)), 1) for train in (_train_lbfgs, _train_adam)],
 )

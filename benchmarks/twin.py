@@ -147,7 +147,7 @@ def _fit_plan(world: str, presses: int) -> Predict:
     def plan_signals(positions_mm: Array) -> Array:
         return signals(pad.morphology, pad.morphology.to_grid(pad.frame.to_plan(positions_mm)), PLAN_CONTACT)
 
-    inputs = plan_signals(measured.places_mm)
+    inputs = plan_signals(measured.positions_mm)
     lines = [
         np.zeros(2) if fibre is None else np.polyfit(inputs[:, fibre], measured.volts[:, channel], 1)
         for channel, fibre in enumerate(fibres)
@@ -165,7 +165,7 @@ def _fit_smooth(world: str, presses: int) -> Predict:
     """Fit a smooth function of position by ridge regression on radial basis functions, as the localizer does."""
     measured = responses(recorded(world, presses), np.ones(presses, bool))
     half_mm = max(printed(world).sensed_mm) / 2
-    design_matrix, mean = bumps(measured.places_mm / half_mm), measured.volts.mean(axis=0)
+    design_matrix, mean = bumps(measured.positions_mm / half_mm), measured.volts.mean(axis=0)
     gram = design_matrix.T @ design_matrix + RIDGE_PLACE * np.eye(design_matrix.shape[1])
     weights = np.linalg.solve(gram, design_matrix.T @ (measured.volts - mean))
     return lambda positions_mm: np.asarray(mean + bumps(positions_mm / half_mm) @ weights, np.float64)

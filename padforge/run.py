@@ -165,7 +165,7 @@ def check_run(run: Run) -> None:
     from padforge.fabricate import FabricationSettings
     from padforge.fabricate.export import require_formats
     from padforge.sense.localizer.calibration import split_presses
-    from padforge.sense.localizer.localizer import FORMAT as LOCALIZER_FORMAT
+    from padforge.sense.localizer.model import FORMAT as LOCALIZER_FORMAT
     from padforge.sense.recording.recording import refuse_replacing
     from padforge.sense.settings import LocalizerSettings, RigSettings
 

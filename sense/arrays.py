@@ -15,7 +15,7 @@ MAX_BYTES = 2**33
 """Size of the largest file of a recording."""
 MAX_INDEX = 2**53
 """Greatest index that float64 holds exactly."""
-LEAST_SPREAD_V = 1e-9
+MIN_SCALE_V = 1e-9
 """Least spread that an input is divided by: what varies less never varied."""
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 """Kinds of arrays that all rooms of sense speak of."""
 
 
-def as_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
+def check_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
     """`values`, or a copy of them, as an array of float64, or of int64 where all are whole numbers.
 
     Raises:
@@ -47,7 +47,7 @@ def as_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool 
     return array.astype(kind, copy=copy)
 
 
-def refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str, missing: bool = False) -> None:
+def check_magnitude(name: str, values: NDArray[np.float64], limit: float, unit: str, missing: bool = False) -> None:
     """Raise InputError if an entry of (N, M) values is not finite, or beyond `limit`; NaN is allowed if `missing`."""
     sound = ~np.isinf(values) if missing else np.isfinite(values)
     if not sound.all():
@@ -68,21 +68,21 @@ def stream_of(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None
     Raises:
         InputError: shapes that do not fit together, what is beyond the limits above, or times that do not ascend.
     """
-    times = as_numbers(times_s, np.float64, "times", copy=False)
-    rows = as_numbers(readings, np.float64, "readings", copy=False)
+    times = check_numbers(times_s, np.float64, "times", copy=False)
+    rows = check_numbers(readings, np.float64, "readings", copy=False)
     if times.ndim != 1 or rows.ndim != 2 or len(rows) != len(times) or rows.shape[1] != (fibres or rows.shape[1]):
         raise InputError(
             f"times have shape {times.shape} and readings {rows.shape}, expected (n,) and (n, {fibres or 'C'})"
         )
     if not 1 <= rows.shape[1] <= MAX_FIBRES:
         raise InputError(f"readings are of {rows.shape[1]} fibres, allowed is 1 to {MAX_FIBRES}")
-    refuse_beyond("readings", rows, MAX_VOLTS, "V", missing=True)
-    refuse_beyond("times", times[:, None], MAX_S, "s")
-    refuse_descent(times)
+    check_magnitude("readings", rows, MAX_VOLTS, "V", missing=True)
+    check_magnitude("times", times[:, None], MAX_S, "s")
+    check_ascending(times)
     return times, rows
 
 
-def refuse_descent(times_s: NDArray[np.float64]) -> None:
+def check_ascending(times_s: NDArray[np.float64]) -> None:
     """Raise InputError unless each of (n,) times is later than the one before."""
     late = np.diff(times_s) > 0
     if not late.all():

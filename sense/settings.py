@@ -10,8 +10,8 @@ from padforge.design.common.settings import Settings, as_tuple, null_as
 from padforge.design.common.validation import InputError
 from padforge.design.settings import Scatter
 
-Features = Literal["full", "causal", "early", "published"]
-Method = Literal["masked", "published"]
+Features = Literal["press_and_release", "causal", "onset", "published"]
+Method = Literal["ensemble", "published"]
 Split = Literal["random", "chronological"]
 
 PLANS = ("uniform", "grid", "boustrophedon", "adaptive")
@@ -83,9 +83,7 @@ class RigSettings(Settings):
     printer_baud: int = Field(
         default=115_200, ge=9600, le=2_000_000, description="speed of the 3D printer's port, baud"
     )
-    converter_rate_hz: float = Field(
-        default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz"
-    )
+    board_rate_hz: float = Field(default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz")
     channels: Annotated[tuple[Input, ...], BeforeValidator(as_tuple)] = Field(
         default=(), max_length=512, description="input of the board that each fibre is on, from 0; [] in order"
     )
@@ -153,16 +151,18 @@ class LocalizerSettings(Settings):
     """`[localizer]`: how places are learnt from readings."""
 
     method: Method = Field(
-        default="masked", description="one network for every loss of fibres, or published: 50 tanh, Levenberg-Marquardt"
+        default="ensemble",
+        description="one network for every loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
     )
     features: Features = Field(
-        default="full", description="press and release; causal: up to its end; early: its first readings; or published"
+        default="press_and_release",
+        description="press and release; causal: up to its end; onset: its first readings; or published",
     )
     split: Split = Field(
         default="random", description="presses held back for the test: drawn at random, or the last ones"
     )
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")
-    lost: int = Field(default=3, ge=0, le=8, description="train and test for up to this many lost fibres")
+    max_failures: int = Field(default=3, ge=0, le=8, description="train and test for up to this many lost fibres")
     members: int = Field(
         default=2,
         ge=1,
@@ -173,5 +173,7 @@ class LocalizerSettings(Settings):
     layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")
     epochs: int = Field(default=200, ge=1, le=100_000, description="times the presses are shown, up to 11 000 steps")
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
-    rate: float = Field(default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule")
+    learning_rate: float = Field(
+        default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule"
+    )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")

@@ -48,7 +48,7 @@ members = 1
 hidden = 8
 layers = 1
 epochs = 8
-lost = 1
+max_failures = 1
 """
 RESUMED = ("--resume",)
 _VOLATILE = {"design.json", "report.html", "run.json"}
@@ -93,12 +93,12 @@ COMMANDS = {
     "run": Command("run --seed 1 --formats stl,svg --out pad", ((), RESUMED)),
     "record": Command("sense record --morphology other/morphology.json --seed 1 --out pad/recording", old=False),
     "drivers": Command(
-        "sense record --through-drivers --presses 2 --morphology other/morphology.json --out pad/recording --resume",
+        "sense record --virtual-hardware --presses 2 --morphology other/morphology.json --out pad/recording --resume",
         old=False,
         real_time=True,
     ),
     "calibrate": Command("sense calibrate other/recording --out pad"),
-    "study": Command("study robustness square@2 --presses 16 --lost 1 --seed 1 --out pad", ((), RESUMED)),
+    "study": Command("study robustness square@2 --presses 16 --max-failures 1 --seed 1 --out pad", ((), RESUMED)),
     "csv": Command("sense export other/recording pad/out.csv"),
     "hdf5": Command("sense export other/recording pad/out.h5"),
     "mcap": Command("sense export other/recording pad/out.mcap"),
@@ -234,7 +234,7 @@ def made(where: Path, names: Sequence[str]) -> Path:
     if {*names} == {"design"}:
         before = ["design --out pad"]
     if "study" in names:
-        before.append("study robustness square@2 --presses 16 --lost 1 --out pad")
+        before.append("study robustness square@2 --presses 16 --max-failures 1 --out pad")
     before += [f"sense export pad/recording pad/out.{kind}" for name, kind in _EXPORTED.items() if name in names]
     for words in before:
         assert ended(started(words.split(), origin)) == 0, Path(f"{origin}.err").read_text()
@@ -250,13 +250,13 @@ def main(where: Path, seconds: float, seed: int, names: Sequence[str]) -> None:
         import_module(name)
     where.mkdir(parents=True)
     origin, failed = made(where, names), 0
-    begun = {name: Rounds(where / name, origin, COMMANDS[name]) for name in names}
+    down_command = {name: Rounds(where / name, origin, COMMANDS[name]) for name in names}
     found: dict[str, Counter[str]] = {name: Counter() for name in names}
     end = time.monotonic() + seconds
     for number in count():
         name, between = names[number % len(names)], number // len(names) % 4 == 3
         try:
-            found[name][begun[name].round(rng, between)] += 1
+            found[name][down_command[name].round(rng, between)] += 1
         except (AssertionError, InputError) as error:
             failed += 1
             print(f"FAILED {name} {number} {between}: {str(error)[:1500]}", flush=True)

@@ -20,7 +20,7 @@ GRIDS = (2, 3, 4, 5)
 """The least has four fibres, of which three may be lost."""
 MOST_KNOTS = 6
 SPLITS = ("chronological", "random")
-LEARNT = LocalizerSettings(members=2, hidden=64, layers=3, epochs=240, lost=3)
+LEARNT = LocalizerSettings(members=2, hidden=64, layers=3, epochs=240, max_failures=3)
 """Enough to find places at all: the radii are to hold however good a localizer is."""
 
 

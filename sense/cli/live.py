@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel
     from padforge.sense.live.outputs import Outlet
     from padforge.sense.live.pipeline import Event
-    from padforge.sense.localizer.localizer import Localizer
-    from padforge.sense.rig.devices import Converter
+    from padforge.sense.localizer.model import LocalizerModel
+    from padforge.sense.rig.devices import Board
     from padforge.sense.rig.streams import Source
 
     Show = Callable[[dict[str, Any], Sequence[Event]], None]
@@ -89,13 +89,13 @@ def live(
     Whoever knows the token sees page and lines from anywhere in the network, and nothing is encrypted.
 
     A fibre found bad is left out from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
-    Fibres are numbered from 1; in JSON "fibres" and "lost" hold indices, from 0.
+    Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
     from padforge.sense.live.outputs import LivePage, Messages, tell_all
     from padforge.sense.live.pipeline import Live
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.localizer.model import LocalizerModel
 
-    localizers = [Localizer.load(model) for model in models]
+    localizers = [LocalizerModel.load(model) for model in models]
     with ExitStack() as stack:
         rigged = (stack, rig, models[0], localizers[0], spec)
         source, mirrored = _connected(*rigged) if replay is None else _replayed(replay, speed)
@@ -121,7 +121,7 @@ def live(
 
 
 def _connected(
-    stack: ExitStack, rig: str, model: Path, localizer: "Localizer", spec: Path | None
+    stack: ExitStack, rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None
 ) -> "tuple[Source, bool]":
     """The readings of a converter, until `stack` is left, and whether the pad lies with its tracks up."""
     from padforge.sense.rig.streams import connected, lies_mirrored
@@ -142,13 +142,13 @@ def _replayed(replay: Path, speed: float) -> "tuple[Source, bool]":
     return replayed(recording, speed), recording.mirrored
 
 
-def _pad(title: str, localizer: "Localizer", mirrored: bool) -> dict[str, Any]:
+def _pad(title: str, localizer: "LocalizerModel", mirrored: bool) -> dict[str, Any]:
     """What stays the same of the view."""
-    scaling = localizer.normalization
+    scaling = localizer.scaler
     half_mm = scaling.half_mm
     return {
         "title": title,
-        "middle_mm": scaling.middle_mm.tolist(),
+        "origin_mm": scaling.origin_mm.tolist(),
         "half_mm": [scaling.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
         "mirrored": mirrored,
     }
@@ -172,7 +172,7 @@ def _outlets(
     return outlets
 
 
-def _converter(rig: str, model: Path, localizer: "Localizer", spec: Path | None) -> "Converter":
+def _converter(rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None) -> "Board":
     """The converter alone, not yet connected: whoever presses the pad, it is not the arm."""
     if rig == "simulated":
         from padforge.sense.rig.streams import simulated

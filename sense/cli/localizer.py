@@ -32,7 +32,7 @@ from padforge.sense.cli.options import (
     METHODS,
     FibreNumbers,
     fibre_indices,
-    lost_option,
+    max_failures_option,
     model_option,
     read_recording,
     recording_argument,
@@ -97,23 +97,23 @@ def calibrate(
 @click.command()
 @model_option
 @recording_argument
-@lost_option
+@max_failures_option
 @common.json_option
 @common.profile_option
-def evaluate(model: Path, recording: Path, lost: int, as_json: bool) -> None:
+def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
     """Errors on RECORDING for every set of lost fibres.
 
     \b
-    padforge sense evaluate --model out/pad out/later/recording --lost 1
+    padforge sense evaluate --model out/pad out/later/recording --max-failures 1
 
     Of the recording the model was trained on, only the presses that were held back count.
     """
     from padforge.sense.localizer.evaluation import calibration_lines
     from padforge.sense.localizer.evaluation import evaluate as test
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.localizer.model import LocalizerModel
 
-    localizer = Localizer.load(model)
-    levels = range(min(lost, localizer.fibres - 1) + 1)
+    localizer = LocalizerModel.load(model)
+    levels = range(min(max_failures, localizer.fibres - 1) + 1)
     document = test(localizer, read_recording(recording), levels)
     common.show_result(document, calibration_lines(document), as_json)
 
@@ -121,34 +121,36 @@ def evaluate(model: Path, recording: Path, lost: int, as_json: bool) -> None:
 @click.command()
 @model_option
 @recording_argument
-@click.option("--mask", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1.")
+@click.option(
+    "--exclude-fibres", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1."
+)
 @out_option(what="CSV file for the places, places.csv", file=True)
 @profile_option
-def locate(model: Path, recording: Path, mask: tuple[int, ...], out: Path | None) -> None:
+def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
     """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
 
     \b
-    padforge sense locate --model out/pad out/later/recording --mask 1,4 --out places.csv
+    padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
 
     \b
-    The columns of the CSV: press (counted from 0), x_mm, y_mm, sd_x_mm, sd_y_mm (standard
+    The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
     deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
     of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
-    from padforge.sense.health import locating
-    from padforge.sense.health.fault_detector import examined, has_health
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
+    from padforge.sense.localizer.model import LocalizerModel, write_localization
 
     file = out or pad_folder(recording) / "places.csv"
-    localizer = Localizer.load(model)
-    lost = fibre_indices(mask, localizer.fibres)
+    localizer = LocalizerModel.load(model)
+    failed = fibre_indices(exclude_fibres, localizer.fibres)
     opened = read_recording(recording)
     findings = examined(model, opened)[1] if has_health(model) else []
     for finding in findings:
         click.echo(f"{finding.text}; left out from there on", err=True)
-    found = locating.locate(localizer, opened, lost, findings)
-    locating.write_places(found, file)
-    click.echo(f"{len(found.r50_mm)} places -> {file}")
+    fibre_mask = fibre_mask_of(findings, len(opened.down_command), localizer.fibres)
+    localization = localizer.predict(opened, failed, fibre_mask)
+    write_localization(localization, file)
+    click.echo(f"{len(localization.r50_mm)} positions -> {file}")
 
 
 @click.command()
@@ -171,8 +173,8 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     opened = read_recording(recording)
     known, findings = examined(model, opened)
     document = {
-        "format": "padforge-findings/1",
-        "presses": len(opened.begun),
+        "format": "padforge-findings/2",
+        "presses": len(opened.down_command),
         "dead": list(known.dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
     }
@@ -218,7 +220,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     trained for this. [localizer] says for how long they learn.
     """
     from padforge.design.common.files import check_writable, sha256
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.localizer.model import LocalizerModel
 
     path, recording = files[-1], files[0] if len(files) == 2 else None
     if len(files) > 2:
@@ -230,7 +232,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: cannot be written, it is there and no file")
     check_writable(path.parent)
-    localizer, digest = Localizer.load(model), sha256(model / "localizer.json")
+    localizer, digest = LocalizerModel.load(model), sha256(model / "localizer.json")
     if path.suffix == ".onnx":
         from padforge.sense.deploy.onnx_export import export_onnx, onnx_line
 
@@ -270,13 +272,13 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.health.fault_detector import health_files, health_in
     from padforge.sense.localizer import recalibration
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.localizer.model import LocalizerModel
 
     target = out or common.pad_folder(recording)
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
     check_writable(target)
-    old, health, opened = Localizer.load(model), health_in(model), open_recording(recording)
+    old, health, opened = LocalizerModel.load(model), health_in(model), open_recording(recording)
     with reported("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
     with atomic_files(target, without=health_files()) as folder:
@@ -293,7 +295,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 @recording_argument
 @click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for every loss.")
 @click.option("--retrain", is_flag=True, help="As published: another network for every set of lost fibres.")
-@lost_option
+@max_failures_option
 @click.option("--failed", type=FibreNumbers(), default=(), help="Map errors without these fibres too, from 1: as 2,5.")
 @common.seed_option
 @common.spec_option
@@ -303,7 +305,7 @@ def fibre_loss(
     recording: Path,
     model: Path | None,
     retrain: bool,
-    lost: int,
+    max_failures: int,
     failed: tuple[int, ...],
     seed: int | None,
     spec: Path | None,
@@ -322,7 +324,7 @@ def fibre_loss(
     from padforge.design.common.files import atomic_files, check_writable, write_json
     from padforge.design.common.parallel import Checkpoints
     from padforge.sense.formats.import_export import open_recording
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies.fibre_loss import draw_fibre_loss, fibre_loss_lines, fibre_loss_study
 
@@ -331,7 +333,7 @@ def fibre_loss(
     target = out or common.pad_folder(recording)
     unfinished = target / "unfinished"
     check_writable(target)
-    localizer = Localizer.load(model) if model else None
+    localizer = LocalizerModel.load(model) if model else None
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with reported("networks") as report:
         document = fibre_loss_study(
@@ -339,7 +341,7 @@ def fibre_loss(
             localizer,
             retrain=retrain,
             options=options,
-            lost=lost,
+            max_failures=max_failures,
             failed=fibre_indices(failed, opened.fibres),
             keep_in=unfinished,
             progress=report,

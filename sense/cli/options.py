@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from padforge.sense.recording.recording import Recording
 
 
-METHODS, FEATURES = ("masked", "published"), ("full", "causal", "early", "published")
+METHODS, FEATURES = ("ensemble", "published"), ("press_and_release", "causal", "onset", "published")
 SHOWN_HZ = 15
 """How often a terminal is drawn anew."""
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -24,8 +24,8 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 
 recording_argument = click.argument("recording", type=click.Path(path_type=Path))
 model_option = click.option("--model", type=FOLDER, required=True, help="Folder that calibrate wrote.")
-lost_option = click.option(
-    "--lost", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
+max_failures_option = click.option(
+    "--max-failures", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
 )
 
 

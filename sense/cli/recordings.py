@@ -18,7 +18,7 @@ _PATH = click.Path(path_type=Path)
 
 @click.command("import")
 @click.argument("file", type=_PATH)
-@click.option("--map", "mapping", default="", metavar="QUANTITY=NAME,...", help="What columns or topics hold.")
+@click.option("--columns", "mapping", default="", metavar="QUANTITY=NAME,...", help="What columns or topics hold.")
 @out_option(what="Folder of the recording; must be new or empty")
 def import_(file: Path, mapping: str, out: Path | None) -> None:
     """Make a recording of FILE, a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a bag of ROS 2: an .mcap, a .db3
@@ -26,13 +26,13 @@ def import_(file: Path, mapping: str, out: Path | None) -> None:
 
     \b
     padforge sense import readings.csv
-    padforge sense import lab.csv --map 'time=t_ms:ms,fibres=ch*:mV,x=px,y=py'
-    padforge sense import lab.csv --map 'time=Time [s],fibres=ch*,press=contact,x=X:cm,y=Y:cm'
-    padforge sense import lab.h5 --map 'time=/t,fibres=/data/volts,places=/xy,begun=/on:s,lifted=/off:s'
-    padforge sense import lab.mcap --map 'fibres=/skin/readings,places=/probe,force=/wrench'
+    padforge sense import lab.csv --columns 'time=t_ms:ms,fibres=ch*:mV,x=px,y=py'
+    padforge sense import lab.csv --columns 'time=Time [s],fibres=ch*,press=contact,x=X:cm,y=Y:cm'
+    padforge sense import lab.h5 --columns 'time=/t,fibres=/data/volts,places=/xy,begun=/on:s,lifted=/off:s'
+    padforge sense import lab.mcap --columns 'fibres=/skin/readings,places=/probe,force=/wrench'
 
     \b
-    Without --map a CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two
+    Without --columns a CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two
     hold the place pressed while the probe is down and are empty on all other lines. An .h5 or a bag
     is one that export wrote, a .mat one of the published study.
 
@@ -113,17 +113,17 @@ def _findings(model: Path, recording: "Recording") -> "ModelFindings":
     import numpy as np
 
     from padforge.sense.formats.annotations import FaultFound, ModelFindings
-    from padforge.sense.health.fault_detector import examined, has_health
-    from padforge.sense.health.locating import locate
-    from padforge.sense.localizer.localizer import Localizer
+    from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
+    from padforge.sense.localizer.model import LocalizerModel
 
     known, faults = examined(model, recording) if has_health(model) else (None, [])
-    found = locate(Localizer.load(model), recording, findings=faults)
+    localizer = LocalizerModel.load(model)
+    found = localizer.predict(recording, fibre_mask=fibre_mask_of(faults, len(recording.down_command), localizer.fibres))
     depth = found.measures.get("depth_mm")
     unknown = np.full(len(found.r90_mm), np.nan)
     return ModelFindings(
-        found.places_mm,
-        found.sd_mm,
+        found.positions_mm,
+        found.std_mm,
         found.r90_mm,
         unknown if depth is None else depth.values,
         unknown if depth is None else depth.r90,

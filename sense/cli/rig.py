@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from padforge.design.settings import PadSettings
     from padforge.design.twin import Twin
     from padforge.sense.recording.recording import Recording
-    from padforge.sense.rig.config import Setup
+    from padforge.sense.rig.config import RigConfig
 
 
 rig_option = click.option(
@@ -28,7 +28,7 @@ rig_option = click.option(
 )
 _warn = partial(click.echo, err=True)
 drivers_option = click.option(
-    "--through-drivers", is_flag=True, help="Emulated devices in real time, behind the drivers of the real ones."
+    "--virtual-hardware", is_flag=True, help="Emulated devices in real time, behind the drivers of the real ones."
 )
 
 
@@ -59,7 +59,7 @@ def record(
     model: Path | None,
     dry_run: bool,
     resume: bool,
-    through_drivers: bool,
+    virtual_hardware: bool,
     seed: int | None,
     spec: Path | None,
     out: Path | None,
@@ -71,7 +71,7 @@ def record(
 
     \b
     --rig simulated                     a simulated pad, at once
-    --through-drivers                   any of them in real time, through emulated devices
+    --virtual-hardware                   any of them in real time, through emulated devices
     --rig ur5, --rig printer            a UR robot or a 3D printer, and the board, as [rig] says
     --rig hand                          you and the board: a page and the terminal show where to press
 
@@ -83,22 +83,22 @@ def record(
     """
     from padforge.design.settings import Contact, PadSettings
     from padforge.sense.rig import operation
-    from padforge.sense.rig.config import Setup
+    from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import require_rig_system
     from padforge.sense.settings import RigSettings
 
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
     target = out or folder / "recording"
-    like = _twin(twin, at_once=rig == "simulated" and not through_drivers)
-    if not (rig == "simulated" or through_drivers or morphology):
+    like = _twin(twin, at_once=rig == "simulated" and not virtual_hardware)
+    if not (rig == "simulated" or virtual_hardware or morphology):
         morphology = _beside(target)
         folder = common.pad_folder(morphology)
     pad = _pad(morphology, settings.section(PadSettings))
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
-    if rig == "simulated" and not through_drivers:
+    if rig == "simulated" and not virtual_hardware:
         if resume or dry_run or model:
-            raise InputError("--resume, --dry-run and --model need --through-drivers or a real rig")
+            raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
         shown = like if like and not morphology else pad
         if like and morphology and (left := like.ignored_effects()):
             click.echo(f"{twin}: {left}", err=True)
@@ -107,10 +107,10 @@ def record(
         require_rig_system()
         options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]
-        command = f"padforge sense record --rig {rig}" + " --through-drivers" * through_drivers
+        command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
         size = settings.section(PadSettings, **pad.layout.settings)
-        setup = Setup(pad, settings.section(Contact), options, target, command, inputs, size, folder)
-        recording = _record_with(rig, setup, model, dry_run, resume, through_drivers)
+        setup = RigConfig(pad, settings.section(Contact), options, target, command, inputs, size, folder)
+        recording = _record_with(rig, setup, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
 
 
@@ -118,7 +118,7 @@ def _twin(path: Path | None, at_once: bool) -> "Twin | None":
     from padforge.design.twin import Twin
 
     if path and not at_once:
-        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --through-drivers")
+        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --virtual-hardware")
     return Twin.load(path) if path else None
 
 
@@ -131,7 +131,7 @@ def _beside(recording: Path) -> Path:
 
 
 def _record_with(
-    rig: str, setup: "Setup", model: Path | None, dry_run: bool, resume: bool, through_drivers: bool
+    rig: str, setup: "RigConfig", model: Path | None, dry_run: bool, resume: bool, virtual_hardware: bool
 ) -> "Recording | None":
     """Record with an arm, or by hand."""
     from padforge.sense.recording.run_directory import START
@@ -142,13 +142,13 @@ def _record_with(
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
-        return _record_by_hand(setup, resume, through_drivers)
+        return _record_by_hand(setup, resume, virtual_hardware)
     with reported("presses") as report:
-        how = {"dry": dry_run, "resume": resume, "through_drivers": through_drivers, "report": report, "say": _warn}
+        how = {"dry": dry_run, "resume": resume, "virtual_hardware": virtual_hardware, "report": report, "say": _warn}
         return operation.record(rig, setup, model, **how)
 
 
-def _record_by_hand(setup: "Setup", resume: bool, emulated: bool) -> "Recording":
+def _record_by_hand(setup: "RigConfig", resume: bool, emulated: bool) -> "Recording":
     """Show a person where to press, on a page and in the terminal, and take what is said on both."""
     from padforge.sense.live.outputs import LivePage
     from padforge.sense.rig.by_hand import WORDS, pad_view, record_by_hand, view_lines
@@ -205,7 +205,7 @@ def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
 @common.json_option
 @click.pass_context
 def doctor(
-    ctx: click.Context, rig: str, morphology: Path | None, through_drivers: bool, spec: Path | None, as_json: bool
+    ctx: click.Context, rig: str, morphology: Path | None, virtual_hardware: bool, spec: Path | None, as_json: bool
 ) -> None:
     """Look the rig over before a long run; nothing moves. Exit 1 where something fails.
 
@@ -218,7 +218,7 @@ def doctor(
     from dataclasses import asdict
 
     from padforge.design.settings import Contact, PadSettings
-    from padforge.sense.rig.config import Setup
+    from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import require_rig_system
     from padforge.sense.rig.operation import look_over
     from padforge.sense.settings import RigSettings
@@ -226,12 +226,12 @@ def doctor(
     require_rig_system()
     settings = common.load_spec(spec)
     pad, options = _pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
-    known = morphology is not None or rig == "simulated" or through_drivers
+    known = morphology is not None or rig == "simulated" or virtual_hardware
     inputs = options.inputs(len(pad.knots)) if known else options.channels
-    setup = Setup(
+    setup = RigConfig(
         pad, settings.section(Contact), options, Path(), "padforge sense doctor", folder=common.pad_folder(morphology)
     )
-    found = look_over(rig, setup, inputs, through_drivers)
+    found = look_over(rig, setup, inputs, virtual_hardware)
     passed = all(diagnosis.status != "fail" for diagnosis in found)
     lines = [f"{d.status:<4} {d.name}: {d.found}" for d in found]
     common.show_result({"passed": passed, "found": [asdict(d) for d in found]}, lines, as_json)

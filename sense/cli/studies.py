@@ -97,7 +97,7 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
 
 @_command("robustness")
 @click.option(
-    "--lost", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
+    "--max-failures", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
 )
 @click.option(
     "--signals",
@@ -113,7 +113,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
     """Errors by number of lost fibres, over all sets of them, and maps before and after (figures 3, 4 and 5).
 
     \b
-    padforge study robustness square random-5 --lost 2
+    padforge study robustness square random-5 --max-failures 2
 
     \b
     Figures 3 and 4, errors by method, number of knots and lost fibres:

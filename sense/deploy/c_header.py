@@ -14,9 +14,8 @@ from padforge.sense.arrays import Array, Floats
 from padforge.sense.deploy import streaming as press_stream
 from padforge.sense.deploy.streaming import CODE, LAYERS, POLES, Budget, rates, state_bytes, table_bytes
 from padforge.sense.deploy.student import Student, causal_beside, examine, split, teach
-from padforge.sense.health.locating import MEASURED
 from padforge.sense.localizer.features import MAX_INPUT
-from padforge.sense.localizer.localizer import UNKNOWN, Localizer
+from padforge.sense.localizer.model import MEASURED, UNKNOWN, LocalizerModel
 from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
@@ -36,7 +35,7 @@ class Header(NamedTuple):
 
 
 def export_header(
-    teacher: Localizer,
+    teacher: LocalizerModel,
     digest: str,
     path: Path,
     recording: Recording,
@@ -54,8 +53,8 @@ def export_header(
     """
     training, test = split(recording, teacher, options)
     student = teach(recording, teacher, training, budget, options, progress)
-    fibres, measures = teacher.fibres, len(student.localizer.normalization.measures)
-    levels = len(student.localizer.factors)
+    fibres, measures = teacher.fibres, len(student.localizer.scaler.measures)
+    levels = len(student.localizer.interval_factors)
     causal = causal_beside(teacher, recording, training, options, progress)
     errors = examine(student, [causal] if causal is teacher else [causal, teacher], recording, test)
     about = [
@@ -78,7 +77,7 @@ def header_lines(header: Header, budget: Budget) -> list[str]:
     """The same for people."""
     student, errors = header.student, header.errors
     kind = "int8" if student.quantized else "float32"
-    found_mm = "" if errors["found_mm"] is None else f"; mean error of these {errors['found_mm']:.2f} mm"
+    predicted_mm = "" if errors["predicted_mm"] is None else f"; mean error of these {errors['predicted_mm']:.2f} mm"
     size = f"{student.hidden} neurons in each of {LAYERS + 1} layers"
     flash = (
         f"flash {(header.tables + CODE) / 1024:.1f} KiB of {budget.flash / 1024:.4g}, {CODE / 1024:g} of them for code"
@@ -96,7 +95,7 @@ def header_lines(header: Header, budget: Budget) -> list[str]:
     return [
         *lines,
         f"its own detector finds {errors['found']} of {errors['test_presses']} presses, "
-        f"{errors['false']} touches that are none{found_mm}",
+        f"{errors['false']} touches that are none{predicted_mm}",
     ]
 
 
@@ -107,7 +106,7 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
         about: lines that say what it was made of and how far off it is.
     """
     localizer, detector = student.localizer, student.detector
-    scaling = localizer.normalization
+    scaling = localizer.scaler
     span, hidden = scaling.span_mm, student.hidden
     environment = Environment(
         loader=PackageLoader("padforge.sense.deploy", "."),
@@ -128,7 +127,7 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
         hidden=hidden,
         layers=len(localizer.weights["hidden.w"]),
         numbers=2 + len(scaling.measures),
-        levels=len(localizer.factors),
+        levels=len(localizer.interval_factors),
         poles=POLES,
         inputs=len(press_stream.WINDOWS),
         **_stream_constants(),
@@ -142,7 +141,7 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
         least_log=_float(LEAST_LOG),
         most_log=_float(MOST_LOG),
         span=_float(span),
-        middle=[_float(each) for each in scaling.middle_mm],
+        middle=[_float(each) for each in scaling.origin_mm],
         unknown=[_float(each * span) for each in UNKNOWN[1:]],
         measures=[
             dict(zip(("value", "r90"), MEASURED[each.name], strict=True))
@@ -166,7 +165,7 @@ def _stream_constants() -> dict[str, Any]:
 
 
 def _tables(student: Student) -> list[dict[str, Any]]:
-    localizer, scaling = student.localizer, student.localizer.normalization
+    localizer, scaling = student.localizer, student.localizer.scaler
     units = [scaling.span_mm] * 3 + [each.span for each in scaling.measures]
     floats = {
         "rates": rates(),
@@ -175,7 +174,7 @@ def _tables(student: Student) -> list[dict[str, Any]]:
         "spread": scaling.spread,
         "memory": scaling.memory,
         "usual": scaling.usual,
-        "factors": localizer.factors * units,
+        "interval_factors": localizer.interval_factors * units,
     }
     out = [_table(name, values) for name, values in floats.items()]
     for name, matrix in student.matrices().items():

@@ -23,9 +23,8 @@ from onnx import TensorProto, helper, numpy_helper
 from padforge.design.common.files import atomic_file
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.health.locating import MEASURED
 from padforge.sense.localizer import features
-from padforge.sense.localizer.bayes import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, Observer
+from padforge.sense.localizer.bayes import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, BayesianLocalizer
 from padforge.sense.localizer.features import (
     DOWN,
     MAX_INPUT,
@@ -40,7 +39,7 @@ from padforge.sense.localizer.features import (
     bridged,
     press_inputs,
 )
-from padforge.sense.localizer.localizer import UNKNOWN, Localizer
+from padforge.sense.localizer.model import MEASURED, UNKNOWN, LocalizerModel
 from padforge.sense.localizer.model_files import refuse_other_pad
 from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
 from padforge.sense.recording.recording import Recording
@@ -90,32 +89,32 @@ class GraphNodes:
 
 
 class PressFeatures:
-    """The inputs of presses, from `readings` (R, C) V in double precision, `begun` and `lifted` (Q,)."""
+    """The inputs of presses, from `readings` (R, C) V in double precision, `down_command` and `up_command` (Q,)."""
 
     def __init__(self, graph: GraphNodes, fibres: int) -> None:
         self._g, self._fibres = graph, fibres
         self._length = graph.part(graph("Shape", "readings"), 0, 1)
-        self._free = graph("Concat", graph.constant([0]), graph.part("lifted", 0, -1), axis=0)
-        self._following = graph("Concat", graph.part("begun", 1, END), self._length, axis=0)
+        self._free = graph("Concat", graph.constant([0]), graph.part("up_command", 0, -1), axis=0)
+        self._following = graph("Concat", graph.part("down_command", 1, END), self._length, axis=0)
 
     def windows(self, kind: str) -> str:
         """(Q, C, F) V, as `features.press_inputs`."""
         if kind == "published":
             reach = (-(MEDIAN // 2), MEDIAN // 2 + 1)
             ranges = (
-                ("begun", -10, self._free, "begun"),
-                ("begun", 10, "begun", "lifted"),
-                ("lifted", 10, "begun", self._following),
+                ("down_command", -10, self._free, "down_command"),
+                ("down_command", 10, "down_command", "up_command"),
+                ("up_command", 10, "down_command", self._following),
             )
             found = [
                 self._g.median(self._gathered(at, (reach[0] + by, reach[1] + by), low, high), MEDIAN)
                 for at, by, low, high in ranges
             ]
             return self._stacked(found)
-        found = [self._mean("begun", window, "begun", "lifted") for window in DOWN[: SIZES[kind]]]
-        if kind == "full":
-            found += [self._mean("lifted", window, "begun", self._following) for window in UP]
-        return self._g("Sub", self._stacked(found), self._rest(REST, "begun"))
+        found = [self._mean("down_command", window, "down_command", "up_command") for window in DOWN[: SIZES[kind]]]
+        if kind == "press_and_release":
+            found += [self._mean("up_command", window, "down_command", self._following) for window in UP]
+        return self._g("Sub", self._stacked(found), self._rest(REST, "down_command"))
 
     def history(self) -> str:
         """(Q, C, J) V, as `features.history`."""
@@ -125,8 +124,8 @@ class PressFeatures:
         sums = g("Concat", g.constant(np.zeros((1, self._fibres)), np.float64), sums, axis=0)
 
         def mean(window: Window) -> str:
-            first = g("Max", g("Add", "begun", g.constant([window[0]])), g.constant([0]))
-            end = g("Max", g("Add", "begun", g.constant([window[1]])), g("Add", first, g.constant([1])))
+            first = g("Max", g("Add", "down_command", g.constant([window[0]])), g.constant([0]))
+            end = g("Max", g("Add", "down_command", g.constant([window[1]])), g("Add", first, g.constant([1])))
             count = g("Cast", g.column(g("Sub", end, first)), to=onnx.TensorProto.DOUBLE)
             total = g("Sub", g("Gather", sums, end, axis=0), g("Gather", sums, first, axis=0))
             return g("Add", g("Div", total, count), level)
@@ -134,7 +133,7 @@ class PressFeatures:
         found = [mean(window) for window in PAST]
         for length in SLOW:
             offsets = np.arange(-length, 0, length // SLOW_SAMPLES)
-            index = g("Max", g("Add", g.column("begun"), g.constant(offsets)), g.constant([0]))
+            index = g("Max", g("Add", g.column("down_command"), g.constant(offsets)), g.constant([0]))
             found.append(g.median(g("Gather", "readings", index, axis=0), len(offsets)))
         return g("Sub", self._stacked(found), g("Unsqueeze", mean(features.REST), g.constant([2])))
 
@@ -163,18 +162,18 @@ def volts(values: Array, graph: GraphNodes) -> str:
     return graph.constant(values, np.float64)
 
 
-def observed(g: GraphNodes, observer: Observer, inputs: str, alive: str) -> tuple[str, str]:
-    """Places (Q, 2) and what is told of them (Q, `TOLD`), as `Observer.__call__`, of inputs that are 0 where lost."""
-    fibres, size = len(observer.projection), COMPONENTS
-    inputs, alive = (g("Cast", each, to=TensorProto.DOUBLE) for each in (inputs, alive))
-    there = g("Unsqueeze", alive, g.constant([2]))
-    by_fibre = g("MatMul", g("Transpose", inputs, perm=[1, 0, 2]), _number(g, observer.projection))
+def observed(g: GraphNodes, bayes: BayesianLocalizer, inputs: str, fibre_mask: str) -> tuple[str, str]:
+    """Places (Q, 2) and what is told of them (Q, `TOLD`), as `BayesianLocalizer.__call__`, of inputs that are 0 where lost."""
+    fibres, size = len(bayes.projection), COMPONENTS
+    inputs, fibre_mask = (g("Cast", each, to=TensorProto.DOUBLE) for each in (inputs, fibre_mask))
+    there = g("Unsqueeze", fibre_mask, g.constant([2]))
+    by_fibre = g("MatMul", g("Transpose", inputs, perm=[1, 0, 2]), _number(g, bayes.projection))
     seen = g("Transpose", by_fibre, perm=[1, 0, 2])
-    mean, variance, both = _on_grid(g, observer, seen, there)
+    mean, variance, both = _on_grid(g, bayes, seen, there)
     known, place = g("Div", _number(g, BEFOREHAND), variance), mean
-    spread, answers = variance, _number(g, observer.answers.reshape(len(observer.answers) ** 2, -1))
+    spread, answers = variance, _number(g, bayes.answers.reshape(len(bayes.answers) ** 2, -1))
     for _ in range(LOOKS):
-        found = _looked_up(g, answers, len(observer.answers), place)
+        found = _looked_up(g, answers, len(bayes.answers), place)
 
         def per_fibre(begin: int, end: int, *shape: int, found: str = found) -> str:
             part = g.part(found, begin * fibres, end * fibres, axis=1)
@@ -188,13 +187,13 @@ def observed(g: GraphNodes, observer: Observer, inputs: str, alive: str) -> tupl
         pull = g("Add", pull, g("Mul", known, g("Sub", mean, place)))
         spread, step = _solved(g, curved, known, pull)
         step = g("Clip", step, _number(g, -FARTHEST), _number(g, FARTHEST))
-        within = g("Max", g("Add", place, step), _number(g, observer.bounds[0]))
-        place = g("Min", within, _number(g, observer.bounds[1]))
+        within = g("Max", g("Add", place, step), _number(g, bayes.bounds[0]))
+        place = g("Min", within, _number(g, bayes.bounds[1]))
     two = _number(g, 2)
     logs = (g("Add", _number(g, 1), g("Mul", _number(g, 0.25), g("Log", each))) for each in (spread, variance))
     of_place, of_mean = logs
     told = g("Concat", g("Mul", two, place), of_place, g("Mul", two, mean), of_mean, both, axis=1)
-    place = g("Add", g("MatMul", place, _number(g, observer.turn.T)), _number(g, observer.shift))
+    place = g("Add", g("MatMul", place, _number(g, bayes.turn.T)), _number(g, bayes.shift))
     return g("Cast", place, to=TensorProto.FLOAT), g("Cast", told, to=TensorProto.FLOAT)
 
 
@@ -205,13 +204,13 @@ def _number(g: GraphNodes, value: ArrayLike) -> str:
     return g("Cast", g.constant(value, np.float32), to=TensorProto.DOUBLE)
 
 
-def _on_grid(g: GraphNodes, observer: Observer, seen: str, there: str) -> tuple[str, str, str]:
+def _on_grid(g: GraphNodes, bayes: BayesianLocalizer, seen: str, there: str) -> tuple[str, str, str]:
     """Mean place (Q, 2), its variances (Q, 2) and correlation (Q, 1)."""
     first, second = (g.constant(each) for each in np.triu_indices(COMPONENTS))
     products = g("Mul", g("Gather", seen, first, axis=2), g("Gather", seen, second, axis=2))
-    known = g("Reshape", g("Concat", products, seen, there, axis=2), g.constant([-1, len(observer.terms)]))
-    share = g("Softmax", g("MatMul", known, _number(g, observer.terms)), axis=1)
-    grid = observer.grid
+    known = g("Reshape", g("Concat", products, seen, there, axis=2), g.constant([-1, len(bayes.terms)]))
+    share = g("Softmax", g("MatMul", known, _number(g, bayes.terms)), axis=1)
+    grid = bayes.grid
     moments = g("MatMul", share, g.constant(np.column_stack([grid, grid**2, grid[:, 0] * grid[:, 1]]), np.float64))
     mean = g.part(moments, 0, 2, axis=1)
     limits = (_number(g, limit) for limit in (LEAST_SPREAD**2, 4))
@@ -258,13 +257,13 @@ OPSET = 18
 """Of the operators: that of ONNX 1.13, from 2022 on."""
 INPUTS = {
     "readings": "V, (R, C): one row a reading, one column a fibre, none missing",
-    "begun": "(Q,), ascending: row of the first reading after the probe was sent down",
-    "lifted": "(Q,): row of the first reading after it was sent up; R where there is none yet",
-    "alive": "(Q, C): which fibres count in each press",
+    "down_command": "(Q,), ascending: row of the first reading after the probe was sent down",
+    "up_command": "(Q,): row of the first reading after it was sent up; R where there is none yet",
+    "fibre_mask": "(Q, C): which fibres count in each press",
 }
 OUTPUTS = {
-    "places_mm": "mm from the middle of the pad, x and y",
-    "sd_mm": "mm, standard deviation in x and in y",
+    "positions_mm": "mm from the middle of the pad, x and y",
+    "std_mm": "mm, standard deviation in x and in y",
     "r50_mm": "mm, radius around the place that holds the press in 50 % of cases",
     "r90_mm": "mm, the same in 90 % of cases",
 }
@@ -276,7 +275,7 @@ MEASURES = {
 }
 
 
-def onnx_model(localizer: Localizer, metadata: Mapping[str, str]) -> onnx.ModelProto:
+def onnx_model(localizer: LocalizerModel, metadata: Mapping[str, str]) -> onnx.ModelProto:
     """One graph that gives, of any number of presses, what `locate` gives.
 
     Args:
@@ -289,12 +288,12 @@ def onnx_model(localizer: Localizer, metadata: Mapping[str, str]) -> onnx.ModelP
     fibres = localizer.fibres
     given = {
         "readings": (TensorProto.DOUBLE, ["readings", fibres]),
-        "begun": (TensorProto.INT64, ["presses"]),
-        "lifted": (TensorProto.INT64, ["presses"]),
-        "alive": (TensorProto.BOOL, ["presses", fibres]),
+        "down_command": (TensorProto.INT64, ["presses"]),
+        "up_command": (TensorProto.INT64, ["presses"]),
+        "fibre_mask": (TensorProto.BOOL, ["presses", fibres]),
     }
     about = INPUTS | OUTPUTS | MEASURES
-    shapes = {name: ["presses", 2] if name in ("places_mm", "sd_mm") else ["presses"] for name in outputs}
+    shapes = {name: ["presses", 2] if name in ("positions_mm", "std_mm") else ["presses"] for name in outputs}
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
@@ -314,25 +313,25 @@ def onnx_model(localizer: Localizer, metadata: Mapping[str, str]) -> onnx.ModelP
     return model
 
 
-def _located(g: GraphNodes, localizer: Localizer) -> dict[str, str]:
-    """What computes each output, by its name, as `Localizer.locate`."""
-    scaling, alive = localizer.normalization, g("Cast", "alive", to=TensorProto.FLOAT)
+def _located(g: GraphNodes, localizer: LocalizerModel) -> dict[str, str]:
+    """What computes each output, by its name, as `LocalizerModel.predict_features`."""
+    scaling, fibre_mask = localizer.scaler, g("Cast", "fibre_mask", to=TensorProto.FLOAT)
     kept = _inputs(g, localizer)
-    entries = g("Concat", g("Reshape", kept, g.constant([0, scaling.centre.size])), alive, axis=1)
+    entries = g("Concat", g("Reshape", kept, g.constant([0, scaling.centre.size])), fibre_mask, axis=1)
     outputs = _network(g, localizer.weights, entries)
-    if localizer.observer is not None:
-        place, told = observed(g, localizer.observer, kept, alive)
-        corrected = _network(g, localizer.corrector, g("Concat", entries, told, axis=1))
+    if localizer.bayes is not None:
+        place, told = observed(g, localizer.bayes, kept, fibre_mask)
+        corrected = _network(g, localizer.residual_network, g("Concat", entries, told, axis=1))
         more = g("Pad", place, g.constant([0, 0, 0, 2]), g.constant(0, np.float32))
         outputs = g("Concat", outputs, g("Add", corrected, more), axis=0)
     numbers, spreads = _pooled(g, outputs, localizer)
-    left = g("ReduceSum", alive, g.constant([1]), keepdims=0)
+    left = g("ReduceSum", fibre_mask, g.constant([1]), keepdims=0)
     blind = g("Less", left, g.constant(0.5, np.float32))
     lost = g("Cast", g("Sub", g.constant(localizer.fibres, np.float32), left), to=TensorProto.INT64)
-    level = g("Min", lost, g.constant(len(localizer.factors) - 1))
+    level = g("Min", lost, g.constant(len(localizer.interval_factors) - 1))
 
     def factor(column: int, unit: float) -> str:
-        return g("Gather", g.constant(localizer.factors[:, column] * unit, np.float32), level, axis=0)
+        return g("Gather", g.constant(localizer.interval_factors[:, column] * unit, np.float32), level, axis=0)
 
     def known(value: str, unknown: float, condition: str = blind) -> str:
         return g("Where", condition, g.constant(unknown, np.float32), value)
@@ -342,8 +341,8 @@ def _located(g: GraphNodes, localizer: Localizer) -> dict[str, str]:
     span, every = scaling.span_mm, g.column(blind)
     there = g("Mul", known(place, 0.0, every), g.constant(span, np.float32))
     out = {
-        "places_mm": g("Add", there, g.constant(scaling.middle_mm, np.float32)),
-        "sd_mm": known(g("Mul", g.column(factor(0, span)), spread), UNKNOWN[0] * span, every),
+        "positions_mm": g("Add", there, g.constant(scaling.origin_mm, np.float32)),
+        "std_mm": known(g("Mul", g.column(factor(0, span)), spread), UNKNOWN[0] * span, every),
         "r50_mm": known(g("Mul", factor(1, span), radius), UNKNOWN[1] * span),
         "r90_mm": known(g("Mul", factor(2, span), radius), UNKNOWN[2] * span),
     }
@@ -356,9 +355,9 @@ def _located(g: GraphNodes, localizer: Localizer) -> dict[str, str]:
     return out
 
 
-def _inputs(g: GraphNodes, localizer: Localizer) -> str:
+def _inputs(g: GraphNodes, localizer: LocalizerModel) -> str:
     """(Q, C, F + G) scaled inputs, 0 for lost fibres."""
-    scaling, features = localizer.normalization, PressFeatures(g, localizer.fibres)
+    scaling, features = localizer.scaler, PressFeatures(g, localizer.fibres)
     windows = features.windows(localizer.features)
     if scaling.usual.size:
         history = g("Sub", features.history(), volts(scaling.usual, g))
@@ -369,7 +368,7 @@ def _inputs(g: GraphNodes, localizer: Localizer) -> str:
     scaled = g("Div", g("Sub", windows, volts(scaling.centre, g)), volts(scaling.spread, g))
     limits = (volts(np.array(limit), g) for limit in (-MAX_INPUT, MAX_INPUT))
     inputs = g("Cast", g("Clip", scaled, *limits), to=TensorProto.FLOAT)
-    return g("Where", g("Unsqueeze", "alive", g.constant([2])), inputs, g.constant(0, np.float32))
+    return g("Where", g("Unsqueeze", "fibre_mask", g.constant([2])), inputs, g.constant(0, np.float32))
 
 
 def _network(g: GraphNodes, weights: Weights, entries: str) -> str:
@@ -390,9 +389,9 @@ def _network(g: GraphNodes, weights: Weights, entries: str) -> str:
     return layer(ready(h), weights["last.w"], weights["last.b"])
 
 
-def _pooled(g: GraphNodes, outputs: str, localizer: Localizer) -> tuple[str, str]:
+def _pooled(g: GraphNodes, outputs: str, localizer: LocalizerModel) -> tuple[str, str]:
     """(Q, N) numbers learnt and their standard deviations, as `network.pooled`."""
-    numbers = 2 + len(localizer.normalization.measures)
+    numbers = 2 + len(localizer.scaler.measures)
     learnt = g.part(outputs, 0, numbers, axis=2)
     limits = (g.constant(limit, np.float32) for limit in (LEAST_LOG, MOST_LOG))
     logs = g("Clip", g.part(outputs, numbers, END, axis=2), *limits)
@@ -407,7 +406,7 @@ def _pooled(g: GraphNodes, outputs: str, localizer: Localizer) -> tuple[str, str
     return g("Squeeze", mean, members), g("Sqrt", g("ReduceSum", whole, members, keepdims=0))
 
 
-FORMAT = "padforge-onnx/1"
+FORMAT = "padforge-onnx/2"
 MOST_OFF_MM = 1e-4
 """A graph whose places differ by more from those of its localizer is not written."""
 TRIED = 64
@@ -423,25 +422,25 @@ class Exported(NamedTuple):
     size: int
     presses: int
     lost: int
-    places_mm: float
+    positions_mm: float
     radii_mm: float
 
 
 class _Readings(NamedTuple):
     readings: Array
-    begun: Indices
-    lifted: Indices
+    down_command: Indices
+    up_command: Indices
 
 
 def onnx_line(found: Exported) -> str:
     """The same for people."""
     return (
         f"{found.size / 1e6:.1f} MB, tried on {found.presses} presses with up to {found.lost} fibres lost: "
-        f"places within {1e3 * found.places_mm:.2f} µm of the localizer's, radii within {1e3 * found.radii_mm:.2f} µm"
+        f"places within {1e3 * found.positions_mm:.2f} µm of the localizer's, radii within {1e3 * found.radii_mm:.2f} µm"
     )
 
 
-def export_onnx(localizer: Localizer, digest: str, path: Path, recording: Recording | None = None) -> Exported:
+def export_onnx(localizer: LocalizerModel, digest: str, path: Path, recording: Recording | None = None) -> Exported:
     """Write `localizer` as an ONNX graph, tried on the presses of `recording`, or on some made up.
 
     Args:
@@ -451,7 +450,7 @@ def export_onnx(localizer: Localizer, digest: str, path: Path, recording: Record
         InputError: it is of the published method, the recording is of another pad or rate, or `path` cannot be written.
         Fault: places differ by more than `MOST_OFF_MM`.
     """
-    if localizer.method != "masked":
+    if localizer.method != "ensemble":
         raise InputError(f"the localizer is of method {localizer.method}, expected masked: calibrate again")
     if recording is not None:
         refuse_other_pad(localizer, "the localizer", recording.fibres, recording.rate_hz)
@@ -459,7 +458,7 @@ def export_onnx(localizer: Localizer, digest: str, path: Path, recording: Record
         "format": FORMAT,
         "padforge": version("padforge"),
         "localizer_sha256": digest,
-        "learnt_from": localizer.learnt_from,
+        "training_recording_sha256": localizer.training_recording_sha256,
         "features": localizer.features,
         "rate_hz": f"{localizer.rate_hz:.9g}",
         "fibres": json.dumps([f"fibre_{fibre}_v" for fibre in range(localizer.fibres)]),
@@ -477,43 +476,48 @@ def export_onnx(localizer: Localizer, digest: str, path: Path, recording: Record
         )
     with atomic_file(path) as temporary:
         temporary.write_bytes(content)
-    return Exported(len(content), len(tried.begun), lost, places, radii)
+    return Exported(len(content), len(tried.down_command), lost, places, radii)
 
 
-def _measured(localizer: Localizer) -> list[str]:
-    kinds = [target.name.rsplit("_", 1) for target in localizer.normalization.measures]
+def _measured(localizer: LocalizerModel) -> list[str]:
+    kinds = [target.name.rsplit("_", 1) for target in localizer.scaler.measures]
     return [f"{kind}{part}_{unit}" for kind, unit in kinds for part in ("", "_r90")]
 
 
 def _of(recording: Recording) -> _Readings:
-    return _Readings(recording.readings, recording.begun, recording.lifted)
+    return _Readings(recording.readings, recording.down_command, recording.up_command)
 
 
-def _made_up(localizer: Localizer) -> _Readings:
+def _made_up(localizer: LocalizerModel) -> _Readings:
     """Readings of presses as strong as those that were learnt from, wherever such may be."""
-    rng, scaling = np.random.default_rng(0), localizer.normalization
-    begun = CYCLE // 2 + CYCLE * np.arange(TRIED)
-    lifted = begun + DOWN[-1][1]
+    rng, scaling = np.random.default_rng(0), localizer.scaler
+    down_command = CYCLE // 2 + CYCLE * np.arange(TRIED)
+    up_command = down_command + DOWN[-1][1]
     readings = 1e-3 * rng.standard_normal((TRIED * CYCLE + CYCLE, localizer.fibres))
     strength = np.abs(scaling.centre).max(axis=1) + scaling.spread.max(axis=1)
-    for first, end in zip(begun, lifted, strict=True):
+    for first, end in zip(down_command, up_command, strict=True):
         readings[first:end] += strength * rng.uniform(-1, 1, localizer.fibres)
-    return _Readings(readings, begun, lifted)
+    return _Readings(readings, down_command, up_command)
 
 
 def _differences(
-    localizer: Localizer, session: onnxruntime.InferenceSession, tried: _Readings
+    localizer: LocalizerModel, session: onnxruntime.InferenceSession, tried: _Readings
 ) -> tuple[float, float, int]:
     """Greatest distance of places, and difference of radii, mm, over all levels of loss that it was trained for."""
-    presses = localizer.normalization.inputs(press_inputs(*tried, localizer.features))
-    rng, most = np.random.default_rng(0), len(localizer.factors) - 1
+    presses = localizer.scaler.inputs(press_inputs(*tried, localizer.features))
+    rng, most = np.random.default_rng(0), len(localizer.interval_factors) - 1
     off: list[tuple[float, float]] = []
     for lost in range(most + 1):
-        alive = presses.alive & _without(presses.alive.shape, lost, rng)
-        found = localizer.locate(replace(presses, alive=alive))
-        given = {"readings": bridged(tried.readings), "begun": tried.begun, "lifted": tried.lifted, "alive": alive}
-        places, r90 = map(np.asarray, session.run(["places_mm", "r90_mm"], given))
-        off.append((float(np.hypot(*(places - found.places_mm).T).max()), float(np.abs(r90 - found.r90_mm).max())))
+        fibre_mask = presses.fibre_mask & _without(presses.fibre_mask.shape, lost, rng)
+        found = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
+        given = {
+            "readings": bridged(tried.readings),
+            "down_command": tried.down_command,
+            "up_command": tried.up_command,
+            "fibre_mask": fibre_mask,
+        }
+        places, r90 = map(np.asarray, session.run(["positions_mm", "r90_mm"], given))
+        off.append((float(np.hypot(*(places - found.positions_mm).T).max()), float(np.abs(r90 - found.r90_mm).max())))
     worst = np.max(off, axis=0)
     return float(worst[0]), float(worst[1]), most
 

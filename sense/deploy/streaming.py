@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.localizer.features import Inputs, bridged
+from padforge.sense.localizer.features import PressFeatures, bridged
 from padforge.sense.recording.recording import Recording
 
 RING = 32
@@ -50,13 +50,13 @@ reading at which the press was found."""
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def follow(
-    readings: Any, held: Any, alive: Any, poles: Any, quiet: Any, judge: Any, edges: Any, shown: Any, there: Any
+    readings: Any, held: Any, fibre_mask: Any, poles: Any, quiet: Any, judge: Any, edges: Any, shown: Any, there: Any
 ) -> int:
     """Take readings in order, and give what is seen of every press.
 
     Args:
         readings: (R, C) V, NaN where missing. held: (R,) whether the pad is pressed, as told from outside; empty where
-            the detector is to judge. alive: (C,) fibres that count for it.
+            the detector is to judge. fibre_mask: (C,) fibres that count for it.
         poles: (J,) shares. quiet: (C,) 1/V, one over the noise. judge: threshold, and readings from the beginning of a
             press to the first that shows it.
         edges: (R, 3) overwritten with the readings with which each press began, was seen enough of, and ended; R if it
@@ -79,7 +79,7 @@ def follow(
         if len(held):
             change = _told(n, held[n], pad)
         else:
-            change = _judged(n, ring[n % RING], alive, quiet, judge, levels, farthest, pad)
+            change = _judged(n, ring[n % RING], fibre_mask, quiet, judge, levels, farthest, pad)
         if change > 0:
             missing[:] = 0
             pad[TOLD], pad[TOUCHED] = 0, n
@@ -131,12 +131,12 @@ def _told(n: int, held: bool, pad: Any) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _judged(n: int, row: Any, alive: Any, quiet: Any, judge: Any, levels: Any, farthest: Any, pad: Any) -> int:
+def _judged(n: int, row: Any, fibre_mask: Any, quiet: Any, judge: Any, levels: Any, farthest: Any, pad: Any) -> int:
     """The same as the detector judges."""
     base, peak = levels[0], levels[1]
     square, along = np.float32(0), np.float32(0)
     for c in range(len(row)):
-        if alive[c]:
+        if fibre_mask[c]:
             off = (row[c] - base[c]) * quiet[c]
             square += off * off
             along += off * peak[c]
@@ -181,16 +181,16 @@ def _remember(n: int, ring: Any, bank: Any, poles: Any, pad: Any) -> None:
 @njit(cache=True, error_model="numpy", nogil=True)
 def _look(c: int, end: int, ring: Any, past: Any, pad: Any, out: Any) -> None:
     """Windows of a fibre in the press, of which readings below `end` count, and its history, from its rest."""
-    begun = pad[BEGUN]
-    first = max(begun - REST, pad[FREE])
+    down_command = pad[BEGUN]
+    first = max(down_command - REST, pad[FREE])
     total = np.float32(0)
-    for i in range(first, begun):
+    for i in range(first, down_command):
         total += ring[i % RING, c]
-    rest = total / np.float32(begun - first)
+    rest = total / np.float32(down_command - first)
     for k in range(len(WINDOWS)):
         total = np.float32(0)
-        for i in range(begun + WINDOWS[k][0], begun + WINDOWS[k][1]):
-            total += ring[max(min(i, end - 1), begun) % RING, c]
+        for i in range(down_command + WINDOWS[k][0], down_command + WINDOWS[k][1]):
+            total += ring[max(min(i, end - 1), down_command) % RING, c]
         out[k] = total / np.float32(WINDOWS[k][1] - WINDOWS[k][0]) - rest
     for j in range(len(past)):
         out[len(WINDOWS) + j] = past[j] - rest
@@ -240,12 +240,12 @@ class Detector:
         scores, lates = [], []
         for threshold in THRESHOLDS:
             found = seen(recording.readings, cls(noise, float(threshold), 0))
-            press = owners(recording, found.begun)
+            press = owners(recording, found.down_command)
             inside = press >= 0
             hits = np.isin(training, press[inside]).sum()
             owned = np.isin(np.abs(press) - (press < 0), training).sum()
             scores.append(2 * hits / (len(training) + owned))
-            late = found.begun[inside] - recording.begun[press[inside]]
+            late = found.down_command[inside] - recording.down_command[press[inside]]
             lates.append(int(np.clip(np.median(late), 0, LAG - 2)) if len(late) else 0)
         good = np.flatnonzero(np.array(scores) >= max(scores) - AS_GOOD)
         best = int(good[len(good) // 2])
@@ -262,18 +262,18 @@ class Seen:
         inputs: what was seen.
     """
 
-    begun: Indices
+    down_command: Indices
     told: Indices
     ended: Indices
-    inputs: Inputs
+    inputs: PressFeatures
 
 
-def seen(readings: Array, detector: Detector, held: Mask | None = None, alive: Mask | None = None) -> Seen:
+def seen(readings: Array, detector: Detector, held: Mask | None = None, fibre_mask: Mask | None = None) -> Seen:
     """Presses as they are seen reading by reading.
 
     Args:
         readings: (R, C) V, NaN where missing. held: (R,) whether the pad is pressed; None where the detector judges.
-        alive: (C,) fibres that count for it; all if None.
+        fibre_mask: (C,) fibres that count for it; all if None.
     """
     count, fibres = readings.shape
     edges = np.empty((count, 3), np.int64)
@@ -282,7 +282,7 @@ def seen(readings: Array, detector: Detector, held: Mask | None = None, alive: M
     found = follow(
         np.ascontiguousarray(readings, np.float32),
         np.zeros(0, bool) if held is None else held,
-        np.ones(fibres, bool) if alive is None else alive,
+        np.ones(fibres, bool) if fibre_mask is None else fibre_mask,
         rates(),
         detector.quiet,
         np.array([detector.threshold, detector.late], np.float32),
@@ -291,8 +291,8 @@ def seen(readings: Array, detector: Detector, held: Mask | None = None, alive: M
         there,
     )
     windows, history = np.split(shown[:found].astype(np.float64), [len(WINDOWS)], axis=2)
-    begun, told, ended = edges[:found].T.copy()
-    return Seen(begun, told, ended, Inputs(windows, history, there[:found].copy()))
+    down_command, told, ended = edges[:found].T.copy()
+    return Seen(down_command, told, ended, PressFeatures(windows, history, there[:found].copy()))
 
 
 def rates() -> Floats:
@@ -303,33 +303,33 @@ def rates() -> Floats:
 def held(recording: Recording) -> Mask:
     """(R,) whether the pad was pressed, as commanded; there is a free reading between two presses."""
     pressed = np.zeros(len(recording.readings) + 1, bool)
-    for first, end in zip(recording.begun, recording.lifted, strict=True):
+    for first, end in zip(recording.down_command, recording.up_command, strict=True):
         pressed[first - 1] = False
         pressed[first:end] = True
     return pressed[:-1]
 
 
-def commanded(recording: Recording) -> Inputs:
+def commanded(recording: Recording) -> PressFeatures:
     """What is seen of every press as it was commanded; no fibre is alive in one that the readings end too soon for."""
     nothing = Detector(np.full(recording.fibres, np.inf), np.inf, 0)
     found = seen(recording.readings, nothing, held(recording))
-    rows = np.searchsorted(recording.begun, found.begun)
+    rows = np.searchsorted(recording.down_command, found.down_command)
 
     def of_all(values: NDArray[Any]) -> NDArray[Any]:
-        out = np.zeros((len(recording.begun), *values.shape[1:]), values.dtype)
+        out = np.zeros((len(recording.down_command), *values.shape[1:]), values.dtype)
         out[rows] = values
         return out
 
-    return Inputs(of_all(found.inputs.windows), of_all(found.inputs.history), of_all(found.inputs.alive))
+    return PressFeatures(of_all(found.inputs.windows), of_all(found.inputs.history), of_all(found.inputs.fibre_mask))
 
 
-def owners(recording: Recording, begun: Indices) -> Indices:
+def owners(recording: Recording, down_command: Indices) -> Indices:
     """(Q,) which press each of the presses found is, by index; -1 - i where it is none, after press i has begun.
 
     Of several found in one press, the first is it.
     """
-    press = np.maximum(np.searchsorted(recording.begun, begun + EARLY, side="right") - 1, 0)
-    inside = (begun >= recording.begun[press] - EARLY) & (begun < recording.lifted[press])
+    press = np.maximum(np.searchsorted(recording.down_command, down_command + EARLY, side="right") - 1, 0)
+    inside = (down_command >= recording.down_command[press] - EARLY) & (down_command < recording.up_command[press])
     inside[1:] &= ~(inside[:-1] & (press[1:] == press[:-1]))
     return np.where(inside, press, -1 - press)
 

@@ -13,8 +13,8 @@ from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.deploy.streaming import LAYERS, Budget, Detector, Seen, commanded, owners, seen, widest
 from padforge.sense.localizer.calibration import CHECKED, learn, radii, split_presses, split_unseen
 from padforge.sense.localizer.evaluation import distances, errors_by_loss
-from padforge.sense.localizer.features import Inputs, Normalization, TrainingPresses
-from padforge.sense.localizer.localizer import Found, Localizer
+from padforge.sense.localizer.features import FeatureScaler, PressFeatures, TrainingPresses
+from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.model_files import refuse_other_pad
 from padforge.sense.localizer.network import Weights, refuse_unsound
 from padforge.sense.recording.recording import Recording
@@ -46,7 +46,7 @@ class Student:
         quantized: whether the weights are int8.
     """
 
-    localizer: Localizer
+    localizer: LocalizerModel
     detector: Detector
     quantized: bool
 
@@ -55,16 +55,18 @@ class Student:
         """Neurons of a layer."""
         return self.localizer.weights["first.w"].shape[2]
 
-    def touches(self, readings: Array, held: Mask | None = None, lost: tuple[int, ...] = ()) -> tuple[Seen, Found]:
+    def touches(
+        self, readings: Array, held: Mask | None = None, lost: tuple[int, ...] = ()
+    ) -> tuple[Seen, Localization]:
         """What `localizer.h` tells of (R, C) readings, V: the presses it sees, and their places.
 
         Args:
             held: (R,) whether the pad is pressed, where somebody else says so. lost: fibres left out, by index.
         """
-        alive = ~np.isin(np.arange(self.localizer.fibres), lost)
-        presses = seen(readings, self.detector, held, alive)
-        shown = self.localizer.normalization.inputs(presses.inputs)
-        return presses, self.localizer.locate(replace(shown, alive=shown.alive & alive))
+        fibre_mask = ~np.isin(np.arange(self.localizer.fibres), lost)
+        presses = seen(readings, self.detector, held, fibre_mask)
+        shown = self.localizer.scaler.inputs(presses.inputs)
+        return presses, self.localizer.predict_features(replace(shown, fibre_mask=shown.fibre_mask & fibre_mask))
 
     def matrices(self) -> dict[str, Matrix]:
         """The layers in order, by name."""
@@ -101,27 +103,27 @@ def as_int8(weights: Weights) -> dict[str, Floats]:
 class Lessons:
     """What presses are taught as: (Q, 2) places in mm, and (Q,) of each measure."""
 
-    places_mm: Array
+    positions_mm: Array
     measures: Mapping[str, Array]
 
     def __getitem__(self, presses: Indices) -> "Lessons":
-        return Lessons(self.places_mm[presses], {name: values[presses] for name, values in self.measures.items()})
+        return Lessons(self.positions_mm[presses], {name: values[presses] for name, values in self.measures.items()})
 
     @classmethod
-    def of(cls, recording: Recording, teacher: Localizer) -> "Lessons":
+    def of(cls, recording: Recording, teacher: LocalizerModel) -> "Lessons":
         """Of every press, between what is known of it and what the teacher finds, or the latter."""
-        found = teacher.locate(teacher.inputs(recording))
+        found = teacher.predict_features(teacher.scaled_features(recording))
 
         def between(known: Array, told: Array) -> Array:
             return np.where(np.isnan(known), told, (1 - TRUSTED) * known + TRUSTED * told)
 
         measures = {name: between(recording.measures[name], each.values) for name, each in found.measures.items()}
-        return cls(between(recording.presses_mm, found.places_mm), measures)
+        return cls(between(recording.presses_mm, found.positions_mm), measures)
 
 
 def teach(
     recording: Recording,
-    teacher: Localizer,
+    teacher: LocalizerModel,
     training: Indices,
     budget: Budget,
     options: LocalizerSettings,
@@ -139,39 +141,45 @@ def teach(
     """
     rng = np.random.default_rng(options.seed)
     taught, checked = (
-        training[part] for part in split_presses(len(training), options.split, CHECKED["masked"], rng, least=2)
+        training[part] for part in split_presses(len(training), options.split, CHECKED["ensemble"], rng, least=2)
     )
-    lessons, levels = Lessons.of(recording, teacher), len(teacher.factors)
+    lessons, levels = Lessons.of(recording, teacher), len(teacher.interval_factors)
     hidden = widest(teacher.fibres, len(lessons.measures), levels, budget)
     detector, plain = Detector.fit(recording, training), commanded(recording)
     found = seen(recording.readings, detector)
-    press = owners(recording, found.begun)
+    press = owners(recording, found.down_command)
     also = np.flatnonzero(np.isin(press, taught))
     shown, rows = plain[taught] + found.inputs[also], np.concatenate([taught, press[also]])
-    scaling, table = Normalization.fit(shown, lessons[rows].places_mm, lessons[rows].measures)
-    size = {"members": 1, "hidden": hidden, "layers": LAYERS, "lost": levels - 1, "epochs": LONGER * options.epochs}
+    scaling, table = FeatureScaler.fit(shown, lessons[rows].positions_mm, lessons[rows].measures)
+    size = {
+        "members": 1,
+        "hidden": hidden,
+        "layers": LAYERS,
+        "max_failures": levels - 1,
+        "epochs": LONGER * options.epochs,
+    }
     # LONGER alone says for how long, whichever features the localizer is to take.
-    own = options.model_copy(update={**size, "features": "full"})
+    own = options.model_copy(update={**size, "features": "press_and_release"})
     weights = _trained(_samples(scaling, shown, lessons[rows]), table, own, rng, progress)
-    localizer = Localizer(
+    localizer = LocalizerModel(
         as_int8(weights) if budget.quantized else weights,
         scaling,
         table,
-        method="masked",
+        method="ensemble",
         features="causal",
-        factors=np.ones((1, 3 + len(lessons.measures))),
+        interval_factors=np.ones((1, 3 + len(lessons.measures))),
         rate_hz=recording.rate_hz,
-        learnt_from=recording.digest,
+        training_recording_sha256=recording.digest,
     )
     known = {name: recording.measures[name][checked] for name in lessons.measures}
     factors = radii(localizer, scaling.inputs(plain[checked]), recording.presses_mm[checked], levels, known)
-    return Student(replace(localizer, factors=factors), detector, budget.quantized)
+    return Student(replace(localizer, interval_factors=factors), detector, budget.quantized)
 
 
-def _samples(scaling: Normalization, inputs: Inputs, lessons: Lessons) -> TrainingPresses:
+def _samples(scaling: FeatureScaler, inputs: PressFeatures, lessons: Lessons) -> TrainingPresses:
     presses = scaling.inputs(inputs)
-    targets = scaling.targets(lessons.places_mm, lessons.measures)
-    return TrainingPresses(presses.inputs, presses.alive, targets, scaling.stretch)
+    targets = scaling.targets(lessons.positions_mm, lessons.measures)
+    return TrainingPresses(presses.inputs, presses.fibre_mask, targets, scaling.stretch)
 
 
 def _trained(
@@ -187,13 +195,15 @@ def _trained(
         weights = train_members(learn, table, options, rng, progress).weights
     fibres, inputs = learn.inputs.shape[1:]
     try:
-        refuse_unsound(weights, fibres * (inputs + 1), "masked", learn.targets.shape[1] - 2)
+        refuse_unsound(weights, fibres * (inputs + 1), "ensemble", learn.targets.shape[1] - 2)
     except InputError as error:
-        raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
+        raise InputError(
+            f"training diverged at [localizer] learning_rate {options.learning_rate:g}, try a lower one: {error}"
+        ) from error
     return weights
 
 
-def split(recording: Recording, teacher: Localizer, options: LocalizerSettings) -> tuple[Indices, Indices]:
+def split(recording: Recording, teacher: LocalizerModel, options: LocalizerSettings) -> tuple[Indices, Indices]:
     """Presses of known place to learn from, and those to test on, which neither the student nor the teacher learns.
 
     Raises:
@@ -204,12 +214,12 @@ def split(recording: Recording, teacher: Localizer, options: LocalizerSettings) 
 
 
 def causal_beside(
-    teacher: Localizer,
+    teacher: LocalizerModel,
     recording: Recording,
     training: Indices,
     options: LocalizerSettings,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Localizer:
+) -> LocalizerModel:
     """A localizer of full size that knows what can be known by the end of a press, as the student does.
 
     It is the teacher, or one trained here on the presses `training` of a recording, by index.
@@ -219,31 +229,33 @@ def causal_beside(
     """
     if teacher.features == "causal":
         return teacher
-    options = options.model_copy(update={"features": "causal", "method": "masked", "lost": len(teacher.factors) - 1})
+    options = options.model_copy(
+        update={"features": "causal", "method": "ensemble", "max_failures": len(teacher.interval_factors) - 1}
+    )
     with one_torch_thread():
         return learn(recording, training, options, np.random.default_rng(options.seed), progress)
 
 
-def examine(student: Student, beside: Sequence[Localizer], recording: Recording, test: Indices) -> dict[str, Any]:
+def examine(student: Student, beside: Sequence[LocalizerModel], recording: Recording, test: Indices) -> dict[str, Any]:
     """How far off a student is on the presses `test`, by index, beside localizers.
 
     Returns:
         "errors", by "header" and the features of the localizers: rows as `evaluation.evaluate` has them; "found", how
         many of the presses the detector finds, "false", how many more it finds from the first to the last reading of
-        them, and "found_mm", the mean error of those found.
+        them, and "predicted_mm", the mean error of those found.
     """
-    places_mm, localizer = recording.presses_mm[test], student.localizer
-    shown = {"header": (localizer, localizer.normalization.inputs(commanded(recording)[test]))}
-    shown |= {each.features: (each, each.inputs(recording)[test]) for each in beside}
-    levels = range(len(localizer.factors))
+    positions_mm, localizer = recording.presses_mm[test], student.localizer
+    shown = {"header": (localizer, localizer.scaler.inputs(commanded(recording)[test]))}
+    shown |= {each.features: (each, each.scaled_features(recording)[test]) for each in beside}
+    levels = range(len(localizer.interval_factors))
     rows = {
-        name: errors_by_loss(model.fibres, levels, partial(model.locate, inputs), places_mm)[0]
+        name: errors_by_loss(model.fibres, levels, partial(model.predict_features, inputs), positions_mm)[0]
         for name, (model, inputs) in shown.items()
     }
     presses, found = student.touches(recording.readings)
-    press = owners(recording, presses.begun)
+    press = owners(recording, presses.down_command)
     own = np.flatnonzero(np.isin(press, test))
     false = int(np.isin(-1 - press, test).sum())
-    off = distances(found.places_mm[own], recording.presses_mm[press[own]])
+    off = distances(found.positions_mm[own], recording.presses_mm[press[own]])
     mean = float(off.mean()) if len(own) else None
-    return {"errors": rows, "found": len(own), "false": false, "found_mm": mean}
+    return {"errors": rows, "found": len(own), "false": false, "predicted_mm": mean}

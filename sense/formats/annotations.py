@@ -25,14 +25,14 @@ class ModelFindings:
     """What a model says of Q presses.
 
     Attributes:
-        places_mm: (Q, 2). sd_mm: (Q, 2) standard deviations. r90_mm: (Q,) radius that holds 90 % of presses.
+        positions_mm: (Q, 2). std_mm: (Q, 2) standard deviations. r90_mm: (Q,) radius that holds 90 % of presses.
         depths_mm: (Q,) and depths_r90_mm: (Q,) how far beside it 90 % are at most; NaN where depth was not learnt.
         faults: by the press at which they were named; None where health was not learnt.
         dead: fibres, by index, that never lived.
     """
 
-    places_mm: Array
-    sd_mm: Array
+    positions_mm: Array
+    std_mm: Array
     r90_mm: Array
     depths_mm: Array
     depths_r90_mm: Array

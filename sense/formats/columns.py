@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.design.common.validation import check_path as as_path
-from padforge.sense.arrays import Array, Indices, Mask, as_numbers
+from padforge.sense.arrays import Array, Indices, Mask, check_numbers
 from padforge.sense.recording.csv_table import UNKNOWN
 from padforge.sense.recording.recording import Recording
 
@@ -35,13 +35,13 @@ UNITS: dict[str, Mapping[str, float]] = {
     "reached": MILLIMETRES,
     "force": NEWTONS,
     "press": {},
-    "begun": SECONDS,
-    "lifted": SECONDS,
+    "down_command": SECONDS,
+    "up_command": SECONDS,
 }
 """Quantities that a mapping may name, and how many s, V, mm or N their units are.
 
 `press` numbers the presses, or is 1 while the pad is pressed; `places` are x and y in one array; `depth`
-is how deep a press was to be, `reached` how deep it was, and `force` how hard; `begun` and `lifted`
+is how deep a press was to be, `reached` how deep it was, and `force` how hard; `down_command` and `up_command`
 are numbers of readings, or times where a unit is said.
 """
 _LONGEST = 10_000
@@ -89,10 +89,10 @@ def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part
             raise InputError(
                 f"mapping {short_repr(text)} does not name {quantity}, expected {' and '.join(needed)} in each"
             )
-    for one, other in (("x", "y"), ("begun", "lifted")):
+    for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
             raise InputError(f"mapping {short_repr(text)} names one of {one} and {other}, expected both or neither")
-    for one, other in (("x", "places"), ("press", "begun")):
+    for one, other in (("x", "places"), ("press", "down_command")):
         if one in named and other in named:
             raise InputError(f"mapping {short_repr(text)} names {one} and {other}, expected one of them")
     return parts
@@ -169,8 +169,8 @@ FOUND = {"presses": "found"}
 class _PressColumns(NamedTuple):
     """(Q,) readings at which presses begin and end, as in a `Recording`, and how they are known."""
 
-    begun: Indices
-    lifted: Indices
+    down_command: Indices
+    up_command: Indices
     source: Mapping[str, str]
 
 
@@ -179,7 +179,7 @@ def assembled(path: Path, found: Sequence[tuple[Part, NDArray[Any]]], source: Ma
 
     `time` has R values, `fibres` is (R, C), (C, R) or R values of one fibre, in one array or several. `press` has R
     values. Places are (2, n) or (n, 2), or x and y of n values, for n = R readings or n = Q presses. Presses are where
-    `begun` and `lifted` say so, else `press`, else where places stand that are missing between presses; or they are
+    `down_command` and `up_command` say so, else `press`, else where places stand that are missing between presses; or they are
     found in the readings. Where places, depths or forces are given a reading, that of a press is the one in the middle
     of it.
 
@@ -208,7 +208,7 @@ def _assembled(found: Sequence[tuple[Part, NDArray[Any]]], source: Mapping[str, 
     readings = columns[0] if len(columns) == 1 else np.column_stack(columns)
     places = _places(given)
     timed = {part.quantity for part, _ in found if part.factor is not None}
-    for name in ("begun", "lifted"):
+    for name in ("down_command", "up_command"):
         if name in timed:
             given[name] = _first_at(times, given[name]).astype(np.float64)
     presses = _told(given, places, len(times)) or _found(readings, times, source)
@@ -233,7 +233,7 @@ def _first_at(times_s: Array, events_s: Array) -> Indices:
 
 def _numbers(name: str, values: NDArray[Any]) -> Array:
     values = np.asarray(values)
-    return as_numbers(values.astype(np.uint8) if values.dtype.kind == "b" else values, np.float64, name, copy=False)
+    return check_numbers(values.astype(np.uint8) if values.dtype.kind == "b" else values, np.float64, name, copy=False)
 
 
 def _scaled(numbers: Array, factor: float) -> Array:
@@ -271,11 +271,13 @@ def _places(given: Mapping[str, Array]) -> Array | None:
 
 def _told(given: Mapping[str, Array], places: Array | None, count: int) -> _PressColumns | None:
     """Presses as the arrays tell them; None where they do not."""
-    if "begun" in given:
-        begun, lifted = (as_numbers(given[name], np.int64, name) for name in ("begun", "lifted"))
-        if len(begun) != len(lifted):
-            raise InputError(f"begun has {len(begun)} values and lifted {len(lifted)}, expected as many")
-        return _PressColumns(begun, lifted, {})
+    if "down_command" in given:
+        down_command, up_command = (
+            check_numbers(given[name], np.int64, name) for name in ("down_command", "up_command")
+        )
+        if len(down_command) != len(up_command):
+            raise InputError(f"begun has {len(down_command)} values and lifted {len(up_command)}, expected as many")
+        return _PressColumns(down_command, up_command, {})
     if "press" in given:
         press = given["press"]
         if len(press) != count:
@@ -309,19 +311,19 @@ def _contact(press: Array) -> Mask:
 def _runs(values: Array, down: Mask) -> _PressColumns:
     """Presses that last while the pad is `down` (R,) and `values` (R, k) stay the same."""
     before = np.vstack([np.full((1, values.shape[1]), np.nan), values[:-1]])
-    begun = np.flatnonzero(down & (values != before).any(axis=1))
+    down_command = np.flatnonzero(down & (values != before).any(axis=1))
     ends = np.append(np.flatnonzero(~down), len(values))
-    lifted = np.minimum(ends[np.searchsorted(ends, begun)], np.append(begun[1:], len(values)))
-    return _PressColumns(begun, lifted, {})
+    up_command = np.minimum(ends[np.searchsorted(ends, down_command)], np.append(down_command[1:], len(values)))
+    return _PressColumns(down_command, up_command, {})
 
 
 def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _PressColumns:
     """Presses that the readings show."""
-    from padforge.sense.signals.press_detection import as_commanded, find_presses
+    from padforge.sense.signals.press_detection import as_commanded, detect_presses
 
     first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
     Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)
-    presses = find_presses(readings, times_s)
+    presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
         raise InputError("has no press: no place or number tells one, and none is found in the readings")
     return _PressColumns(*as_commanded(presses, times_s), FOUND)
@@ -330,18 +332,18 @@ def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _Press
 def _pressed(places: Array | None, presses: _PressColumns, count: int) -> Array:
     """(Q, 2) places of presses, NaN where they are unknown."""
     if places is None:
-        return np.full((len(presses.begun), 2), np.nan)
+        return np.full((len(presses.down_command), 2), np.nan)
     places = _of_presses("places", places, presses, count)
     return np.where(places == UNKNOWN, np.nan, places)
 
 
 def _of_presses(name: str, values: Array, presses: _PressColumns, count: int) -> Array:
     """(Q, ...) values of presses, from such, or from (R, ...) of readings, R = `count`."""
-    if len(values) == len(presses.begun):
+    if len(values) == len(presses.down_command):
         return values
     if len(values) != count:
         raise InputError(
-            f"{name} are {len(values)}, expected one for each of {len(presses.begun)} presses or {count} readings"
+            f"{name} are {len(values)}, expected one for each of {len(presses.down_command)} presses or {count} readings"
         )
-    middle = (presses.begun + presses.lifted) // 2
+    middle = (presses.down_command + presses.up_command) // 2
     return values[np.clip(middle, 0, count - 1)]

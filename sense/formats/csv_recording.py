@@ -89,10 +89,10 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     header = ["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures]
     places: list[list[float | str]] = [[""] * (2 + len(measures)) for _ in recording.times_s]
     presses = np.column_stack([recording.presses_mm, *measures.values()]).tolist()
-    for press, begun, lifted in zip(presses, recording.begun, recording.lifted, strict=True):
+    for press, down_command, up_command in zip(presses, recording.down_command, recording.up_command, strict=True):
         place: list[float | str] = ["?", "?"] if isnan(press[0]) else press[:2]
         cells = [*place, *("" if isnan(value) else value for value in press[2:])]
-        places[begun:lifted] = [cells] * int(lifted - begun)
+        places[down_command:up_command] = [cells] * int(up_command - down_command)
     with (
         reraise_write_error(path),
         atomic_file(path) as temporary,

@@ -1,5 +1,5 @@
 """Recordings as HDF5: an export made of a finished run directory, for other programs; never written to while recording.
-Datasets: `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `begun` and `lifted` (Q,), and `depths_mm`,
+Datasets: `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `down_command` and `up_command` (Q,), and `depths_mm`,
 `reached_mm` and `forces_n` (Q,) where any is known; the attribute `source` is JSON text. The states of an arm stay in
 the run directory. Files of other programs are told by a mapping (see `mapping`).
 
@@ -20,8 +20,10 @@ from padforge.sense.formats.annotations import export_path
 from padforge.sense.formats.columns import MEASURES, assembled, chosen, file_and_mapping, listed, parse_mapping
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-hdf5/1"
-_ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {key: key for key in ("presses_mm", "begun", "lifted")}
+FORMAT = "padforge-hdf5/2"
+_ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {
+    key: key for key in ("presses_mm", "down_command", "up_command")
+}
 """Names of the datasets and of what they hold of a `Recording`."""
 _KNOWN = tuple(MEASURES.values())
 """Datasets that are there where any of their values is known."""
@@ -125,9 +127,11 @@ def _published(path: Path) -> Recording:
         )
     source = {"kind": "published", "file": path.name} | _note(len(places), len(voltage))
     places = places[:whole]
-    begun = READINGS_PER_PRESS * np.arange(len(places)) + DOWN_AT
+    down_command = READINGS_PER_PRESS * np.arange(len(places)) + DOWN_AT
     try:
-        return Recording(voltage, tim.ravel(), places, begun, begun - DOWN_AT + READINGS_PER_PRESS, source)
+        return Recording(
+            voltage, tim.ravel(), places, down_command, down_command - DOWN_AT + READINGS_PER_PRESS, source
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -76,7 +76,7 @@ def _rate(hz: float) -> float:
 
 def _episodes(recording: Recording) -> tuple[Indices, Indices]:
     """(E,) first readings of episodes, and those after their last."""
-    middle = (recording.lifted[:-1] + recording.begun[1:]) // 2
+    middle = (recording.up_command[:-1] + recording.down_command[1:]) // 2
     starts, ends = np.append(0, middle), np.append(middle, len(recording.readings))
     return starts[recording.known], ends[recording.known]
 
@@ -111,7 +111,7 @@ def _named_values(
     action = {"x_mm": x, "y_mm": y}
     if not np.isnan(recording.depths_mm[press]).any():
         action["depth_mm"] = recording.depths_mm[press]
-    down = (frames >= recording.begun[press]) & (frames < recording.lifted[press])
+    down = (frames >= recording.down_command[press]) & (frames < recording.up_command[press])
     first = np.append(0, np.flatnonzero(np.diff(press)) + 1)
     since = recording.times_s[frames[first]]
     features = {
@@ -121,8 +121,8 @@ def _named_values(
     if not np.isnan(recording.forces_n[press]).any():
         features["observation.force"] = {"force_n": np.where(down, recording.forces_n[press], 0)}
     if findings is not None:
-        over = frames >= recording.lifted[press]
-        x, y = findings.places_mm[press].T
+        over = frames >= recording.up_command[press]
+        x, y = findings.positions_mm[press].T
         told = {"x_mm": x, "y_mm": y, "r90_mm": findings.r90_mm[press], "found": np.ones(len(press))}
         features["observation.touch"] = {name: np.where(over, values, 0) for name, values in told.items()}
     return {**features, "action": {**action, "down": down}}

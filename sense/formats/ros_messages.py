@@ -104,10 +104,12 @@ def stamps_at(readings: NDArray[np.int64], indices: NDArray[np.int64]) -> NDArra
 def streams_of(recording: Recording, epoch_s: float) -> dict[str, Stream]:
     """What a recording says, by its topics; those without a message are left out."""
     stamps = stamps_of(recording.times_s, epoch_s)
-    begun, lifted = (stamps_at(stamps, indices) for indices in (recording.begun, recording.lifted))
+    down_command, up_command = (
+        stamps_at(stamps, indices) for indices in (recording.down_command, recording.up_command)
+    )
     metres = recording.presses_mm / 1000
     deep = ~np.isnan(recording.depths_mm)
-    variances = np.zeros((len(begun), 36))
+    variances = np.zeros((len(down_command), 36))
     variances[~deep, 14] = NOT_KNOWN
     places = {X: metres[:, 0], Y: metres[:, 1], Z: heights(recording, recording.depths_mm), COVARIANCE: variances}
     heights_m = heights(recording, recording.reached_mm)
@@ -116,11 +118,12 @@ def streams_of(recording: Recording, epoch_s: float) -> dict[str, Stream]:
     streams = {
         READINGS: Stream(stamps, {"data": recording.readings}),
         PRESSED: Stream(
-            np.column_stack([begun, lifted]).ravel(), {"data": np.tile(np.array([1, 0], np.uint8), len(begun))}
+            np.column_stack([down_command, up_command]).ravel(),
+            {"data": np.tile(np.array([1, 0], np.uint8), len(down_command))},
         ),
-        PLACE: _where(recording.known, begun, places),
-        REACHED: _where(~np.isnan(recording.reached_mm), begun, reached),
-        FORCE: _where(~np.isnan(recording.forces_n), begun, forces),
+        PLACE: _where(recording.known, down_command, places),
+        REACHED: _where(~np.isnan(recording.reached_mm), down_command, reached),
+        FORCE: _where(~np.isnan(recording.forces_n), down_command, forces),
     }
     return {topic: stream for topic, stream in streams.items() if len(stream.stamps)}
 
@@ -139,8 +142,8 @@ def _where(there: NDArray[np.bool_], stamps: NDArray[np.int64], fields: Mapping[
     return Stream(stamps[there], {path: values[there] for path, values in fields.items()})
 
 
-FORMAT = "padforge-ros/1"
-_WHOLE = ("begun", "lifted")
+FORMAT = "padforge-ros/2"
+_WHOLE = ("down_command", "up_command")
 _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
 MOST_BYTES, MOST_PARTS = 2**26, 2**21
 """Most that the text may have, and most brackets, braces and quotes in it: Python makes much of little text."""
@@ -217,7 +220,7 @@ def health_messages(
     for fibre in findings.dead:
         bad[fibre] = ("dead", "was dead in the recording that health was learnt from")
     stamps, messages = [int(readings[0])], [_message(store, recording.fibres, bad, int(readings[0]))]
-    ends = stamps_at(readings, recording.lifted)
+    ends = stamps_at(readings, recording.up_command)
     for fault in findings.faults or ():
         bad |= dict.fromkeys(fault.fibres, (fault.kind, fault.text))
         stamps.append(int(ends[min(fault.press, len(ends) - 1)]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from padforge.design.common.files import UNFINISHED, atomic_files, reraise_write_error
 from padforge.design.common.validation import InputError, short_repr
-from padforge.sense.arrays import Array, Indices, as_numbers
+from padforge.sense.arrays import Array, Indices, check_numbers
 from padforge.sense.formats import ros_messages as exact
 from padforge.sense.formats import ros_messages as topics
 from padforge.sense.formats.annotations import ModelFindings, export_path
@@ -168,14 +168,14 @@ def _told(streams: Mapping[str, topics.Stream]) -> list[tuple[Part, NDArray[Any]
     ]
     if topics.PRESSED not in streams:
         return found
-    begun, lifted = _presses(streams[topics.PRESSED], readings.stamps)
+    down_command, up_command = _presses(streams[topics.PRESSED], readings.stamps)
 
     def of_presses(topic: str, path: str, factor: float) -> Array:
         """What the last message of a topic says in each press, NaN without one."""
         if topic not in streams:
-            return np.full(len(begun), np.nan)
-        at = np.searchsorted(streams[topic].stamps, lifted) - 1
-        there = (at >= 0) & (streams[topic].stamps[at] >= begun)
+            return np.full(len(down_command), np.nan)
+        at = np.searchsorted(streams[topic].stamps, up_command) - 1
+        there = (at >= 0) & (streams[topic].stamps[at] >= down_command)
         return np.where(there, streams[topic].fields[path][at] * factor, np.nan)
 
     x, y = (of_presses(topics.PLACE, axis, 1e3) for axis in (topics.X, topics.Y))
@@ -183,7 +183,7 @@ def _told(streams: Mapping[str, topics.Stream]) -> list[tuple[Part, NDArray[Any]
     down = 1.0 if np.nansum(heights) > 0 else -1.0  # the pad lay mirrored, or not
     return [
         *found,
-        *_times(begun, lifted),
+        *_times(down_command, up_command),
         (Part("places", ""), np.column_stack([x, y])),
         (Part("depth", ""), np.where(down * heights > 0, down * heights, np.nan)),
         (Part("reached", ""), of_presses(topics.REACHED, "point.z", down * 1e3)),
@@ -191,8 +191,8 @@ def _told(streams: Mapping[str, topics.Stream]) -> list[tuple[Part, NDArray[Any]
     ]
 
 
-def _times(begun: Indices, lifted: Indices) -> list[tuple[Part, NDArray[Any]]]:
-    return [(Part("begun", "", 1.0), begun / 1e9), (Part("lifted", "", 1.0), lifted / 1e9)]
+def _times(down_command: Indices, up_command: Indices) -> list[tuple[Part, NDArray[Any]]]:
+    return [(Part("down_command", "", 1.0), down_command / 1e9), (Part("up_command", "", 1.0), up_command / 1e9)]
 
 
 def _presses(pressed: topics.Stream, readings: Indices) -> tuple[Indices, Indices]:
@@ -202,14 +202,14 @@ def _presses(pressed: topics.Stream, readings: Indices) -> tuple[Indices, Indice
     """
     down = pressed.fields["data"].astype(bool)
     before = np.append(False, down[:-1])
-    begun = pressed.stamps[down & ~before]
-    lifted = pressed.stamps[~down & before]
-    if len(lifted) < len(begun):
-        lifted = np.append(lifted, topics.stamps_at(readings, np.array([len(readings)])))
-    kept = (begun > readings[0]) & (begun <= readings[-1])
+    down_command = pressed.stamps[down & ~before]
+    up_command = pressed.stamps[~down & before]
+    if len(up_command) < len(down_command):
+        up_command = np.append(up_command, topics.stamps_at(readings, np.array([len(readings)])))
+    kept = (down_command > readings[0]) & (down_command <= readings[-1])
     if not kept.any():
         raise InputError("press is nowhere true after the first reading")
-    return begun[kept], lifted[kept]
+    return down_command[kept], up_command[kept]
 
 
 def _mapped(store: "Typestore", path: Path, mapping: str) -> Recording:
@@ -284,7 +284,9 @@ def export_bag(
             argument is of another kind.
     """
     path = export_path(recording, path, findings)
-    if states is not None and (states := as_numbers(states, np.float64, "states")).shape[1:] != (len(STATE_COLUMNS),):
+    if states is not None and (states := check_numbers(states, np.float64, "states")).shape[1:] != (
+        len(STATE_COLUMNS),
+    ):
         raise InputError(f"states have shape {states.shape}, expected (n, {len(STATE_COLUMNS)})")
     store = typestore(f"{path}: MCAP")
     epoch_s = topics.epoch_of(recording.times_s)
@@ -345,15 +347,15 @@ def _pattern(store: "Typestore", topic: str, stream: topics.Stream) -> Any:
 def _touches(recording: Recording, findings: ModelFindings, epoch_s: float) -> topics.Stream:
     """Places found, at the end of each press."""
     readings = topics.stamps_of(recording.times_s, epoch_s)
-    x, y = (findings.places_mm / 1000).T
+    x, y = (findings.positions_mm / 1000).T
     variances = np.zeros((len(x), 36))
-    variances[:, [0, 7]] = (findings.sd_mm / 1000) ** 2
+    variances[:, [0, 7]] = (findings.std_mm / 1000) ** 2
     variances[:, 14] = np.where(
         np.isnan(findings.depths_mm), topics.NOT_KNOWN, (findings.depths_r90_mm / 1000 / topics.R90) ** 2
     )
     z = topics.heights(recording, findings.depths_mm)
     fields = {topics.X: x, topics.Y: y, topics.Z: z, topics.COVARIANCE: variances}
-    return topics.Stream(topics.stamps_at(readings, recording.lifted), fields)
+    return topics.Stream(topics.stamps_at(readings, recording.up_command), fields)
 
 
 def _poses(states: Array, epoch_s: float) -> dict[str, topics.Stream]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from padforge.design.common.files import resolve_exchange
 from padforge.design.common.validation import InputError, check_int, check_type
-from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Indices, Mask, as_numbers, refuse_beyond
+from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Indices, Mask, check_magnitude, check_numbers
 from padforge.sense.formats.columns import FOUND
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, MOST, climb, noise_of
 from padforge.sense.health.health_model import COMMANDED, DETECTED, SETTLED, HealthModel, checked_presses
@@ -86,7 +86,7 @@ class _Press(NamedTuple):
     settled: Mask
 
 
-class Monitor:
+class FaultDetector:
     """Follows presses and names fibres; a fibre that was named is left out from then on.
 
     Attributes:
@@ -109,13 +109,13 @@ class Monitor:
         """Fibres that are not to be relied on, by index: dead from the first, or named since."""
         return tuple(sorted((*self.model.dead, *self.model.living[self._lost].tolist())))
 
-    def update(self, readings: Array, begun: int, lifted: int) -> list[FibreFault]:
+    def update(self, readings: Array, down_command: int, up_command: int) -> list[FibreFault]:
         """Take in the next press.
 
         Args:
             readings: (R, C) volts, NaN where missing: of this press alone, best from 10 readings before the probe was
                 sent down to 20 after it was sent up; fewer after it only where the next press begins.
-            begun, lifted: first of them after the probe was sent down, and up; 1 <= begun < lifted <= R.
+            down_command, up_command: first of them after the probe was sent down, and up; 1 <= begun < lifted <= R.
 
         Returns:
             What this press brought to light, mostly nothing.
@@ -123,13 +123,13 @@ class Monitor:
         Raises:
             InputError: other fibres than health was learnt from, or indices out of range.
         """
-        readings = as_numbers(readings, np.float64, "readings", copy=False)
+        readings = check_numbers(readings, np.float64, "readings", copy=False)
         if readings.ndim != 2 or readings.shape[1] != self.model.fibres:
             raise InputError(f"readings have shape {readings.shape}, expected (R, {self.model.fibres})")
-        refuse_beyond("readings", readings, MAX_VOLTS, "V", missing=True)
-        begun = check_int("begun", begun, 1, len(readings) - 1)
-        lifted = check_int("lifted", lifted, begun + 1, len(readings))
-        traces = press_trace(readings[:, self.model.living], begun, lifted, 0, len(readings))
+        check_magnitude("readings", readings, MAX_VOLTS, "V", missing=True)
+        down_command = check_int("down_command", down_command, 1, len(readings) - 1)
+        up_command = check_int("up_command", up_command, down_command + 1, len(readings))
+        traces = press_trace(readings[:, self.model.living], down_command, up_command, 0, len(readings))
         level, settled = self._history.level, self._history.seen >= SETTLED
         inputs, targets = self.model.shapes.scaled(*self.model.shapes.advance(traces, self._history))
         self._recent.append(_Press(traces, inputs, targets, level, settled))
@@ -160,8 +160,8 @@ class Monitor:
     def _predicted(self, presses: Sequence[_Press], lost: Mask) -> tuple[Array, Array, Array, Array]:
         """Traces, targets, and the means and spreads predicted without the fibres `lost`, (Q, L, ...) each."""
         traces, inputs, targets, _, settled = (np.stack(part) for part in zip(*presses, strict=True))
-        alive = ~lost & np.isfinite(traces).all(axis=2)
-        mean, spread = expected(self.model.weights, inputs, alive)
+        fibre_mask = ~lost & np.isfinite(traces).all(axis=2)
+        mean, spread = expected(self.model.weights, inputs, fibre_mask)
         # A rest has no level to be compared with before some presses have made one.
         targets[:, :, -1] = np.where(settled, targets[:, :, -1], np.nan)
         return traces, targets, mean, spread
@@ -261,12 +261,14 @@ class Monitor:
         return self.presses + 1 - len(self._recent)
 
 
-def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> list[FibreFault]:
+def examine(
+    model: HealthModel, readings: Array, times_s: Array, down_command: Indices, up_command: Indices
+) -> list[FibreFault]:
     """Follow a whole recording.
 
     Args:
         model: of the same pad. readings: (R, C) volts, NaN where missing. times_s: (R,) s.
-        begun, lifted: (Q,) first reading after the probe was sent down, and up.
+        down_command, up_command: (Q,) first reading after the probe was sent down, and up.
 
     Returns:
         Findings in the order in which they were made. Presses are counted from the recording's first.
@@ -274,15 +276,37 @@ def examine(model: HealthModel, readings: Array, times_s: Array, begun: Indices,
     Raises:
         InputError: other fibres or another rate than health was learnt from, or presses out of order.
     """
-    readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
+    readings, times_s, down_command, up_command = checked_presses(readings, times_s, down_command, up_command)
     check_type("model", model, HealthModel).refuse_other(readings, times_s)
-    monitor = Monitor(model)
-    readings, lows, highs = press_ranges(readings, begun, lifted)
+    monitor = FaultDetector(model)
+    readings, lows, highs = press_ranges(readings, down_command, up_command)
     findings: list[FibreFault] = []
-    for down, up, low, high in zip(begun, lifted, lows, highs, strict=True):
+    for down, up, low, high in zip(down_command, up_command, lows, highs, strict=True):
         first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
         findings += monitor.update(readings[first:last], int(down - first), int(up - first))
     return findings
+
+
+def fibre_mask_of(faults: Sequence[FibreFault], presses: int, fibres: int) -> Mask:
+    """Return which fibres of each press no fault has reached.
+
+    Args:
+        faults: of a recording; a faulty fibre is left out from the press on since which it is.
+        presses: Q of the recording.
+        fibres: C of the pad.
+
+    Returns:
+        (Q, C), false where a fibre is at fault.
+
+    Raises:
+        InputError: a fault of a fibre that the pad does not have.
+    """
+    mask = np.ones((presses, fibres), dtype=bool)
+    for fault in faults:
+        if max(fault.fibres, default=0) >= fibres:
+            raise InputError(f"findings name fibre {max(fault.fibres) + 1}, allowed are 1 to {fibres}")
+        mask[fault.since :, list(fault.fibres)] = False
+    return mask
 
 
 def fault_lines(findings: Sequence[FibreFault], fibres: int, dead: Sequence[int] = ()) -> list[str]:
@@ -308,7 +332,7 @@ def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[Fibre
         InputError: health was not learnt into this folder, or does not suit the recording.
     """
     known = HealthModel.load(model, DETECTED if FOUND.items() <= recording.source.items() else COMMANDED)
-    return known, examine(known, recording.readings, recording.times_s, recording.begun, recording.lifted)
+    return known, examine(known, recording.readings, recording.times_s, recording.down_command, recording.up_command)
 
 
 def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:

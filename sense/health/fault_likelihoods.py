@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from padforge.sense.arrays import LEAST_SPREAD_V, Array, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 from padforge.sense.health.trace_model import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
@@ -78,7 +78,7 @@ class FaultLikelihoods:
         from them, and `size` (C, T), V, of a target of 1."""
         scale, extra = _calibrated(targets - mean, spread)
         usual = np.median(noise_of(traces), axis=0)
-        usual = np.where(usual > LEAST_SPREAD_V, usual, 1e-3 * size[:, 0])
+        usual = np.where(usual > MIN_SCALE_V, usual, 1e-3 * size[:, 0])
         logs = _log_noise(traces, usual)
         centre = np.median(logs, axis=0)
         honest = np.hypot(spread * scale, extra)

@@ -21,15 +21,15 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import Settings, validate
 from padforge.design.common.validation import InputError, check_float, check_int, check_mapping, check_type, short_repr
 from padforge.sense.arrays import (
-    LEAST_SPREAD_V,
     MAX_FIBRES,
     MAX_RATE_HZ,
     MIN_RATE_HZ,
+    MIN_SCALE_V,
     Array,
     Floats,
     Indices,
     Mask,
-    as_numbers,
+    check_numbers,
     stream_of,
 )
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, STEPS, FaultLikelihoods, Tail
@@ -52,7 +52,7 @@ from padforge.sense.health.trace_model import (
 from padforge.sense.localizer.model_files import files_of, refuse_other_pad
 from padforge.sense.recording.recording import Recording, rate_of
 
-FORMAT = "padforge-health/1"
+FORMAT = "padforge-health/2"
 MAX_FALSE_ALARMS = 0.1
 """Greatest rate of false alarms a press: above it every press is one."""
 MOST_LOST = 2
@@ -74,7 +74,7 @@ MAX_VALUE = 1e6
 class HealthDocument(Settings):
     """The whole of `health.json`, see `HealthModel`."""
 
-    format: Literal["padforge-health/1"] = FORMAT
+    format: Literal["padforge-health/2"] = FORMAT
     fibres: int = Field(ge=1, le=MAX_FIBRES)
     dead: list[Annotated[int, Field(ge=0, lt=MAX_FIBRES)]]
     rate_hz: float = Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
@@ -217,7 +217,7 @@ class HealthModel:
 
 
 def checked_presses(
-    readings: ArrayLike, times_s: ArrayLike, begun: ArrayLike, lifted: ArrayLike
+    readings: ArrayLike, times_s: ArrayLike, down_command: ArrayLike, up_command: ArrayLike
 ) -> tuple[Array, Array, Indices, Indices]:
     """Readings (R, C), R >= 2, their times (R,), and the presses (Q,) one after another, as plain arrays.
 
@@ -225,19 +225,23 @@ def checked_presses(
         InputError: they are something else.
     """
     times_s, readings = stream_of(times_s, readings)
-    begun, lifted = (as_numbers(edges, np.int64, "presses", copy=False) for edges in (begun, lifted))
+    down_command, up_command = (
+        check_numbers(edges, np.int64, "presses", copy=False) for edges in (down_command, up_command)
+    )
     if len(readings) < 2:
         raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2")
-    if begun.ndim != 1 or begun.shape != lifted.shape or len(begun) == 0:
-        raise InputError(f"presses have {begun.size} begins and {lifted.size} ends, expected as many, at least one")
-    ends = np.stack([begun, lifted], axis=1).ravel()
-    sound = np.concatenate([[begun[0] >= 1], (ends[1::2] > ends[::2]), ends[2::2] >= ends[1:-1:2]])
-    if not sound.all() or lifted[-1] > len(readings):
+    if down_command.ndim != 1 or down_command.shape != up_command.shape or len(down_command) == 0:
         raise InputError(
-            f"presses begin at {begun[0]} and end at {lifted[-1]} of {len(readings)} readings, expected a reading "
+            f"presses have {down_command.size} begins and {up_command.size} ends, expected as many, at least one"
+        )
+    ends = np.stack([down_command, up_command], axis=1).ravel()
+    sound = np.concatenate([[down_command[0] >= 1], (ends[1::2] > ends[::2]), ends[2::2] >= ends[1:-1:2]])
+    if not sound.all() or up_command[-1] > len(readings):
+        raise InputError(
+            f"presses begin at {down_command[0]} and end at {up_command[-1]} of {len(readings)} readings, expected a reading "
             "before the first, and each to end before the next begins"
         )
-    return readings, times_s, begun, lifted
+    return readings, times_s, down_command, up_command
 
 
 BLOCK = 50
@@ -263,19 +267,19 @@ def learn_health(
     from padforge.sense.signals.press_detection import as_detected
 
     learnt = np.ones(len(check_type("recording", recording, Recording).presses_mm), dtype=bool)
-    away = as_numbers(held_back, np.int64, "held_back")
+    away = check_numbers(held_back, np.int64, "held_back")
     if away.ndim != 1 or not ((away >= 0) & (away < len(learnt))).all():
         raise InputError(f"held_back is {short_repr(held_back)}, allowed are presses from 0 to {len(learnt) - 1}")
     learnt[away] = False
     seed = check_int("the seed of provenance", check_mapping("provenance", provenance).get("seed"), 0, 2**64 - 1)
     readings, times_s = recording.readings, recording.times_s
-    commanded = recording.begun, recording.lifted
+    commanded = recording.down_command, recording.up_command
     edges = {COMMANDED: commanded, DETECTED: as_detected(readings, times_s, *commanded)}
 
     def fit(name: str) -> HealthModel:
-        begun, lifted = (edge[learnt] for edge in edges[name])
+        down_command, up_command = (edge[learnt] for edge in edges[name])
         rng = np.random.default_rng(seed)
-        return fit_health_model(readings, times_s, begun, lifted, rng=rng, provenance=provenance)
+        return fit_health_model(readings, times_s, down_command, up_command, rng=rng, provenance=provenance)
 
     with one_torch_thread():
         found = dict(run_tasks((name, partial(fit, name)) for name in edges))
@@ -285,8 +289,8 @@ def learn_health(
 def fit_health_model(
     readings: Array,
     times_s: Array,
-    begun: Indices,
-    lifted: Indices,
+    down_command: Indices,
+    up_command: Indices,
     *,
     rng: np.random.Generator,
     false_alarms: float = FALSE_ALARMS,
@@ -300,7 +304,7 @@ def fit_health_model(
 
     Args:
         readings: (R, C) volts, NaN where missing. times_s: (R,) ascending, s.
-        begun, lifted: (Q,) first reading after the probe was sent down, and up.
+        down_command, up_command: (Q,) first reading after the probe was sent down, and up.
         rng: source of all that is random. false_alarms: above 0, at most 0.1.
 
     Raises:
@@ -310,9 +314,9 @@ def fit_health_model(
     if not (false_alarms := check_float("false alarms a press", false_alarms, 0.0, MAX_FALSE_ALARMS)) > 0:
         raise InputError(f"false alarms a press are {false_alarms}, allowed is above 0 to {MAX_FALSE_ALARMS}")
     check_type("rng", rng, np.random.Generator)
-    readings, times_s, begun, lifted = checked_presses(readings, times_s, begun, lifted)
+    readings, times_s, down_command, up_command = checked_presses(readings, times_s, down_command, up_command)
     dead = dead_fibres(readings)
-    traces = _whole_traces(readings, begun, lifted, dead)
+    traces = _whole_traces(readings, down_command, up_command, dead)
     shapes, inputs, targets = shapes_of(traces)
     held_out = _HeldOut.train(inputs, targets, rng)
     measured = traces[held_out.settled], targets[held_out.settled]
@@ -343,15 +347,15 @@ def dead_fibres(readings: Array) -> Indices:
     at_end = np.maximum((spread == low).mean(axis=0), (spread == high).mean(axis=0))
     # Where there is no noise every fibre rests at the end of its range.
     saturated = (at_end > 0.5) & (np.median(at_end) <= 0.5)
-    return np.flatnonzero(missing | (high - low < LEAST_SPREAD_V) | saturated)
+    return np.flatnonzero(missing | (high - low < MIN_SCALE_V) | saturated)
 
 
-def _whole_traces(readings: Array, begun: Indices, lifted: Indices, dead: Indices) -> Array:
+def _whole_traces(readings: Array, down_command: Indices, up_command: Indices, dead: Indices) -> Array:
     """(Q, L, TRACE) traces of the living fibres, of the presses that lack none of their readings."""
     living = np.setdiff1d(np.arange(readings.shape[1]), dead)
     if len(living) == 0:
         raise InputError(f"all {len(dead)} fibres are dead: they read one value, or nothing; one must live")
-    traces = traces_of(readings[:, living], begun, lifted)
+    traces = traces_of(readings[:, living], down_command, up_command)
     traces = traces[np.isfinite(traces).all(axis=(1, 2))]
     if len(traces) < LEAST_PRESSES:
         raise InputError(f"recording has {len(traces)} whole presses, health is learnt from {LEAST_PRESSES} or more")
@@ -384,8 +388,8 @@ class _HeldOut:
         mean, spread = np.empty_like(self.targets), np.empty_like(self.targets)
         for k in range(MEMBERS):
             own = self.fold == k
-            alive = np.tile(~np.isin(np.arange(self.inputs.shape[1]), lost), (own.sum(), 1))
-            mean[own], spread[own] = expected(member(self.weights, k), self.inputs[own], alive)
+            fibre_mask = np.tile(~np.isin(np.arange(self.inputs.shape[1]), lost), (own.sum(), 1))
+            mean[own], spread[own] = expected(member(self.weights, k), self.inputs[own], fibre_mask)
         return mean[self.settled], spread[self.settled]
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread
-from padforge.sense.arrays import LEAST_SPREAD_V, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
 from padforge.sense.localizer.model_files import average_in, one_cycle
 
 Weights = Mapping[str, Floats]
@@ -50,49 +50,51 @@ LOG_SPREAD = (-4.0, 2.0)
 """Range of the logarithm of a predicted spread."""
 
 
-def press_trace(readings: Array, begun: int, lifted: int, low: int, high: int) -> Array:
+def press_trace(readings: Array, down_command: int, up_command: int, low: int, high: int) -> Array:
     """The readings around one press.
 
     Args:
-        readings: (R, C) volts. begun, lifted: first reading after the probe was sent down, and up.
+        readings: (R, C) volts. down_command, up_command: first reading after the probe was sent down, and up.
         low, high: the trace keeps to low <= index < high, the press's own readings; where it would reach further it
             is filled with the nearest.
 
     Returns:
         (C, TRACE) volts; NaN after the release if the press has no reading of its own from there.
     """
-    before = np.arange(begun - REST, begun).clip(min(low, begun - 1))
-    down = np.minimum(np.arange(begun, begun + SUNK), lifted - 1)
-    up = np.minimum(np.arange(lifted, lifted + RELEASED), high - 1)
+    before = np.arange(down_command - REST, down_command).clip(min(low, down_command - 1))
+    down = np.minimum(np.arange(down_command, down_command + SUNK), up_command - 1)
+    up = np.minimum(np.arange(up_command, up_command + RELEASED), high - 1)
     trace = readings[np.concatenate([before, down, up])].T
-    if high <= lifted:
+    if high <= up_command:
         # The nearest reading is of the pressed pad: the fibres would look as if they had stayed where they were.
         trace[:, -RELEASED:] = np.nan
     return trace
 
 
-def press_ranges(readings: Array, begun: Indices, lifted: Indices) -> tuple[Array, Indices, Indices]:
+def press_ranges(readings: Array, down_command: Indices, up_command: Indices) -> tuple[Array, Indices, Indices]:
     """Bound the readings that belong to each press by its neighbours.
 
     Args:
         readings: (R, C) volts.
-        begun: (Q,) first reading after the probe was sent down.
-        lifted: (Q,) first reading after it was sent up.
+        down_command: (Q,) first reading after the probe was sent down.
+        up_command: (Q,) first reading after it was sent up.
 
     Returns:
         Readings, with NaN where the recording ends before the last press has been released for RELEASED readings; and
         (Q,) the first reading of each press, and the first that is no longer its own.
     """
     # No press follows that cuts the last one off, so what lacks of it is missing, and is not filled.
-    missing = max(int(lifted[-1]) + RELEASED - len(readings), 0)
+    missing = max(int(up_command[-1]) + RELEASED - len(readings), 0)
     readings = np.pad(readings, ((0, missing), (0, 0)), constant_values=np.nan) if missing else readings
-    return readings, np.concatenate([[0], lifted[:-1]]), np.append(begun[1:], len(readings))
+    return readings, np.concatenate([[0], up_command[:-1]]), np.append(down_command[1:], len(readings))
 
 
-def traces_of(readings: Array, begun: Indices, lifted: Indices) -> Array:
+def traces_of(readings: Array, down_command: Indices, up_command: Indices) -> Array:
     """(Q, C, TRACE) traces of all presses of (R, C) readings."""
-    readings, lows, highs = press_ranges(readings, begun, lifted)
-    return np.stack([press_trace(readings, *press) for press in zip(begun, lifted, lows, highs, strict=True)])
+    readings, lows, highs = press_ranges(readings, down_command, up_command)
+    return np.stack(
+        [press_trace(readings, *press) for press in zip(down_command, up_command, lows, highs, strict=True)]
+    )
 
 
 @dataclass
@@ -162,22 +164,22 @@ def shapes_of(traces: Array) -> tuple[Shapes, Floats, Array]:
     own, spread = np.sqrt((inputs**2).mean(axis=0)), np.sqrt((targets**2).mean(axis=0))
     # Small components keep a part of their smallness, and so of their noise.
     size = np.sqrt(own * own.max(axis=1, keepdims=True))
-    shapes = Shapes(basis, *(np.where(each > LEAST_SPREAD_V, each, 1.0) for each in (size, spread)))
+    shapes = Shapes(basis, *(np.where(each > MIN_SCALE_V, each, 1.0) for each in (size, spread)))
     return shapes, *shapes.scaled(inputs, targets)
 
 
-def expected(weights: Weights, inputs: Floats, alive: Mask) -> tuple[Array, Array]:
+def expected(weights: Weights, inputs: Floats, fibre_mask: Mask) -> tuple[Array, Array]:
     """What each fibre should give by the *other* living ones.
 
     Args:
-        weights: of the network. inputs: (Q, C, N) scaled. alive: (Q, C) fibres to go by.
+        weights: of the network. inputs: (Q, C, N) scaled. fibre_mask: (Q, C) fibres to go by.
 
     Returns:
         Mean and spread, (Q, C, T) each, of the ensemble's mixture.
     """
     # A fibre's part in the first layer is taken out again to leave it out: C predictions for little more than one.
     parts = np.einsum("qcn,ecnh->eqch", inputs, weights["first.w"]) + weights["first.alive"][:, None]
-    parts = np.where(alive[:, :, None], parts, np.float32(0))
+    parts = np.where(fibre_mask[:, :, None], parts, np.float32(0))
     h = _silu(parts.sum(axis=2, keepdims=True) - parts + weights["first.b"][:, None, None])
     h = _silu(h @ weights["hidden.w"][:, None] + weights["hidden.b"][:, None, None])
     out = np.einsum("eqch,echt->eqct", h, weights["last.w"]) + weights["last.b"][:, None]

@@ -27,7 +27,7 @@ from padforge.sense.formats.ros_messages import FRAME, HEALTH, KINDS, NOT_KNOWN,
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live
 
-FORMAT = "padforge-live/1"
+FORMAT = "padforge-live/2"
 _OK, _ERROR = 0, 2
 """Levels of a `DiagnosticStatus`."""
 SOUND = ("sound", "unwatched")
@@ -121,7 +121,7 @@ def _touch(found: Estimate, inwards: float) -> Message:
     return Message(
         TOUCHES,
         {"header": _header(found.time_s), "pose": {"pose": pose, "covariance": variances}},
-        {"event": "touch", **found.document, "lost": list(found.lost)},
+        {"event": "touch", **found.document, "failed": list(found.lost)},
     )
 
 

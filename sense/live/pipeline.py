@@ -13,14 +13,13 @@ import numpy as np
 
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
-from padforge.sense.health.fault_detector import FibreFault, Monitor
+from padforge.sense.health.fault_detector import FaultDetector, FibreFault
 from padforge.sense.health.health_model import HealthModel
-from padforge.sense.health.locating import MEASURED
-from padforge.sense.localizer.features import REST, SIZES, Scaled, bridged, press_inputs
-from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.features import REST, SIZES, ScaledFeatures, bridged, press_inputs
+from padforge.sense.localizer.model import MEASURED, LocalizerModel
 from padforge.sense.localizer.model_files import refuse_other_pad
 from padforge.sense.rig.streams import DONE, NEEDS, BufferedPress, Ring
-from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
 TRAIL = 12
 """Presses that are kept to be shown."""
@@ -88,7 +87,7 @@ class Live:
     """
 
     def __init__(
-        self, localizers: Sequence[Localizer], health: HealthModel | None, fibres: int, rate_hz: float
+        self, localizers: Sequence[LocalizerModel], health: HealthModel | None, fibres: int, rate_hz: float
     ) -> None:
         """Get ready for readings of so many fibres, `rate_hz` a second.
 
@@ -105,15 +104,15 @@ class Live:
         )
         if not isinstance(localizers, Sequence) or not localizers:
             raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
-        self._monitor = None if health is None else Monitor(health)
-        models = [check_type("localizers", each, Localizer) for each in localizers]
+        self._monitor = None if health is None else FaultDetector(health)
+        models = [check_type("localizers", each, LocalizerModel) for each in localizers]
         for model in models:
             refuse_other_pad(model, "the localizer", fibres, rate_hz)
         if health is not None:
             refuse_other_pad(health, "health", fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda each: NEEDS[each.features][::-1])
         self._usual = _usual(self._localizers[-1])
-        self._finder = Finder(fibres)
+        self._finder = PressDetector(fibres)
         self._ring = Ring(1 + fibres)
         self._press: BufferedPress | None = None
         self._count = self._free = 0
@@ -123,7 +122,7 @@ class Live:
     @property
     def pressed(self) -> bool:
         """Whether the pad is pressed now."""
-        return self._press is not None and self._press.lifted is None
+        return self._press is not None and self._press.up_command is None
 
     @property
     def lost(self) -> tuple[int, ...]:
@@ -197,11 +196,11 @@ class Live:
 
     def _begin(self, touched: int) -> list[Event]:
         """The pad is touched; what was still to come of the press before comes now."""
-        begun = self._ring.sent(touched, SENT_DOWN_S)
-        events = self._advance(begun)
-        begun = max(begun, self._free + 1)
+        down_command = self._ring.sent(touched, SENT_DOWN_S)
+        events = self._advance(down_command)
+        down_command = max(down_command, self._free + 1)
         time_s = float(self._ring.rows(touched, touched + 1)[0, 0])
-        self._press = BufferedPress(self._count, time_s, touched, begun, self._free, self._rest(begun))
+        self._press = BufferedPress(self._count, time_s, touched, down_command, self._free, self._rest(down_command))
         self._count += 1
         return events
 
@@ -211,8 +210,8 @@ class Live:
         if press is None:
             return []
         if over is not None:
-            now = max(over, press.begun + 1)
-            if press.lifted is None:
+            now = max(over, press.down_command + 1)
+            if press.up_command is None:
                 press.let_go(over)
         press.keep_opening(self._ring)
         events: list[Event] = []
@@ -222,22 +221,22 @@ class Live:
                 break
             press.told += 1
             events.append(self._estimate(press, localizer, min(enough, now)))
-        if press.lifted is not None and (now >= press.lifted + DONE or over is not None):
-            events += self._judge(press, min(press.lifted + DONE, now))
-            self._free, self._press = press.lifted, None
+        if press.up_command is not None and (now >= press.up_command + DONE or over is not None):
+            events += self._judge(press, min(press.up_command + DONE, now))
+            self._free, self._press = press.up_command, None
         return events
 
-    def _estimate(self, press: BufferedPress, localizer: Localizer, end: int) -> Estimate:
-        readings, begun, lifted, free = press.excerpt(self._ring, end)
+    def _estimate(self, press: BufferedPress, localizer: LocalizerModel, end: int) -> Estimate:
+        readings, down_command, up_command, free = press.excerpt(self._ring, end)
         # The press before stands in by its end alone: the rest of this one reaches back no further.
-        begins, ends = ([free - 1, begun], [free, lifted]) if free > 0 else ([begun], [lifted])
+        begins, ends = ([free - 1, down_command], [free, up_command]) if free > 0 else ([down_command], [up_command])
         raw = press_inputs(readings, np.array(begins), np.array(ends), localizer.features)[-1:]
-        presses = localizer.normalization.inputs(raw)
-        alive = presses.alive.copy()
-        alive[:, list(self.lost)] = False
-        found = localizer.locate(Scaled(presses.inputs, alive))
-        numbers = np.concatenate([found.places_mm[0], found.sd_mm[0], found.r50_mm, found.r90_mm]).tolist()
-        final, lost = localizer is self._localizers[-1], tuple(np.flatnonzero(~alive[0]).tolist())
+        presses = localizer.scaler.inputs(raw)
+        fibre_mask = presses.fibre_mask.copy()
+        fibre_mask[:, list(self.lost)] = False
+        found = localizer.predict_features(ScaledFeatures(presses.inputs, fibre_mask))
+        numbers = np.concatenate([found.positions_mm[0], found.std_mm[0], found.r50_mm, found.r90_mm]).tolist()
+        final, lost = localizer is self._localizers[-1], tuple(np.flatnonzero(~fibre_mask[0]).tolist())
         measured = {
             column: float(values[0])
             for name, each in found.measures.items()
@@ -253,15 +252,15 @@ class Live:
         """What a press that is over says of the fibres."""
         if self._monitor is None:
             return []
-        readings, begun, lifted, free = press.excerpt(self._ring, end)
-        first = max(begun + REST[0], free)
-        findings = self._monitor.update(readings[first:], begun - first, lifted - first)
+        readings, down_command, up_command, free = press.excerpt(self._ring, end)
+        first = max(down_command + REST[0], free)
+        findings = self._monitor.update(readings[first:], down_command - first, up_command - first)
         self.findings += findings
         return findings
 
 
-def _usual(localizer: Localizer) -> Array:
+def _usual(localizer: LocalizerModel) -> Array:
     """(C,) V, what a fibre's answer to a press goes up to."""
-    scaling, windows = localizer.normalization, SIZES[localizer.features]
+    scaling, windows = localizer.scaler, SIZES[localizer.features]
     usual = (np.abs(scaling.centre) + 2 * scaling.spread)[:, :windows].max(axis=1)
     return np.where(usual > 0, usual, 1.0)

@@ -38,7 +38,7 @@ _VALUES = 2**15
 
 
 @dataclass(frozen=True)
-class Observer:
+class BayesianLocalizer:
     """What is known of a pad, as arrays of NumPy or of torch.
 
     Numbers are such as single precision holds. NumPy works in double precision, since the steps are as large as they
@@ -63,7 +63,7 @@ class Observer:
     shift: Any
 
     @classmethod
-    def fit(cls, table: Any, inputs: Any, alive: Mask, places: Any) -> "Observer":
+    def fit(cls, table: Any, inputs: Any, fibre_mask: Mask, places: Any) -> "BayesianLocalizer":
         """From a table (S, S, C, F + G) of expected inputs, and presses: inputs (Q, C, F + G), alive, places (Q, 2)."""
         side, _, fibres, size = table.shape
         table, inputs, places = (part.astype(np.float64) for part in (table, inputs, places))
@@ -76,11 +76,11 @@ class Observer:
         projection = np.zeros((fibres, size, COMPONENTS))
         rest = inputs - looked_up(table.reshape(side, side, -1), places).reshape(inputs.shape)
         for fibre in range(fibres):
-            told, there = table[:, :, fibre].any(axis=(0, 1)), alive[:, fibre]
+            told, there = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
             found = _components(table[:, :, fibre, told].reshape(side * side, -1), rest[there, fibre][:, told])
             projection[fibre, told] = found
-        rest = np.einsum("qcf,cfd->qcd", rest, projection) * alive[:, :, None]
-        scatter = _scatter(coarse.reshape(-1, 2), places, rest, alive, max(cell, NEAR * _apart(places)))
+        rest = np.einsum("qcf,cfd->qcd", rest, projection) * fibre_mask[:, :, None]
+        scatter = _scatter(coarse.reshape(-1, 2), places, rest, fibre_mask, max(cell, NEAR * _apart(places)))
         scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
         terms, answers, slopes, curvatures = [], [], [], []
         for fibre in range(fibres):
@@ -107,15 +107,15 @@ class Observer:
         )
         return cls(*(_rounded(part) for part in (*parts, np.stack([low, high]), np.eye(2), np.zeros(2))))
 
-    def __call__(self, inputs: Any, alive: Any, xp: Any = np) -> tuple[Any, Any]:
+    def __call__(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
         """(Q, C, F + G) scaled inputs and (Q, C) which count, to places (Q, 2) and what is told of them (Q, `TOLD`).
 
         Args:
             xp: the module whose arrays all these are, numpy or torch.
         """
         fibres, _, size = self.projection.shape
-        there = xp.asarray(alive, dtype=inputs.dtype)
-        seen = xp.matmul(xp.where(alive[:, :, None], inputs, 0.0).swapaxes(0, 1), self.projection).swapaxes(0, 1)
+        there = xp.asarray(fibre_mask, dtype=inputs.dtype)
+        seen = xp.matmul(xp.where(fibre_mask[:, :, None], inputs, 0.0).swapaxes(0, 1), self.projection).swapaxes(0, 1)
         mean, variance, both = self._on_grid(seen, there, xp)
         known, place, spread = BEFOREHAND / variance, mean, variance
         for _ in range(LOOKS):
@@ -166,17 +166,17 @@ class Observer:
         """All of it, by the names under which it is kept, in single precision, which takes nothing off it."""
         return {PREFIX + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
 
-    def moved(self, turn: Array, shift: Array) -> "Observer":
+    def moved(self, turn: Array, shift: Array) -> "BayesianLocalizer":
         """One that calls places otherwise: by turn (2, 2) and shift (2,) of what it calls them now."""
         named = (turn @ self.turn, turn @ self.shift + shift)
         return replace(self, turn=_rounded(named[0]), shift=_rounded(named[1]))
 
-    def changed(self, change: Callable[[Any], Any]) -> "Observer":
+    def changed(self, change: Callable[[Any], Any]) -> "BayesianLocalizer":
         """With every array, in single precision, changed: as into one of torch."""
-        return Observer(*map(change, self.arrays().values()))
+        return BayesianLocalizer(*map(change, self.arrays().values()))
 
     @classmethod
-    def of(cls, arrays: Mapping[str, Any]) -> "Observer":
+    def of(cls, arrays: Mapping[str, Any]) -> "BayesianLocalizer":
         """What `arrays` gave; raises KeyError for one that is not there."""
         return cls(**{each.name: arrays[PREFIX + each.name].astype(np.float64) for each in fields(cls)})
 
@@ -189,7 +189,7 @@ def _rounded(part: Array) -> Array:
     return part.astype(np.float32).astype(np.float64)
 
 
-def _scatter(around: Array, places: Array, rest: Array, alive: Mask, width: float) -> Any:
+def _scatter(around: Array, places: Array, rest: Array, fibre_mask: Mask, width: float) -> Any:
     """(P, C, D, D) mean products of what is left (Q, C, D) of components, which are about 1, near places (P, 2)."""
     fibres, size = rest.shape[1:]
     sums, weights = np.zeros((len(around), fibres * size * size)), np.zeros((len(around), fibres))
@@ -199,7 +199,7 @@ def _scatter(around: Array, places: Array, rest: Array, alive: Mask, width: floa
         apart = ((around[:, None] - places[part]) ** 2).sum(axis=2)
         near = np.exp(-0.5 * apart / width**2)
         sums += near @ (rest[part, :, :, None] * rest[part, :, None, :]).reshape(near.shape[1], -1)
-        weights += near @ alive[part]
+        weights += near @ fibre_mask[part]
     usual = USUAL * np.eye(size)
     return (sums.reshape(-1, fibres, size, size) + usual) / (weights + USUAL)[:, :, None, None]
 

@@ -17,14 +17,14 @@ from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import TOLD
 from padforge.sense.localizer.evaluation import conformal, evaluate, held_back
-from padforge.sense.localizer.features import PHASES, Normalization, Scaled, TrainingPresses, press_inputs
-from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.features import PHASES, FeatureScaler, ScaledFeatures, TrainingPresses, press_inputs
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.network import LEAST_LOG, MOST_LOG, Weights, learnt, refuse_unsound
 from padforge.sense.recording.recording import Recording
 
 LEAST_TRAINING = 3
 """Presses needed to learn from and to check on: of fewer, the span is none."""
-CHECKED = {"masked": 0.08, "published": 0.15 / 0.85}
+CHECKED = {"ensemble": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that are not learnt from but find the radii. Of the published method, 15 % of all,
 half of which end the training."""
 MOST_SECONDS = 1e9
@@ -45,7 +45,7 @@ def calibrate(
     seed: int | None = None,
     time_budget: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Localizer, dict[str, Any]]:
+) -> tuple[LocalizerModel, dict[str, Any]]:
     """Train a localizer on a part of the presses and test it on the rest.
 
     Test presses enter nothing but the test, which looks at them once: not the scaling, not the training, not its
@@ -84,7 +84,7 @@ def calibrate(
     with stage("train"), one_torch_thread():
         localizer = learn(recording, training, options, rng, progress, time_budget)
     localizer = replace(localizer, split=options.split, test=tuple(test.tolist()), provenance=made_by)
-    levels = range(min(options.lost, recording.fibres - 1) + 1) if options.method == "masked" else (0,)
+    levels = range(min(options.max_failures, recording.fibres - 1) + 1) if options.method == "ensemble" else (0,)
     with stage("evaluate"):
         document = evaluate(localizer, recording, levels)
     document |= {"training_presses": len(training), "settings": options.model_dump()}
@@ -98,7 +98,7 @@ def learn(
     rng: np.random.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None,
     time_budget: float | None = None,
-) -> Localizer:
+) -> LocalizerModel:
     """Train a localizer on the presses `training` of a recording, by index.
 
     Of them, a share finds the radii: drawn at random, or the last ones, as the split is. The others are shown as they
@@ -109,60 +109,62 @@ def learn(
         InputError: the training diverged.
     """
     taught, ending, proving = _parts(training, options, rng)
-    masked = options.method == "masked"
-    raw = press_inputs(recording.readings, recording.begun, recording.lifted, options.features)
+    masked = options.method == "ensemble"
+    raw = press_inputs(recording.readings, recording.down_command, recording.up_command, options.features)
     measures = learnable(recording, training) if masked else {}
     shown_raw, rows = raw[taught], taught
     if masked:
         from padforge.sense.signals.press_detection import as_detected
 
-        again = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
+        again = as_detected(recording.readings, recording.times_s, recording.down_command, recording.up_command)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         rows = np.concatenate([taught, taught])
     shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
-    scaling, table = Normalization.fit(shown_raw, shown_mm, shown_more, PHASES[options.features])
+    scaling, table = FeatureScaler.fit(shown_raw, shown_mm, shown_more, PHASES[options.features])
     shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
-    observer, corrector = None, {}
+    bayes, residual_network = None, {}
     if masked:
         from padforge.sense.localizer.training import train_members
 
-        weights, observer, corrector = train_members(shown, table, options, rng, progress, time_budget)
+        weights, bayes, residual_network = train_members(shown, table, options, rng, progress, time_budget)
     else:
         from padforge.sense.localizer.training import train_published
 
         held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], {})
         weights = train_published(shown, held, rng)
-    _refuse_diverged(weights, corrector, scaling, options)
-    localizer = Localizer(
+    _refuse_diverged(weights, residual_network, scaling, options)
+    localizer = LocalizerModel(
         weights=weights,
-        normalization=scaling,
+        scaler=scaling,
         table=table,
-        observer=observer,
-        corrector=corrector,
+        bayes=bayes,
+        residual_network=residual_network,
         method=options.method,
         features=options.features,
-        factors=np.ones((1, 3 + len(measures))),
+        interval_factors=np.ones((1, 3 + len(measures))),
         rate_hz=recording.rate_hz,
-        learnt_from=recording.digest,
+        training_recording_sha256=recording.digest,
     )
-    levels = min(options.lost, recording.fibres - 1) + 1 if masked else 1
-    presses, places_mm = scaling.inputs(raw[proving]), recording.presses_mm[proving]
-    if observer is not None:
-        localizer = proven(localizer, presses, places_mm, levels)
-    return replace(localizer, factors=radii(localizer, presses, places_mm, levels, _of(measures, proving)))
+    levels = min(options.max_failures, recording.fibres - 1) + 1 if masked else 1
+    presses, positions_mm = scaling.inputs(raw[proving]), recording.presses_mm[proving]
+    if bayes is not None:
+        localizer = proven(localizer, presses, positions_mm, levels)
+    return replace(localizer, interval_factors=radii(localizer, presses, positions_mm, levels, _of(measures, proving)))
 
 
-def proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int) -> Localizer:
+def proven(localizer: LocalizerModel, presses: ScaledFeatures, positions_mm: Array, levels: int) -> LocalizerModel:
     """One whose members expect the errors that they make of presses never learnt from, and so count as they deserve.
 
     Of few presses, or badly placed ones, an observer is far surer than it may be: it finds the presses of training,
     moved as the response says, by that same response.
     """
-    targets = localizer.normalization.targets(places_mm)
+    targets = localizer.scaler.targets(positions_mm)
     ratios = []
     for lost in (lost for level in range(levels) for lost in failure_subsets(localizer.fibres, level, PROVEN)):
-        alive = presses.alive & ~np.isin(np.arange(localizer.fibres), lost)
-        outputs = learnt(localizer.weights, presses.inputs, alive, "masked", localizer.observer, localizer.corrector)
+        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(localizer.fibres), lost)
+        outputs = learnt(
+            localizer.weights, presses.inputs, fibre_mask, "ensemble", localizer.bayes, localizer.residual_network
+        )
         found, logs = np.split(outputs, 2, axis=2)
         ratios.append(np.abs(found - targets).mean(axis=2) / np.exp(np.clip(logs, LEAST_LOG, MOST_LOG)).mean(axis=2))
     whole = np.mean(ratios, axis=0)
@@ -173,20 +175,22 @@ def proven(localizer: Localizer, presses: Scaled, places_mm: Array, levels: int)
         bias[:, :, 2:] += more[:, None, None]
         return {**weights, "last.b": bias}
 
-    weights, corrector = honest(localizer.weights, logs[:-1]), honest(localizer.corrector, logs[-1:])
-    return replace(localizer, weights=weights, corrector=corrector)
+    weights, residual_network = honest(localizer.weights, logs[:-1]), honest(localizer.residual_network, logs[-1:])
+    return replace(localizer, weights=weights, residual_network=residual_network)
 
 
 def _refuse_diverged(
-    weights: Weights, corrector: Weights, scaling: Normalization, options: settings.LocalizerSettings
+    weights: Weights, residual_network: Weights, scaling: FeatureScaler, options: settings.LocalizerSettings
 ) -> None:
     entries = scaling.entries(options.method)
     try:
         refuse_unsound(weights, entries, options.method, len(scaling.measures))
-        if corrector:
-            refuse_unsound(corrector, entries + TOLD, options.method)
+        if residual_network:
+            refuse_unsound(residual_network, entries + TOLD, options.method)
     except InputError as error:
-        raise InputError(f"training diverged at [localizer] rate {options.rate:g}, try a lower one: {error}") from error
+        raise InputError(
+            f"training diverged at [localizer] learning_rate {options.learning_rate:g}, try a lower one: {error}"
+        ) from error
 
 
 def _parts(
@@ -196,16 +200,16 @@ def _parts(
     taught, checked = (
         training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
     )
-    if options.method == "masked" or len(checked) < 2:
+    if options.method == "ensemble" or len(checked) < 2:
         return taught, checked, checked
     ending, proving = (checked[part] for part in split_presses(len(checked), options.split, 0.5, rng, least=1))
     return taught, ending, proving
 
 
 def _samples(
-    scaling: Normalization, presses: Scaled, places_mm: Array, measures: Mapping[str, Array]
+    scaling: FeatureScaler, presses: ScaledFeatures, positions_mm: Array, measures: Mapping[str, Array]
 ) -> TrainingPresses:
-    return TrainingPresses(presses.inputs, presses.alive, scaling.targets(places_mm, measures), scaling.stretch)
+    return TrainingPresses(presses.inputs, presses.fibre_mask, scaling.targets(positions_mm, measures), scaling.stretch)
 
 
 def _of(measures: Mapping[str, Array], presses: Indices) -> dict[str, Array]:
@@ -224,11 +228,11 @@ def learnable(recording: Recording, presses: Indices) -> dict[str, Array]:
     return measures if not np.isnan(force).any() else {"depth_mm": measures["depth_mm"]}
 
 
-def left_out(recording: Recording, localizer: Localizer) -> list[str]:
+def left_out(recording: Recording, localizer: LocalizerModel) -> list[str]:
     """Why `localizer` has not learnt a depth or force that is known of some presses of `recording`, a line each."""
-    if localizer.method != "masked":
+    if localizer.method != "ensemble":
         return []
-    learnt = {target.name for target in localizer.normalization.measures}
+    learnt = {target.name for target in localizer.scaler.measures}
     measures = {name: values[recording.known] for name, values in recording.measures.items()}
     deep, force = measures["depth_mm"], measures["force_n"]
     out = []
@@ -244,17 +248,21 @@ def left_out(recording: Recording, localizer: Localizer) -> list[str]:
 
 
 def radii(
-    localizer: Localizer, presses: Scaled, places_mm: Array, levels: int, measures: Mapping[str, Array] | None = None
+    localizer: LocalizerModel,
+    presses: ScaledFeatures,
+    positions_mm: Array,
+    levels: int,
+    measures: Mapping[str, Array] | None = None,
 ) -> Array:
     """(levels, 3 + T) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
-    plain = replace(localizer, factors=np.ones((1, localizer.factors.shape[1])))
+    plain = replace(localizer, interval_factors=np.ones((1, localizer.interval_factors.shape[1])))
     by_level = (failure_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
-    found = ([plain.locate(presses, subset) for subset in subsets] for subsets in by_level)
-    return np.clip([conformal(each, places_mm, measures) for each in found], 1e-6, 1e6)
+    found = ([plain.predict_features(presses, subset) for subset in subsets] for subsets in by_level)
+    return np.clip([conformal(each, positions_mm, measures) for each in found], 1e-6, 1e6)
 
 
 def split_unseen(
-    recording: Recording, localizer: Localizer | None, options: settings.LocalizerSettings
+    recording: Recording, localizer: LocalizerModel | None, options: settings.LocalizerSettings
 ) -> tuple[Indices, Indices]:
     """Presses of known place to learn from, and those to test on, which `localizer`, if there is one, has not learnt.
 
@@ -264,7 +272,7 @@ def split_unseen(
     known, digest = np.flatnonzero(recording.known), recording.digest
     if localizer is not None and digest in localizer.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    if localizer is not None and digest == localizer.learnt_from:
+    if localizer is not None and digest == localizer.training_recording_sha256:
         test = held_back(localizer, recording)
         return np.setdiff1d(known, test), test
     rng = np.random.default_rng(options.seed)

@@ -11,17 +11,17 @@ from padforge.design.common.validation import InputError, check_int, check_type,
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import bridged, window_inputs
-from padforge.sense.localizer.localizer import Found, Localizer, Measured
+from padforge.sense.localizer.model import Localization, LocalizerModel, Measured
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-calibration/1"
+FORMAT = "padforge-calibration/2"
 CELLS = 5
 """Cells along a side of the map of errors by place."""
 ACTIVE = 0.02
 """Share of its total variation that a fibre must change by to be active in a press (paper, table III)."""
 
 
-def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
+def evaluate(localizer: LocalizerModel, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
     """Errors of a localizer for every set of lost fibres of the sizes `levels`.
 
     On the recording it was trained on, only the presses held back then count; of any other, all of known place do.
@@ -38,7 +38,7 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
         InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
             or was seen in its recalibration.
     """
-    check_type("localizer", localizer, Localizer)
+    check_type("localizer", localizer, LocalizerModel)
     check_type("recording", recording, Recording)
     presses = len(recording.presses_mm)
     try:
@@ -50,27 +50,27 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     digest = recording.digest
     if digest in localizer.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    own = digest == localizer.learnt_from
+    own = digest == localizer.training_recording_sha256
     test = held_back(localizer, recording) if own else np.flatnonzero(recording.known)
     if len(test) == 0:
         raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
-    inputs, places_mm = localizer.inputs(recording)[test], recording.presses_mm[test]
+    inputs, positions_mm = localizer.scaled_features(recording)[test], recording.presses_mm[test]
     measures = {name: values[test] for name, values in recording.measures.items()}
-    locate = partial(localizer.locate, inputs)
-    rows, by_subset = errors_by_loss(localizer.fibres, levels, locate, places_mm, measures)
-    whole = localizer.locate(inputs)
+    locate = partial(localizer.predict_features, inputs)
+    rows, by_subset = errors_by_loss(localizer.fibres, levels, locate, positions_mm, measures)
+    whole = localizer.predict_features(inputs)
     return {
         "format": FORMAT,
         "errors": rows,
         "split": localizer.split if own else "none",
         "test_presses": len(test),
         "by_subset": by_subset,
-        "by_place": by_place(whole.places_mm, places_mm),
+        "by_place": by_place(whole.positions_mm, positions_mm),
         "idle_share": idle_share(recording).tolist(),
         "test": {
             "press": test.tolist(),
-            "pressed_mm": places_mm.tolist(),
-            "found_mm": whole.places_mm.tolist(),
+            "pressed_mm": positions_mm.tolist(),
+            "predicted_mm": whole.positions_mm.tolist(),
             "r90_mm": whole.r90_mm.tolist(),
             **_measures_told(whole, measures),
         },
@@ -78,7 +78,7 @@ def evaluate(localizer: Localizer, recording: Recording, levels: Iterable[int] =
     }
 
 
-def held_back(localizer: Localizer, recording: Recording) -> Indices:
+def held_back(localizer: LocalizerModel, recording: Recording) -> Indices:
     """Presses of the recording it was trained on that a localizer says were held back, by index.
 
     Raises:
@@ -93,7 +93,7 @@ def held_back(localizer: Localizer, recording: Recording) -> Indices:
     return np.array(localizer.test, dtype=np.int64)
 
 
-def _measures_told(found: Found, measures: Mapping[str, Array]) -> dict[str, Any]:
+def _measures_told(found: Localization, measures: Mapping[str, Array]) -> dict[str, Any]:
     """Depths and forces found, their `r90`, and what they were, None where that is not known; by name."""
     return {
         name: {
@@ -108,15 +108,15 @@ def _measures_told(found: Found, measures: Mapping[str, Array]) -> dict[str, Any
 def errors_by_loss(
     fibres: int,
     levels: Iterable[int],
-    locate: Callable[[tuple[int, ...]], Found],
-    places_mm: Array,
+    locate: Callable[[tuple[int, ...]], Localization],
+    positions_mm: Array,
     measures: Mapping[str, Array] | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """ "errors" and "by_subset" as `evaluate` gives them.
 
     Args:
         fibres: how many there are. levels: how many are lost.
-        locate: finds the presses without the fibres given by index. places_mm: (Q, 2) where they were.
+        locate: finds the presses without the fibres given by index. positions_mm: (Q, 2) where they were.
         measures: (Q,) how deep and forceful they were, see `Recording.measures`.
 
     Raises:
@@ -127,20 +127,20 @@ def errors_by_loss(
         level = check_int("lost", level, 0, fibres - 1)
         subsets = failure_subsets(fibres, level)
         found = [locate(subset) for subset in subsets]
-        rows.append(error_row(level, found, places_mm, measures))
+        rows.append(error_row(level, found, positions_mm, measures))
         by_subset += [
-            {"lost": list(subset), "mean_mm": float(distances(each.places_mm, places_mm).mean())}
+            {"failed": list(subset), "mean_mm": float(distances(each.positions_mm, positions_mm).mean())}
             for subset, each in zip(subsets, found, strict=True)
         ]
     return rows, by_subset
 
 
-def distances(found_mm: Array, pressed_mm: Array) -> Array:
+def distances(predicted_mm: Array, pressed_mm: Array) -> Array:
     """(Q,) distance of (Q, 2) places."""
-    return np.hypot(*(found_mm - pressed_mm).T)
+    return np.hypot(*(predicted_mm - pressed_mm).T)
 
 
-def conformal(found: Sequence[Found], places_mm: Array, measures: Mapping[str, Array] | None = None) -> Array:
+def conformal(found: Sequence[Localization], positions_mm: Array, measures: Mapping[str, Array] | None = None) -> Array:
     """(3 + T,) factors by which standard deviations, the radii of 50 and 90 %, and the r90 of T measures must grow.
 
     They are then right for these presses.
@@ -150,11 +150,11 @@ def conformal(found: Sequence[Found], places_mm: Array, measures: Mapping[str, A
     So of few presses they are the more cautious.
 
     Args:
-        found: the Q presses, with each of some sets of lost fibres. places_mm: (Q, 2).
+        found: the Q presses, with each of some sets of lost fibres. positions_mm: (Q, 2).
         measures: (Q,) of those that were learnt; where none is known its factor is 1.
     """
-    off = [(each.places_mm - places_mm) / each.sd_mm for each in found]
-    errors = [distances(each.places_mm, places_mm) for each in found]
+    off = [(each.positions_mm - positions_mm) / each.std_mm for each in found]
+    errors = [distances(each.positions_mm, positions_mm) for each in found]
     r50 = _covering(0.5, np.array([error / each.r50_mm for error, each in zip(errors, found, strict=True)]))
     r90 = _covering(0.9, np.array([error / each.r90_mm for error, each in zip(errors, found, strict=True)]))
     more = [_conformal_r90(each) for each in _paired(found, measures).values()]
@@ -182,19 +182,21 @@ def _conformal_r90(pairs: list[tuple[Measured, Array]]) -> float:
     return _covering(0.9, ratios) if ratios.shape[1] else 1.0
 
 
-def _paired(found: Sequence[Found], measures: Mapping[str, Array] | None) -> dict[str, list[tuple[Measured, Array]]]:
+def _paired(
+    found: Sequence[Localization], measures: Mapping[str, Array] | None
+) -> dict[str, list[tuple[Measured, Array]]]:
     """Of each measure learnt, how it was found with each set of lost fibres, and what it was; NaN if unknown."""
     names = list(found[0].measures)
-    unknown = np.full(len(found[0].places_mm), np.nan)
+    unknown = np.full(len(found[0].positions_mm), np.nan)
     return {name: [(each.measures[name], (measures or {}).get(name, unknown)) for each in found] for name in names}
 
 
-def by_place(found_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
+def by_place(predicted_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
     """Presses, mean and greatest error in each cell of the pad that was pressed; "x_mm", "y_mm" are its middle."""
     low, high = pressed_mm.min(axis=0), pressed_mm.max(axis=0)
     side = np.where(high > low, (high - low) / CELLS, 1.0)
     cells = np.minimum(((pressed_mm - low) / side).astype(int), CELLS - 1)
-    errors = distances(found_mm, pressed_mm)
+    errors = distances(predicted_mm, pressed_mm)
     rows = []
     for cell in np.unique(cells, axis=0):
         inside = (cells == cell).all(axis=1)
@@ -213,19 +215,21 @@ def by_place(found_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
 
 def idle_share(recording: Recording) -> Array:
     """(C,) share of presses in which each fibre is idle: it changes by less than 2 % of its range over all presses."""
-    changes = window_inputs(bridged(recording.readings), recording.begun, recording.lifted, release=False)[:, :, -1]
+    changes = window_inputs(bridged(recording.readings), recording.down_command, recording.up_command, release=False)[
+        :, :, -1
+    ]
     variation = np.ptp(changes, axis=0)
     return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
 
 
 def error_row(
-    lost: int, found: list[Found], places_mm: Array, measures: Mapping[str, Array] | None = None
+    lost: int, found: list[Localization], positions_mm: Array, measures: Mapping[str, Array] | None = None
 ) -> dict[str, Any]:
     """A row of "errors" from what was found with each set of so many lost fibres, and what was pressed."""
-    errors = np.stack([distances(each.places_mm, places_mm) for each in found])
+    errors = np.stack([distances(each.positions_mm, positions_mm) for each in found])
     means = errors.mean(axis=1)
     return {
-        "lost": lost,
+        "n_failed": lost,
         "subsets": len(errors),
         "mean_mm": float(means.mean()),
         "std_mm": float(means.std()),
@@ -238,7 +242,7 @@ def error_row(
     }
 
 
-def _measure_errors(found: Sequence[Found], measures: Mapping[str, Array] | None) -> dict[str, float]:
+def _measure_errors(found: Sequence[Localization], measures: Mapping[str, Array] | None) -> dict[str, float]:
     """What a row of "errors" says of the measures that were learnt and are known."""
     out = {}
     for name, pairs in _paired(found, measures).items():

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.validation import InputError
-from padforge.sense.arrays import LEAST_SPREAD_V, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
 
 Window = tuple[int, int]
 
@@ -55,58 +55,65 @@ MEDIAN = 15
 LEAST_THERE = 0.75
 """Share of a press's readings that a fibre must have given to count."""
 
-FEATURES = ("full", "causal", "early", "published")
+FEATURES = ("press_and_release", "causal", "onset", "published")
 """What inputs are made of: press and release, the press up to its end, its first readings, or the published values."""
-SIZES = {"full": len(DOWN) + len(UP), "causal": len(DOWN), "early": EARLY, "published": 3}
+SIZES = {"press_and_release": len(DOWN) + len(UP), "causal": len(DOWN), "onset": EARLY, "published": 3}
 """F, how many numbers of each fibre they are."""
 PHASES = {
-    "full": (slice(2, 5), slice(5, 9), slice(12, 17)),
+    "press_and_release": (slice(2, 5), slice(5, 9), slice(12, 17)),
     "causal": (slice(2, 5), slice(5, 9)),
-    "early": (slice(2, 6),),
+    "onset": (slice(2, 6),),
     "published": (),
 }
 """Windows in which a fibre answers more or less strongly together: while the probe sinks in, rests, and has gone."""
-PASTS = {"full": len(PAST) + len(SLOW), "causal": len(PAST) + len(SLOW), "early": len(PAST) + len(SLOW), "published": 0}
+PASTS = {
+    "press_and_release": len(PAST) + len(SLOW),
+    "causal": len(PAST) + len(SLOW),
+    "onset": len(PAST) + len(SLOW),
+    "published": 0,
+}
 """J, how many numbers of its history."""
 
 
 @dataclass(frozen=True)
-class Inputs:
+class PressFeatures:
     """What readings say of Q presses.
 
     Attributes:
         windows: (Q, C, F) V. history: (Q, C, J) V, relative to the rest before the press.
-        alive: (Q, C) whether the fibre gave enough readings to count.
+        fibre_mask: (Q, C) whether the fibre gave enough readings to count.
     """
 
     windows: Array
     history: Array
-    alive: Mask
+    fibre_mask: Mask
 
-    def __getitem__(self, rows: Indices | slice) -> "Inputs":
-        return Inputs(self.windows[rows], self.history[rows], self.alive[rows])
+    def __getitem__(self, rows: Indices | slice) -> "PressFeatures":
+        return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows])
 
-    def __add__(self, other: "Inputs") -> "Inputs":
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("windows", "history", "alive"))
-        return Inputs(*(np.concatenate(pair) for pair in pairs))
+    def __add__(self, other: "PressFeatures") -> "PressFeatures":
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("windows", "history", "fibre_mask"))
+        return PressFeatures(*(np.concatenate(pair) for pair in pairs))
 
     def __len__(self) -> int:
         return len(self.windows)
 
 
-def press_inputs(readings: Array, begun: Indices, lifted: Indices, features: str) -> Inputs:
+def press_inputs(readings: Array, down_command: Indices, up_command: Indices, features: str) -> PressFeatures:
     """The inputs of every press.
 
     Args:
-        readings: (R, C) volts, NaN where missing. begun, lifted: (Q,) first reading after the probe was sent down, up.
+        readings: (R, C) volts, NaN where missing. down_command, up_command: (Q,) first reading after the probe was sent down, up.
         features: one of `FEATURES`.
     """
     filled = bridged(readings)
-    alive = _there(readings, begun, lifted, features)
+    fibre_mask = _there(readings, down_command, up_command, features)
     if features == "published":
-        return Inputs(published_inputs(filled, begun, lifted), np.empty((*alive.shape, 0)), alive)
-    windows = window_inputs(filled, begun, lifted, release=features == "full")
-    return Inputs(windows[:, :, : SIZES[features]], history(filled, begun), alive)
+        return PressFeatures(
+            published_inputs(filled, down_command, up_command), np.empty((*fibre_mask.shape, 0)), fibre_mask
+        )
+    windows = window_inputs(filled, down_command, up_command, release=features == "press_and_release")
+    return PressFeatures(windows[:, :, : SIZES[features]], history(filled, down_command), fibre_mask)
 
 
 def bridged(readings: Array) -> Array:
@@ -122,40 +129,40 @@ def bridged(readings: Array) -> Array:
     return filled
 
 
-def _there(readings: Array, begun: Indices, lifted: Indices, features: str) -> Mask:
+def _there(readings: Array, down_command: Indices, up_command: Indices, features: str) -> Mask:
     """(Q, C) whether enough of a press's readings are there, from its rest to the end of what `features` looks at."""
     counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
-    first = np.maximum(begun + REST[0], 0)
-    ends = lifted if features in ("causal", "early") else lifted + UP[-1][1]
+    first = np.maximum(down_command + REST[0], 0)
+    ends = up_command if features in ("causal", "onset") else up_command + UP[-1][1]
     ends = np.minimum(ends, len(readings))
     return counts[ends] - counts[first] >= LEAST_THERE * (ends - first)[:, None]
 
 
-def window_inputs(readings: Array, begun: Indices, lifted: Indices, release: bool = True) -> Array:
+def window_inputs(readings: Array, down_command: Indices, up_command: Indices, release: bool = True) -> Array:
     """Means over windows of the press and its release, minus the mean at rest before it.
 
     Args:
-        readings: (R, C) volts, none missing. begun, lifted: (Q,) first reading after the probe was sent down, and up.
+        readings: (R, C) volts, none missing. down_command, up_command: (Q,) first reading after the probe was sent down, and up.
         release: whether the windows after the release are wanted.
 
     Returns:
         (Q, C, 17) volts, or (Q, C, 9).
     """
-    free, following = _neighbours(begun, lifted, len(readings))
-    rest = _gather(readings, begun, REST, free, begun).mean(axis=1)
-    means = [_gather(readings, begun, window, begun, lifted).mean(axis=1) for window in DOWN]
+    free, following = _neighbours(down_command, up_command, len(readings))
+    rest = _gather(readings, down_command, REST, free, down_command).mean(axis=1)
+    means = [_gather(readings, down_command, window, down_command, up_command).mean(axis=1) for window in DOWN]
     if release:
-        means += [_gather(readings, lifted, window, begun, following).mean(axis=1) for window in UP]
+        means += [_gather(readings, up_command, window, down_command, following).mean(axis=1) for window in UP]
     return np.stack(means, axis=2) - rest[:, :, None]
 
 
-def history(readings: Array, begun: Indices) -> Array:
+def history(readings: Array, down_command: Indices) -> Array:
     """What each fibre gave before the presses, relative to the rest just before: windows, then slow medians.
 
     Whatever was recorded counts, whether or not a press is known there.
 
     Args:
-        readings: (R, C) volts, none missing. begun: (Q,).
+        readings: (R, C) volts, none missing. down_command: (Q,).
 
     Returns:
         (Q, C, 16) volts.
@@ -164,40 +171,44 @@ def history(readings: Array, begun: Indices) -> Array:
     sums = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(readings - level, axis=0)])
 
     def mean(window: Window) -> Array:
-        first = np.maximum(begun + window[0], 0)
-        end = np.maximum(begun + window[1], first + 1)
+        first = np.maximum(down_command + window[0], 0)
+        end = np.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + level
 
     rest = mean(REST)
     windows = [mean(window) for window in PAST]
-    slow = [_settled(readings, begun, length) for length in SLOW]
+    slow = [_settled(readings, down_command, length) for length in SLOW]
     return np.stack(windows + slow, axis=2) - rest[:, :, None]
 
 
-def _settled(readings: Array, begun: Indices, length: int) -> Array:
+def _settled(readings: Array, down_command: Indices, length: int) -> Array:
     """(Q, C) medians of some readings spread over the `length` before each press."""
     offsets = np.arange(-length, 0, length // SLOW_SAMPLES)
-    out = np.empty((len(begun), readings.shape[1]))
-    for part in range(0, len(begun), 1024):
-        index = np.maximum(begun[part : part + 1024, None] + offsets, 0)
+    out = np.empty((len(down_command), readings.shape[1]))
+    for part in range(0, len(down_command), 1024):
+        index = np.maximum(down_command[part : part + 1024, None] + offsets, 0)
         out[part : part + 1024] = np.median(readings[index], axis=1)
     return out
 
 
-def published_inputs(readings: Array, begun: Indices, lifted: Indices) -> Array:
+def published_inputs(readings: Array, down_command: Indices, up_command: Indices) -> Array:
     """The published inputs: the running median of 15 readings before, in and after the press.
 
     Args and returns as `window_inputs`, but (Q, C, 3) volts.
     """
-    free, following = _neighbours(begun, lifted, len(readings))
+    free, following = _neighbours(down_command, up_command, len(readings))
     reach = (-(MEDIAN // 2), MEDIAN // 2 + 1)
-    ranges = ((begun - 10, free, begun), (begun + 10, begun, lifted), (lifted + 10, begun, following))
+    ranges = (
+        (down_command - 10, free, down_command),
+        (down_command + 10, down_command, up_command),
+        (up_command + 10, down_command, following),
+    )
     return np.stack([np.median(_gather(readings, at, reach, low, high), axis=1) for at, low, high in ranges], axis=2)
 
 
-def _neighbours(begun: Indices, lifted: Indices, readings: int) -> tuple[Indices, Indices]:
+def _neighbours(down_command: Indices, up_command: Indices, readings: int) -> tuple[Indices, Indices]:
     """(Q,) the first reading that no earlier press owns, and the first that belongs to the next press."""
-    return np.concatenate([[0], lifted[:-1]]), np.concatenate([begun[1:], [readings]])
+    return np.concatenate([[0], up_command[:-1]]), np.concatenate([down_command[1:], [readings]])
 
 
 def _gather(readings: Array, at: Indices, window: Window, low: Indices, high: Indices) -> Array:
@@ -241,7 +252,7 @@ class ResponseModel:
         places: Array,
         windows: Array,
         history: Array,
-        alive: Mask,
+        fibre_mask: Mask,
         strengths: Array | None = None,
         phases: Sequence[slice] = (),
     ) -> "ResponseModel":
@@ -261,12 +272,12 @@ class ResponseModel:
         memory = np.zeros((fibres, pasts, size + len(phases)))
         table = np.zeros((len(at_table), fibres, size + len(phases)))
         penalty = np.diag(np.repeat([RIDGE_PLACE, RIDGE_HISTORY], [BUMPS**2, pasts]))
-        for fibre in np.flatnonzero(alive.any(axis=0)):
-            there = alive[:, fibre]
+        for fibre in np.flatnonzero(fibre_mask.any(axis=0)):
+            there = fibre_mask[:, fibre]
             past, answer = history[there, fibre], windows[there, fibre]
             usual[fibre] = past.mean(axis=0)
             spread = past.std(axis=0)
-            past = np.divide(past - usual[fibre], spread, out=np.zeros_like(past), where=spread > LEAST_SPREAD_V)
+            past = np.divide(past - usual[fibre], spread, out=np.zeros_like(past), where=spread > MIN_SCALE_V)
             shown = None if strengths is None else strengths[there]
             own, both = _moments(places[there], past, answer, shown)
             weights = np.linalg.solve(own + penalty, both)
@@ -278,7 +289,7 @@ class ResponseModel:
                 gains = [_gain(expected[:, phase].mean(axis=1), left[:, phase].mean(axis=1), past) for phase in phases]
             shares = np.column_stack([by_past, *(-gain for gain in gains)])
             memory[fibre] = np.divide(
-                shares, spread[:, None], out=np.zeros(shares.shape), where=spread[:, None] > LEAST_SPREAD_V
+                shares, spread[:, None], out=np.zeros(shares.shape), where=spread[:, None] > MIN_SCALE_V
             )
             table[:, fibre, :size] = at_table @ by_place
         return cls(table.reshape(STEPS + 1, STEPS + 1, fibres, -1), memory, usual)
@@ -294,7 +305,7 @@ def _answers(places: Array, by_place: Any, strengths: Array | None) -> Array:
 def _gain(expected: Array, left: Array, past: Array) -> Array:
     """(J,) by how much, as a share, a spread of each history strengthens (Q,) answers that leave (Q,) to explain."""
     usual = expected.std()
-    if not past.shape[1] or usual <= LEAST_SPREAD_V:
+    if not past.shape[1] or usual <= MIN_SCALE_V:
         return np.zeros(past.shape[1])
     known = np.hstack([expected[:, None] / usual * past, past])  # what is added anew is none of the gain
     own = known.T @ known + RIDGE_HISTORY * np.eye(known.shape[1])
@@ -364,25 +375,25 @@ MAX_INPUT = 1e4
 
 
 @dataclass(frozen=True)
-class Scaled:
+class ScaledFeatures:
     """Presses as the network takes them.
 
     Attributes:
-        inputs: (Q, C, F). alive: (Q, C) whether the fibre gave enough readings to count.
+        inputs: (Q, C, F). fibre_mask: (Q, C) whether the fibre gave enough readings to count.
     """
 
     inputs: Floats
-    alive: Mask
+    fibre_mask: Mask
 
-    def __getitem__(self, rows: slice | Indices) -> "Scaled":
-        return Scaled(self.inputs[rows], self.alive[rows])
+    def __getitem__(self, rows: slice | Indices) -> "ScaledFeatures":
+        return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows])
 
     def __len__(self) -> int:
         return len(self.inputs)
 
 
 @dataclass(frozen=True)
-class Target:
+class TargetScaler:
     """What the network gives beside the place.
 
     Attributes:
@@ -395,7 +406,7 @@ class Target:
     span: float
 
     @classmethod
-    def of(cls, name: str, values: Array) -> "Target":
+    def of(cls, name: str, values: Array) -> "TargetScaler":
         """The one that puts (Q,) known values within [-1, 1]."""
         low, high = float(values.min()), float(values.max())
         return cls(name, (low + high) / 2, (high - low) / 2 or 1.0)
@@ -410,14 +421,14 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Normalization:
+class FeatureScaler:
     """Fitted on the presses of training.
 
     Attributes:
         centre, spread: (C, F + G) V; an input enters as (input - centre) / spread. The G gains enter as they are.
         memory: (C, J, F + G) V/V, what of a volt of history shows in the inputs, see `ResponseModel`.
         usual: (C, J) V, the usual history.
-        middle_mm: (2,) place that the network calls 0. span_mm: distance that it calls 1.
+        origin_mm: (2,) place that the network calls 0. span_mm: distance that it calls 1.
         measures: what the network gives beside the place; none, the depth, or depth and force, in this order.
         half_mm: (2,) half the width and height of what was pressed; None where nobody has kept it.
     """
@@ -426,19 +437,19 @@ class Normalization:
     spread: Array
     memory: Array
     usual: Array
-    middle_mm: Array
+    origin_mm: Array
     span_mm: float
-    measures: Sequence[Target] = ()
+    measures: Sequence[TargetScaler] = ()
     half_mm: Array | None = None
 
     @classmethod
     def fit(
         cls,
-        inputs: Inputs,
-        places_mm: Array,
+        inputs: PressFeatures,
+        positions_mm: Array,
         measures: Mapping[str, Array] | None = None,
         phases: Sequence[slice] = (),
-    ) -> tuple["Normalization", Floats]:
+    ) -> tuple["FeatureScaler", Floats]:
         """From the inputs and the places (Q, 2) of the presses of training, and (Q,) of each measure to be learnt.
 
         For each of `phases`, windows that are stronger together, what came before a press tells a gain. A window is
@@ -449,20 +460,20 @@ class Normalization:
             The scaling, and the scaled inputs by place (S, S, C, F + G), see `ResponseModel.table`; of several depths,
             for the one that the network calls 0.
         """
-        targets = tuple(Target.of(name, values) for name, values in (measures or {}).items())
-        low, high = places_mm.min(axis=0), places_mm.max(axis=0)
+        targets = tuple(TargetScaler.of(name, values) for name, values in (measures or {}).items())
+        low, high = positions_mm.min(axis=0), positions_mm.max(axis=0)
         middle, span = (low + high) / 2, float((high - low).max() / 2) or 1.0
         strengths = measures["depth_mm"] / targets[0].middle if measures else None
         response = ResponseModel.fit(
-            (places_mm - middle) / span, inputs.windows, inputs.history, inputs.alive, strengths, phases
+            (positions_mm - middle) / span, inputs.windows, inputs.history, inputs.fibre_mask, strengths, phases
         )
         size = inputs.windows.shape[2]
         windows = settled(inputs.windows, inputs.history, response.memory, response.usual)[:, :, :size]
-        there = np.broadcast_to(inputs.alive[:, :, None], windows.shape)
+        there = np.broadcast_to(inputs.fibre_mask[:, :, None], windows.shape)
         centre = _mean(windows, there)
         variance = _mean((windows - centre) ** 2, there)
         spread = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
-        spread = np.where(spread >= LEAST_SPREAD_V, spread, 1.0)
+        spread = np.where(spread >= MIN_SCALE_V, spread, 1.0)
         centre = np.zeros_like(centre) if targets else centre
         gains = ((0, 0), (0, len(phases)))
         centre, spread = np.pad(centre, gains), np.pad(spread, gains, constant_values=1.0)
@@ -480,11 +491,13 @@ class Normalization:
 
     def entries(self, method: str) -> int:
         """D, the numbers that enter the network: the inputs, and, if masked, one a fibre that says whether it lives."""
-        return self.centre.size + (len(self.centre) if method == "masked" else 0)
+        return self.centre.size + (len(self.centre) if method == "ensemble" else 0)
 
-    def inputs(self, inputs: Inputs) -> Scaled:
+    def inputs(self, inputs: PressFeatures) -> ScaledFeatures:
         """What the network takes."""
-        return Scaled(self.scaled(settled(inputs.windows, inputs.history, self.memory, self.usual)), inputs.alive)
+        return ScaledFeatures(
+            self.scaled(settled(inputs.windows, inputs.history, self.memory, self.usual)), inputs.fibre_mask
+        )
 
     def scaled(self, windows: Array) -> Floats:
         """(..., C, F + G) volts after the usual history, and gains, to numbers of about 1."""
@@ -495,14 +508,14 @@ class Normalization:
         """By how much a press grows stronger, as a share of one of the middle depth, for a depth that is 1 greater."""
         return self.measures[0].span / self.measures[0].middle if self.measures else 0.0
 
-    def targets(self, places_mm: Array, measures: Mapping[str, Array] | None = None) -> Floats:
+    def targets(self, positions_mm: Array, measures: Mapping[str, Array] | None = None) -> Floats:
         """(Q, 2) mm, and (Q,) of each measure that is learnt, to what the network gives, (Q, 2 + T)."""
         more = [each.scaled((measures or {})[each.name]) for each in self.measures]
-        return np.column_stack([(places_mm - self.middle_mm) / self.span_mm, *more]).astype(np.float32)
+        return np.column_stack([(positions_mm - self.origin_mm) / self.span_mm, *more]).astype(np.float32)
 
-    def places_mm(self, targets: Floats) -> Array:
+    def positions_mm(self, targets: Floats) -> Array:
         """What the network gives of places, (Q, 2), to mm."""
-        return targets * self.span_mm + self.middle_mm
+        return targets * self.span_mm + self.origin_mm
 
 
 def _mean(windows: Array, there: Mask) -> Array:
@@ -515,12 +528,12 @@ class TrainingPresses:
     """Presses to learn from or to check on.
 
     Attributes:
-        inputs: (Q, C, F) scaled. alive: (Q, C).
-        targets: (Q, 2 + T) what the network is to give. stretch: see `Normalization`.
+        inputs: (Q, C, F) scaled. fibre_mask: (Q, C).
+        targets: (Q, 2 + T) what the network is to give. stretch: see `FeatureScaler`.
     """
 
     inputs: Floats
-    alive: Mask
+    fibre_mask: Mask
     targets: Floats
     stretch: float = 0.0
 

@@ -1,6 +1,6 @@
 """The networks of the localizer, in NumPy: what they compute, apart from how they are trained.
 
-Of the method "masked": masked inputs enter together with the mask, so one network serves every set of lost fibres. A
+Of the method "ensemble": masked inputs enter together with the mask, so one network serves every set of lost fibres. A
 first layer leads to residual layers h + gelu(normalised h) W + b, and a normalised last one to two coordinates, to what
 else is learnt of a press, and to the logarithms of the expected errors of all these. Members of an ensemble are stacked
 along the first axis of every array. Of the method "published": one layer of tanh neurons leads to two coordinates."""
@@ -43,14 +43,14 @@ def refuse_unsound(weights: Weights, entries: int, method: str, measures: int = 
     if len(first) != 3 or len(layers) != 1 or 0 in first:
         raise InputError(f"weights have shapes {found}, expected first.w (E, D, H) and others")
     members, _, hidden = first
-    outputs = OUTPUTS + 2 * measures if method == "masked" else 2
+    outputs = OUTPUTS + 2 * measures if method == "ensemble" else 2
     expected = {
         "first.w": (members, entries, hidden),
         "first.b": (members, 1, hidden),
         "last.w": (members, hidden, outputs),
         "last.b": (members, 1, outputs),
     }
-    if method == "masked":
+    if method == "ensemble":
         expected |= {"hidden.w": (*layers, members, hidden, hidden), "hidden.b": (*layers, members, 1, hidden)}
     if found != expected:
         raise InputError(f"weights have shapes {found}, expected {expected}")
@@ -62,18 +62,18 @@ def refuse_unsound(weights: Weights, entries: int, method: str, measures: int = 
             )
 
 
-def masked(inputs: Floats, alive: Mask) -> Floats:
+def masked(inputs: Floats, fibre_mask: Mask) -> Floats:
     """What enters the network: the inputs of the living fibres, zeros for the lost, then the mask.
 
     Args:
-        inputs: (Q, C, F) scaled inputs. alive: (C,) or (Q, C).
+        inputs: (Q, C, F) scaled inputs. fibre_mask: (C,) or (Q, C).
 
     Returns:
         (Q, C F + C). A lost fibre's inputs are replaced, not multiplied: not even NaN gets through.
     """
-    alive = np.broadcast_to(alive, inputs.shape[:2])
-    kept = np.where(alive[:, :, None], inputs, np.float32(0))
-    return np.concatenate([kept.reshape(len(inputs), -1), alive.astype(np.float32)], axis=1)
+    fibre_mask = np.broadcast_to(fibre_mask, inputs.shape[:2])
+    kept = np.where(fibre_mask[:, :, None], inputs, np.float32(0))
+    return np.concatenate([kept.reshape(len(inputs), -1), fibre_mask.astype(np.float32)], axis=1)
 
 
 def forward(weights: Weights, x: Floats) -> Floats:
@@ -93,22 +93,22 @@ def forward(weights: Weights, x: Floats) -> Floats:
 def learnt(
     weights: Weights,
     inputs: Floats,
-    alive: Mask,
-    method: str = "masked",
-    observer: Observing | None = None,
-    corrector: Weights = MappingProxyType({}),
+    fibre_mask: Mask,
+    method: str = "ensemble",
+    bayes: Observing | None = None,
+    residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
     """(E, Q, 2 N) what the members give of Q presses, see `network.forward`, the corrected observer as the last.
 
     Args:
-        inputs: (Q, C, F + G) scaled. alive: (Q, C).
+        inputs: (Q, C, F + G) scaled. fibre_mask: (Q, C).
     """
-    entries = inputs.reshape(len(inputs), -1) if method == "published" else masked(inputs, alive)
+    entries = inputs.reshape(len(inputs), -1) if method == "published" else masked(inputs, fibre_mask)
     outputs = forward(weights, entries)
-    if observer is None:
+    if bayes is None:
         return outputs
-    place, told = observer(inputs.astype(np.float64), alive)
-    corrected = forward(corrector, np.concatenate([entries, told.astype(np.float32)], axis=1))
+    place, told = bayes(inputs.astype(np.float64), fibre_mask)
+    corrected = forward(residual_network, np.concatenate([entries, told.astype(np.float32)], axis=1))
     corrected[:, :, :2] += place
     return np.concatenate([outputs, corrected])
 

@@ -23,8 +23,8 @@ from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.evaluation import conformal, distances, error_row
-from padforge.sense.localizer.features import Inputs
-from padforge.sense.localizer.localizer import Found, Localizer, joined
+from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.model import Localization, LocalizerModel, joined
 from padforge.sense.localizer.network import Weights
 from padforge.sense.recording.recording import Recording
 
@@ -37,25 +37,28 @@ STEP = 0.02
 
 
 def fit_correction(
-    localizer: Localizer, raw: Inputs, places_mm: Array, measures: Mapping[str, Array] = MappingProxyType({})
-) -> Localizer:
+    localizer: LocalizerModel,
+    raw: PressFeatures,
+    positions_mm: Array,
+    measures: Mapping[str, Array] = MappingProxyType({}),
+) -> LocalizerModel:
     """The corrected localizer that finds presses nearest to where they were, in robust least squares.
 
     A correction costs the square of its size in the spreads expected, so of three presses little is made.
 
     Args:
-        raw: inputs of Q presses in volts. places_mm: (Q, 2).
+        raw: inputs of Q presses in volts. positions_mm: (Q, 2).
         measures: (Q,) of those that the localizer has learnt, as far as they are known; NaN tells nothing.
     """
     from scipy.optimize import least_squares  # slow to import, and needed here only
 
-    expected = localizer.locate(localizer.normalization.inputs(raw))
+    expected = localizer.predict_features(localizer.scaler.inputs(raw))
 
     def off(numbers: Array) -> Array:
         # Numbers are counted from 1, since the solver takes its steps relative to them.
         found = _corrected(localizer, numbers - 1)
-        presses = found.locate(found.normalization.inputs(raw))
-        misses = (presses.places_mm - places_mm) / expected.sd_mm
+        presses = found.predict_features(found.scaler.inputs(raw))
+        misses = (presses.positions_mm - positions_mm) / expected.std_mm
         more = [
             (each.values - measures[name]) / (expected.measures[name].r90 / IN_R90)
             for name, each in presses.measures.items()
@@ -68,24 +71,22 @@ def fit_correction(
     return replace(_corrected(localizer, numbers), table=_moved_table(localizer, *_parts(localizer, numbers)[1:]))
 
 
-def _parts(localizer: Localizer, numbers: Array) -> tuple[Array, Array, Array]:
+def _parts(localizer: LocalizerModel, numbers: Array) -> tuple[Array, Array, Array]:
     """Gains (C,), turn (2, 2) and shift (2,), in spans, from numbers in spreads."""
     angle, stretch = TURN * numbers[-4:-2]
     turn = np.exp(stretch) * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return np.exp(GAIN * numbers[:-4]), turn, SHIFT * numbers[-2:]
 
 
-def _corrected(localizer: Localizer, numbers: Array) -> Localizer:
+def _corrected(localizer: LocalizerModel, numbers: Array) -> LocalizerModel:
     gains, turn, shift = _parts(localizer, numbers)
-    before, observer, gains = localizer.normalization, localizer.observer, gains[:, None]
+    before, bayes, gains = localizer.scaler, localizer.bayes, gains[:, None]
     return replace(
         localizer,
         weights=_turned(localizer.weights, turn, shift),
-        observer=observer and observer.moved(turn, shift),
-        corrector=_turned(localizer.corrector, turn, np.zeros(2)) if observer else {},
-        normalization=replace(
-            before, centre=gains * before.centre, spread=gains * before.spread, usual=gains * before.usual
-        ),
+        bayes=bayes and bayes.moved(turn, shift),
+        residual_network=_turned(localizer.residual_network, turn, np.zeros(2)) if bayes else {},
+        scaler=replace(before, centre=gains * before.centre, spread=gains * before.spread, usual=gains * before.usual),
     )
 
 
@@ -96,7 +97,7 @@ def _turned(weights: Weights, turn: Array, shift: Array) -> Weights:
     return {**weights, "last.w": last, "last.b": bias}
 
 
-def _moved_table(localizer: Localizer, turn: Array, shift: Array) -> Floats:
+def _moved_table(localizer: LocalizerModel, turn: Array, shift: Array) -> Floats:
     """The table by places as they are called now; over the edge, what is at the edge."""
     from scipy.interpolate import RegularGridInterpolator
 
@@ -106,7 +107,7 @@ def _moved_table(localizer: Localizer, turn: Array, shift: Array) -> Floats:
     return RegularGridInterpolator((grid, grid), localizer.table)(before).astype(np.float32)
 
 
-FORMAT = "padforge-recalibration/1"
+FORMAT = "padforge-recalibration/2"
 LEAST_PRESSES = 10
 """New presses needed: fewer can neither change much nor show that it was for the better."""
 FOLDS = 5
@@ -118,17 +119,17 @@ SUBSETS = 16
 """Sets of lost fibres of a size that are looked at, at most."""
 
 Measures = Mapping[str, Array]
-FoundByLoss = Mapping[tuple[int, ...], Found]
-Change = Callable[[Localizer, Inputs, Array, Measures], Localizer]
+FoundByLoss = Mapping[tuple[int, ...], Localization]
+Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
 
 
 def recalibrate(
-    localizer: Localizer,
+    localizer: LocalizerModel,
     recording: Recording,
     *,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Localizer, dict[str, Any]]:
+) -> tuple[LocalizerModel, dict[str, Any]]:
     """Follow a pad that has changed since `localizer` was trained.
 
     The radii only ever grow: they are widened where presses left out lie outside more often than they should. What the
@@ -147,17 +148,17 @@ def recalibrate(
     Raises:
         InputError: too few presses of known place, or a recording that does not suit the localizer.
     """
-    check_type("localizer", localizer, Localizer)
+    check_type("localizer", localizer, LocalizerModel)
     known = np.flatnonzero(check_type("recording", recording, Recording).known)
     seed = check_int("seed", seed, 0, 2**32 - 1)
     if len(known) < LEAST_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known place, expected at least {LEAST_PRESSES}")
     rows = np.random.default_rng(seed).permutation(known)
-    raw, places_mm = localizer.raw_inputs(recording)[rows], recording.presses_mm[rows]
-    measures = {each.name: recording.measures[each.name][rows] for each in localizer.normalization.measures}
-    levels = range(len(localizer.factors))
+    raw, positions_mm = localizer.raw_features(recording)[rows], recording.presses_mm[rows]
+    measures = {each.name: recording.measures[each.name][rows] for each in localizer.scaler.measures}
+    levels = range(len(localizer.interval_factors))
     subsets = [subset for level in levels for subset in failure_subsets(localizer.fibres, level, SUBSETS)]
-    validation = CrossValidation(raw, places_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
+    validation = CrossValidation(raw, positions_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
     before = validation.found([localizer] * FOLDS)
     now, after, changes = _changed(localizer, validation, before, seed, progress)
     gain, error = validation.gain(before, after)
@@ -178,7 +179,7 @@ def recalibrate(
     }
     now = replace(
         now,
-        factors=np.minimum(now.factors * widened, 1e6),
+        interval_factors=np.minimum(now.interval_factors * widened, 1e6),
         recalibrated_by=(*localizer.recalibrated_by, recording.digest),
         provenance=made_by,
     )
@@ -186,14 +187,14 @@ def recalibrate(
 
 
 def _changed(
-    localizer: Localizer,
+    localizer: LocalizerModel,
     validation: "CrossValidation",
     before: FoundByLoss,
     seed: int,
     progress: Callable[[int, int], None],
-) -> tuple[Localizer, FoundByLoss, list[str]]:
+) -> tuple[LocalizerModel, FoundByLoss, list[str]]:
     """The localizer with the changes that are worth it, what is found of presses left out, and the changes' names."""
-    steps, total = count(1), 2 + (FOLDS + 1 if localizer.method == "masked" else 0)
+    steps, total = count(1), 2 + (FOLDS + 1 if localizer.method == "ensemble" else 0)
 
     def step() -> None:
         progress(next(steps), total)
@@ -207,10 +208,12 @@ def _changed(
         now, kept, after = fit_correction(now, *validation.presses), corrected, found
         changes.append("corrected")
     step()
-    if localizer.method == "masked":
+    if localizer.method == "ensemble":
 
-        def adapt(old: Localizer, inputs: Inputs, places_mm: Array, measures: Measures) -> Localizer:
-            changed = _adapted(old, inputs, places_mm, measures, np.random.default_rng([seed, len(inputs)]))
+        def adapt(
+            old: LocalizerModel, inputs: PressFeatures, positions_mm: Array, measures: Measures
+        ) -> LocalizerModel:
+            changed = _adapted(old, inputs, positions_mm, measures, np.random.default_rng([seed, len(inputs)]))
             step()
             return changed
 
@@ -225,64 +228,68 @@ def _changed(
 
 
 def _adapted(
-    localizer: Localizer, raw: Inputs, places_mm: Array, measures: Measures, rng: np.random.Generator
-) -> Localizer:
+    localizer: LocalizerModel, raw: PressFeatures, positions_mm: Array, measures: Measures, rng: np.random.Generator
+) -> LocalizerModel:
     from padforge.sense.localizer.features import TrainingPresses
     from padforge.sense.localizer.training import adapt
 
-    scaling, scaled = localizer.normalization, localizer.normalization.inputs(raw)
-    found = localizer.locate(scaled).measures  # where it is not known how deep a press was, it goes on being found so
+    scaling, scaled = localizer.scaler, localizer.scaler.inputs(raw)
+    found = localizer.predict_features(
+        scaled
+    ).measures  # where it is not known how deep a press was, it goes on being found so
     known = {name: np.where(np.isnan(values), found[name].values, values) for name, values in measures.items()}
-    samples = TrainingPresses(scaled.inputs, scaled.alive, scaling.targets(places_mm, known), scaling.stretch)
-    given, lost = (samples, localizer.table), len(localizer.factors) - 1
-    weights, observer, corrector = adapt(localizer.weights, *given, lost, rng), localizer.observer, localizer.corrector
-    if observer is not None:
-        corrector = adapt(corrector, *given, lost, rng, observer=observer)
-    return replace(localizer, weights=weights, corrector=corrector)
+    samples = TrainingPresses(scaled.inputs, scaled.fibre_mask, scaling.targets(positions_mm, known), scaling.stretch)
+    given, lost = (samples, localizer.table), len(localizer.interval_factors) - 1
+    weights, bayes, residual_network = (
+        adapt(localizer.weights, *given, lost, rng),
+        localizer.bayes,
+        localizer.residual_network,
+    )
+    if bayes is not None:
+        residual_network = adapt(residual_network, *given, lost, rng, bayes=bayes)
+    return replace(localizer, weights=weights, residual_network=residual_network)
 
 
 class CrossValidation:
     """Cross-validation on the new presses.
 
     Args:
-        raw, places_mm: inputs and places (Q, 2) of the presses. folds: indices that are left out in turn, in order.
+        raw, positions_mm: inputs and places (Q, 2) of the presses. folds: indices that are left out in turn, in order.
         subsets: the sets of lost fibres to look at, by number of lost fibres.
         measures: (Q,) of each that the localizers have learnt, NaN where it is not known.
     """
 
     def __init__(
         self,
-        raw: Inputs,
-        places_mm: Array,
+        raw: PressFeatures,
+        positions_mm: Array,
         folds: Sequence[Indices],
         subsets: Sequence[tuple[int, ...]],
         measures: Measures = MappingProxyType({}),
     ) -> None:
-        self._raw, self._places_mm, self._measures = raw, places_mm, measures
+        self._raw, self._positions_mm, self._measures = raw, positions_mm, measures
         self._folds, self._subsets = folds, subsets
 
     @property
-    def presses(self) -> tuple[Inputs, Array, Measures]:
+    def presses(self) -> tuple[PressFeatures, Array, Measures]:
         """Inputs, places and measures of them all."""
-        return self._raw, self._places_mm, self._measures
+        return self._raw, self._positions_mm, self._measures
 
-    def changed(self, localizers: Sequence[Localizer], change: Change) -> list[Localizer]:
+    def changed(self, localizers: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
         """The localizers, one a fold, each changed by the presses that its fold does not hold."""
         out = []
         for localizer, fold in zip(localizers, self._folds, strict=True):
-            rest = np.setdiff1d(np.arange(len(self._places_mm)), fold)
+            rest = np.setdiff1d(np.arange(len(self._positions_mm)), fold)
             measures = {name: values[rest] for name, values in self._measures.items()}
-            out.append(change(localizer, self._raw[rest], self._places_mm[rest], measures))
+            out.append(change(localizer, self._raw[rest], self._positions_mm[rest], measures))
         return out
 
-    def found(self, localizers: Sequence[Localizer]) -> FoundByLoss:
+    def found(self, localizers: Sequence[LocalizerModel]) -> FoundByLoss:
         """Each press found by the localizer of the fold that holds it, with each set of lost fibres."""
-        scaled = [
-            each.normalization.inputs(self._raw[fold]) for each, fold in zip(localizers, self._folds, strict=True)
-        ]
+        scaled = [each.scaler.inputs(self._raw[fold]) for each, fold in zip(localizers, self._folds, strict=True)]
         out = {}
         for lost in self._subsets:
-            parts = [each.locate(part, lost) for each, part in zip(localizers, scaled, strict=True)]
+            parts = [each.predict_features(part, lost) for each, part in zip(localizers, scaled, strict=True)]
             out[lost] = joined(parts)
         return out
 
@@ -298,21 +305,21 @@ class CrossValidation:
     def summary(self, found: FoundByLoss) -> list[dict[str, Any]]:
         """Rows as "errors" of `evaluate`."""
         return [
-            error_row(len(level[0]), [found[lost] for lost in level], self._places_mm, self._measures)
+            error_row(len(level[0]), [found[lost] for lost in level], self._positions_mm, self._measures)
             for level in self._levels()
         ]
 
     def widened(self, found: FoundByLoss) -> Array:
         """(K, 3) what makes the deviations and radii hold at least for these presses; 1 where they do."""
         by_level = ([found[lost] for lost in sets] for sets in self._levels())
-        return np.maximum([conformal(each, self._places_mm, self._measures) for each in by_level], 1.0)
+        return np.maximum([conformal(each, self._positions_mm, self._measures) for each in by_level], 1.0)
 
     def _levels(self) -> list[list[tuple[int, ...]]]:
         sizes = dict.fromkeys(len(lost) for lost in self._subsets)
         return [[lost for lost in self._subsets if len(lost) == size] for size in sizes]
 
-    def _errors(self, found: Found) -> Array:
-        return distances(found.places_mm, self._places_mm)
+    def _errors(self, found: Localization) -> Array:
+        return distances(found.positions_mm, self._positions_mm)
 
 
 def recalibration_lines(document: Mapping[str, Any]) -> list[str]:

@@ -10,7 +10,7 @@ loses a random few fibres of every press and moves the press by a few millimetre
 `response_model` of the pad says. Of several depths, these are learnt too, with forces where they are known, and presses
 are moved in depth as well: the lighter, and so the more blurred, the farther. The rate follows one cycle; what is kept
 is a running average of the weights. None of it is chosen by presses held back: so few as there are choose by chance.
-Beside the members, which know nothing of it, a smaller network learns to correct what an `observer` finds: their
+Beside the members, which know nothing of it, a smaller network learns to correct what an `bayes` finds: their
 errors are of different kinds, so together they err by a tenth less than two of either. All are independent, each on a
 thread of its own. In a time budget, the cycle is one of time, and there is a network for every core, and more of them
 only where each can be trained for five times its usual length: until then, longer training gains more.
@@ -40,7 +40,7 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.networks import fit_batch
 from padforge.sense import settings
 from padforge.sense.arrays import Floats
-from padforge.sense.localizer.bayes import TOLD, Observer
+from padforge.sense.localizer.bayes import TOLD, BayesianLocalizer
 from padforge.sense.localizer.features import TrainingPresses, as_unseen, looked_up
 from padforge.sense.localizer.model_files import average_in, one_cycle
 from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Weights
@@ -95,19 +95,19 @@ def draw_alive(batch: int, fibres: int, lost: int, generator: torch.Generator) -
     return (rank >= count) | whole
 
 
-def masked(inputs: Tensor, alive: Tensor) -> Tensor:
+def masked(inputs: Tensor, fibre_mask: Tensor) -> Tensor:
     """(B, C, F) inputs and (B, C) masks to (B, C F + C) entries, as `network.masked`."""
-    kept = torch.where(alive[..., None], inputs, 0.0)
-    return torch.cat([kept.flatten(1), alive.to(inputs.dtype)], dim=1)
+    kept = torch.where(fibre_mask[..., None], inputs, 0.0)
+    return torch.cat([kept.flatten(1), fibre_mask.to(inputs.dtype)], dim=1)
 
 
-def entries(inputs: Tensor, alive: Tensor, observer: Observer | None) -> tuple[Tensor, Tensor]:
+def entries(inputs: Tensor, fibre_mask: Tensor, bayes: BayesianLocalizer | None) -> tuple[Tensor, Tensor]:
     """(B, D) what enters a network for (B, C, F) inputs, and the place that it is to correct: (B, 2), or 0 for none."""
-    known = masked(inputs, alive)
-    if observer is None:
+    known = masked(inputs, fibre_mask)
+    if bayes is None:
         return known, known.new_zeros(())
     with torch.no_grad():
-        place, told = observer(inputs, alive, torch)
+        place, told = bayes(inputs, fibre_mask, torch)
     return torch.cat([known, told], dim=1), place
 
 
@@ -249,8 +249,8 @@ class Trained(NamedTuple):
     """Weights as `network.forward` takes them, of the members and of the network that corrects the observer, if any."""
 
     weights: Weights
-    observer: Observer | None
-    corrector: Weights
+    bayes: BayesianLocalizer | None
+    residual_network: Weights
 
 
 def train_members(
@@ -275,7 +275,9 @@ def train_members(
     """
     begin = time.monotonic()
     learn = as_unseen(learn, table)
-    steps = training_steps(len(learn.inputs), options) * (LONGER if learn.stretch or options.features != "full" else 1)
+    steps = training_steps(len(learn.inputs), options) * (
+        LONGER if learn.stretch or options.features != "press_and_release" else 1
+    )
     networks, seconds = options.members, None
     with one_torch_thread():
         if time_budget is not None:
@@ -284,7 +286,7 @@ def train_members(
             networks = max(2, cores * in_turn)
             seconds = max(0.0, time_budget - (time.monotonic() - begin)) / math.ceil(networks / cores)
     observing = networks > 1 and not learn.stretch
-    observer = Observer.fit(table, learn.inputs, learn.alive, learn.targets) if observing else None
+    bayes = BayesianLocalizer.fit(table, learn.inputs, learn.fibre_mask, learn.targets) if observing else None
     seeds = [int(seed) for seed in rng.integers(2**63, size=networks)]
     joint = JointProgress([TrainingLength(steps, seconds).total] * networks, progress)
     small = options.model_copy(update={name: min(most, getattr(options, name)) for name, most in CORRECTOR.items()})
@@ -292,14 +294,12 @@ def train_members(
 
     def train(number: int) -> Weights:
         corrects = number == members
-        training = _Training(
-            learn, table, small if corrects else options, seeds[number], observer if corrects else None
-        )
+        training = _Training(learn, table, small if corrects else options, seeds[number], bayes if corrects else None)
         return training.run(TrainingLength(steps, seconds), lambda done: joint.tell(number, done))
 
     with one_torch_thread(), joint:
         weights = dict(run_tasks((number, partial(train, number)) for number in range(len(seeds))))
-    return Trained(joined([weights[number] for number in range(members)]), observer, weights.get(members, {}))
+    return Trained(joined([weights[number] for number in range(members)]), bayes, weights.get(members, {}))
 
 
 def joined(members: Sequence[Weights]) -> Weights:
@@ -322,15 +322,15 @@ class _Training:
         table: Floats,
         options: settings.LocalizerSettings,
         seed: int,
-        observer: Observer | None = None,
+        bayes: BayesianLocalizer | None = None,
     ) -> None:
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._generator = torch.Generator(self._device).manual_seed(seed)
         self._options = options
-        arrays = (learn.inputs, learn.alive, learn.targets)
-        self._x, self._alive, self._y = (torch.from_numpy(array).to(self._device) for array in arrays)
+        arrays = (learn.inputs, learn.fibre_mask, learn.targets)
+        self._x, self._fibre_mask, self._y = (torch.from_numpy(array).to(self._device) for array in arrays)
         self._fibres, size = self._x.shape[1:]
-        self._lost = min(options.lost, self._fibres - 1)
+        self._lost = min(options.max_failures, self._fibres - 1)
         self._table = torch.from_numpy(table).to(self._device).flatten(2)
         self._bounds = self._y[:, :3].amin(dim=0), self._y[:, :3].amax(dim=0)
         places = self._y[:, :2].unique(dim=0)
@@ -345,8 +345,8 @@ class _Training:
         self._stretch = learn.stretch
         at_home = inputs_at(self._table, self._y, self._stretch)
         self._rest = self._x - at_home.view_as(self._x)
-        self._observer = observer and observer.changed(lambda part: torch.from_numpy(part).to(self._device))
-        width = self._fibres * (size + 1) + (0 if observer is None else TOLD)
+        self._bayes = bayes and bayes.changed(lambda part: torch.from_numpy(part).to(self._device))
+        width = self._fibres * (size + 1) + (0 if bayes is None else TOLD)
         self._weights = initial(width, options, self._generator, OUTPUTS + 2 * (self._y.shape[1] - 2))
 
     def pace(self) -> float:
@@ -359,7 +359,7 @@ class _Training:
         return float(np.median(took))
 
     def run(self, length: TrainingLength, tell: Callable[[int], None]) -> Weights:
-        weights, rate = self._weights, self._options.rate
+        weights, rate = self._weights, self._options.learning_rate
         average = {name: w.detach().clone() for name, w in weights.items()}
         optimizer = torch.optim.AdamW(weights.values(), lr=rate, weight_decay=WEIGHT_DECAY, fused=True)
         told, share, number = 0, 0.0, 0
@@ -383,8 +383,8 @@ class _Training:
         rest = self._rest[rows]
         inputs = inputs_at(self._table, targets, self._stretch).view_as(rest) + rest
         inputs += INPUT_NOISE * self._normal(*rest.shape)
-        alive = self._alive[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
-        known, found = entries(inputs, alive, self._observer)
+        fibre_mask = self._fibre_mask[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
+        known, found = entries(inputs, fibre_mask, self._bayes)
         learnt, logs = forward_fast(self._weights, known[None])[0].chunk(2, dim=1)
         off, logs = learnt + found - targets, logs.clamp(LEAST_LOG, MOST_LOG)
         return (misses(off) + EXPECTING * (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)).mean()
@@ -422,9 +422,9 @@ def adapt(
     lost: int,
     rng: np.random.Generator,
     progress: Callable[[int], None] = lambda steps: None,
-    observer: Observer | None = None,
+    bayes: BayesianLocalizer | None = None,
 ) -> Weights:
-    """Adapt the members of a network of method "masked", or the network that corrects an observer.
+    """Adapt the members of a network of method "ensemble", or the network that corrects an observer.
 
     Args:
         weights: as `network.forward` takes them.
@@ -433,7 +433,7 @@ def adapt(
         lost: fibres that are lost at once, at most, while adapting.
         rng: source of the seed of torch's generator, which draws all that is random here.
         progress: called with the steps done since it was last called.
-        observer: what they correct, if anything; it stays as it is.
+        bayes: what they correct, if anything; it stays as it is.
 
     Returns:
         Weights of the same shapes.
@@ -441,7 +441,7 @@ def adapt(
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     before = {name: torch.from_numpy(weight) for name, weight in weights.items()}
     now = {name: weight.clone().requires_grad_() for name, weight in before.items()}
-    presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator, observer)
+    presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator, bayes)
     members = len(now["first.w"])
     trust = len(samples.inputs) / (len(samples.inputs) + OLD_PRESSES)
     optimizer = torch.optim.Adam(now.values(), lr=RATE)
@@ -471,13 +471,15 @@ class _Presses:
         table: Floats,
         lost: int,
         generator: torch.Generator,
-        observer: Observer | None,
+        bayes: BayesianLocalizer | None,
     ) -> None:
-        self._x, self._alive, self._y = (torch.from_numpy(a) for a in (samples.inputs, samples.alive, samples.targets))
+        self._x, self._fibre_mask, self._y = (
+            torch.from_numpy(a) for a in (samples.inputs, samples.fibre_mask, samples.targets)
+        )
         self._table, self._stretch = torch.from_numpy(table).flatten(2), samples.stretch
         self._at_home = inputs_at(self._table, self._y, self._stretch)
         self._lost, self._generator = lost, generator
-        self._observer = observer and observer.changed(torch.from_numpy)
+        self._bayes = bayes and bayes.changed(torch.from_numpy)
 
     def nearby(self) -> tuple[Tensor, Tensor]:
         """Entries (1, B, D) and what is to be found of them (B, 2 + T), of presses moved by a few millimetres."""
@@ -503,8 +505,8 @@ class _Presses:
         moved = (inputs_at(self._table, targets, self._stretch) - self._at_home[rows]).view_as(self._x[rows])
         inputs = self._x[rows] + moved
         inputs = inputs + noise * self._normal(*inputs.shape)
-        alive = self._alive[rows] & draw_alive(BATCH, self._x.shape[1], self._lost, self._generator)
-        known, found = entries(inputs, alive, self._observer)
+        fibre_mask = self._fibre_mask[rows] & draw_alive(BATCH, self._x.shape[1], self._lost, self._generator)
+        known, found = entries(inputs, fibre_mask, self._bayes)
         return known[None], found
 
     def _normal(self, *shape: int) -> Tensor:

@@ -13,7 +13,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.keep_outs import is_outside, keep_outs
 from padforge.design.settings import PadSettings
-from padforge.sense.arrays import MAX_MM, Array, Indices, Mask, as_numbers, refuse_beyond
+from padforge.sense.arrays import MAX_MM, Array, Indices, Mask, check_magnitude, check_numbers
 from padforge.sense.recording.csv_table import CsvTable
 from padforge.sense.settings import RigSettings
 
@@ -30,42 +30,42 @@ class PressPlan:
     """Presses to be made.
 
     Attributes:
-        places_mm: (Q, 2) from the pad's centre.
+        positions_mm: (Q, 2) from the pad's centre.
         depths_mm: (Q,) from the pad's surface, > 0.
 
     Raises:
         InputError: shapes that do not fit together, no press, or values that are not finite or beyond all pads.
     """
 
-    places_mm: Array
+    positions_mm: Array
     depths_mm: Array
 
     def __post_init__(self) -> None:
-        places = as_numbers(self.places_mm, np.float64, "places of the plan")
-        depths = as_numbers(self.depths_mm, np.float64, "depths of the plan")
+        places = check_numbers(self.positions_mm, np.float64, "places of the plan")
+        depths = check_numbers(self.depths_mm, np.float64, "depths of the plan")
         if places.ndim != 2 or places.shape[1] != 2 or len(places) == 0 or depths.shape != (len(places),):
             raise InputError(
                 f"plan: places have shape {places.shape} and depths {depths.shape}, expected (Q, 2) and (Q,), Q > 0"
             )
-        refuse_beyond("places of the plan", places, MAX_MM, "mm")
-        refuse_beyond("depths of the plan", depths[:, None], MAX_MM, "mm")
+        check_magnitude("places of the plan", places, MAX_MM, "mm")
+        check_magnitude("depths of the plan", depths[:, None], MAX_MM, "mm")
         if (depths <= 0).any():
             press = int(np.argmax(depths <= 0))
             raise InputError(f"plan: press {press} has depth {depths[press]:g} mm, allowed is more than 0")
-        object.__setattr__(self, "places_mm", places)
+        object.__setattr__(self, "positions_mm", places)
         object.__setattr__(self, "depths_mm", depths)
 
     def __len__(self) -> int:
-        return len(self.places_mm)
+        return len(self.positions_mm)
 
     def document(self) -> list[list[float]]:
         """The plan as JSON: one [x_mm, y_mm, depth_mm] a press."""
-        return np.column_stack([self.places_mm, self.depths_mm]).tolist()
+        return np.column_stack([self.positions_mm, self.depths_mm]).tolist()
 
     @classmethod
     def of(cls, rows: ArrayLike) -> "PressPlan":
         """The plan of rows (Q, 3) as `document` gives them."""
-        table = as_numbers(rows, np.float64, "plan")
+        table = check_numbers(rows, np.float64, "plan")
         if table.ndim != 2 or table.shape[1] != 3:
             raise InputError(f"plan has shape {table.shape}, expected (Q, 3): {', '.join(COLUMNS)}")
         return cls(table[:, :2], table[:, 2])
@@ -98,7 +98,7 @@ def told_pad(pad: Morphology) -> dict[str, Any]:
 
 def free_of(pad: Morphology, size: PadSettings) -> Free:
     """Which places on the plan of a pad lie in no keep-out of `size`."""
-    return lambda places_mm: is_outside(pad.to_grid(places_mm), size)
+    return lambda positions_mm: is_outside(pad.to_grid(positions_mm), size)
 
 
 def planned(pad: Morphology, rig: RigSettings, rng: np.random.Generator, size: PadSettings | None = None) -> PressPlan:
@@ -171,10 +171,10 @@ def _counts(width: float, height: float, asked: int) -> tuple[int, int]:
 
 def all_free(plan: PressPlan, path: Path, free: Free) -> PressPlan:
     """The plan that was read from `path`; InputError where it presses what is not free."""
-    there = free(plan.places_mm)
+    there = free(plan.positions_mm)
     if not there.all():
         press = int(np.argmin(there))
-        x, y = plan.places_mm[press]
+        x, y = plan.positions_mm[press]
         raise InputError(
             f"{path}: press {press + 1}, at ({x:g}, {y:g}) mm, lies in a keep-out, allowed are places outside of those "
             "of [pad] keep_out_mm"

@@ -34,7 +34,7 @@ from padforge.sense.recording.run_directory import (
 )
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64) | dict.fromkeys(
-    ("begun", "lifted"), np.int64
+    ("down_command", "up_command"), np.int64
 )
 _MEASURED = {
     "depths_mm": (limits.MAX_MM, "mm"),
@@ -51,8 +51,8 @@ class Recording:
         readings: (R, C) volts, one row per reading, one column per fibre; NaN where one is missing.
         times_s: (R,) ascending, s.
         presses_mm: (Q, 2) places, mm from the pad's centre; NaN where a press's place is not known.
-        begun: (Q,) index of the first reading after the probe was sent down.
-        lifted: (Q,) index of the first reading after it was sent up; R if none was taken.
+        down_command: (Q,) index of the first reading after the probe was sent down.
+        up_command: (Q,) index of the first reading after it was sent up; R if none was taken.
         source: where the recording came from; free JSON.
         torn_presses: presses that were left out because the end of the stream was torn off.
         depths_mm: (Q,) how deep the probe was to go below the surface, mm, > 0; NaN where that is not known.
@@ -68,8 +68,8 @@ class Recording:
     readings: Array
     times_s: Array
     presses_mm: Array
-    begun: Indices
-    lifted: Indices
+    down_command: Indices
+    up_command: Indices
     source: Mapping[str, Any] = field(default_factory=dict, compare=False)
     torn_presses: int = field(default=0, compare=False)
     depths_mm: Array = field(default_factory=lambda: np.empty(0))
@@ -78,10 +78,10 @@ class Recording:
 
     def __post_init__(self) -> None:
         for name, kind in _ARRAYS.items():
-            self._keep(name, limits.as_numbers(getattr(self, name), kind, name))
+            self._keep(name, limits.check_numbers(getattr(self, name), kind, name))
         _validate(self)
         for name, (limit, unit) in _MEASURED.items():
-            values = limits.as_numbers(getattr(self, name), np.float64, name)
+            values = limits.check_numbers(getattr(self, name), np.float64, name)
             unknown = np.isnan(values).all()  # of however many: `replace` may have left some presses out
             self._keep(name, np.full(len(self.presses_mm), np.nan) if unknown else values)
             _validate_measured(self, name, limit, unit)
@@ -151,15 +151,15 @@ class Recording:
         start = read_json(path / START, FORMAT)
         rows, _ = read_blocks(path / READINGS, fibres)
         done = read_journal(path / JOURNAL)
-        presses = [press for press in done.values() if press.lifted <= len(rows)]
+        presses = [press for press in done.values() if press.up_command <= len(rows)]
         table = np.array(presses, dtype=np.float64).reshape(-1, len(Press._fields))
         try:
             return cls(
                 readings=rows[:, 1:],
                 times_s=rows[:, 0],
                 presses_mm=table[:, :2],
-                begun=table[:, 2].astype(np.int64),
-                lifted=table[:, 3].astype(np.int64),
+                down_command=table[:, 2].astype(np.int64),
+                up_command=table[:, 3].astype(np.int64),
                 source=start.get("source", {}),
                 torn_presses=len(done) - len(presses),
                 depths_mm=table[:, 4],
@@ -197,11 +197,11 @@ class Recording:
         with Recorder(path, self.fibres, self.source, provenance) as recorder:
             recorder.append(self.times_s, self.readings)
             measured = np.column_stack([getattr(self, name) for name in _MEASURED]).tolist()
-            edges = zip(self.presses_mm, self.begun, self.lifted, measured, strict=True)
-            for place, begun, lifted, (depth, reached, force) in edges:
-                recorder.begin(place, int(begun), **({} if isnan(depth) else {"depth_mm": depth}))
+            edges = zip(self.presses_mm, self.down_command, self.up_command, measured, strict=True)
+            for place, down_command, up_command, (depth, reached, force) in edges:
+                recorder.begin(place, int(down_command), **({} if isnan(depth) else {"depth_mm": depth}))
                 told = {} if isnan(reached) else {"at_mm": [None, None, reached]}
-                recorder.finish(int(lifted), **told, **({} if isnan(force) else {"force_n": force}))
+                recorder.finish(int(up_command), **told, **({} if isnan(force) else {"force_n": force}))
 
 
 def _put(unfinished: Path, path: Path) -> None:
@@ -258,28 +258,30 @@ def _validate(recording: Recording) -> None:
         raise InputError(f"times have shape {recording.times_s.shape}, expected ({len(readings)},)")
     if presses.ndim != 2 or presses.shape[1] != 2 or len(presses) == 0:
         raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
-    if recording.begun.shape != (len(presses),) or recording.lifted.shape != (len(presses),):
-        raise InputError(f"{len(presses)} presses have {recording.begun.size} begins and {recording.lifted.size} ends")
-    limits.refuse_beyond("readings", readings, limits.MAX_VOLTS, "V", missing=True)
-    limits.refuse_beyond("times", recording.times_s[:, None], limits.MAX_S, "s")
-    limits.refuse_beyond("presses", presses, limits.MAX_MM, "mm", missing=True)
+    if recording.down_command.shape != (len(presses),) or recording.up_command.shape != (len(presses),):
+        raise InputError(
+            f"{len(presses)} presses have {recording.down_command.size} begins and {recording.up_command.size} ends"
+        )
+    limits.check_magnitude("readings", readings, limits.MAX_VOLTS, "V", missing=True)
+    limits.check_magnitude("times", recording.times_s[:, None], limits.MAX_S, "s")
+    limits.check_magnitude("presses", presses, limits.MAX_MM, "mm", missing=True)
     if np.isnan(readings).all():
         raise InputError(f"readings are all missing (NaN), all {readings.size} of them, expected some numbers")
     half = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
     if half.any():
         raise InputError(f"press {int(np.argmax(half))} has one of x and y, expected both or neither")
-    limits.refuse_descent(recording.times_s)
+    limits.check_ascending(recording.times_s)
     if not limits.MIN_RATE_HZ <= recording.rate_hz <= limits.MAX_RATE_HZ:
         raise InputError(
             f"times give {recording.rate_hz:g} readings a second, "
             f"allowed is {limits.MIN_RATE_HZ:g} to {limits.MAX_RATE_HZ:g}"
         )
-    edges = np.column_stack([recording.begun, recording.lifted]).ravel()
+    edges = np.column_stack([recording.down_command, recording.up_command]).ravel()
     late = np.diff(edges, prepend=0, append=len(readings) + 1) < 1
     if late.any():
         press = min(int(np.argmax(late)) // 2, len(presses) - 1)
         raise InputError(
-            f"press {press} goes from reading {recording.begun[press]} to {recording.lifted[press]}, "
+            f"press {press} goes from reading {recording.down_command[press]} to {recording.up_command[press]}, "
             f"expected presses that do not overlap, each after at least one reading and within {len(readings)}"
         )
 
@@ -289,7 +291,7 @@ def _validate_measured(recording: Recording, name: str, limit: float, unit: str)
     values = getattr(recording, name)
     if values.shape != (len(recording.presses_mm),):
         raise InputError(f"{name} have shape {values.shape}, expected ({len(recording.presses_mm)},)")
-    limits.refuse_beyond(name, values[:, None], limit, unit, missing=True)
+    limits.check_magnitude(name, values[:, None], limit, unit, missing=True)
     wrong = {"depths_mm": values <= 0, "forces_n": values < 0}.get(name, np.zeros(len(values), bool))
     if wrong.any():
         press = int(np.argmax(wrong))

@@ -33,7 +33,7 @@ from padforge.design.common.files import (
 )
 from padforge.design.common.validation import InputError, check_int, check_mapping, short_repr
 from padforge.design.common.validation import check_path as as_path
-from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, MAX_MM, MAX_N, Array, as_numbers
+from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, MAX_MM, MAX_N, Array, check_numbers
 from padforge.sense.recording.block_file import BlockWriter, open_in_place, read_blocks, write_at
 
 
@@ -42,8 +42,8 @@ class Press(NamedTuple):
 
     x_mm: float
     y_mm: float
-    begun: int
-    lifted: int
+    down_command: int
+    up_command: int
     depth_mm: float
     reached_mm: float
     force_n: float
@@ -61,7 +61,7 @@ def read_journal(path: Path) -> dict[int, Press]:
         text = read_bytes(path).decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: no journal ({error})") from error
-    begun: dict[int, tuple[float, float, int, float]] = {}
+    down_command: dict[int, tuple[float, float, int, float]] = {}
     done: dict[int, tuple[int, float, float]] = {}
     for number, line in enumerate(text.split("\n")[:-1], start=1):  # what follows the last newline is a torn line
         try:
@@ -69,23 +69,23 @@ def read_journal(path: Path) -> dict[int, Press]:
             if not isinstance(event, dict):
                 raise ValueError(f"{shortened(event)}, expected an object")
             press, reading = _whole(event, "press"), _whole(event, "reading")
-            if event.get("event") == "begun":
+            if event.get("event") == "started":
                 place = (_number(event, "x_mm", MAX_MM), _number(event, "y_mm", MAX_MM))
-                begun[press] = (*place, reading, _number(event, "depth_mm", MAX_MM, None))
+                down_command[press] = (*place, reading, _number(event, "depth_mm", MAX_MM, None))
                 done.pop(press, None)
-            elif event.get("event") == "done" and press in begun:
+            elif event.get("event") == "done" and press in down_command:
                 done[press] = (reading, _reached(event), _number(event, "force_n", MAX_N, None))
-            elif event.get("event") == "aborted" and press in begun:
-                del begun[press]
+            elif event.get("event") == "aborted" and press in down_command:
+                del down_command[press]
                 done.pop(press, None)
             else:
                 raise ValueError(f"event {shortened(event.get('event'))} of press {press}")
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: line {number} is no journal entry ({error})") from error
-    presses = ((press, *begun[press], *done[press]) for press in sorted(done))
+    presses = ((press, *down_command[press], *done[press]) for press in sorted(done))
     return {
-        press: Press(x, y, first, lifted, depth, reached, force)
-        for press, x, y, first, depth, lifted, reached, force in presses
+        press: Press(x, y, first, up_command, depth, reached, force)
+        for press, x, y, first, depth, up_command, reached, force in presses
     }
 
 
@@ -122,7 +122,7 @@ def _number(event: Mapping[str, Any], key: str, limit: float, missing: object = 
     return float(value)
 
 
-FORMAT = "padforge-recording/1"
+FORMAT = "padforge-recording/2"
 START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
 _UNBORN = UNFINISHED + START
 _BIRTH = (JOURNAL, READINGS, _UNBORN)
@@ -224,7 +224,7 @@ class Recorder:
             InputError: shapes that do not fit, or times that are not finite.
             OSError: the disk is full or gone; then nothing was added.
         """
-        times, volts = as_numbers(times_s, np.float64, "times"), as_numbers(readings, np.float64, "readings")
+        times, volts = check_numbers(times_s, np.float64, "times"), check_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
             raise InputError(
                 f"times have shape {times.shape} and readings {volts.shape}, expected (n,) finite numbers and "
@@ -258,13 +258,13 @@ class Recorder:
         Raises:
             InputError: a place, index or number that no press has, or what JSON cannot hold.
         """
-        place = as_numbers(place_mm, np.float64, "place")
+        place = check_numbers(place_mm, np.float64, "place")
         if place.shape != (2,) or not (np.isnan(place).all() or (np.abs(place) <= MAX_MM).all()):
             raise InputError(f"place is {short_repr(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
         number = self._press if press is None else check_int("press", press, 0, MAX_INDEX)
         reading = check_int("reading", reading, 0, MAX_INDEX)
         x, y = (None if np.isnan(value) else value for value in place.tolist())
-        self._note({"event": "begun", "press": number, "reading": reading, "x_mm": x, "y_mm": y, **more})
+        self._note({"event": "started", "press": number, "reading": reading, "x_mm": x, "y_mm": y, **more})
         self._press, self._down = number, True
 
     def finish(self, reading: int, **more: Any) -> None:

@@ -25,7 +25,7 @@ from padforge.sense.studies.fibre_loss import label_losses
 def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
     """Draw where on the pad presses were found, and how far off: `error_map.png` of a calibration document."""
     test = document["test"]
-    pressed, found = np.array(test["pressed_mm"]), np.array(test["found_mm"])
+    pressed, found = np.array(test["pressed_mm"]), np.array(test["predicted_mm"])
     errors = np.hypot(*(found - pressed).T)
     figure, axes = new_figure(6.4, 5.6)
     lines = list(np.stack([pressed, found], axis=1))
@@ -53,7 +53,7 @@ def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
     rows = document["errors"]
     figure, axes = new_figure(6.0, 4.4)
     for at, row in enumerate(rows):
-        means = [s["mean_mm"] for s in document["by_subset"] if len(s["lost"]) == row["lost"]]
+        means = [s["mean_mm"] for s in document["by_subset"] if len(s["failed"]) == row["n_failed"]]
         # Spread sideways in order of the error, so that no two dots of a level hide each other.
         sideways = np.linspace(-0.17, 0.17, len(means)) if len(means) > 1 else [0.0]
         axes.scatter(at + np.array(sideways), sorted(means), s=14, color=ALARM, alpha=0.45, linewidths=0)

@@ -32,13 +32,13 @@ COLUMNS = ("measured", "predicted", "left over")
 def draw_responses(found: Identification, path: Path) -> None:
     """Draw what each live channel answers by place: measured, predicted, and what is left over, on one scale each."""
     presses, pad = found.held_out, found.fit.pad
-    predicted = pad.predict(presses.places_mm)
+    predicted = pad.predict(presses.positions_mm)
     channels = len(found.live)
     figure = Figure(figsize=(7.2, 0.5 + 1.9 * channels), layout="constrained")
     axes = figure.subplots(channels, 3, squeeze=False, sharex=True, sharey=True)
     for row in range(channels):
         there = presses.there[:, row]
-        x, y = presses.places_mm[there].T
+        x, y = presses.positions_mm[there].T
         measured, told = presses.volts[there, row] * 1e3, predicted[there, row] * 1e3
         most = float(np.abs(np.concatenate([measured, told])).max()) or 1.0
         dots = None
@@ -67,7 +67,7 @@ def draw_laid_plan(found: Identification, path: Path) -> None:
     plan.add_patch(Rectangle((-right, -top), 2 * right, 2 * top, facecolor=PAPER, edgecolor=FAINT))
     for points in flatten(pad, 1e-3):
         plan.plot(*pad.to_mm(points).T, color=FAINT, linewidth=1.4)
-    pressed = found.fit.pad.frame.to_plan(found.learnt.places_mm)
+    pressed = found.fit.pad.frame.to_plan(found.learnt.positions_mm)
     plan.scatter(*pressed.T, s=1, color=INK, alpha=0.25, linewidths=0)
     for row, (off, unsure, within) in enumerate(found.laid_mm()):
         fibre = found.fit.pad.fibres[row]
@@ -93,7 +93,7 @@ def draw_laid_plan(found: Identification, path: Path) -> None:
     save_figure(figure, path)
 
 
-FORMAT = "padforge-identification/1"
+FORMAT = "padforge-identification/2"
 STRANGER = 0.02
 """Share of the variance by which a plan must explain more than straight fibres do, to be known by its presses."""
 COMMAND, TWIN = "padforge sense identify", "twin.json"
@@ -247,7 +247,7 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
             "How the pad was laid",
             [
                 paragraph(
-                    f"Found from {document['presses']} presses: it lay {_side(document)}, turned"
+                    f"Localization from {document['presses']} presses: it lay {_side(document)}, turned"
                     f" {_tenths(frame['turn_deg'])} degrees, shifted {_shift(frame)} mm, scale {frame['scale']:.3f}."
                     f" The twin explains {document['explained']:.0%} of what {document['held_out']} presses held out"
                     f" show, the plan as it is {document['explained_on_plan']:.0%}; noise is"

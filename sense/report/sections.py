@@ -200,8 +200,12 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
             table(["fibre", *map(str, range(1, len(idle) + 1))], [["idle", *idle]]),
         ],
         [
-            (f"{first['mean_mm']:.2f} mm", f"mean error on {of}, " + _lost(first["lost"])),
-            *([(f"{last['mean_mm']:.2f} mm", f"mean error on {of}, " + _lost(last["lost"]))] if len(rows) > 1 else []),
+            (f"{first['mean_mm']:.2f} mm", f"mean error on {of}, " + _lost(first["n_failed"])),
+            *(
+                [(f"{last['mean_mm']:.2f} mm", f"mean error on {of}, " + _lost(last["n_failed"]))]
+                if len(rows) > 1
+                else []
+            ),
         ],
     )
     return [section, *([] if (folder / "fibre_loss.json").exists() else fibre_loss_sections(folder, document))]
@@ -213,7 +217,7 @@ def _measure_errors(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for kind, unit in (("depth", "mm"), ("force", "N")):
         names = [f"{kind}_{what}_{unit.lower()}" for what in ("mean", "p95")]
         if names[0] in rows[0]:
-            numbers = [[row["lost"], *(f"{row[name]:.2f}" for name in names)] for row in rows]
+            numbers = [[row["n_failed"], *(f"{row[name]:.2f}" for name in names)] for row in rows]
             within = [[*line, f"{row[f'{kind}_within_r90']:.1%}"] for line, row in zip(numbers, rows, strict=True)]
             out.append(table(["lost", f"{kind}, mean ({unit})", "95 %", "in r90"], within))
     return out
@@ -228,7 +232,7 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
     """
     ways: Mapping[str, Any] = document.get("ways") or {"": document}
     found = {
-        name: {tuple(each["lost"]): float(each["mean_mm"]) for each in way["by_subset"]} for name, way in ways.items()
+        name: {tuple(each["failed"]): float(each["mean_mm"]) for each in way["by_subset"]} for name, way in ways.items()
     }
     body = []
     for name, errors in found.items():
@@ -320,7 +324,7 @@ def _mean(errors: Errors, fibre: int, count: int) -> str:
 
 def _errors(row: Mapping[str, Any], *more: str) -> list[object]:
     names = ("mean_mm", "std_mm", "max_mm", *more)
-    return [row["lost"], row["subsets"], *(f"{row[name]:.2f}" for name in names)]
+    return [row["n_failed"], row["subsets"], *(f"{row[name]:.2f}" for name in names)]
 
 
 def _lost(count: int) -> str:

@@ -18,23 +18,23 @@ from padforge.design import Morphology
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import flatten
-from padforge.sense.arrays import MAX_MM, Array, as_numbers, refuse_beyond
+from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.features import REST, bridged
 from padforge.sense.recording.press_plan import free_of, planned, size_of
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, read_journal, refuse_begun
 from padforge.sense.rig.by_hand_presses import GONE_S, MOST, SOON_S, Judge, Phase, Place, Turns, answers
-from padforge.sense.rig.config import Setup, begun_source, require_same_devices, source_of
-from padforge.sense.rig.devices import Converter, RigFault
+from padforge.sense.rig.config import RigConfig, begun_source, require_same_devices, source_of
+from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, Ring, connected
-from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, Finder
+from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
 ROUND = 25
 """Places of a uniform plan that are gone through by a short way, before the next ones. Whoever stops early has been
 all over the pad, and what drifts with time is not taken for what changes with the place."""
 
 
-def targets_of(setup: Setup) -> Array:
+def targets_of(setup: RigConfig) -> Array:
     """(Q, 2) places in mm as `[rig]` asks for them: of a grid or a file in that order, or uniform ones in short rounds.
 
     Uniform places are whole millimetres: nobody hits fractions, and whole ones are found on squared paper.
@@ -45,20 +45,20 @@ def targets_of(setup: Setup) -> Array:
     rig = setup.rig
     if rig.plan == "adaptive":
         raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, boustrophedon or a .csv of places")
-    places_mm = planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size).places_mm
+    positions_mm = planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size).positions_mm
     if rig.plan != "uniform":
-        return places_mm
-    whole_mm = np.rint(places_mm)
+        return positions_mm
+    whole_mm = np.rint(positions_mm)
     free = free_of(setup.pad, size_of(setup.pad, setup.size))(whole_mm)
-    return in_rounds(np.where(free[:, None], whole_mm, places_mm))
+    return in_rounds(np.where(free[:, None], whole_mm, positions_mm))
 
 
-def in_rounds(places_mm: Array) -> Array:
+def in_rounds(positions_mm: Array) -> Array:
     """(Q, 2) places, `ROUND` at a time, each round from where the last one ended always to the nearest that is left."""
-    ordered = np.empty_like(places_mm)
-    at = places_mm[0]
-    for first in range(0, len(places_mm), ROUND):
-        left = places_mm[first : first + ROUND]
+    ordered = np.empty_like(positions_mm)
+    at = positions_mm[0]
+    for first in range(0, len(positions_mm), ROUND):
+        left = positions_mm[first : first + ROUND]
         for row in range(first, first + len(left)):
             nearest = int(np.argmin(np.linalg.norm(left - at, axis=1)))
             at = ordered[row] = left[nearest]
@@ -82,7 +82,7 @@ KIND = "hand"
 """Of the source of such a recording: nobody knows how deep its presses were."""
 
 
-def opened(setup: Setup, converter: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
+def opened(setup: RigConfig, converter: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
     """The recorder, the places (Q, 2) mm of its plan, and those (P, 2) that are still to be pressed.
 
     Args:
@@ -106,12 +106,12 @@ def opened(setup: Setup, converter: Mapping[str, Any], resume: bool) -> tuple[Re
     return Recorder(setup.out, converter["channels"], source, made_by), targets, targets
 
 
-def _kept_targets(setup: Setup, source: Mapping[str, Any]) -> Array:
+def _kept_targets(setup: RigConfig, source: Mapping[str, Any]) -> Array:
     """The places of a recording that is to be gone on with."""
-    targets = as_numbers(source["plan"]["presses"], np.float64, "places of the plan")
+    targets = check_numbers(source["plan"]["presses"], np.float64, "places of the plan")
     if targets.ndim != 2 or targets.shape[1] != 2:
         raise InputError(f"{setup.out}: its plan has shape {targets.shape}, expected (Q, 2)")
-    refuse_beyond("places of the plan", targets, MAX_MM, "mm")
+    check_magnitude("places of the plan", targets, MAX_MM, "mm")
     return targets
 
 
@@ -149,9 +149,9 @@ class HandSession:
         self._made = made
         self._turns = Turns(targets_mm, hold_s, self._start_s)
         self._ring, self._now_s = Ring(1 + fibres), self._start_s
-        self._finder: Finder | None = Finder(fibres)  # None while it has lost its way
+        self._finder: PressDetector | None = PressDetector(fibres)  # None while it has lost its way
         self._found_from, self._judge = 0, Judge()
-        self._touched = self._begun = self._free = 0
+        self._touched = self._down_command = self._free = 0
         self._free_s = self._start_s
         self._rest = np.zeros(fibres)  # before the press under way
         self._kept: list[tuple[int, int, int]] = []  # number, begun and lifted in the recording
@@ -201,35 +201,35 @@ class HandSession:
     def _touch(self, touched: int) -> None:
         place = self._turns.touch(self._time_s(touched))
         self._touched = touched
-        self._begun = max(self._ring.sent(touched, SENT_DOWN_S), self._free + 1)
-        self._rest = self._rest_before(self._begun)
+        self._down_command = max(self._ring.sent(touched, SENT_DOWN_S), self._free + 1)
+        self._rest = self._rest_before(self._down_command)
         self._refused = None
-        self._recorder.begin(place or UNKNOWN, self._first + self._begun, self._number)
+        self._recorder.begin(place or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
 
     def _release(self, released: int) -> None:
-        lifted = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._begun + 1)
+        up_command = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
         target, fault = self._turns.target, self._turns.release(self._time_s(released))
-        answered = self._answers(lifted)
+        answered = self._answers(up_command)
         fault = fault or self._judge.fault_of(answered)
         if fault:
-            self._refuse(self._number, self._first + self._begun, self._first + lifted, fault)
+            self._refuse(self._number, self._first + self._down_command, self._first + up_command, fault)
             self._told, self._refused = f"not counted: {fault}", target
         else:
-            self._recorder.finish(self._first + lifted)
-            self._kept.append((self._number, self._first + self._begun, self._first + lifted))
+            self._recorder.finish(self._first + up_command)
+            self._kept.append((self._number, self._first + self._down_command, self._first + up_command))
             self._judge.keep(answered, self._rest)
             self._most_v = max(self._most_v, float(np.abs(answered).max()))
             self._turns.keep(self._now_s)
             self._told = f"counted: {shown(target)}"
         self._recorder.sync()
-        self._number, self._free = self._number + 1, lifted
+        self._number, self._free = self._number + 1, up_command
         self._free_s = self._now_s
 
-    def _refuse(self, press: int, begun: int, lifted: int, why: str) -> None:
+    def _refuse(self, press: int, down_command: int, up_command: int, why: str) -> None:
         """Note that a press was at an unknown place."""
-        self._recorder.begin(UNKNOWN, begun, press)
-        self._recorder.finish(lifted, refused=why)
+        self._recorder.begin(UNKNOWN, down_command, press)
+        self._recorder.finish(up_command, refused=why)
 
     def _obey(self, word: str) -> None:
         if word == "skip":
@@ -263,7 +263,7 @@ class HandSession:
             self._turns.drop()
             self._release(self._ring.end - 1)
         self._turns.wait(self._now_s)
-        self._finder, self._found_from = Finder(self._fibres), self._ring.end
+        self._finder, self._found_from = PressDetector(self._fibres), self._ring.end
 
     def _late(self) -> Array:
         """(C,) V, mean of the latest readings."""
@@ -273,11 +273,11 @@ class HandSession:
     def _time_s(self, reading: int) -> float:
         return float(self._ring.rows(reading, reading + 1)[0, 0])
 
-    def _answers(self, lifted: int) -> Array:
+    def _answers(self, up_command: int) -> Array:
         """See `judging.answers`; of a press of which the begin is forgotten, by its end alone."""
-        first = max(self._begun + REST[0], self._free, self._ring.end - HISTORY - SLACK)
+        first = max(self._down_command + REST[0], self._free, self._ring.end - HISTORY - SLACK)
         readings = self._ring.rows(first, self._ring.end)[:, 1:]
-        return answers(readings, max(self._begun - first, 1), lifted - first)
+        return answers(readings, max(self._down_command - first, 1), up_command - first)
 
     def _rest_before(self, at: int) -> Array:
         """(C,) V, mean of the readings just before index `at`."""
@@ -333,7 +333,7 @@ class HandSession:
 
 
 def record_by_hand(
-    setup: Setup, converter: Converter, show: Show, said: Said = lambda: (), resume: bool = False
+    setup: RigConfig, converter: Board, show: Show, said: Said = lambda: (), resume: bool = False
 ) -> Recording:
     """Record presses by hand into `setup.out`; what is done is on the disk whatever happens.
 
@@ -377,7 +377,7 @@ def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, A
     courses = [np.round(pad.to_mm(course), 1).tolist() for course in flatten(pad, TOLERANCE)]
     return {
         "title": title,
-        "middle_mm": [0.0, 0.0],
+        "origin_mm": [0.0, 0.0],
         "half_mm": [side / 2 for side in pad.layout.size_mm],
         "mirrored": mirrored,
         "courses": courses,

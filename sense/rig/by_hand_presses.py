@@ -28,18 +28,18 @@ SOON_S, GONE_S = 0.4, 1.0
 """After so long a touch has sunk in, and a release has come to its end but for a slow rest."""
 
 
-def answers(readings: Array, begun: int, lifted: int) -> Array:
+def answers(readings: Array, down_command: int, up_command: int) -> Array:
     """(2, C) V, what fibres give early in a press, sunk in, and at its end, beyond their rest before; 0 where missing.
 
     Args:
-        readings: (n, C) V, NaN where missing. begun, lifted: as in a `Recording`, 0 < begun < lifted <= n.
+        readings: (n, C) V, NaN where missing. down_command, up_command: as in a `Recording`, 0 < begun < lifted <= n.
     """
-    quarter = max((lifted - begun) // 4, 1)
-    early, last = begun + quarter, lifted - 1  # the last reading may show the finger leave
+    quarter = max((up_command - down_command) // 4, 1)
+    early, last = down_command + quarter, up_command - 1  # the last reading may show the finger leave
     parts = (
-        readings[max(begun + REST[0], 0) : begun],
+        readings[max(down_command + REST[0], 0) : down_command],
         readings[early : early + quarter],
-        readings[max(last - quarter, begun) : last],
+        readings[max(last - quarter, down_command) : last],
     )
     rest, *held = (_mean(part) for part in parts)
     return np.nan_to_num(np.array(held) - rest)

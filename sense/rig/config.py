@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Frame:
+class RobotFrame:
     """The pad's frame in the arm's base frame.
 
     Attributes:
@@ -44,7 +44,7 @@ class Frame:
     mirrored: bool = False
 
     @classmethod
-    def of(cls, rig: RigSettings) -> "Frame":
+    def of(cls, rig: RigSettings) -> "RobotFrame":
         """The frame that `[rig]` says; raises RigFault where the contact height or the pad's place is unknown."""
         if rig.contact_mm is None:
             raise RigFault(
@@ -153,7 +153,7 @@ def _numbers(value: object, count: int) -> Any:
 
 
 @dataclass(frozen=True)
-class Setup:
+class RigConfig:
     """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from.
 
     Attributes:
@@ -171,7 +171,7 @@ class Setup:
     folder: Path = Path()
 
 
-def plan_of(setup: Setup, rig: "RigSettings", resume: bool) -> "PressPlan":
+def plan_of(setup: RigConfig, rig: "RigSettings", resume: bool) -> "PressPlan":
     """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
 
@@ -200,7 +200,7 @@ _IDENTITY = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "fir
 """What devices say of themselves that all of a recording has to share."""
 
 
-def begun_source(setup: Setup, rig: "RigSettings", kind: str) -> dict[str, Any]:
+def begun_source(setup: RigConfig, rig: "RigSettings", kind: str) -> dict[str, Any]:
     """The source of the recording in `setup.out`, which is to be gone on with.
 
     Raises:
@@ -224,7 +224,7 @@ def begun_source(setup: Setup, rig: "RigSettings", kind: str) -> dict[str, Any]:
     return source
 
 
-def kept_plan(setup: Setup) -> str:
+def kept_plan(setup: RigConfig) -> str:
     """What to tell where other presses are asked for than the recording was begun with, whose plan is kept; else ""."""
     from padforge.sense.recording.run_directory import FORMAT, START
 
@@ -247,7 +247,7 @@ def require_same_devices(out: Path, source: Mapping[str, Any], devices: Mapping[
 
 
 def source_of(
-    setup: Setup, rig: "RigSettings", kind: str, plan: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
+    setup: RigConfig, rig: "RigSettings", kind: str, plan: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """What a new recording says of where it came from.
 
@@ -258,7 +258,7 @@ def source_of(
     return {"kind": kind, "devices": said, **_told(setup, rig), "plan": dict(plan)}
 
 
-def _told(setup: Setup, rig: "RigSettings") -> dict[str, Any]:
+def _told(setup: RigConfig, rig: "RigSettings") -> dict[str, Any]:
     """Settings, with the inputs of the board as they are wired and the side of the pad as it counts, and the pad."""
     from padforge.sense.recording.press_plan import told_pad
 
@@ -272,7 +272,7 @@ def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def recorder_of(
-    setup: Setup,
+    setup: RigConfig,
     rig: "RigSettings",
     plan: "PressPlan",
     folder: Path,

@@ -4,7 +4,7 @@ mm in the arm's base frame, angles radians.
 
 Arms and boards by their names: those of padforge, and those of any installed package, found by entry points.
 `padforge.arms` names functions of the settings of `[rig]` that give an `Arm`; `padforge.boards` functions of these
-settings and of the inputs to read, in the order of the fibres, that give a `Converter`.
+settings and of the inputs to read, in the order of the fibres, that give a `Board`.
 
 Starts a module of this package as a process of its own.
 
@@ -105,7 +105,7 @@ class Arm(Protocol):
 
 
 @dataclass(frozen=True)
-class ConverterSamples:
+class BoardSamples:
     """Readings as they come from a converter.
 
     Attributes:
@@ -118,7 +118,7 @@ class ConverterSamples:
     missing: Indices
 
 
-class Converter(Protocol):
+class Board(Protocol):
     """An analogue-to-digital converter with C channels. Methods raise `RigFault` within 5 s."""
 
     def connect(self) -> Mapping[str, Any]:
@@ -131,7 +131,7 @@ class Converter(Protocol):
         """
         ...
 
-    def read(self) -> ConverterSamples:
+    def read(self) -> BoardSamples:
         """All samples since the last call, without waiting; RigFault("stale") after 1 s without any, "lost" if gone."""
         ...
 

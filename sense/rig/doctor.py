@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from padforge.sense.arrays import Array
-from padforge.sense.rig.devices import Arm, Converter, RigFault
+from padforge.sense.rig.devices import Arm, Board, RigFault
 from padforge.sense.rig.safety import require_tool
 from padforge.sense.settings import RigSettings
 
@@ -32,9 +32,7 @@ class Diagnosis:
     found: str
 
 
-def examine_converter(
-    converter: Converter, clock: Callable[[], float], sleep: Callable[[float], None]
-) -> list[Diagnosis]:
+def examine_converter(converter: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> list[Diagnosis]:
     """Whether a converter answers, at its rate, without a gap, and each of its channels."""
     try:
         info = converter.connect()
@@ -107,9 +105,7 @@ def _force(force_n: float | None, max_force_n: float | None) -> Diagnosis:
     return Diagnosis("force", "ok", f"{told}, stopped beyond {max_force_n:g} N")
 
 
-def _samples(
-    converter: Converter, clock: Callable[[], float], sleep: Callable[[float], None]
-) -> tuple[Array, Array, int]:
+def _samples(converter: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> tuple[Array, Array, int]:
     end, pieces = clock() + LOOK_S, []
     while clock() < end:
         pieces.append(converter.read())

@@ -21,13 +21,12 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
 from padforge.sense.arrays import Array
-from padforge.sense.health.locating import locate
-from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import Free, PressPlan, free_of, size_of, uniform
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import refuse_begun, refuse_existing
-from padforge.sense.rig.config import Setup, kept_plan, on_bed, plan_of, recorder_of
-from padforge.sense.rig.devices import Arm, Converter, RigFault, device, host_ports
+from padforge.sense.rig.config import RigConfig, kept_plan, on_bed, plan_of, recorder_of
+from padforge.sense.rig.devices import Arm, Board, RigFault, device, host_ports
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_converter
 from padforge.sense.rig.press_loop import Interrupts, Report, Session, require_safe_plan
 from padforge.sense.rig.safety import Limits, require_ready, require_tool
@@ -40,7 +39,7 @@ _CANDIDATES = 500
 _NEIGHBOURS = 5
 
 
-class Steering:
+class AdaptivePlanner:
     """Chooses presses: those candidates where errors nearby, times the way to the nearest press, are largest.
 
     Args:
@@ -48,7 +47,7 @@ class Steering:
             every press. rng: of the candidates. free: which of them may be pressed.
     """
 
-    def __init__(self, localizer: Localizer, run: Path, rng: np.random.Generator, free: Free) -> None:
+    def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: Free) -> None:
         self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
 
     def __call__(self, plan: PressPlan, press: int) -> PressPlan:
@@ -56,9 +55,9 @@ class Steering:
         if press == 0 or press % EVERY:
             return plan
         recording = Recording.open(self._run)
-        errors = np.linalg.norm(locate(self._localizer, recording).places_mm - recording.presses_mm, axis=1)
-        places = plan.places_mm.copy()
-        high = np.abs(plan.places_mm).max(axis=0)
+        errors = np.linalg.norm(self._localizer.predict(recording).positions_mm - recording.presses_mm, axis=1)
+        places = plan.positions_mm.copy()
+        high = np.abs(plan.positions_mm).max(axis=0)
         candidates = uniform(np.array([-high, high]), _CANDIDATES, self._rng, self._free)
         pressed = recording.presses_mm
         for number in range(press, min(press + EVERY, len(plan))):
@@ -114,20 +113,20 @@ def record_simulated(
 
 @contextmanager
 def opened_rig(
-    kind: str, setup: Setup, inputs: Sequence[int], through_drivers: bool = False
-) -> Iterator[tuple[Arm, Converter, RigSettings]]:
+    kind: str, setup: RigConfig, inputs: Sequence[int], virtual_hardware: bool = False
+) -> Iterator[tuple[Arm, Board, RigSettings]]:
     """Arm and converter of a rig, "simulated" or the name of an arm, not yet connected, and the settings for them.
 
     Args:
         inputs: of the board, fibre by fibre; all of them where empty. The settings then name these.
-        through_drivers: emulated devices behind the drivers of the rig, as the simulated one always has them.
+        virtual_hardware: emulated devices behind the drivers of the rig, as the simulated one always has them.
     """
     rig = setup.rig.model_copy(update={"channels": tuple(inputs)})
-    if kind == "simulated" or through_drivers:
+    if kind == "simulated" or virtual_hardware:
         from padforge.sense.virtual.virtual_rig import RIGS
 
         if kind not in RIGS:
-            raise InputError(f"--through-drivers: got --rig {kind}, allowed are {', '.join(RIGS)}")
+            raise InputError(f"--virtual-hardware: got --rig {kind}, allowed are {', '.join(RIGS)}")
         settle, emulated = RIGS[kind]
         chosen = settle(rig, setup.pad)
         with emulated(setup.pad, setup.contact, chosen) as (arm, converter, _, _):
@@ -138,26 +137,26 @@ def opened_rig(
         yield arm, converter, rig
 
 
-def _arm(kind: str, setup: Setup, rig: RigSettings) -> tuple[Arm, RigSettings]:
+def _arm(kind: str, setup: RigConfig, rig: RigSettings) -> tuple[Arm, RigSettings]:
     """An arm by its name, and the settings for it."""
     make = device("padforge.arms", kind)
     rig = on_bed(rig, setup.folder) if kind == "printer" else rig
     return make(rig), rig
 
 
-def _board(rig: RigSettings, inputs: Sequence[int]) -> Converter:
+def _board(rig: RigSettings, inputs: Sequence[int]) -> Board:
     return device("padforge.boards", rig.board)(rig, inputs)
 
 
 @contextmanager
-def opened_board(setup: Setup, inputs: Sequence[int]) -> Iterator[Converter]:
+def opened_board(setup: RigConfig, inputs: Sequence[int]) -> Iterator[Board]:
     """The board alone, not yet connected: the pad is pressed by hand. `inputs` as of `opened_rig`."""
     with closing(_board(setup.rig, inputs)) as converter:
         yield converter
 
 
 @contextmanager
-def _emulated_board(setup: Setup) -> Iterator[Converter]:
+def _emulated_board(setup: RigConfig) -> Iterator[Board]:
     from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
     with pressed_by_finger(setup.pad, setup.contact, setup.rig) as (converter, _):
@@ -166,12 +165,12 @@ def _emulated_board(setup: Setup) -> Iterator[Converter]:
 
 def record(
     kind: str,
-    setup: Setup,
+    setup: RigConfig,
     model: Path | None = None,
     *,
     dry: bool = False,
     resume: bool = False,
-    through_drivers: bool = False,
+    virtual_hardware: bool = False,
     report: Report = lambda done, of: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Recording | None:
@@ -180,7 +179,7 @@ def record(
     Args:
         model: folder of the localizer that an adaptive plan is steered by.
         dry: go through the plan without touching the pad; nothing is kept. resume: go on with what is in `setup.out`.
-        through_drivers: see `opened_rig`.
+        virtual_hardware: see `opened_rig`.
         report: told of presses done, and in all. say: told what a person should know before the arm moves.
 
     Returns:
@@ -191,7 +190,7 @@ def record(
         RigFault: the rig failed, or the plan is not safe.
     """
     inputs = setup.rig.inputs(len(setup.pad.knots))
-    with opened_rig(kind, setup, inputs, through_drivers) as (arm, converter, rig):
+    with opened_rig(kind, setup, inputs, virtual_hardware) as (arm, converter, rig):
         with Interrupts() as interrupts:
             plan = plan_of(setup, rig, resume)
             steer = _steering(setup, rig, model)
@@ -213,24 +212,24 @@ def record(
             return None if dry else Recording.open(folder)
 
 
-def _steering(setup: Setup, rig: RigSettings, model: Path | None) -> Callable[[PressPlan, int], PressPlan]:
+def _steering(setup: RigConfig, rig: RigSettings, model: Path | None) -> Callable[[PressPlan, int], PressPlan]:
     if rig.plan != "adaptive":
         return lambda plan, press: plan
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
     free = free_of(setup.pad, size_of(setup.pad, setup.size))
-    return Steering(Localizer.load(model), setup.out, np.random.default_rng(rig.seed), free)
+    return AdaptivePlanner(LocalizerModel.load(model), setup.out, np.random.default_rng(rig.seed), free)
 
 
-def look_over(kind: str, setup: Setup, inputs: Sequence[int], through_drivers: bool = False) -> list[Diagnosis]:
+def look_over(kind: str, setup: RigConfig, inputs: Sequence[int], virtual_hardware: bool = False) -> list[Diagnosis]:
     """What to know of a rig, see `opened_rig`, or of the board alone for "hand", before a long run; nothing moves."""
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     found = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
     if kind == "hand":
-        with _emulated_board(setup) if through_drivers else opened_board(setup, inputs) as converter:
+        with _emulated_board(setup) if virtual_hardware else opened_board(setup, inputs) as converter:
             return found + examine_converter(converter, time.monotonic, time.sleep)
-    if kind == "simulated" or through_drivers:
-        with opened_rig(kind, setup, inputs, through_drivers) as (arm, converter, rig):
+    if kind == "simulated" or virtual_hardware:
+        with opened_rig(kind, setup, inputs, virtual_hardware) as (arm, converter, rig):
             found += examine_converter(converter, time.monotonic, time.sleep)
             return found + examine_arm(arm, rig, time.monotonic, time.sleep)
 

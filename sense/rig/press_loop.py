@@ -29,8 +29,8 @@ import numpy as np
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder
-from padforge.sense.rig.config import Frame
-from padforge.sense.rig.devices import Arm, ArmState, Converter, Pose, RigFault
+from padforge.sense.rig.config import RobotFrame
+from padforge.sense.rig.devices import Arm, ArmState, Board, Pose, RigFault
 from padforge.sense.rig.safety import POLL_S, Limits, require_ready, require_safe, wait_until_still, watch
 from padforge.sense.rig.streams import Averager
 from padforge.sense.settings import RigSettings
@@ -214,7 +214,7 @@ class Session:
     def __init__(
         self,
         arm: Arm,
-        converter: Converter,
+        converter: Board,
         recorder: Recorder,
         rig: RigSettings,
         *,
@@ -224,9 +224,9 @@ class Session:
     ) -> None:
         self._arm, self._converter, self._recorder, self._rig = arm, converter, recorder, rig
         self._clock, self._sleep, self._dry = clock, sleep, dry
-        self._frame, self._limits = Frame.of(rig), Limits.of(rig)
-        ratio = max(1, round(rig.converter_rate_hz / rig.rate_hz))
-        self._half_s = rig.readings_per_press / 2 * ratio / rig.converter_rate_hz
+        self._frame, self._limits = RobotFrame.of(rig), Limits.of(rig)
+        ratio = max(1, round(rig.board_rate_hz / rig.rate_hz))
+        self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz
         self._averager = Averager(ratio, recorder.fibres)
         self._recent: deque[float] = deque(maxlen=_KEPT)
         self._disk, self._readings = DiskThread(), recorder.readings
@@ -258,7 +258,7 @@ class Session:
                     if (steered := steer(plan, press)) is not plan:
                         require_safe_plan(steered, self._rig)
                         plan = steered
-                    self._press(press, plan.places_mm[press], float(plan.depths_mm[press]))
+                    self._press(press, plan.positions_mm[press], float(plan.depths_mm[press]))
                     self._await_disk()
                     report(len(self._recorder.done), len(plan))
             self._go_on_until(self._clock() + self._half_s)  # the release after the last press
@@ -419,8 +419,8 @@ class Session:
 
 def require_safe_plan(plan: PressPlan, rig: RigSettings) -> None:
     """Refuse a plan of which any pose or move is beyond the limits of `[rig]`; raises RigFault("refused")."""
-    frame, limits = Frame.of(rig), Limits.of(rig)
-    for place, depth in zip(plan.places_mm, plan.depths_mm.tolist(), strict=True):
+    frame, limits = RobotFrame.of(rig), Limits.of(rig)
+    for place, depth in zip(plan.positions_mm, plan.depths_mm.tolist(), strict=True):
         require_safe(frame.pose(place, -rig.clearance_mm), rig.travel_mm_s, rig.acceleration_mm_s2, limits)
         require_safe(frame.pose(place, depth), rig.press_mm_s, rig.acceleration_mm_s2, limits)
 

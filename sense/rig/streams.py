@@ -20,7 +20,7 @@ from padforge.sense.health.trace_model import RELEASED
 from padforge.sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
 from padforge.sense.recording.recording import Recording, is_mirrored
 from padforge.sense.recording.run_directory import FORMAT, START
-from padforge.sense.rig.devices import Converter, ConverterSamples
+from padforge.sense.rig.devices import Board, BoardSamples
 from padforge.sense.settings import RigSettings
 
 if TYPE_CHECKING:
@@ -32,10 +32,10 @@ HISTORY = SLOW[-1]
 SUNK = DOWN[-1][1]
 """Readings after the probe was sent down that are looked at; of the others until it is sent up, none is."""
 NEEDS = {
-    "early": (DOWN[EARLY - 1][1], 0),
+    "onset": (DOWN[EARLY - 1][1], 0),
     "causal": (SUNK, 0),
     "published": (SUNK, 10 + MEDIAN // 2 + 1),
-    "full": (SUNK, UP[-1][1]),
+    "press_and_release": (SUNK, UP[-1][1]),
 }
 """Readings that features take after the probe was sent down, and after it was sent up."""
 DONE = max(UP[-1][1], RELEASED)
@@ -84,8 +84,8 @@ class Excerpt(NamedTuple):
     """The readings (n, C) V that tell of a press, and at which of them it begins and ends, and the one before ended."""
 
     readings: Array
-    begun: int
-    lifted: int
+    down_command: int
+    up_command: int
     free: int
 
 
@@ -95,51 +95,53 @@ class BufferedPress:
 
     Attributes:
         number: counted from 0. time_s: when the pad was touched. touched: index of the first reading that shows it.
-        begun: index of the first reading after the probe was sent down, or would have been.
+        down_command: index of the first reading after the probe was sent down, or would have been.
         free: index of the reading at which the press before was let go, < begun.
         rest: (C,) V before it.
-        lifted: index of the first reading after it was let go; None while it is held.
+        up_command: index of the first reading after it was let go; None while it is held.
         told: how many localizers have told its place.
     """
 
     number: int
     time_s: float
     touched: int
-    begun: int
+    down_command: int
     free: int
     rest: Array
-    lifted: int | None = None
+    up_command: int | None = None
     told: int = 0
     _opening: Array | None = None
 
-    def let_go(self, lifted: int) -> None:
-        """It was let go by the reading of index `lifted`."""
-        self.lifted = max(lifted, self.begun + 1)
+    def let_go(self, up_command: int) -> None:
+        """It was let go by the reading of index `up_command`."""
+        self.up_command = max(up_command, self.down_command + 1)
 
     def enough(self, features: str) -> int | None:
         """Index of the first reading that `features` can do without; None while that is not known."""
         down, up = NEEDS[features]
         if up == 0:
-            return self.begun + down if self.lifted is None else min(self.begun + down, self.lifted)
-        return None if self.lifted is None else self.lifted + up
+            return (
+                self.down_command + down if self.up_command is None else min(self.down_command + down, self.up_command)
+            )
+        return None if self.up_command is None else self.up_command + up
 
     def keep_opening(self, ring: Ring) -> None:
         """Keep what was before it and its first readings, once these are there, however long it will be held."""
-        if self._opening is None and self.lifted is None and ring.end >= self.begun + SUNK:
-            self._opening = ring.rows(self.begun - HISTORY, self.begun + SUNK)[:, 1:].copy()
+        if self._opening is None and self.up_command is None and ring.end >= self.down_command + SUNK:
+            self._opening = ring.rows(self.down_command - HISTORY, self.down_command + SUNK)[:, 1:].copy()
 
     def excerpt(self, ring: Ring, end: int) -> Excerpt:
         """Its readings up to index `end`; of a press that was held for long, without those that nobody looks at."""
-        lifted = end if self.lifted is None else min(self.lifted, end)
-        if self._opening is None or lifted <= self.begun + SUNK:
-            readings = ring.rows(self.begun - HISTORY, end)[:, 1:]
-            begun = len(readings) - (end - self.begun)
-            up = begun + lifted - self.begun
+        up_command = end if self.up_command is None else min(self.up_command, end)
+        if self._opening is None or up_command <= self.down_command + SUNK:
+            readings = ring.rows(self.down_command - HISTORY, end)[:, 1:]
+            down_command = len(readings) - (end - self.down_command)
+            up = down_command + up_command - self.down_command
         else:
-            readings = np.concatenate([self._opening, ring.rows(lifted, end)[:, 1:]])
+            readings = np.concatenate([self._opening, ring.rows(up_command, end)[:, 1:]])
             up = len(self._opening)
-            begun = up - SUNK
-        return Excerpt(readings, begun, up, max(begun - (self.begun - self.free), 0))
+            down_command = up - SUNK
+        return Excerpt(readings, down_command, up, max(down_command - (self.down_command - self.free), 0))
 
 
 Block = tuple[Array, Array]
@@ -168,7 +170,7 @@ class Averager:
         self._waiting = np.empty((0, 2 + channels))  # stretch, time, volts
         self.lost = 0
 
-    def feed(self, samples: ConverterSamples) -> tuple[Array, Array]:
+    def feed(self, samples: BoardSamples) -> tuple[Array, Array]:
         """Times (n,) and volts (n, C) of the stretches that are complete now; the others wait for more samples."""
         if len(samples.times_s) == 0:
             return np.empty(0), np.empty((0, self._waiting.shape[1] - 2))
@@ -202,7 +204,7 @@ class Source:
     converter: Mapping[str, Any] = field(default_factory=dict)
 
 
-def connected(converter: Converter, rate_hz: float) -> Source:
+def connected(converter: Board, rate_hz: float) -> Source:
     """The readings of a converter, which is connected now, averaged to about `rate_hz`; without end.
 
     Raises:

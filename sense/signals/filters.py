@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from padforge.design.common.parallel import map_chunks
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
-from padforge.sense.arrays import MAX_FIBRES, MAX_S, Array, Indices, as_numbers, refuse_beyond
+from padforge.sense.arrays import MAX_FIBRES, MAX_S, Array, Indices, check_magnitude, check_numbers
 from padforge.sense.signals import filter_kernels
 
 Fidelity = Literal["robust", "squares"]
@@ -49,10 +49,10 @@ def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
     Raises:
         InputError: times that are not finite, beyond 1e10 s or do not ascend, or an interval that is not above 0.
     """
-    times = as_numbers(times_s, np.float64, "times_s")
+    times = check_numbers(times_s, np.float64, "times_s")
     if times.ndim != 1:
         raise InputError(f"times_s have shape {times.shape}, expected (R,)")
-    refuse_beyond("times_s", times[:, None], MAX_S, "s")
+    check_magnitude("times_s", times[:, None], MAX_S, "s")
     if (np.diff(times) < 0).any():
         raise InputError(f"times_s are {short_repr(times_s)}, expected finite numbers that ascend")
     if not (longest := check_float("longest_s", longest_s, 0.0, 1e300)):
@@ -153,7 +153,7 @@ def checked_readings(readings: ArrayLike) -> Array:
     Raises:
         InputError: they are no real numbers, or beyond GREATEST.
     """
-    array = as_numbers(readings, np.float64, "readings")
+    array = check_numbers(readings, np.float64, "readings")
     beyond = np.abs(array) > GREATEST
     if beyond.any():
         first = np.argwhere(beyond)[0].tolist()
@@ -165,7 +165,7 @@ def checked_readings(readings: ArrayLike) -> Array:
 
 
 def _checked_starts(starts: ArrayLike, readings: int) -> list[int]:
-    array = as_numbers(starts, np.int64, "starts")
+    array = check_numbers(starts, np.int64, "starts")
     if array.ndim != 1 or (np.diff(array) <= 0).any() or (len(array) and not 0 <= array[0] <= array[-1] < readings):
         raise InputError(f"starts are {short_repr(starts)}, allowed are ascending indices of {readings} readings")
     return array.tolist()

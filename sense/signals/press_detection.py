@@ -1,5 +1,5 @@
 """Finding presses in readings: from when a pad was touched, and from when it was let go, whatever the protocol.
-The same code finds them as readings come (`Finder`) and in a recording (`find_presses`). It learns the noise of every
+The same code finds them as readings come (`PressDetector`) and in a recording (`detect_presses`). It learns the noise of every
 fibre, follows drift, creep and the return from the overshoot after a release, and bears spikes, missing readings and
 fibres that are dead, saturated, noisy or break meanwhile. It expects a pad that begins at rest, for eight readings or
 a quarter of a second, and a probe that sinks in within about half a second.
@@ -29,7 +29,7 @@ _PART = 65_536
 """Readings taken at a time, so that a long recording is not copied as a whole."""
 
 
-class Event(NamedTuple):
+class PressEvent(NamedTuple):
     """What became of the pad.
 
     Attributes:
@@ -52,7 +52,7 @@ class Presses(NamedTuple):
     released: Indices
 
 
-class Finder:
+class PressDetector:
     """Finds presses as readings come.
 
     A touch is told a look or two after its first reading (see `kernels.level_tracking`), a tap or a touch of a rare
@@ -71,7 +71,7 @@ class Finder:
         self._last_s = -np.inf
         self._doubt, self._sure = (chi_square_limits(fibres, chance) for chance in (DOUBT, SURE))
 
-    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
+    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
         """Take (n,) times in s, ascending, and (n, C) volts, NaN where missing; what became of the pad meanwhile.
 
         Raises:
@@ -82,16 +82,16 @@ class Finder:
             raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
         return self.follow(times, rows)
 
-    def follow(self, times_s: Array, readings: Array) -> list[Event]:
+    def follow(self, times_s: Array, readings: Array) -> list[PressEvent]:
         """The same of arrays of float64 that were checked already."""
         events = np.empty((2 * len(times_s), 2), np.int64)
         rows = np.ascontiguousarray(readings)
         self._last_s = times_s[-1] if len(times_s) else self._last_s
         count = find(self._fibres, self._pad, times_s, rows, self._doubt, self._sure, events)
-        return [Event(bool(down), reading) for down, reading in events[:count].tolist()]
+        return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
 
 
-def find_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
+def detect_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
     """Presses in readings of a pad.
 
     Args:
@@ -101,7 +101,7 @@ def find_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
         InputError: as `limits.stream_of`.
     """
     times_s, readings = stream_of(times_s, readings)
-    finder = Finder(readings.shape[1])
+    finder = PressDetector(readings.shape[1])
     parts = (slice(first, first + _PART) for first in range(0, len(readings), _PART))
     events = [event for part in parts for event in finder.follow(times_s[part], readings[part])]
     touched = [event.reading for event in events if event.down]
@@ -111,7 +111,7 @@ def find_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
 
 
 def as_commanded(presses: Presses, times_s: Array) -> tuple[Indices, Indices]:
-    """Presses found, as if they had been commanded: `begun` and `lifted` of a `Recording`.
+    """Presses found, as if they had been commanded: `down_command` and `up_command` of a `Recording`.
 
     Args:
         presses: found in readings taken at times_s (R,) s.
@@ -121,10 +121,10 @@ def as_commanded(presses: Presses, times_s: Array) -> tuple[Indices, Indices]:
     """
     touched, released = presses
     sent_up = np.searchsorted(times_s, np.append(times_s, np.inf)[released] - SENT_UP_S)
-    lifted = np.maximum(sent_up, touched + 1)
+    up_command = np.maximum(sent_up, touched + 1)
     # Presses may follow each other closely: none begins before the one before it has ended.
     sent_down = np.searchsorted(times_s, times_s[touched] - SENT_DOWN_S)
-    return np.maximum(sent_down, np.concatenate([[0], lifted[:-1]]) + 1), lifted
+    return np.maximum(sent_down, np.concatenate([[0], up_command[:-1]]) + 1), up_command
 
 
 def chi_square_limits(most: int, chance: float) -> Array:
@@ -163,22 +163,27 @@ EARLY = 2
 """Readings before its command at which a press may show: commands are noted a little late."""
 
 
-def as_detected(readings: Array, times_s: Array, begun: Indices, lifted: Indices) -> tuple[Indices, Indices]:
+def as_detected(readings: Array, times_s: Array, down_command: Indices, up_command: Indices) -> tuple[Indices, Indices]:
     """Presses as one who follows the readings live would have them.
 
     Args:
         readings: (R, C) volts, NaN where missing. times_s: (R,) s.
-        begun, lifted: (Q,) first reading after the probe was sent down, and up.
+        down_command, up_command: (Q,) first reading after the probe was sent down, and up.
 
     Returns:
         The same as found in the readings; of a press that is not found, as given.
     """
-    found = find_presses(readings, times_s)
+    found = detect_presses(readings, times_s)
     downs, ups = as_commanded(found, times_s)
     if len(downs) == 0:
-        return begun, lifted
-    nearest = np.minimum(np.searchsorted(found.touched, begun - EARLY), len(downs) - 1)
+        return down_command, up_command
+    nearest = np.minimum(np.searchsorted(found.touched, down_command - EARLY), len(downs) - 1)
     touched, released = found.touched[nearest], found.released[nearest]
-    following = np.append(begun[1:], len(readings))
-    sure = (touched >= begun - EARLY) & (touched < lifted) & (released >= lifted - EARLY) & (released < following)
-    return np.where(sure, downs[nearest], begun), np.where(sure, ups[nearest], lifted)
+    following = np.append(down_command[1:], len(readings))
+    sure = (
+        (touched >= down_command - EARLY)
+        & (touched < up_command)
+        & (released >= up_command - EARLY)
+        & (released < following)
+    )
+    return np.where(sure, downs[nearest], down_command), np.where(sure, ups[nearest], up_command)

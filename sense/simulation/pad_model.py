@@ -242,15 +242,15 @@ class LivePad:
         self._gains = np.ones(len(pad.knots))
         self._touched = False
 
-    def volts(self, places_mm: Array, depths_mm: Array) -> Array:
+    def volts(self, positions_mm: Array, depths_mm: Array) -> Array:
         """(R, C) volts for tips at (R, 2) mm from the pad's centre, (R,) mm below its surface (above: less than 0)."""
-        strained = np.zeros((len(places_mm), len(self._pad.knots)))
+        strained = np.zeros((len(positions_mm), len(self._pad.knots)))
         for row, touched in enumerate(depths_mm > 0):
             if touched and not self._touched:
                 self._gains = self._rig.response_scatter.sample_gains((1, len(self._gains)), self._rng)[0]
             self._touched = bool(touched)
             if touched:
-                strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(places_mm[row])
+                strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(positions_mm[row])
         return self._divider(strained)
 
     def _stretch(self, place_mm: Array) -> Array:

@@ -21,7 +21,7 @@ from padforge.design.common.validation import MAX_VALUES, InputError, check_int,
 from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
 from padforge.design.twin import TwinChannel
-from padforge.sense.arrays import LEAST_SPREAD_V, MAX_FIBRES, Array, Indices
+from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array, Indices
 from padforge.sense.recording.press_plan import Free, free_of, planned_in, size_of, told_pad, uniform
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
@@ -70,7 +70,7 @@ def planned(pad: Morphology, contact: Contact, size: PadSettings | None = None) 
         len(pad.knots),
         pad.to_mm(size.sensed),
         free_of(pad, size),
-        lambda places_mm: relative_stretch(pad, pad.to_grid(places_mm), contact),
+        lambda positions_mm: relative_stretch(pad, pad.to_grid(positions_mm), contact),
         None,
         {},
         source | ({"keep_out_mm": told["keep_out_mm"]} if size.keep_out_mm else {}),
@@ -90,9 +90,9 @@ def measured(twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
     noise_v = np.zeros(len(twin.channels))
     noise_v[columns] = [channel.noise_v for channel in live]
 
-    def answers(places_mm: Array) -> Array:
-        out = np.zeros((len(places_mm), len(twin.channels)))
-        out[:, columns] = gains_v * twin.as_built_stretch(places_mm)[:, fibres]
+    def answers(positions_mm: Array) -> Array:
+        out = np.zeros((len(positions_mm), len(twin.channels)))
+        out[:, columns] = gains_v * twin.as_built_stretch(positions_mm)[:, fibres]
         return out
 
     half_mm = _sides_mm(twin) / 2
@@ -101,7 +101,7 @@ def measured(twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
     return SimulatedPad(
         len(twin.channels),
         np.array([-half_mm, half_mm]),
-        lambda places_mm: plan.free(twin.frame.to_plan(places_mm)),
+        lambda positions_mm: plan.free(twin.frame.to_plan(positions_mm)),
         answers,
         *_told(twin, noise_v, source),
     )
@@ -130,7 +130,7 @@ def measured_alike(pad: Morphology, twin: Twin, size: PadSettings | None = None)
         plan.channels,
         plan.pressed_mm,
         plan.free,
-        lambda places_mm: gain_v * plan.answers(places_mm),
+        lambda positions_mm: gain_v * plan.answers(positions_mm),
         *_told(twin, noise_v, plan.source),
     )
 
@@ -208,15 +208,15 @@ def simulate(
             f"{values} values, allowed are {MAX_VALUES}"
         )
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
-    readings = read_pad(model.answers(plan.places_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
+    readings = read_pad(model.answers(plan.positions_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
     first = cycle.readings * np.arange(len(plan))
     return Recording(
         readings,
         np.cumsum(intervals_s),
-        plan.places_mm,
-        begun=first + cycle.down_at,
-        lifted=first + cycle.readings,
+        plan.positions_mm,
+        down_command=first + cycle.down_at,
+        up_command=first + cycle.readings,
         depths_mm=plan.depths_mm,
         source={"kind": "simulated", "rig": rig.model_dump(mode="json"), **model.source},
     )
@@ -250,19 +250,19 @@ def strengths(recording: Recording) -> dict[str, float]:
     Returns:
         None of them where fewer than LEAST_PRESSES, or no channel, can tell.
     """
-    begun, lifted, rate_hz = recording.begun[:-1], recording.lifted[:-1], recording.rate_hz
-    whole = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > LEAST_SPREAD_V)
-    if len(begun) < LEAST_PRESSES or not whole.any():
+    down_command, up_command, rate_hz = recording.down_command[:-1], recording.up_command[:-1], recording.rate_hz
+    whole = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > MIN_SCALE_V)
+    if len(down_command) < LEAST_PRESSES or not whole.any():
         return {}
-    readings, after = recording.readings[:, whole], recording.begun[1:]
+    readings, after = recording.readings[:, whole], recording.down_command[1:]
     settled, rested, first, last = np.ceil(np.array([DELAY_S[1] + TRAVEL_S, REST_S, *LEFT_S]) * rate_hz).astype(int)
-    rest = _means(readings, np.maximum(begun - rested, np.append(0, lifted[:-1])), begun)
-    answer = _means(readings, np.minimum(begun + settled, lifted - 1), lifted) - rest
-    left = _means(readings, np.minimum(lifted + first, after - 1), np.minimum(lifted + last, after)) - rest
-    lasting_s, drift_v = _memory(rest, float(np.median(np.diff(recording.times_s[begun]))))
+    rest = _means(readings, np.maximum(down_command - rested, np.append(0, up_command[:-1])), down_command)
+    answer = _means(readings, np.minimum(down_command + settled, up_command - 1), up_command) - rest
+    left = _means(readings, np.minimum(up_command + first, after - 1), np.minimum(up_command + last, after)) - rest
+    lasting_s, drift_v = _memory(rest, float(np.median(np.diff(recording.times_s[down_command]))))
     answer, left = answer - answer.mean(axis=0), left - left.mean(axis=0)
     share = -float((answer * left).sum() / (answer**2).sum()) * np.exp(np.mean(LEFT_S) / lasting_s)
-    middle = (begun + lifted) // 2
+    middle = (down_command + up_command) // 2
     bends = readings[middle - 1] - 2 * readings[middle] + readings[middle + 1]
     return {
         "noise_mv": 1e3 * float(np.sqrt((bends**2).mean() / 6)),  # white noise bends by six times its variance
@@ -284,6 +284,6 @@ def _memory(rest: Array, apart_s: float) -> tuple[float, float]:
     found: list[tuple[float, float, float]] = []
     for lasting_s in LASTING_S.tolist():
         shapes = 1 - np.exp(-lags[:, None] * apart_s / np.array([lasting_s, DRIFT_S]))
-        (_, drift), misfit = nnls(shapes / np.maximum(seen, LEAST_SPREAD_V**2)[:, None], np.ones(len(lags)))
+        (_, drift), misfit = nnls(shapes / np.maximum(seen, MIN_SCALE_V**2)[:, None], np.ones(len(lags)))
         found.append((float(misfit), lasting_s, float(np.sqrt(drift))))
     return min(found)[1:]

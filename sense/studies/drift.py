@@ -297,47 +297,49 @@ def _split(known: Indices, share: float, seed: int) -> Split:
     return Split(known[training[taught]], known[training[checked]], known[test], known[last])
 
 
-def values(readings: Array, begun: Indices, lifted: Indices) -> Array:
+def values(readings: Array, down_command: Indices, up_command: Indices) -> Array:
     """What each fibre reads before, in and after each press, `SETTLED` readings from the probe's commands.
 
     Where a cycle is too short for that, the nearest reading is taken that belongs neither to the press's other phases
     nor to a neighbouring press.
 
     Args:
-        readings: (R, C) volts. begun, lifted: (Q,) first reading after the probe was sent down, and up.
+        readings: (R, C) volts. down_command, up_command: (Q,) first reading after the probe was sent down, and up.
 
     Returns:
         (Q, C, 3) volts.
     """
-    return np.stack([readings[at] for at in _places(len(readings), begun, lifted)], axis=2)
+    return np.stack([readings[at] for at in _places(len(readings), down_command, up_command)], axis=2)
 
 
-def _places(readings: int, begun: Indices, lifted: Indices) -> tuple[Indices, Indices, Indices]:
+def _places(readings: int, down_command: Indices, up_command: Indices) -> tuple[Indices, Indices, Indices]:
     """(Q,) which readings are those of before, in and after each press."""
-    free, following = np.concatenate([[0], lifted[:-1]]), np.concatenate([begun[1:], [readings]])
+    free, following = np.concatenate([[0], up_command[:-1]]), np.concatenate([down_command[1:], [readings]])
     return (
-        np.maximum(begun - SETTLED, free),
-        np.minimum(begun + SETTLED, lifted - 1),
-        np.minimum(lifted + SETTLED, following - 1),
+        np.maximum(down_command - SETTLED, free),
+        np.minimum(down_command + SETTLED, up_command - 1),
+        np.minimum(up_command + SETTLED, following - 1),
     )
 
 
-def scheme_inputs(name: str, readings: Array, begun: Indices, lifted: Indices, taught: Indices) -> Array:
+def scheme_inputs(name: str, readings: Array, down_command: Indices, up_command: Indices, taught: Indices) -> Array:
     """(Q, D) what a network is given of each press when the drift is taken off as `name`, one of `SCHEMES`, says.
 
     "windows" are the windows of `press_inputs`, of which the principal components are taken that are as many as
     "published" has inputs: else the networks would differ by their size.
 
     Args:
-        readings: (R, C) volts, none missing. begun, lifted: as `values`.
+        readings: (R, C) volts, none missing. down_command, up_command: as `values`.
         taught: presses that the principal components are of.
     """
     if name == "windows":
-        windows = press_inputs(readings, begun, lifted, "full").windows.reshape(len(begun), -1)
+        windows = press_inputs(readings, down_command, up_command, "press_and_release").windows.reshape(
+            len(down_command), -1
+        )
         middle = windows[taught].mean(axis=0)
         axes = np.linalg.eigh(np.cov(windows[taught], rowvar=False))[1]
         return (windows - middle) @ axes[:, -3 * readings.shape[1] :]
-    before, pressed, after = np.moveaxis(values(readings, begun, lifted), 2, 0)
+    before, pressed, after = np.moveaxis(values(readings, down_command, up_command), 2, 0)
     if name == "published":
         return np.hstack([before, pressed, after])
     if name == "rest taken off":
@@ -357,7 +359,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
     from padforge.design.networks import fit_batch
 
     recording = source()
-    begun, lifted, places_mm = recording.begun, recording.lifted, recording.presses_mm
+    down_command, up_command, positions_mm = recording.down_command, recording.up_command, recording.presses_mm
     readings = bridged(recording.readings)
     FILTERS[name](readings[:2])  # compiled before the clock runs
     clock = perf_counter()
@@ -366,33 +368,33 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
     state["idle"] = np.array(recorded_idle_share(replace(recording, readings=filtered)).mean())
     split = _split(np.flatnonzero(recording.known), share, seed)
     for number, scheme in enumerate(SCHEMES):
-        inputs = scheme_inputs(scheme, filtered, begun, lifted, split.taught)
+        inputs = scheme_inputs(scheme, filtered, down_command, up_command, split.taught)
         rngs = np.random.default_rng([8, seed]).spawn(MEMBERS)
         check = np.broadcast_to(inputs[split.checked], (MEMBERS, len(split.checked), inputs.shape[1]))
         networks = fit_batch(
-            inputs[split.taught], places_mm[split.taught], rngs, hidden, epochs, (check, places_mm[split.checked])
+            inputs[split.taught], positions_mm[split.taught], rngs, hidden, epochs, (check, positions_mm[split.checked])
         )
         for kind, rows in (("test", split.test), ("last", split.last)):
-            found = [distances(network(inputs[rows]), places_mm[rows]) for network in networks]
+            found = [distances(network(inputs[rows]), positions_mm[rows]) for network in networks]
             state[f"{kind}_{number}"] = np.stack(found)
-    return state | _shown(recording.times_s, readings, filtered, begun, lifted)
+    return state | _shown(recording.times_s, readings, filtered, down_command, up_command)
 
 
-def _shown(times_s: Array, readings: Array, filtered: Array, begun: Indices, lifted: Indices) -> State:
+def _shown(times_s: Array, readings: Array, filtered: Array, down_command: Indices, up_command: Indices) -> State:
     """What the figure needs of a recording: see `_tried`."""
-    taken = values(filtered, begun, lifted)
+    taken = values(filtered, down_command, up_command)
     answers = taken[:, :, 1] - taken[:, :, 0]
     fibre = int(np.argmax(answers.std(axis=0)))
-    shown = min(SHOWN, len(begun))
+    shown = min(SHOWN, len(down_command))
     first = int(np.argmax(np.convolve(np.abs(answers[:, fibre]), np.ones(shown), "valid")))
-    at = np.stack(_places(len(readings), begun, lifted), axis=1)
+    at = np.stack(_places(len(readings), down_command, up_command), axis=1)
     presses = slice(first, first + shown)
     window = slice(max(0, at[first, 0] - SETTLED), at[first + shown - 1, 2] + SETTLED)
-    some = np.unique(np.linspace(0, len(begun) - 1, LEVELS).astype(int))
+    some = np.unique(np.linspace(0, len(down_command) - 1, LEVELS).astype(int))
     return {
         "stretch": np.stack([times_s[window], readings[window, fibre], filtered[window, fibre]]),
         "marks": np.stack([times_s[at[presses]], taken[presses, fibre]], axis=2),
-        "levels": np.column_stack([times_s[begun[some]], taken[some, fibre, :2]]),
+        "levels": np.column_stack([times_s[down_command[some]], taken[some, fibre, :2]]),
         "fibre": np.array(fibre),
     }
 

@@ -25,7 +25,7 @@ from padforge.sense import settings
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices
 from padforge.sense.localizer.calibration import learn, split_unseen
 from padforge.sense.localizer.evaluation import by_place, errors_by_loss
-from padforge.sense.localizer.localizer import Found, Localizer
+from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 
 _WIDTH = 0.36
@@ -43,7 +43,7 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
     for place, (way, colour) in enumerate(zip(ways, (VERTICAL, HORIZONTAL), strict=False)):
         sideways = _WIDTH * (place - (len(ways) - 1) / 2)
         for at, row in enumerate(ways[way]["errors"]):
-            means = [each["mean_mm"] for each in ways[way]["by_subset"] if len(each["lost"]) == row["lost"]]
+            means = [each["mean_mm"] for each in ways[way]["by_subset"] if len(each["failed"]) == row["n_failed"]]
             # Spread in order of the error, so that no two dots of a level hide each other.
             spread = np.linspace(-0.3, 0.3, len(means)) * _WIDTH if len(means) > 1 else np.zeros(1)
             axes.bar(at + sideways, row["mean_mm"], 0.9 * _WIDTH, color=colour, alpha=0.35, label=None if at else way)
@@ -62,7 +62,7 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
 
 def label_losses(axes: Any, rows: Sequence[Mapping[str, Any]], title: str) -> None:
     """Say along and over `axes` what stands for the `rows` of errors, one a number of lost fibres, and their sets."""
-    names = ["all fibres" if row["lost"] == 0 else f"{row['lost']} lost" for row in rows]
+    names = ["all fibres" if row["n_failed"] == 0 else f"{row['n_failed']} lost" for row in rows]
     sets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
     axes.set_xticks(range(len(rows)), [f"{name}\n{count}" for name, count in zip(names, sets, strict=True)])
     axes.set_ylabel("mean error (mm)")
@@ -85,13 +85,13 @@ def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
     errors[rows, columns] = [cell["mean_mm"] for cell in cells]
     (left, below), (right, above) = low - side / 2, high + side / 2
     axes.set(xticks=[], yticks=[])
-    lost = "+".join(str(fibre + 1) for fibre in found["lost"])
+    lost = "+".join(str(fibre + 1) for fibre in found["failed"])
     axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
     extent = (left, right, below, above)
     return axes.imshow(errors, origin="lower", extent=extent, cmap="magma_r", vmin=0, vmax=highest_mm)
 
 
-FORMAT = "padforge-fibre-loss/1"
+FORMAT = "padforge-fibre-loss/2"
 ONE, MANY = "one network", "retrained"
 """The two ways, as the document calls them."""
 
@@ -100,11 +100,11 @@ Lost = tuple[int, ...]
 
 def fibre_loss_study(
     recording: Recording,
-    localizer: Localizer | None = None,
+    localizer: LocalizerModel | None = None,
     *,
     retrain: bool = False,
     options: settings.LocalizerSettings | None = None,
-    lost: int = 3,
+    max_failures: int = 3,
     failed: Sequence[int] = (),
     keep_in: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -116,7 +116,7 @@ def fibre_loss_study(
             recording, else the share of them that `options` hold back.
         localizer: the one network; None for the second way alone. retrain: whether the second way is wanted.
         options: split, share and seed; the defaults if None.
-        lost: fibres that are lost at once, at most; no more than leave one.
+        max_failures: fibres that fail at once, at most; no more than leave one.
         failed: fibres, by index, without which errors are mapped too, however many they are; none where empty.
         keep_in: folder for the networks that are done, from which a run that was broken off goes on;
             `Checkpoints.clear` removes them once the document is kept.
@@ -136,20 +136,23 @@ def fibre_loss_study(
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
     check_type("recording", recording, Recording)
     if localizer is not None:
-        check_type("localizer", localizer, Localizer)
+        check_type("localizer", localizer, LocalizerModel)
     keep_in = None if keep_in is None else check_path("keep_in", keep_in)
-    options, lost = or_default("options", options, settings.LocalizerSettings), check_int("lost", lost, 0, MAX_FIBRES)
+    options, max_failures = (
+        or_default("options", options, settings.LocalizerSettings),
+        check_int("max_failures", max_failures, 0, MAX_FIBRES),
+    )
     chosen = _chosen(failed, recording.fibres)
     training, test = split_unseen(recording, localizer, options)
-    levels = range(min(lost, recording.fibres - 1) + 1)
-    places_mm = recording.presses_mm[test]
+    levels = range(min(max_failures, recording.fibres - 1) + 1)
+    positions_mm = recording.presses_mm[test]
     ways: dict[str, Any] = {}
     if localizer is not None:
-        locate = partial(localizer.locate, localizer.inputs(recording)[test])
-        ways[ONE] = _way(recording.fibres, levels, chosen, locate, places_mm)
+        locate = partial(localizer.predict_features, localizer.scaled_features(recording)[test])
+        ways[ONE] = _way(recording.fibres, levels, chosen, locate, positions_mm)
     if retrain:
         found = _retrained(recording, training, test, options, levels, chosen, keep_in, progress)
-        ways[MANY] = _way(recording.fibres, levels, chosen, found.__getitem__, places_mm)
+        ways[MANY] = _way(recording.fibres, levels, chosen, found.__getitem__, positions_mm)
     made_by = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     made_by["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
     return {
@@ -172,15 +175,15 @@ def _chosen(failed: Sequence[int], fibres: int) -> list[Lost]:
 
 
 def _way(
-    fibres: int, levels: range, chosen: Sequence[Lost], locate: Callable[[Lost], Found], places_mm: Array
+    fibres: int, levels: range, chosen: Sequence[Lost], locate: Callable[[Lost], Localization], positions_mm: Array
 ) -> dict[str, Any]:
-    rows, by_subset = errors_by_loss(fibres, levels, locate, places_mm)
+    rows, by_subset = errors_by_loss(fibres, levels, locate, positions_mm)
     worst = [
-        max((each for each in by_subset if len(each["lost"]) == level), key=lambda each: each["mean_mm"])["lost"]
+        max((each for each in by_subset if len(each["failed"]) == level), key=lambda each: each["mean_mm"])["failed"]
         for level in levels
     ]
     maps = [
-        {"lost": list(lost), "by_place": by_place(locate(tuple(lost)).places_mm, places_mm)}
+        {"failed": list(lost), "by_place": by_place(locate(tuple(lost)).positions_mm, positions_mm)}
         for lost in (*worst, *chosen)
     ]
     return {"errors": rows, "by_subset": by_subset, "maps": maps}
@@ -195,7 +198,7 @@ def _retrained(
     chosen: Sequence[Lost],
     keep_in: Path | None,
     progress: Callable[[int, int], None],
-) -> dict[Lost, Found]:
+) -> dict[Lost, Localization]:
     """What the network of each set of lost fibres finds for the test presses; finished ones are not made again."""
     subsets = [subset for level in levels for subset in failure_subsets(recording.fibres, level)]
     subsets += [subset for subset in chosen if subset not in subsets]
@@ -218,12 +221,12 @@ def _retrained(
 
 def train_without(
     lost: Lost, recording: Recording, training: Indices, test: Indices, options: settings.LocalizerSettings
-) -> Found:
+) -> Localization:
     """Train on the other fibres alone, and find the test presses; the same whatever else is trained, and when."""
     rest = np.setdiff1d(np.arange(recording.fibres), lost)
     fewer = replace(recording, readings=recording.readings[:, rest])
     localizer = learn(fewer, training, options, np.random.default_rng([options.seed, _number(lost)]))
-    return localizer.locate(localizer.inputs(fewer)[test])
+    return localizer.predict_features(localizer.scaled_features(fewer)[test])
 
 
 def _number(lost: Lost) -> int:
@@ -231,15 +234,15 @@ def _number(lost: Lost) -> int:
     return sum(1 << fibre for fibre in lost)
 
 
-def _found_of(state: State, presses: int) -> Found:
+def _found_of(state: State, presses: int) -> Localization:
     """What a network that was done found for so many presses; InputError where its file holds something else."""
-    shapes = {"places_mm": (presses, 2), "sd_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
+    shapes = {"positions_mm": (presses, 2), "std_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
     arrays = {name: (array.shape, array.dtype.kind) for name, array in state.items()}
     if arrays != {name: (shape, "f") for name, shape in shapes.items()}:
         raise InputError(f"unfinished networks hold {short_repr(arrays)}, expected {shapes}; remove them to start anew")
     if not all(np.isfinite(array).all() for array in state.values()):
         raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
-    return Found(state["places_mm"], state["sd_mm"], state["r50_mm"], state["r90_mm"])
+    return Localization(state["positions_mm"], state["std_mm"], state["r50_mm"], state["r90_mm"])
 
 
 def fibre_loss_lines(document: dict[str, Any]) -> list[str]:
@@ -248,7 +251,7 @@ def fibre_loss_lines(document: dict[str, Any]) -> list[str]:
     out = [head, f"{'':14s}lost  sets   mean    std    max"]
     for way, errors in document["ways"].items():
         out += [
-            f"{way:<14s}{row['lost']:4d} {row['subsets']:5d} {row['mean_mm']:6.2f} {row['std_mm']:6.2f} "
+            f"{way:<14s}{row['n_failed']:4d} {row['subsets']:5d} {row['mean_mm']:6.2f} {row['std_mm']:6.2f} "
             f"{row['max_mm']:6.2f}"
             for row in errors["errors"]
         ]

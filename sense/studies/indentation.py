@@ -187,7 +187,7 @@ def _conclude(
                     "pad": label,
                     "noise_counts": noise,
                     "pressed_mm": np.round(deep * pad.unit_mm, 4).tolist(),
-                    "found_mm": np.round(found * pad.unit_mm, 4).tolist(),
+                    "predicted_mm": np.round(found * pad.unit_mm, 4).tolist(),
                     "middles_mm": ((edges[1:] + edges[:-1]) / 2 * pad.unit_mm).tolist(),
                     "place_mm": [
                         float(off[own == bin].mean() * pad.unit_mm) if (own == bin).any() else None
@@ -244,7 +244,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         own = [curve for curve in curves if curve["pad"] == label]
         for curve, colour in reversed(list(zip(own, CURVES[2::-1], strict=False))):
             name = f"noise {curve['noise_counts']:g}"
-            axes.scatter(curve["pressed_mm"], curve["found_mm"], s=3, color=colour, alpha=0.5, linewidths=0, label=name)
+            axes.scatter(
+                curve["pressed_mm"], curve["predicted_mm"], s=3, color=colour, alpha=0.5, linewidths=0, label=name
+            )
         ends = [min(own[0]["pressed_mm"]), max(own[0]["pressed_mm"])]
         axes.plot(ends, ends, color=INK, linewidth=0.8)
         axes.set_title(label, loc="left", color=INK, fontsize=10)

@@ -52,7 +52,7 @@ def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
     save_figure(figure, path)
 
 
-FORMAT = "padforge-learning-curve/1"
+FORMAT = "padforge-learning-curve/2"
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Shares of the training presses."""
 LEAST_PRESSES = 10
@@ -97,9 +97,9 @@ def learning_curve(
         )
     order = rng.permutation(training)
     sizes = [round(share * len(order)) for share in SHARES]
-    options = options.model_copy(update={"members": 1, "method": "masked"})
+    options = options.model_copy(update={"members": 1, "method": "ensemble"})
     found = _found(recording, [np.sort(order[:size]) for size in sizes], test, options, progress)
-    errors = [distances(places_mm, recording.presses_mm[test]) for places_mm in found]
+    errors = [distances(positions_mm, recording.presses_mm[test]) for positions_mm in found]
     table, counts = np.array(errors), np.array(sizes, dtype=float)
     fit = fit_power_law(counts, table.mean(axis=1))
     forecast = _forecast(counts, table, fit, rng)
@@ -143,7 +143,7 @@ def _found(
 
         training = trainings[number]
         localizer = learn(recording, training, options, np.random.default_rng([options.seed, len(training)]), report)
-        return localizer.locate(localizer.inputs(recording)[test]).places_mm
+        return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
 
     longest_first = reversed(range(len(steps)))
     with one_torch_thread(), joint:

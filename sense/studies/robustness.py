@@ -35,7 +35,7 @@ def robustness_study(
     *,
     contact: Contact | None = None,
     rule: str = "published",
-    lost: int = 3,
+    max_failures: int = 3,
     hidden: int = 50,
     presses: int = 1024,
     test: int = 2000,
@@ -45,7 +45,7 @@ def robustness_study(
 
     Args:
         pads: by label. contact: PUBLISHED_CONTACT if None. rule: of RULES.
-        lost: most fibres that are lost at once. hidden: neurons of a network.
+        max_failures: most fibres that fail at once. hidden: neurons of a network.
         presses: to train on, a square number. test: fresh presses. seed: of presses and networks.
 
     Raises:
@@ -58,7 +58,7 @@ def robustness_study(
     parts = [
         (label, part)
         for label, pad in pads.items()
-        for level in range(min(lost, pad.layout.fibres - 1) + 1)
+        for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
         for part in split_batches(failure_subsets(pad.layout.fibres, level, MOST_SETS))
     ]
     tasks = [
@@ -71,7 +71,7 @@ def robustness_study(
         "pads": described(pads),
         "contact": contact.model_dump(mode="json"),
         "signals": rule,
-        "lost": lost,
+        "max_failures": max_failures,
         "hidden": hidden,
         "presses": presses,
         "test": test,
@@ -130,7 +130,7 @@ def _conclude(
             rows.append(
                 {
                     "pad": label,
-                    "lost": level,
+                    "n_failed": level,
                     "subsets": len(means),
                     "of": math.comb(pad.layout.fibres, level),
                     "mean": float(means.mean()),
@@ -145,10 +145,10 @@ def _conclude(
             worst = int(np.flatnonzero(sizes == level)[means.argmax()])
             shown = np.round(over[worst].reshape(SIDE, SIDE), 3)
             (left, low), (right, high) = between_fibres(pad.layout)
-            told = {"pad": label, "lost": list(losses[worst]), "extent": [left, right, low, high]}
+            told = {"pad": label, "failed": list(losses[worst]), "extent": [left, right, low, high]}
             maps.append(told | {"errors": shown.tolist()})
         by_subset += [
-            {"pad": label, "lost": list(loss), "mean": float(mean)} for loss, mean in zip(losses, fresh, strict=True)
+            {"pad": label, "failed": list(loss), "mean": float(mean)} for loss, mean in zip(losses, fresh, strict=True)
         ]
     return Findings(rows, _told(settings, rows), {"maps": maps, "by_subset": by_subset})
 
@@ -161,29 +161,30 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     )
     text = [
         f"Networks of {settings['hidden']} neurons learnt from {settings['presses']} presses of a serpentine, another "
-        f"one for every set of up to {max(row['lost'] for row in rows)} lost fibres{drawn}, and were tested on "
+        f"one for every set of up to {max(row['n_failed'] for row in rows)} lost fibres{drawn}, and were tested on "
         f"{settings['test']} fresh "
         f"presses; errors are in grid units ({settings['signals']} signals). Sets of which there are few were trained "
         f"several times, so that at least {NETWORKS} networks stand behind each mean. The last column is the paper's "
         "own measure, taken over the serpentine, most of which was trained on."
     ]
     least, most = (
-        {row["pad"]: row for row in rows if row["lost"] == level} for level in (0, max(row["lost"] for row in rows))
+        {row["pad"]: row for row in rows if row["n_failed"] == level}
+        for level in (0, max(row["n_failed"] for row in rows))
     )
     for label, row in least.items():
         said = f"{label}: {row['mean']:.3f} with all fibres ({row['mean_mm']:.2f} mm)"
-        if label in most and most[label]["lost"] > 0:
+        if label in most and most[label]["n_failed"] > 0:
             worst = most[label]
             said += (
-                f", {worst['mean']:.3f} with {worst['lost']} lost ({worst['mean'] / row['mean']:.1f} times as much), "
-                f"{worst['max']:.3f} with the worst {worst['lost']}"
+                f", {worst['mean']:.3f} with {worst['n_failed']} lost ({worst['mean'] / row['mean']:.1f} times as much), "
+                f"{worst['max']:.3f} with the worst {worst['n_failed']}"
             )
         text.append(f"{said}.")
     if len(most) > 1:
         order = sorted(most, key=lambda label: most[label]["mean"])
         worse = most[order[-1]]["mean"] / most[order[0]]["mean"]
         text.append(
-            f"With {most[order[0]]['lost']} lost {order[0]} is the most accurate and {order[-1]} the least, "
+            f"With {most[order[0]]['n_failed']} lost {order[0]} is the most accurate and {order[-1]} the least, "
             f"{worse:.1f} times as far off."
         )
     return text
@@ -192,14 +193,14 @@ def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
 def _draw(document: Mapping[str, Any]) -> Figure:
     """Errors by number of lost fibres, and maps of them before a loss and after the worst ones."""
     labels = list(document["settings"]["pads"])
-    levels = 1 + max(row["lost"] for row in document["rows"])
+    levels = 1 + max(row["n_failed"] for row in document["rows"])
     figure = Figure(figsize=(max(7.2, 1.9 * levels), 3.6 + 1.75 * len(labels)), layout="constrained")
     grid = figure.add_gridspec(1 + len(labels), levels, height_ratios=[1.9] + [1.0] * len(labels))
     axes = figure.add_subplot(grid[0, :])
     wide = 0.8 / len(labels)
     for place, label in enumerate(labels):
         rows = [row for row in document["rows"] if row["pad"] == label]
-        at = np.array([row["lost"] for row in rows]) + wide * (place - (len(labels) - 1) / 2)
+        at = np.array([row["n_failed"] for row in rows]) + wide * (place - (len(labels) - 1) / 2)
         means, stds = ([row[key] for row in rows] for key in ("mean", "std"))
         colour = CURVES[place % len(CURVES)]
         axes.bar(at, means, 0.9 * wide, yerr=stds, color=colour, alpha=0.85, ecolor=INK, label=label)
@@ -218,7 +219,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
                 each["errors"], origin="lower", extent=each["extent"], cmap="magma_r", vmin=0, vmax=highest
             )
             axes.set(xticks=[], yticks=[])
-            lost = "+".join(str(fibre + 1) for fibre in each["lost"])
+            lost = "+".join(str(fibre + 1) for fibre in each["failed"])
             axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
             if column == 0:
                 axes.set_ylabel(label, fontsize=8, color=INK)

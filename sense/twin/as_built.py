@@ -146,20 +146,20 @@ class Responses:
     """Answers of C channels to Q presses of known places.
 
     Attributes:
-        places_mm: (Q, 2) as the arm counts. volts: (Q, C) mean while held minus the rest before, as it would be after
+        positions_mm: (Q, 2) as the arm counts. volts: (Q, C) mean while held minus the rest before, as it would be after
             the channel's usual history. there: (Q, C) whether the channel gave enough readings.
     """
 
-    places_mm: Array
+    positions_mm: Array
     volts: Array
     there: Mask
 
     def __len__(self) -> int:
-        return len(self.places_mm)
+        return len(self.positions_mm)
 
     def of(self, rows: Indices, channels: Indices | slice = slice(None)) -> "Responses":
         """Those of some presses and channels."""
-        return Responses(self.places_mm[rows], self.volts[rows][:, channels], self.there[rows][:, channels])
+        return Responses(self.positions_mm[rows], self.volts[rows][:, channels], self.there[rows][:, channels])
 
     @property
     def spread(self) -> Array:
@@ -199,12 +199,12 @@ def responses(recording: Recording, learnt: Mask) -> Responses:
         learnt: (Q,) of these presses, those from which is learnt what of its history a channel still shows.
     """
     known = recording.known
-    inputs = press_inputs(recording.readings, recording.begun[known], recording.lifted[known], "causal")
+    inputs = press_inputs(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
     places = recording.presses_mm[known]
     about = _about(places)
-    model = ResponseModel.fit(about[learnt], inputs.windows[learnt], inputs.history[learnt], inputs.alive[learnt])
+    model = ResponseModel.fit(about[learnt], inputs.windows[learnt], inputs.history[learnt], inputs.fibre_mask[learnt])
     windows = settled(inputs.windows, inputs.history, model.memory, model.usual)
-    return Responses(places, windows @ HOLD, inputs.alive)
+    return Responses(places, windows @ HOLD, inputs.fibre_mask)
 
 
 def information(recording: Recording, channels: Indices) -> Array:
@@ -214,12 +214,14 @@ def information(recording: Recording, channels: Indices) -> Array:
         channels: (C',) which ones, each by the presses in which it gave enough readings.
     """
     known = recording.known
-    inputs = press_inputs(recording.readings, recording.begun[known], recording.lifted[known], "full")
+    inputs = press_inputs(
+        recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
+    )
     places = _about(recording.presses_mm[known])
     side_mm = np.ptp(recording.presses_mm[known], axis=0).max()
     told = []
     for channel in channels.tolist():
-        there = inputs.alive[:, channel]
+        there = inputs.fibre_mask[:, channel]
         told.append(_told(places[there], inputs.windows[there, channel], inputs.history[there, channel]))
     return np.array(told) * (2 / side_mm) ** 2
 
@@ -230,11 +232,11 @@ def _told(places: Array, windows: Array, history: Array) -> float:
     Of two response models, each of half the presses, what is left over of the other half and the product of their
     slopes are taken: noise that a model takes for a slope is not in the other one.
     """
-    windows, history, alive = windows[:, None], history[:, None], np.ones((len(places), 1), bool)
+    windows, history, fibre_mask = windows[:, None], history[:, None], np.ones((len(places), 1), bool)
     grid, odd = np.linspace(-1, 1, STEPS + 1), np.arange(len(places)) % 2 == 1
     left, tables = np.empty_like(windows), []
     for seen in (odd, ~odd):
-        model = ResponseModel.fit(places[seen], windows[seen], history[seen], alive[seen])
+        model = ResponseModel.fit(places[seen], windows[seen], history[seen], fibre_mask[seen])
         expected = RegularGridInterpolator((grid, grid), model.table)(places[~seen])
         left[~seen] = settled(windows[~seen], history[~seen], model.memory, model.usual) - expected
         tables.append(model.table[:, :, 0])
@@ -245,10 +247,10 @@ def _told(places: Array, windows: Array, history: Array) -> float:
     return max(told, 0.0)
 
 
-def _about(places_mm: Array) -> Array:
+def _about(positions_mm: Array) -> Array:
     """(Q, 2) places to the square [-1, 1] about all of them."""
-    middle = (places_mm.min(axis=0) + places_mm.max(axis=0)) / 2
-    return (places_mm - middle) / np.abs(places_mm - middle).max()
+    middle = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
+    return (positions_mm - middle) / np.abs(positions_mm - middle).max()
 
 
 ELEMENTS = 160
@@ -298,9 +300,9 @@ class PadPlan:
             length.append(size)
         return cls(np.array(course), np.array(tangent), np.array(length), pad.layout)
 
-    def to_grid(self, places_mm: Array) -> Array:
+    def to_grid(self, positions_mm: Array) -> Array:
         """(Q, 2) mm on the plan, from its middle, to grid units from its corner."""
-        return places_mm / self.unit_mm + self.middle
+        return positions_mm / self.unit_mm + self.middle
 
     @property
     def unit_mm(self) -> float:
@@ -374,19 +376,21 @@ class LaidPad:
         own = self.own[channel]
         return own[AWAY].reshape(2, ASIDE), own[None, COUNTS]
 
-    def predict(self, places_mm: Array) -> Array:
+    def predict(self, positions_mm: Array) -> Array:
         """(Q, C) volts for presses (Q, 2) mm as the arm counts."""
-        return self.parts(places_mm)[0]
+        return self.parts(positions_mm)[0]
 
-    def steepness(self, places_mm: Array) -> Array:
+    def steepness(self, positions_mm: Array) -> Array:
         """(C,) V^2/mm^2, squares of how volts change with the place, mean over places (Q, 2) mm as the arm counts."""
         steps = STEP_MM * np.eye(2)
-        rates = [(self.predict(places_mm + step) - self.predict(places_mm - step)) / (2 * STEP_MM) for step in steps]
+        rates = [
+            (self.predict(positions_mm + step) - self.predict(positions_mm - step)) / (2 * STEP_MM) for step in steps
+        ]
         return np.sum(np.square(rates), axis=0).mean(axis=0)
 
     def with_gains(self, presses: Responses) -> "LaidPad":
         """The same pad with the gains and rests that go best with answers: a fit begins near enough not to run away."""
-        values, signals = self.values.copy(), self.predict(presses.places_mm)
+        values, signals = self.values.copy(), self.predict(presses.positions_mm)
         for channel, own in enumerate(self.own):
             there = presses.there[:, channel]
             known = np.column_stack([(signals[there, channel] - own[1]) / own[0], np.ones(there.sum())])
@@ -418,11 +422,11 @@ class LaidPad:
 
     def left_over(self, presses: Responses) -> Responses:
         """What this pad does not explain of answers."""
-        return replace(presses, volts=presses.volts - self.predict(presses.places_mm))
+        return replace(presses, volts=presses.volts - self.predict(presses.positions_mm))
 
-    def parts(self, places_mm: Array) -> tuple[Array, list[Array]]:
+    def parts(self, positions_mm: Array) -> tuple[Array, list[Array]]:
         """Volts (Q, C), and for each channel their derivatives (Q, SHARED + OWN) by the shared values and its own."""
-        places, by_frame = self._placed(places_mm)
+        places, by_frame = self._placed(positions_mm)
         profile = self.values[4:SHARED].reshape(2, SPLINES)
         volts, rates = np.empty((len(places), len(self.fibres))), []
         for c, (fibre, own) in enumerate(zip(self.fibres, self.own, strict=True)):
@@ -447,15 +451,15 @@ class LaidPad:
             moved.values[SHARED::OWN] *= largest
         return moved
 
-    def _placed(self, places_mm: Array) -> tuple[Array, Array]:
+    def _placed(self, positions_mm: Array) -> tuple[Array, Array]:
         """Places (Q, 2) in grid units of the plan, and their derivatives (Q, 2, 4) by turn, shift and scale."""
         frame, unit_mm = self.frame, self.plan.unit_mm
-        turned = frame.rotate(places_mm)
-        by = np.zeros((len(places_mm), 2, 4))
+        turned = frame.rotate(positions_mm)
+        by = np.zeros((len(positions_mm), 2, 4))
         by[:, 0, 0], by[:, 1, 0] = -frame.scale * turned[:, 1], frame.scale * turned[:, 0]
         by[:, 0, 1] = by[:, 1, 2] = 1
         by[:, :, 3] = turned
-        return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(places_mm))), by / unit_mm
+        return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(positions_mm))), by / unit_mm
 
 
 def _turn_between(points: Array, others: Array) -> float:

@@ -28,7 +28,7 @@ from scipy.optimize import linear_sum_assignment, minimize, nnls
 from scipy.spatial import KDTree
 
 from padforge.design.twin import PlanTransform, TwinScatter
-from padforge.sense.arrays import LEAST_SPREAD_V, Array, Indices, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Indices, Mask
 from padforge.sense.twin.as_built import (
     ASIDE,
     AWAY,
@@ -67,7 +67,7 @@ class Smooth(NamedTuple):
 
 def smooth_function(values: Responses, unit_mm: float) -> Smooth:
     """The most probable smooth function of place of each channel; NaN and 0 for one with fewer than 10 answers."""
-    places = values.places_mm[:PRESSES] / unit_mm
+    places = values.positions_mm[:PRESSES] / unit_mm
     squares = ((places[:, None, :] - places) ** 2).sum(axis=2)
 
     @cache
@@ -114,9 +114,9 @@ def response_scatter(pad: LaidPad, presses: Responses, noise_v: Array) -> TwinSc
     valid = np.flatnonzero(presses.there.all(axis=1))
     if len(valid) < 2 * MIN_PAIRS:
         return TwinScatter()
-    pairs = valid[KDTree(presses.places_mm[valid]).query(presses.places_mm[valid], 2)[1]]
+    pairs = valid[KDTree(presses.positions_mm[valid]).query(presses.positions_mm[valid], 2)[1]]
     first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
-    expected = pad.predict(presses.places_mm) - pad.own[:, 1]
+    expected = pad.predict(presses.positions_mm) - pad.own[:, 1]
     difference = (presses.volts - expected)[first] - (presses.volts - expected)[second]
     response = (expected[first] + expected[second]) / 2 / noise_v
     variance = (difference / noise_v) ** 2 / 2
@@ -269,7 +269,7 @@ class _Objective:
         self, pad: LaidPad, presses: Responses, freedom: Freedom, caution: Array | float, noise: Array
     ) -> None:
         self.pad, self.freedom, self.noise, self._presses, self._caution = pad, freedom, noise, presses, caution
-        volts, self._rates = pad.parts(presses.places_mm)
+        volts, self._rates = pad.parts(presses.positions_mm)
         self._left = np.where(presses.there, presses.volts - volts, 0.0)
         self._precision, self._off = self._prior()
         self.value = self._valued()
@@ -294,7 +294,7 @@ class _Objective:
     def learnt(self, covariance: Array | None) -> "_Objective":
         """The same pad with the noise, and with a covariance the freedom, that it now shows."""
         counts = np.maximum(self._presses.there.sum(axis=0), 1)
-        self.noise = np.maximum(self._caution * np.sqrt((self._left**2).sum(axis=0) / counts), LEAST_SPREAD_V)
+        self.noise = np.maximum(self._caution * np.sqrt((self._left**2).sum(axis=0) / counts), MIN_SCALE_V)
         if covariance is not None:
             aside = self._spread(covariance, AWAY, ASIDE_STIFFNESS) * self.pad.plan.unit_mm
             uneven = self._spread(covariance, COUNTS, SENSITIVITY_STIFFNESS)
@@ -395,7 +395,7 @@ class Matcher:
 
     def __call__(self, frame: PlanTransform, width: float) -> Wiring:
         """The best wiring for a frame."""
-        places = self._plan.to_grid(frame.to_plan(self._presses.places_mm))
+        places = self._plan.to_grid(frame.to_plan(self._presses.positions_mm))
         points = self._course.reshape(-1, 2)
         squares = (points**2).sum(axis=1) + (places**2).sum(axis=1)[:, None] - 2 * places @ points.T
         near = np.exp(squares * (-0.5 / width**2)).reshape(len(places), *self._length.shape)
@@ -443,7 +443,7 @@ def wirings(
 ) -> list[Wiring]:
     """The wirings that go best with the presses, each with its best frame, best first."""
     matcher = Matcher(plan, presses, rng)
-    middle = presses.places_mm.min(axis=0) / 2 + presses.places_mm.max(axis=0) / 2
+    middle = presses.positions_mm.min(axis=0) / 2 + presses.positions_mm.max(axis=0) / 2
     tried = []
     for mirrored, quarter, x, y in product((False, True), range(4), SHIFTS, SHIFTS):
         lying = PlanTransform(mirrored, 90.0 * quarter)

@@ -62,7 +62,7 @@ class Identification:
         """For each live channel how far its fibre lies beside the plan, to its left, (F,) mm; how sure that is, (F,)
         mm; and which of its elements lie within what was pressed, (F,)."""
         laid, unit_mm = self.fit.pad, self.pad.unit_mm
-        pressed = laid.plan.to_grid(laid.frame.to_plan(self.learnt.places_mm))
+        pressed = laid.plan.to_grid(laid.frame.to_plan(self.learnt.positions_mm))
         low, high = pressed.min(axis=0), pressed.max(axis=0)
         out = []
         for row, fibre in enumerate(laid.fibres):
@@ -87,7 +87,7 @@ class Identification:
             courses[fibre], counts[fibre] = self.pad.to_mm(np.vstack(ends)), counted / mean
             gains[channel] = laid.own[row, 0] * mean * fibre_lengths[fibre]
         distance, weights = _trimmed(laid)
-        pressed = laid.frame.to_plan(self.learnt.places_mm)
+        pressed = laid.frame.to_plan(self.learnt.positions_mm)
         return Twin(
             self.pad,
             tuple(
@@ -195,33 +195,33 @@ def identify(
     report("courses", 0, 3)
     found = _fitted(best.pad, learnt, report)
     noise_v = _noise(shown.noise, found.pad, learnt, live)
-    full_scale_v = np.abs(found.pad.predict(learnt.places_mm) - found.pad.own[:, 1]).max(axis=0)
+    full_scale_v = np.abs(found.pad.predict(learnt.positions_mm) - found.pad.own[:, 1]).max(axis=0)
     return Identification(
         pad,
         found,
         live,
-        held_out.explained(found.pad.predict(held_out.places_mm)),
+        held_out.explained(found.pad.predict(held_out.positions_mm)),
         _explained_on_plan([bare for _, bare in candidates], learnt, held_out),
         noise_v,
         float(noise_v[live].mean() / full_scale_v.mean()),
         full_scale_v,
         [wiring for wiring, each in laid[1:] if best.evidence - each.evidence < DOUBT],
         _explained_on_plan([bare for _, bare in straight], learnt, held_out) if straight else None,
-        _readings(recording, live, found.pad, noise_v, learnt.places_mm),
+        _readings(recording, live, found.pad, noise_v, learnt.positions_mm),
         response_scatter(found.pad, learnt, noise_v[live]),
         learnt,
         held_out,
     )
 
 
-def _refuse_places(places_mm: Array, pad: Morphology) -> None:
+def _refuse_places(positions_mm: Array, pad: Morphology) -> None:
     """Refuse too few presses, and such as do not go over most of the pad."""
-    if len(places_mm) < LEAST_PRESSES:
+    if len(positions_mm) < LEAST_PRESSES:
         raise InputError(
-            f"the recording has {len(places_mm)} presses of known place and about one depth, allowed are"
+            f"the recording has {len(positions_mm)} presses of known place and about one depth, allowed are"
             f" {LEAST_PRESSES} or more"
         )
-    spans = np.subtract(*np.quantile(places_mm, [0.95, 0.05], axis=0))
+    spans = np.subtract(*np.quantile(positions_mm, [0.95, 0.05], axis=0))
     low, high = np.array(sensed_rectangle(pad.layout))
     least = LEAST_SIDE * pad.unit_mm * (high - low)
     if (spans < least).any() and (spans < least[::-1]).any():  # nobody knows yet how the pad was turned
@@ -275,7 +275,7 @@ def _laid(candidates: list[tuple[Wiring, Fit]], compared: Responses) -> list[tup
 def _explained_on_plan(fits: list[Fit], learnt: Responses, held_out: Responses) -> float:
     """Mean over the channels of what the most probable of some pads that lie on their plan explains, once fitted."""
     best = max(fits, key=lambda each: each.evidence)
-    return float(held_out.explained(fit(best.pad, learnt, Freedom()).pad.predict(held_out.places_mm)).mean())
+    return float(held_out.explained(fit(best.pad, learnt, Freedom()).pad.predict(held_out.positions_mm)).mean())
 
 
 def _fitted(pad: LaidPad, learnt: Responses, report: Report) -> Fit:
@@ -289,7 +289,7 @@ def _fitted(pad: LaidPad, learnt: Responses, report: Report) -> Fit:
     caution = _caution(plain.pad, part)
     turned = fit(plain.pad, part, replace(FIRST, angle=True), caution=caution)
     report("courses", 2, 3)
-    gain = rest.explained(turned.pad.predict(rest.places_mm)) - rest.explained(plain.pad.predict(rest.places_mm))
+    gain = rest.explained(turned.pad.predict(rest.positions_mm)) - rest.explained(plain.pad.predict(rest.positions_mm))
     best = turned if gain.mean() > WORTH else plain
     return fit(best.pad.settled(), learnt, best.freedom, caution=caution)
 
@@ -304,13 +304,13 @@ def _caution(pad: LaidPad, presses: Responses) -> Array:
 
 
 def _readings(
-    recording: Recording, live: Indices, pad: LaidPad, noise_v: Array, places_mm: Array
+    recording: Recording, live: Indices, pad: LaidPad, noise_v: Array, positions_mm: Array
 ) -> TwinReadings | None:
     """How readings run beside what presses answer, if that can be told."""
     found = strengths(recording)
     if not found:
         return None
-    told = information(recording, live).sum() / (pad.steepness(places_mm) / noise_v[live] ** 2).sum()
+    told = information(recording, live).sum() / (pad.steepness(positions_mm) / noise_v[live] ** 2).sum()
     return TwinReadings(**found, information_gain=float(np.clip(told, 1, MAX_INFORMATION_GAIN)))
 
 

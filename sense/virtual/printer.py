@@ -194,8 +194,8 @@ class Firmware:
         self._feed = float(words["F"]) / 60 if "F" in words else self._feed
         move = StraightMove(start, end, self._feed, self._acceleration).within(self._speeds, self._accelerations)
         if move.length_mm:
-            begun = max(now_s + START_S, self.made[-1].end_s)
-            self.made.append(Made(begun, move, move.duration_s))
+            down_command = max(now_s + START_S, self.made[-1].end_s)
+            self.made.append(Made(down_command, move, move.duration_s))
 
     _do_g0 = _do_g1
 
@@ -234,8 +234,11 @@ class Firmware:
 
     def _cut(self, now_s: float) -> None:
         """End all moves at once; those that have not begun are never made."""
-        begun = [made for made in self.made if made.begun_s < now_s]
-        self.made = [*begun[:-1], replace(begun[-1], lasted_s=min(begun[-1].lasted_s, now_s - begun[-1].begun_s))]
+        down_command = [made for made in self.made if made.begun_s < now_s]
+        self.made = [
+            *down_command[:-1],
+            replace(down_command[-1], lasted_s=min(down_command[-1].lasted_s, now_s - down_command[-1].begun_s)),
+        ]
 
     def _believed(self, true: Place) -> Place:
         x, y, z = (value - origin for value, origin in zip(true, self._origin, strict=True))

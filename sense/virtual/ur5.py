@@ -53,14 +53,14 @@ class UrEmulator:
 
     def __enter__(self) -> Self:
         self._end = ExitStack()
-        with ExitStack() as begun:
-            path = begun.enter_context(temporary_file(Path(tempfile.gettempdir()), prefix=_TRUTH))
+        with ExitStack() as down_command:
+            path = down_command.enter_context(temporary_file(Path(tempfile.gettempdir()), prefix=_TRUTH))
             create(path)
             self._process = start(
                 "padforge.sense.virtual.ur5_server", json.dumps(self._settings | {"truth": str(path)})
             )
             self.truth = Truth(path)
-            self._end = begun.pop_all()
+            self._end = down_command.pop_all()
         if problem := self._hear():
             self.__exit__()
             raise RigFault("refused", f"no emulated arm at {problem}", "is there another one?")

@@ -84,7 +84,7 @@ class Motion:
     def __init__(self, pose: Array) -> None:
         self.pose, self.velocity = pose, np.zeros(6)
         self._path: Trajectory | None = None
-        self._begun = 0.0
+        self._down_command = 0.0
         self._interrupted: Line | None = None
 
     @property
@@ -121,13 +121,13 @@ class Motion:
         """Go on to the time `now`."""
         if self._path is None:
             return
-        t = now - self._begun
+        t = now - self._down_command
         self.pose, self.velocity = self._path.at(min(t, self._path.duration))
         if t >= self._path.duration:
             self._path, self.velocity = None, np.zeros(6)
 
     def _begin(self, path: Trajectory, now: float) -> None:
-        self._path, self._begun = path, now
+        self._path, self._down_command = path, now
 
 
 Series = Literal["cb3", "e"]
@@ -286,7 +286,7 @@ class Controller:
 
     def _program(self) -> Iterator[None]:
         """The loop of ur-rtde's control program: one command, then done, then ready when the client has taken note."""
-        self._progress(begun=False)
+        self._progress(down_command=False)
         executed = False
         while True:
             command = int(self.inputs["input_int_register_0"])
@@ -334,26 +334,26 @@ class Controller:
             yield from thread
 
     def _mover(self, pose: Array, speed: float, acceleration: float) -> Iterator[None]:
-        self._progress(begun=True)
+        self._progress(down_command=True)
         yield
         self.motion.line(pose, speed, acceleration, self._now)
         while self.motion.moving:
             yield
-        self._progress(begun=False)
+        self._progress(down_command=False)
 
     def _halt(self, deceleration: float) -> Iterator[None]:
         if len(self._threads) > 1:
-            self._progress(begun=False)
+            self._progress(down_command=False)
         del self._threads[1:]
         self.motion.brake(deceleration, self._now)
         while self.motion.moving:
             yield
 
-    def _progress(self, begun: bool) -> None:
+    def _progress(self, down_command: bool) -> None:
         """Register 2 as ur-rtde packs it: number of the operation, number of writes, whether it runs."""
         self._writes = (self._writes + 1) % 128
-        self._operation = (self._operation + begun) % 128
-        self.outputs["output_int_register_2"] = self._operation << 24 | self._writes << 16 | begun << 15
+        self._operation = (self._operation + down_command) % 128
+        self.outputs["output_int_register_2"] = self._operation << 24 | self._writes << 16 | down_command << 15
 
     def _double(self, index: int) -> float:
         return self.inputs[f"input_double_register_{index}"]

@@ -11,7 +11,7 @@ import numpy as np
 from padforge.design import Contact, Morphology, signals
 from padforge.sense.arrays import Array
 from padforge.sense.rig.boards.due import Arduino
-from padforge.sense.rig.devices import Converter
+from padforge.sense.rig.devices import Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import TRAVEL_S, LivePad
 from padforge.sense.virtual.boards import EmulatedBoard
@@ -127,9 +127,9 @@ class Finger:
 
 
 @contextmanager
-def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Converter, Finger]]:
+def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Board, Finger]]:
     """The driver of an emulated board, not yet connected, over a simulated pad, and the finger that presses it."""
-    finger = Finger(pad, contact, rig, rig.converter_rate_hz)
+    finger = Finger(pad, contact, rig, rig.board_rate_hz)
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     with EmulatedBoard(finger.volts) as board:
         emulated = rig.model_copy(update={"port": board.port})

@@ -11,14 +11,14 @@ from padforge.design import Contact, Morphology, signals
 from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import planned
-from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
 from padforge.sense.simulation.simulated_recording import random_places
 
 
 class SimulatedConverter:
-    """The converter of the simulated rig, `rate_hz` of which is its own; implements `Converter`.
+    """The converter of the simulated rig, `rate_hz` of which is its own; implements `Board`.
 
     The pad is the one that `simulate` records with the same arguments, down to the rests of its fibres. Presses come
     as often and are held as long as there, at other places, and as deep as `[rig]` says, its depths in turn.
@@ -45,27 +45,27 @@ class SimulatedConverter:
         self._press, self._place_mm = -1, np.zeros(2)
 
     def connect(self) -> Mapping[str, Any]:
-        """Begin; see `Converter`."""
+        """Begin; see `Board`."""
         signals(self._pad, self._pad.to_grid([[0.0, 0.0]]), self._contact)  # compiled before it has to keep up
         self._started_s, self._count = self._clock(), 0
         fibres = len(self._pad.knots)
         named = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
         return {**named, "rate_hz": self._rig.rate_hz, "supply_v": SUPPLY_V}
 
-    def read(self) -> ConverterSamples:
-        """All samples since the last call; see `Converter`. Raises RigFault("refused") before `connect`."""
+    def read(self) -> BoardSamples:
+        """All samples since the last call; see `Board`. Raises RigFault("refused") before `connect`."""
         if self._started_s is None:
             raise RigFault("refused", "the simulated rig is not connected")
         count = math.floor((self._clock() - self._started_s) * self._rig.rate_hz)
         elapsed_s = np.arange(self._count + 1, count + 1) / self._rig.rate_hz
         self._count = count
         touches = [self._touch(at_s) for at_s in elapsed_s.tolist()]
-        places_mm = np.array([place for place, _ in touches]).reshape(-1, 2)
-        volts = self._model.volts(places_mm, np.array([depth for _, depth in touches]))
-        return ConverterSamples(self._started_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
+        positions_mm = np.array([place for place, _ in touches]).reshape(-1, 2)
+        volts = self._model.volts(positions_mm, np.array([depth for _, depth in touches]))
+        return BoardSamples(self._started_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
 
     def close(self) -> None:
-        """Nothing is open; see `Converter`."""
+        """Nothing is open; see `Board`."""
 
     def _touch(self, at_s: float) -> tuple[Array, float]:
         """Where the finger is, and how deep, mm: it comes down in the middle of a cycle and goes up at its end."""

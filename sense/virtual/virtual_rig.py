@@ -14,7 +14,7 @@ from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards.due import Arduino
 from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.boards.line_framing import LineHeader
-from padforge.sense.rig.config import Frame
+from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, LivePad
 from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard, Source
@@ -33,11 +33,13 @@ _START_S = 2.0
 _DRIVERS = {"due": Arduino, "line": LineBoard}
 
 Driver = Arduino | LineBoard
-Board = EmulatedBoard | EmulatedLineBoard
+EmulatedBoards = EmulatedBoard | EmulatedLineBoard
 
 
 @contextmanager
-def emulated(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[UR5, Driver, UrEmulator, Board]]:
+def emulated(
+    pad: Morphology, contact: Contact, rig: RigSettings
+) -> Iterator[tuple[UR5, Driver, UrEmulator, EmulatedBoards]]:
     """Drivers of an arm and a board, not yet connected, and the emulators behind them.
 
     Args:
@@ -47,7 +49,7 @@ def emulated(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tu
     Raises:
         InputError, RigFault: a board that is not emulated, or has too few inputs.
     """
-    start = Frame.of(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
+    start = RobotFrame.of(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
     with UrEmulator("e", start, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
         _await_pose(robot)
@@ -58,9 +60,9 @@ def emulated(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tu
 @contextmanager
 def emulated_printer(
     pad: Morphology, contact: Contact, rig: RigSettings
-) -> Iterator[tuple[Printer, Driver, EmulatedPrinter, Board]]:
+) -> Iterator[tuple[Printer, Driver, EmulatedPrinter, EmulatedBoards]]:
     """As `emulated`, with a printer for the arm and `rig` as `emulated_printer_rig` makes it."""
-    tip = Frame.of(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
+    tip = RobotFrame.of(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp = np.array(rig.tcp_mm)
     x, y, z = (tip[:3] - tcp).tolist()
     with EmulatedPrinter((x, y, z), bed_mm=(BED_MM, BED_MM, BED_MM)) as robot:
@@ -74,11 +76,13 @@ def emulated_printer(
 
 
 @contextmanager
-def _read_below(pad: Morphology, contact: Contact, rig: RigSettings, tips: Source) -> Iterator[tuple[Driver, Board]]:
+def _read_below(
+    pad: Morphology, contact: Contact, rig: RigSettings, tips: Source
+) -> Iterator[tuple[Driver, EmulatedBoards]]:
     """The driver of a board and the board, which reads the pad below a tip whose x, y, z `tips` gives for times."""
-    frame, inputs = Frame.of(rig), rig.inputs(len(pad.knots))
+    frame, inputs = RobotFrame.of(rig), rig.inputs(len(pad.knots))
     there = max(MUX_INPUTS, 1 + max(inputs))
-    model = LivePad(pad, contact, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
+    model = LivePad(pad, contact, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
 
     def volts(times_s: Array) -> Array:
@@ -99,13 +103,13 @@ def _await_pose(robot: UrEmulator) -> None:
         time.sleep(1e-3)
 
 
-def _board(rig: RigSettings, volts: Source, inputs: int) -> Board:
+def _board(rig: RigSettings, volts: Source, inputs: int) -> EmulatedBoards:
     """The emulated board that `[rig]` names, with so many inputs if it is a line board."""
     if rig.board == "due":
         return EmulatedBoard(volts)
     if rig.board == "line":
         said = (("name", "emulated"), ("serial", "0"))
-        return EmulatedLineBoard(volts, LineHeader(rig.converter_rate_hz, 12, SUPPLY_V, inputs, said=said))
+        return EmulatedLineBoard(volts, LineHeader(rig.board_rate_hz, 12, SUPPLY_V, inputs, said=said))
     raise InputError(f"[rig] board: got {rig.board!r}, emulated are {' and '.join(_DRIVERS)}")
 
 

@@ -83,8 +83,7 @@ def sense_kernels() -> None:
         LocalizerSettings,
         RigSettings,
         calibrate,
-        find_presses,
-        locate,
+        detect_presses,
         running_median,
         simulate,
         total_variation,
@@ -96,9 +95,11 @@ def sense_kernels() -> None:
     total_variation(recording.readings, 2.0)
     total_variation(recording.readings, 2.0, "squares", causal=True)
     running_median(recording.readings, 5)
-    find_presses(recording.readings, recording.times_s)
-    localizer, _ = calibrate(recording, LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, lost=1))
-    locate(localizer, recording)
+    detect_presses(recording.readings, recording.times_s)
+    localizer, _ = calibrate(
+        recording, LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=1)
+    )
+    localizer.predict(recording)
     Detector.fit(recording, np.arange(20))
     identify(recording, Morphology.straight(2))
 

@@ -22,7 +22,7 @@ presses = 80
 members = 1
 hidden = 16
 epochs = 4
-lost = 1
+max_failures = 1
 """
 
 

@@ -139,7 +139,7 @@ def test_only_requested_formats_are_written(tmp_path):
 
 def test_calibration_has_profile_stages():
     recording = simulate(Morphology.straight(2), RigSettings(presses=40, seed=0))
-    options = LocalizerSettings(members=2, hidden=8, epochs=10, batch=16, lost=1)
+    options = LocalizerSettings(members=2, hidden=8, epochs=10, batch=16, max_failures=1)
     with profiling.profiled() as profile:
         calibrate(recording, options)
     assert {"train", "evaluate"} <= set(profile.seconds)

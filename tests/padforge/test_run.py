@@ -54,7 +54,7 @@ def test_run_makes_everything(finished: tuple[Path, str]) -> None:
     walls = 2 * (2 + 2 + 6 * math.tan(math.radians(2)))  # exits, walls and their lean
     assert mesh.extents[:2] == pytest.approx([3 * 11.25 + walls] * 2, abs=1e-3)
     assert load_file(out / "localizer.safetensors")
-    assert [row["lost"] for row in json.loads((out / "calibration.json").read_text())["errors"]] == [0, 1]
+    assert [row["n_failed"] for row in json.loads((out / "calibration.json").read_text())["errors"]] == [0, 1]
     for name in ("design", "fabrication", "calibration", "morphology", "localizer"):
         document = json.loads((out / f"{name}.json").read_text())
         assert document["format"] == f"padforge-{name}/{2 if name in ('design', 'fabrication', 'localizer') else 1}"
@@ -149,7 +149,7 @@ def test_resume_continues_search(finished: tuple[Path, str], tmp_path: Path, mon
         save(kept, start, state)
         raise SystemExit(9)
 
-    def begun(kept: Checkpoints, resume: bool) -> dict:
+    def down_command(kept: Checkpoints, resume: bool) -> dict:
         found.append(begin(kept, resume))
         return found[-1]
 
@@ -157,7 +157,7 @@ def test_resume_continues_search(finished: tuple[Path, str], tmp_path: Path, mon
         patch.setattr(Checkpoints, "save", save_and_break)
         assert called("run", cwd=tmp_path).code == 9
     assert not (tmp_path / "out" / "pad" / "morphology.json").exists()
-    monkeypatch.setattr(Checkpoints, "begin", begun)
+    monkeypatch.setattr(Checkpoints, "begin", down_command)
     assert resumed(tmp_path, "--formats", "svg") == ""
     assert [sorted(states) for states in found] == [[0]]
     assert digests(tmp_path)["morphology.json"] == digests(finished[0])["morphology.json"]

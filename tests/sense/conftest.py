@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from padforge.design import Morphology
-from padforge.sense import Localizer, Recording, calibrate
+from padforge.sense import Recording, calibrate
 from padforge.sense import settings as sense_settings
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
@@ -36,18 +37,18 @@ def recording(once: Once) -> Recording:
 @pytest.fixture(scope="session")
 def brief(recording: Recording) -> Recording:
     """Its first 40 presses."""
-    end = int(recording.begun[40])
-    presses = {name: getattr(recording, name)[:40] for name in ("presses_mm", "begun", "lifted")}
+    end = int(recording.down_command[40])
+    presses = {name: getattr(recording, name)[:40] for name in ("presses_mm", "down_command", "up_command")}
     return Recording(recording.readings[:end], recording.times_s[:end], **presses)
 
 
 @pytest.fixture(scope="session")
-def calibrated(once: Once, recording: Recording) -> tuple[Localizer, dict]:
+def calibrated(once: Once, recording: Recording) -> tuple[LocalizerModel, dict]:
     return once("calibrated", lambda folder: calibrate(recording, QUICK))
 
 
 @pytest.fixture(scope="session")
-def localizer(calibrated: tuple[Localizer, dict]) -> Localizer:
+def localizer(calibrated: tuple[LocalizerModel, dict]) -> LocalizerModel:
     return calibrated[0]
 
 
@@ -64,19 +65,19 @@ def deep_recording(once: Once) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[Localizer, dict]:
+def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[LocalizerModel, dict]:
     options = QUICK.model_copy(update={"members": 1, "epochs": 40})
     return once("deeply-calibrated", lambda folder: calibrate(deep_recording, options))
 
 
 @pytest.fixture(scope="session")
-def deep_localizer(deeply_calibrated: tuple[Localizer, dict]) -> Localizer:
+def deep_localizer(deeply_calibrated: tuple[LocalizerModel, dict]) -> LocalizerModel:
     """It has learnt depth and force."""
     return deeply_calibrated[0]
 
 
 @pytest.fixture(scope="session")
-def model(recording: Recording, localizer: Localizer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(recording: Recording, localizer: LocalizerModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as `padforge run` leaves it."""
     folder = tmp_path_factory.mktemp("pad")
     localizer.save(folder)

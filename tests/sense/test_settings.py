@@ -19,13 +19,20 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "seed": 0,
     }
     expected |= {"noise_mv": 1.6, "drift_mv": 40.0, "creep": 0.1, "hysteresis": 0.2}
-    expected |= {"converter_rate_hz": 1000.0, "channels": (), "mirrored": "unknown", "max_depth_mm": 6.0}
+    expected |= {"board_rate_hz": 1000.0, "channels": (), "mirrored": "unknown", "max_depth_mm": 6.0}
     expected |= dict.fromkeys(("box_mm", "contact_mm", "pad_mm", "tcp_mm"), "unknown") | {"pad_angle_deg": 0.0}
     expected |= {"clearance_mm": 10.0, "travel_mm_s": 100.0, "press_mm_s": 40.0, "acceleration_mm_s2": 500.0}
     expected |= {"max_force_n": 60.0}
     assert {key: rig[key] for key in expected} == expected
-    chosen = {"method": "masked", "features": "full", "split": "random", "test_share": 0.15, "lost": 3, "members": 2}
-    network = {"hidden": 256, "layers": 5, "epochs": 200, "batch": 256, "rate": 0.004, "seed": 0}
+    chosen = {
+        "method": "ensemble",
+        "features": "press_and_release",
+        "split": "random",
+        "test_share": 0.15,
+        "max_failures": 3,
+        "members": 2,
+    }
+    network = {"hidden": 256, "layers": 5, "epochs": 200, "batch": 256, "learning_rate": 0.004, "seed": 0}
     assert LocalizerSettings().model_dump() == chosen | network
 
 
@@ -47,8 +54,8 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         (RigSettings, "baud", (9600, 20_000_000), (9599, 20_000_001)),
         (RigSettings, "channels", ([0, 511], []), (8, [-1], [512], ["A0"])),
         (LocalizerSettings, "test_share", (0.01, 0.99), (0.0, 1.0)),
-        (LocalizerSettings, "lost", (0, 8), (-1, 9)),
-        (LocalizerSettings, "rate", (1e-6, 1.0), (0.0, 1.1)),
+        (LocalizerSettings, "max_failures", (0, 8), (-1, 9)),
+        (LocalizerSettings, "learning_rate", (1e-6, 1.0), (0.0, 1.1)),
     ],
 )
 def test_values_at_the_ends_of_what_is_allowed(model: type, key: str, kept: tuple, refused: tuple) -> None:

@@ -20,7 +20,7 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-TRUSTED = {"sense.HealthModel.refuse_other", "sense.Finder.follow"}
+TRUSTED = {"sense.HealthModel.refuse_other", "sense.PressDetector.follow"}
 """They are handed what those who call them have checked."""
 CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
 """Parameters that are left alone: what is called back may raise what it likes."""
@@ -37,9 +37,8 @@ def sound() -> dict[str, Any]:
         "knots": pad.knots,
         "presses": np.array([[1.0, 1.0], [1.5, 2.0]]),
         "places": np.array([[1.0, 2.0]]),
-        "places_mm": np.array([[1.0, 2.0]]),
-        "positions": np.array([[1.0, 2.0]]),
         "positions_mm": np.array([[1.0, 2.0]]),
+        "positions": np.array([[1.0, 2.0]]),
         "parameters": np.ones((3, 8)),
         "contact": design.Contact(),
         "rules": design.RulesSettings(enforce=False),
@@ -47,16 +46,16 @@ def sound() -> dict[str, Any]:
         "search": search,
         "twin": design.Twin.load("pad/twin.json"),
         "recording": recording,
-        "localizer": sense.Localizer.load(Path("pad")),
-        "localizers": [sense.Localizer.load(Path("pad"))],
+        "localizer": sense.LocalizerModel.load(Path("pad")),
+        "localizers": [sense.LocalizerModel.load(Path("pad"))],
         "model": sense.HealthModel.load(Path("pad")),
         "health": sense.HealthModel.load(Path("pad"), DETECTED),
-        "options": sense.LocalizerSettings(members=1, hidden=8, layers=1, epochs=2, batch=64, lost=2),
+        "options": sense.LocalizerSettings(members=1, hidden=8, layers=1, epochs=2, batch=64, max_failures=2),
         "rig": sense.RigSettings(presses=4, readings_per_press=8),
         "readings": recording.readings,
         "times_s": recording.times_s,
-        "begun": recording.begun,
-        "lifted": recording.lifted,
+        "down_command": recording.down_command,
+        "up_command": recording.up_command,
         "presses_mm": recording.presses_mm,
         "rng": np.random.default_rng(0),
         "indenter": design.Indenter(),
@@ -81,7 +80,7 @@ def sound() -> dict[str, Any]:
         "provenance": {},
         "source": {"a": 1},
         "unit_mm": 11.25,
-        "lost": 1,
+        "n_failed": 1,
     }
     return found | {f"{name} of {where}": value for (where, name), value in _elsewhere(found).items()}
 
@@ -127,11 +126,11 @@ def functions() -> dict[str, Callable[..., Any]]:
     """All that the packages hand out and that can be called, by name; records that check nothing are not among them."""
     found: dict[str, Callable[..., Any]] = {"padforge.report.write_report": write_report}
     made = {
-        "Finder": lambda: sense.Finder(4),
+        "PressDetector": lambda: sense.PressDetector(4),
         "RunningMedian": lambda: sense.RunningMedian(4, 5),
         "TotalVariation": lambda: sense.TotalVariation(4, 2.0),
         "Live": lambda: sense.Live(sound()["localizers"], sound()["health"], 4, 13.3),
-        "Monitor": lambda: sense.Monitor(sound()["model"]),
+        "FaultDetector": lambda: sense.FaultDetector(sound()["model"]),
         "Spec": lambda: design.Spec({}),
         **{name: lambda key=key: sound()[key] for name, key in _OF_CLASS.items()},
     }

@@ -29,7 +29,7 @@ members = 1
 hidden = 4
 layers = 1
 epochs = 1
-lost = 1
+max_failures = 1
 """
 """Settings with which every command is done in about a second."""
 

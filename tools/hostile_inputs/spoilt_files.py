@@ -15,7 +15,7 @@ from .workplace import BAG, LAB, LAB_H5
 
 _MODEL = (
     "sense locate --model pad pad/recording --out new.csv",
-    "sense evaluate --model pad pad/recording --lost 1",
+    "sense evaluate --model pad pad/recording --max-failures 1",
     "sense health --model pad pad/recording",
     "sense live --model pad --replay pad/recording --speed 1e6 --port 0",
     "sense recalibrate --model pad pad/recording --out new",
@@ -25,7 +25,7 @@ _MODEL = (
 )
 _RECORDING = (
     "sense locate --model pad {} --out new.csv",
-    "sense evaluate --model pad {} --lost 0",
+    "sense evaluate --model pad {} --max-failures 0",
     "sense health --model pad {}",
     "sense calibrate {} --out new",
     "sense export {} new.h5",
@@ -62,12 +62,12 @@ READERS: dict[str, tuple[str, ...]] = {
     "pad/recording/*": (*_RUN_DIRECTORY, "report pad"),
     "presses.*": (*_RECORDING, "sense import {} --out new"),
     "long/*": ("sense identify long --morphology pad/morphology.json --out new",),
-    "lab.csv": (f"sense import {{}} --map {LAB} --out new", "sense import {} --map fibres=fibre* --out new"),
-    "lab.h5": (f"sense import {{}} --map {LAB_H5} --out new",),
-    "bag_*/*.mcap": (f"sense import {{}} --map {BAG} --out new",),
-    "bag_*/*.db3": (f"sense import {{}} --map {BAG} --out new",),
-    "bag_mcap/metadata.yaml": (f"sense import bag_mcap --map {BAG} --out new",),
-    "bag_sqlite3/metadata.yaml": (f"sense import bag_sqlite3 --map {BAG} --out new",),
+    "lab.csv": (f"sense import {{}} --columns {LAB} --out new", "sense import {} --columns fibres=fibre* --out new"),
+    "lab.h5": (f"sense import {{}} --columns {LAB_H5} --out new",),
+    "bag_*/*.mcap": (f"sense import {{}} --columns {BAG} --out new",),
+    "bag_*/*.db3": (f"sense import {{}} --columns {BAG} --out new",),
+    "bag_mcap/metadata.yaml": (f"sense import bag_mcap --columns {BAG} --out new",),
+    "bag_sqlite3/metadata.yaml": (f"sense import bag_sqlite3 --columns {BAG} --out new",),
     "plan.svg": ("design import {} --out new",),
     "plan.dxf": ("design import {} --out new",),
     "plan.csv": ("sense record --plan {} --out new",),
@@ -79,7 +79,7 @@ READERS: dict[str, tuple[str, ...]] = {
     "pad/design.json": ("bench contact --against {} --out file", "report pad"),
 }
 """Commands that read a file, or whatever a pattern names; {} stands for its name."""
-FOLDERS = {"pad/recording": _RUN_DIRECTORY, "bag_mcap": (f"sense import bag_mcap --map {BAG} --out new",)}
+FOLDERS = {"pad/recording": _RUN_DIRECTORY, "bag_mcap": (f"sense import bag_mcap --columns {BAG} --out new",)}
 NAMES = (
     *("-{}", "a b{}", "é{}", "日本{}", "\udc80{}", "a\nb{}", "\x1b[31m{}", "'\"{}", "%s{}", "{{0}}{}", "$HOME{}"),
     *("x" * 200 + "{}", "<b>{}", "&{}", "--help{}", "con{}", "{}.", "{} "),

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.io
 
 from tests.helpers.door import Ended, call, contents
-from tests.sense.recordings.formats.ros.foreign import array, pose, write_bag
+from tests.sense.formats.foreign import array, pose, write_bag
 from tools.kills import killed
 
 from .files import CHEAP, SPECIAL, fill, published
@@ -101,7 +101,7 @@ def _fill_more() -> None:
     Path("long.toml").write_text(CHEAP.replace("= 24", "= 420").replace("readings_per_press = 8", ""))
     _made("sense", "record", *planned, "--spec", "long.toml", "--out", "long")
     _made("sense", "identify", "long", *planned, "--out", "pad")
-    _made("sense", "fibre-loss", "pad/recording", "--model", "pad", "--lost", "1", "--out", "pad")
+    _made("sense", "fibre-loss", "pad/recording", "--model", "pad", "--max-failures", "1", "--out", "pad")
     _made("sense", "calibrate", "long", "--out", "pad", "--force")
     _made("sense", "learning-curve", "long", "--out", "pad")
     _made("sense", "recalibrate", "--model", "pad", "pad/recording", "--out", "again")

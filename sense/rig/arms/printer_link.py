@@ -187,7 +187,7 @@ class MarlinLink:
         self._text = b""
         self._number = 0
         self._sent: deque[bytes] = deque(maxlen=_KEPT)
-        self._begun = self.ended = False
+        self._down_command = self.ended = False
 
     def begin(self, wait_s: float) -> None:
         """Wait until the printer answers, and count its lines from 0.
@@ -199,7 +199,7 @@ class MarlinLink:
         while time.monotonic() < end:
             self._write(b"\n" + numbered(0, "M110 N0"))
             if any(map(_confirms, list(self._quiet()))):
-                self._begun = True
+                self._down_command = True
                 return
         advice = "check [rig] printer_port and printer_baud, and that no print is under way"
         raise RigFault("refused", f"{self._port}: no printer answers", advice)
@@ -291,7 +291,7 @@ class MarlinLink:
     def _judge(self, line: str) -> None:
         self.ended = self.ended or line == "start" or halts(line)
         if line == "start":
-            cause: Cause = "lost" if self._begun else "refused"
+            cause: Cause = "lost" if self._down_command else "refused"
             raise RigFault(cause, f"{self._port}: the printer has restarted, so that its place is unknown", HOME)
         if halts(line):
             message = f"{self._port}: the printer has halted ({line.removeprefix('Error:')})"

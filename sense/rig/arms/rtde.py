@@ -20,7 +20,7 @@ _STATE = struct.Struct("<c14d")
 _ANSWER = struct.Struct("<cI")
 
 
-class Row(NamedTuple):
+class StateRow(NamedTuple):
     """One state on the wire: mm, rad, s and N; the flags are 0 or 1, force is NaN without a sensor."""
 
     time_s: float
@@ -39,7 +39,7 @@ class Row(NamedTuple):
     sideways_n: float
 
 
-def pack_row(row: Row) -> bytes:
+def pack_row(row: StateRow) -> bytes:
     """Bytes of a state."""
     return _STATE.pack(b"S", *row)
 
@@ -50,13 +50,13 @@ def pack_answer(answer: Any) -> bytes:
     return _ANSWER.pack(b"A", len(text)) + text
 
 
-def read(source: Callable[[int], bytes]) -> Iterator[Row | dict[str, Any]]:
+def read(source: Callable[[int], bytes]) -> Iterator[StateRow | dict[str, Any]]:
     """States and answers from a blocking `source` of bytes until it ends, be it in the middle of one."""
     while kind := source(1):
         head = kind + source((_STATE if kind == b"S" else _ANSWER).size - 1)
         try:
             if kind == b"S":
-                yield Row._make(_STATE.unpack(head)[1:])
+                yield StateRow._make(_STATE.unpack(head)[1:])
             else:
                 yield json.loads(source(_ANSWER.unpack(head)[1]))
         except (struct.error, ValueError, RecursionError):

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from padforge.sense.rig.arms import rtde as frames
-from padforge.sense.rig.arms.rtde import Reading, Row, RtdeReader, pack_answer, pack_row
+from padforge.sense.rig.arms.rtde import Reading, RtdeReader, StateRow, pack_answer, pack_row
 
 WATCHDOG_HZ = 4.0
 KICK_S = 0.04
@@ -43,17 +43,19 @@ OPERATION, UNDER_WAY = 0x7F << 24, 1 << 15
 LOOK = "look at the arm, unlock it at the pendant, then connect again"
 
 
-class Refused(Exception):  # noqa: N818  what the parent raises is a RigFault
+class CommandRejected(Exception):  # noqa: N818  what the parent raises is a RigFault
     """Cause, message and advice of a fault that the parent raises."""
 
 
 def _require_ready(reading: Reading) -> None:
     if reading.safety & frames.EMERGENCY_BITS:
-        raise Refused("emergency_stop", "the arm is in an emergency stop", LOOK)
+        raise CommandRejected("emergency_stop", "the arm is in an emergency stop", LOOK)
     if reading.safety & frames.PROTECTIVE_BITS:
-        raise Refused("protective_stop", "the arm is in a protective stop", LOOK)
+        raise CommandRejected("protective_stop", "the arm is in a protective stop", LOOK)
     if reading.mode != frames.RUNNING:
-        raise Refused("refused", f"the arm is not ready: robot mode {reading.mode}, expected {frames.RUNNING}", LOOK)
+        raise CommandRejected(
+            "refused", f"the arm is not ready: robot mode {reading.mode}, expected {frames.RUNNING}", LOOK
+        )
 
 
 def _require_idle(reader: RtdeReader, reading: Reading) -> Reading:
@@ -62,7 +64,7 @@ def _require_idle(reader: RtdeReader, reading: Reading) -> Reading:
     while reading.runtime > frames.STOPPED:
         if time.monotonic() > until:
             advice = "end the other recording, or stop the program at the pendant"
-            raise Refused("refused", "a program runs on the arm, or is paused there", advice)
+            raise CommandRejected("refused", "a program runs on the arm, or is paused there", advice)
         reading = reader.read(ANSWER_S)
     return reading
 
@@ -82,7 +84,7 @@ def _claim(host: str) -> int:
         except BlockingIOError:
             if time.monotonic() > until:
                 what = f"another program on this computer uses the arm {host}"
-                raise Refused("refused", what, "wait for its end, or end it") from None
+                raise CommandRejected("refused", what, "wait for its end, or end it") from None
             time.sleep(KICK_S)
         else:
             return claim
@@ -132,7 +134,7 @@ class Child:
                 answer = getattr(self, f"_do_{order['do']}")(*order["with"])
                 if order["id"]:
                     self._say({"id": order["id"], "is": answer})
-            except Refused as fault:
+            except CommandRejected as fault:
                 self._say({"id": order["id"], "fault": fault.args})
             except Exception as error:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -157,15 +159,15 @@ class Child:
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             what = f"no arm answers at {self._host}, ports {frames.RTDE_PORT} and {frames.DASHBOARD_PORT}: {reason}"
-            raise Refused("refused", what, "check its address, its cable and that it is switched on") from None
+            raise CommandRejected("refused", what, "check its address, its cable and that it is switched on") from None
         threading.Thread(target=self._watch, args=(reader, first), daemon=True).start()
         control = rtde_control.RTDEControlInterface(self._host)
         if not control.setWatchdog(WATCHDOG_HZ):
-            raise Refused("refused", "the arm does not take a watchdog", "")
+            raise CommandRejected("refused", "the arm does not take a watchdog", "")
         tcp = control.getTCPOffset()
         self._control = control
         if not self._running.wait(ANSWER_S):
-            raise Refused("refused", "the arm's program does not run", LOOK)
+            raise CommandRejected("refused", "the arm's program does not run", LOOK)
         return about | {
             "host": self._host,
             "rate_hz": reader.rate_hz,
@@ -179,20 +181,20 @@ class Child:
         polyscope, model = frames.ask_dashboard(self._host, ["PolyscopeVersion", "get robot model"], ANSWER_S)
         remote, serial = frames.ask_dashboard(self._host, ["is in remote control", "get serial number"], ANSWER_S)
         if remote == "false":
-            raise Refused("refused", "the arm is not in remote control", "switch it over at the pendant")
+            raise CommandRejected("refused", "the arm is not in remote control", "switch it over at the pendant")
         names = {"polyscope": polyscope.removeprefix("URSoftware "), "model": model, "serial": serial}
         return {name: text for name, text in names.items() if not text.startswith("could not")}
 
     def _do_move(self, pose_mm: list[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         if not self._playing():
-            raise Refused("refused", "the arm's program does not run, so it takes no moves", LOOK)
+            raise CommandRejected("refused", "the arm's program does not run, so it takes no moves", LOOK)
         if self._before is not None or self._latest is None:
-            raise Refused("refused", "a move is under way", "wait for its end or stop it")
+            raise CommandRejected("refused", "a move is under way", "wait for its end or stop it")
         self._before = self._latest.progress & OPERATION
         pose = [*(value / 1e3 for value in pose_mm[:3]), *pose_mm[3:]]
         if not self._control.moveL(pose, speed_mm_s / 1e3, acceleration_mm_s2 / 1e3, True):
             self._before = None
-            raise Refused("refused", "the arm refused the move", LOOK)
+            raise CommandRejected("refused", "the arm refused the move", LOOK)
 
     def _do_stop(self) -> None:
         if self._playing():
@@ -200,7 +202,7 @@ class Child:
             self._news.clear()
             self._news.wait(NEWS_S)
         elif self._control is not None and not frames.stop_program(self._host, ANSWER_S):
-            raise Refused("lost", "the arm did not confirm the stop", "look at the arm")
+            raise CommandRejected("lost", "the arm did not confirm the stop", "look at the arm")
         self._before = None
         self._halted.set()
 
@@ -248,10 +250,10 @@ class Child:
         if ended or stopped:
             self._before = None
 
-    def _row(self, reading: Reading) -> Row:
+    def _row(self, reading: Reading) -> StateRow:
         emergency = bool(reading.safety & frames.EMERGENCY_BITS)
         x, y, z, *turn = reading.pose
-        return Row(
+        return StateRow(
             *(reading.time_s, 1e3 * x, 1e3 * y, 1e3 * z, *turn),
             speed_mm_s=1e3 * reading.speed,
             force_n=float("nan") if reading.force_n is None else reading.force_n,

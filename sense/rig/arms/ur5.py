@@ -44,12 +44,12 @@ class ArmLink:
     def __init__(self, host: str) -> None:
         self._host = host
         self._ended: tuple[Cause, str, str] | None = None
-        self.latest: wire.Row | None = None
+        self.latest: wire.StateRow | None = None
         self.skipped = 0
         self.stopped = False
         self._answers: dict[int, dict[str, Any]] = {}
         self._numbers = itertools.count(1)
-        self._rows: deque[wire.Row] = deque(maxlen=KEPT)
+        self._rows: deque[wire.StateRow] = deque(maxlen=KEPT)
         self._news = threading.Condition()
         self._looked = time.monotonic()
         self._ending = threading.Event()
@@ -87,7 +87,7 @@ class ArmLink:
         """Note that the program looks at the arm, so that a move may go on."""
         self._looked = time.monotonic()
 
-    def take(self) -> list[wire.Row]:
+    def take(self) -> list[wire.StateRow]:
         """States since the last call."""
         with self._news:
             rows = list(self._rows)
@@ -123,7 +123,7 @@ class ArmLink:
         ended: tuple[Cause, str, str] = ("lost", "the process that holds ur-rtde has ended", "connect again")
         for news in wire.read(self._process.stdout.read):
             with self._news:
-                if isinstance(news, wire.Row):
+                if isinstance(news, wire.StateRow):
                     self.latest = news
                     self.skipped += int(news.skipped)
                     self._rows.append(news)

@@ -28,7 +28,7 @@ from padforge.sense.rig.boards.due_framing import (
     Status,
     encode,
 )
-from padforge.sense.rig.devices import ConverterSamples, RigFault, host_ports
+from padforge.sense.rig.devices import BoardSamples, RigFault, host_ports
 from padforge.sense.settings import RigSettings
 
 BAUD = 115_200
@@ -123,7 +123,7 @@ Arrival = tuple[float, DueBlock]
 
 
 class Arduino:
-    """An Arduino Due that reads fibres every 1 / `rate_hz`; implements `Converter`.
+    """An Arduino Due that reads fibres every 1 / `rate_hz`; implements `Board`.
 
     The host time of a sample is when its last conversion was complete, apart from the least delay of the USB link.
     """
@@ -155,10 +155,10 @@ class Arduino:
     @classmethod
     def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "Arduino":
         """The board that `[rig]` names, looked for where its port is "auto"; see `__init__` and `port_of`."""
-        return cls(port_of(rig), rig.converter_rate_hz, inputs)
+        return cls(port_of(rig), rig.board_rate_hz, inputs)
 
     def connect(self) -> dict[str, Any]:
-        """Open the port, check the firmware, set the board and start it; see `Converter`."""
+        """Open the port, check the firmware, set the board and start it; see `Board`."""
         self.close()
         self._link = link = SerialLink(self._port)
         try:
@@ -182,8 +182,8 @@ class Arduino:
             "port": self._port,
         }
 
-    def read(self) -> ConverterSamples:
-        """All samples since the last call, C columns of volts; see `Converter`.
+    def read(self) -> BoardSamples:
+        """All samples since the last call, C columns of volts; see `Board`.
 
         Raises:
             RigFault: "stale" or "lost" once all samples that came before have been read, "data" where nobody has read
@@ -275,7 +275,7 @@ class DueAssembler:
         self._next = 0
         self._time_us: int | None = None
 
-    def samples(self, arrivals: Iterable[Arrival]) -> ConverterSamples:
+    def samples(self, arrivals: Iterable[Arrival]) -> BoardSamples:
         """The samples of the blocks that have arrived since the last call.
 
         Raises:
@@ -288,7 +288,7 @@ class DueAssembler:
             placed.append((first, lost, block.counts))
         times = [self.clock.times(np.arange(first, first + len(counts))) for first, _, counts in placed]
         missing = [np.r_[lost, np.zeros(len(counts) - 1, np.int64)] for _, lost, counts in placed]
-        return ConverterSamples(
+        return BoardSamples(
             np.concatenate([np.empty(0), *times]),
             np.concatenate([np.empty((0, len(self._columns))), *(counts[:, self._columns] for *_, counts in placed)])
             * self._volts,

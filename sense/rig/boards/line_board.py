@@ -9,7 +9,7 @@ import numpy as np
 
 from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, chosen_inputs
 from padforge.sense.rig.boards.line_framing import ASK, LineDecoder, LineHeader, Sample
-from padforge.sense.rig.devices import ConverterSamples, RigFault, host_ports
+from padforge.sense.rig.devices import BoardSamples, RigFault, host_ports
 from padforge.sense.settings import RigSettings
 
 RESONATOR_SKEW = 5e-3
@@ -38,7 +38,7 @@ class LineReader:
 
 
 class LineBoard:
-    """A board at a serial port that sends samples as lines; implements `Converter`.
+    """A board at a serial port that sends samples as lines; implements `Board`.
 
     The host time of a sample is when it was taken by the board's clock, apart from the least delay of the port.
     """
@@ -59,10 +59,10 @@ class LineBoard:
     @classmethod
     def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
         """The board that `[rig]` names; where its port is "auto", at the only serial port there is."""
-        return cls(port_of(rig), rig.baud, rig.converter_rate_hz, inputs)
+        return cls(port_of(rig), rig.baud, rig.board_rate_hz, inputs)
 
     def connect(self) -> dict[str, Any]:
-        """Open the port, ask the board what it is and begin to read; see `Converter`."""
+        """Open the port, ask the board what it is and begin to read; see `Board`."""
         self.close()
         self._stream, self._decoder = ByteStream(self._port, self._baud), LineDecoder()
         try:
@@ -84,8 +84,8 @@ class LineBoard:
             **({} if header.checked else {"warning": "its lines have no check: a damaged one may pass for a sample"}),
         }
 
-    def read(self) -> ConverterSamples:
-        """All samples since the last call, C columns of volts; see `Converter`.
+    def read(self) -> BoardSamples:
+        """All samples since the last call, C columns of volts; see `Board`.
 
         Raises:
             RigFault: "stale" or "lost" once all samples that came before have been read, "data" where nobody has read
@@ -126,7 +126,7 @@ class LineBoard:
         header = self._decoder.header
         if abs(header.rate_hz / self._rate_hz - 1) > _SAME_RATE:
             message = f"{self._port}: the board takes {header.rate_hz:g} samples a second, [rig] says {self._rate_hz:g}"
-            raise RigFault("refused", message, f"set converter_rate_hz = {header.rate_hz:g}")
+            raise RigFault("refused", message, f"set board_rate_hz = {header.rate_hz:g}")
         return header
 
     def _start(self, stream: ByteStream, header: LineHeader) -> None:
@@ -153,7 +153,7 @@ class LineBoard:
 
 
 class LineAssembler:
-    """Makes `ConverterSamples` of lines: times by a `SampleClock`, volts fibre by fibre, what is missing by the times.
+    """Makes `BoardSamples` of lines: times by a `SampleClock`, volts fibre by fibre, what is missing by the times.
 
     Every sample has its slot, a period after the one before; the slots follow the board, whose rate need not be quite
     what it says. A line that fits into no slot, by its time, is no sample.
@@ -172,7 +172,7 @@ class LineAssembler:
         self._slot_us = 0.0
         self._misplaced = 0.0
 
-    def samples(self, arrivals: Iterable[tuple[float, LineReader]]) -> ConverterSamples:
+    def samples(self, arrivals: Iterable[tuple[float, LineReader]]) -> BoardSamples:
         """The samples of the lines that have arrived since the last call.
 
         Raises:
@@ -192,7 +192,7 @@ class LineAssembler:
         volts = (
             np.array(counts, np.float64).reshape(len(counts), -1) if counts else np.empty((0, 1 + max(self._columns)))
         )
-        return ConverterSamples(
+        return BoardSamples(
             self.clock.times(np.array(times_us)) if times_us else np.empty(0),
             volts[:, self._columns] * self._volts,
             np.array(missing, np.int64),

@@ -10,7 +10,7 @@ import pytest
 from padforge.design.morphology import Morphology
 from padforge.fabricate.outputs.drawings import TURN_DEG, orientation_sentence, orientation_svg
 from padforge.fabricate.plan import Plan
-from padforge.sense.rig.config import Frame
+from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import with_settings
 
@@ -40,13 +40,13 @@ def matrix(transform: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("name", POSES)
 @pytest.mark.parametrize("pad", PADS)
 def test_panels_match_frame_of_rig(pad, name):
-    """Fibres, axes and numbers are drawn where `Frame`, which poses the rig's presses, has them."""
+    """Fibres, axes and numbers are drawn where `RobotFrame`, which poses the rig's presses, has them."""
     plan, (mirrored, turn_deg) = Plan(pad), POSES[name]
     group = panel(draw(pad), name)
     (use,) = group.findall(f"{SVG}use")
     linear, shift = matrix(use.get("transform", ""))
     rig = RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, pad_angle_deg=turn_deg, mirrored=mirrored)
-    frame, scale = Frame.of(rig), np.sqrt(abs(np.linalg.det(linear)))
+    frame, scale = RobotFrame.of(rig), np.sqrt(abs(np.linalg.det(linear)))
     starts = np.array([line.coords[0] for line in plan.lines])
     expected = np.array([frame.pose(start, 0.0)[:2] for start in starts])
     drawn = starts * (1, -1) @ linear + shift

@@ -33,7 +33,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     written(folder / "contacts.json", contacts_document())
     source = {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}}
     made_by = provenance("padforge sense record")
-    start = {"format": "padforge-recording/1", "fibres": 4, "source": source, "provenance": made_by}
+    start = {"format": "padforge-recording/2", "fibres": 4, "source": source, "provenance": made_by}
     written(folder / "recording" / "start.json", start)
     written(folder / "studies" / "drift.json", study_document())
     shutil.copy(folder / "tracks.png", folder / "studies" / "drift.png")

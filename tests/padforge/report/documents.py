@@ -48,15 +48,15 @@ def errors(by_subset: dict[tuple[int, ...], float]) -> dict:
         means = [mean for each, mean in by_subset.items() if len(each) == lost]
         names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm", "within_r50", "within_r90")
         values = dict.fromkeys(names, 0.5) | {"mean_mm": float(np.mean(means)), "max_mm": max(means)}
-        rows.append({"lost": lost, "subsets": len(means), **values})
-    return {"errors": rows, "by_subset": [{"lost": list(lost), "mean_mm": mean} for lost, mean in by_subset.items()]}
+        rows.append({"n_failed": lost, "subsets": len(means), **values})
+    return {"errors": rows, "by_subset": [{"failed": list(lost), "mean_mm": mean} for lost, mean in by_subset.items()]}
 
 
 def calibration_document() -> dict:
     found = {(): 1.0, (0,): 1.5, (1,): 4.25, (2,): 1.25, (3,): 2.0}
     pairs = {(one, two): found[one,] + found[two,] for two in range(4) for one in range(two)}
     return {
-        "format": "padforge-calibration/1",
+        "format": "padforge-calibration/2",
         **errors(found | pairs),
         "split": "random",
         "test_presses": 12,

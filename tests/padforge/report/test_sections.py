@@ -116,7 +116,7 @@ def test_report_names_worst_failures(page: Path) -> None:
 
 def test_fibre_loss_study_replaces_errors_of_calibration(pad: Path) -> None:
     ways = {"one network": errors({(): 1.0, (0,): 7.5, (1,): 3.0}), "retrained": errors({(): 1.0, (0,): 2, (1,): 8.5})}
-    document = {"format": "padforge-fibre-loss/1", "ways": ways, "test_presses": 9, "provenance": provenance("x")}
+    document = {"format": "padforge-fibre-loss/2", "ways": ways, "test_presses": 9, "provenance": provenance("x")}
     written(pad / "fibre_loss.json", document)
     text = write_report(pad).read_text()
     assert "of one fibre, 1 (7.50 mm)" in text
@@ -193,9 +193,9 @@ def test_report_refuses_folder_without_results(tmp_path: Path) -> None:
 DAMAGED = {
     "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}', "{", "[]"],
     "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
-    "calibration.json": ['{"format": "padforge-calibration/1", "errors": []}'],
-    "fibre_loss.json": ['{"format": "padforge-fibre-loss/1", "ways": {"x": {"by_subset": [{"lost": [1]}]}}}'],
-    "recording/start.json": ['{"format": "padforge-recording/1", "fibres": 4}'],
+    "calibration.json": ['{"format": "padforge-calibration/2", "errors": []}'],
+    "fibre_loss.json": ['{"format": "padforge-fibre-loss/2", "ways": {"x": {"by_subset": [{"failed": [1]}]}}}'],
+    "recording/start.json": ['{"format": "padforge-recording/2", "fibres": 4}'],
     "mould.stl": ["solid nothing", ""],
     "mould.png": ["", "no picture"],
     "design.svg": ["<svg", ""],
@@ -256,9 +256,9 @@ def test_report_shows_depth_and_force(pad: Path) -> None:
     start["source"]["rig"]["depths_mm"] = [0.5, 5.0]
     (pad / "recording" / "start.json").write_text(json.dumps(start))
     lines = [
-        {"event": "begun", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
+        {"event": "down_command", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
         {"event": "done", "press": 0, "reading": 2, "at_mm": [0, 0, 0.45], "force_n": 1.25},
-        {"event": "begun", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
+        {"event": "down_command", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
         {"event": "done", "press": 1, "reading": 4, "at_mm": [0, 0, 4.95]},
     ]
     journal = "".join(json.dumps(line) + "\n" for line in lines)

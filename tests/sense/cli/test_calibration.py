@@ -24,7 +24,7 @@ def test_a_recording_is_learnt_from_and_evaluated(few) -> None:
     for name in ("error_map.png", "error_by_loss.png"):
         assert Path("new", name).read_bytes()[:4] == b"\x89PNG"
     for lost, levels in (("0", 1), ("2", 3), ("8", 4)):  # of 4 fibres one is left
-        code, out, _ = few("evaluate", "--model", "new", "rec", "--lost", lost, "--json")
+        code, out, _ = few("evaluate", "--model", "new", "rec", "--max-failures", lost, "--json")
         assert code == 0
         assert json.loads(out)["errors"] == document["errors"][:levels]
 
@@ -73,7 +73,7 @@ def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkey
 def test_a_torn_recording_is_said_to_be_one(few) -> None:
     content = Path("rec/readings.bin").read_bytes()
     Path("rec/readings.bin").write_bytes(content[:-100])
-    code, _, err = few("evaluate", "--model", "model", "rec", "--lost", "0")
+    code, _, err = few("evaluate", "--model", "model", "rec", "--max-failures", "0")
     assert code == 0
     assert "last 1 presses are left out" in err
 
@@ -81,7 +81,7 @@ def test_a_torn_recording_is_said_to_be_one(few) -> None:
 def test_errors_of_depth_and_force_are_listed(padforge_sense, deep_localizer, deep_recording) -> None:
     deep_localizer.save("model")
     deep_recording.save("rec", {})
-    words = ("evaluate", "--model", "model", "rec", "--lost", "1")
+    words = ("evaluate", "--model", "model", "rec", "--max-failures", "1")
     lines = padforge_sense(*words)[1].splitlines()
     rows = json.loads(padforge_sense(*words, "--json")[1])["errors"]
     depth = lines.index("error of depth in mm")

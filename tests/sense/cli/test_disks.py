@@ -52,7 +52,7 @@ def test_all_or_nothing_is_left(few, name: str) -> None:
         assert {path.name for path in out.iterdir()} == set(before)
         assert (out / "localizer.json").read_bytes() != before["localizer.json"]
     if name in ("record", "import"):
-        assert len(sense.Recording.open("out/rec").begun) == 60
+        assert len(sense.Recording.open("out/rec").down_command) == 60
 
 
 def test_two_imports_into_one_folder_leave_one_of_them_whole(few) -> None:
@@ -62,5 +62,5 @@ def test_two_imports_into_one_folder_leave_one_of_them_whole(few) -> None:
     said = [each.communicate()[1].decode() for each in running]
     assert sorted(each.returncode for each in running) == [0, 2], said
     assert [text.count("\n") for text in sorted(said, key=len)] == [0, 1]
-    assert len(sense.Recording.open("out/rec").begun) == 60
+    assert len(sense.Recording.open("out/rec").down_command) == 60
     assert [path.name for path in Path("out").iterdir()] == ["rec"]

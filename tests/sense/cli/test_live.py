@@ -9,10 +9,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from padforge.sense import Localizer, Recording
+from padforge.sense import Recording
 from padforge.sense.cli.live import view_lines
 from padforge.sense.live import outputs as messages
 from padforge.sense.live.outputs import LivePage
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.virtual import virtual_pad as live_pad
 from tests.sense.live.conftest import first_presses
@@ -75,7 +76,7 @@ def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch,
     """As the pad lay when the model was learnt: a holder had said how, so that `[rig]` leaves it open."""
     board, told = Mock(read=Mock(side_effect=error)), Mock()
     board.connect.return_value = {"channels": 4, "rate_hz": 13.3}
-    Localizer.load(model).save("mine")
+    LocalizerModel.load(model).save("mine")
     recording = Recording.open(model / "recording")
     source = {**recording.source, "rig": {**recording.source["rig"], "mirrored": True}}
     replace(recording, source=source).save("mine/recording", {})

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense import Localizer, Recording
-from padforge.sense.health.locating import locate
+from padforge.sense import Recording
+from padforge.sense.localizer.model import LocalizerModel
 
 
 def test_places_without_the_fibres_masked(few) -> None:
     """A mask names fibres as people count them; arrays count from 0."""
-    assert few("locate", "--model", "model", "rec", "--mask", "1,4")[:2] == (0, "60 places -> places.csv\n")
+    assert few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")[:2] == (0, "60 places -> places.csv\n")
     table = np.genfromtxt("places.csv", delimiter=",", names=True)
     assert table.dtype.names == ("press", "x_mm", "y_mm", "sd_x_mm", "sd_y_mm", "r50_mm", "r90_mm")
     assert len(table) == 60
     assert (table["r50_mm"] < table["r90_mm"]).all()
-    found = locate(Localizer.load("model"), Recording.open("rec"), (0, 3))
-    np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), found.places_mm, atol=1e-4)
+    found = LocalizerModel.load("model").predict(Recording.open("rec"), (0, 3))
+    np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), found.positions_mm, atol=1e-4)
 
 
 def test_a_fibre_found_at_fault_is_left_out(enough) -> None:
@@ -27,9 +27,9 @@ def test_a_fibre_found_at_fault_is_left_out(enough) -> None:
     code, out, _ = enough("health", "--model", "model", "rec")
     assert (code, out.strip()) == (0, "sound fibres: 1, 2, 3, 4")
     whole = Recording.open("rec")
-    readings, first = np.array(whole.readings), whole.lifted[239]
-    readings[whole.begun[300] - 15 :, 2] = readings[whole.begun[300] - 15, 2]
-    edges = whole.begun[240:] - first, whole.lifted[240:] - first
+    readings, first = np.array(whole.readings), whole.up_command[239]
+    readings[whole.down_command[300] - 15 :, 2] = readings[whole.down_command[300] - 15, 2]
+    edges = whole.down_command[240:] - first, whole.up_command[240:] - first
     Recording(readings[first:], whole.times_s[first:], whole.presses_mm[240:], *edges).save("stuck", {})
     code, out, _ = enough("health", "--model", "model", "stuck", "--json")
     assert code == 1
@@ -43,7 +43,7 @@ def test_a_fibre_found_at_fault_is_left_out(enough) -> None:
     assert (code, err.count("\n")) == (0, 1)
     assert err.startswith("fibre 3 reads one value")
     assert "left out from there on" in err
-    enough("locate", "--model", "model", "stuck", "--mask", "3", "--out", "masked.csv")
+    enough("locate", "--model", "model", "stuck", "--exclude-fibres", "3", "--out", "masked.csv")
     places, masked = (Path(name).read_text().splitlines() for name in ("places.csv", "masked.csv"))
     assert places[82:] == masked[82:]
     assert places[:60] != masked[:60]

@@ -14,7 +14,7 @@ from padforge.sense.cli.options import typed_keys
 
 def test_importing_takes_no_torch() -> None:
     modules = (
-        "padforge.sense, padforge.sense.cli.main, padforge.sense.settings, padforge.sense.localizer.localizer,"
+        "padforge.sense, padforge.sense.cli.main, padforge.sense.settings, padforge.sense.localizer.model,"
         " padforge.sense.localizer.calibration"
     )
     code = f"import sys, {modules}; sys.exit(bool({{'torch', 'matplotlib'}} & set(sys.modules)))"
@@ -69,7 +69,7 @@ print(json.dumps(ends))
 def test_places_are_found_without_what_only_other_jobs_need(few) -> None:
     lines = (
         "sense locate --model model rec",
-        "sense evaluate --model model rec --lost 1",
+        "sense evaluate --model model rec --max-failures 1",
         "sense live --model model --replay rec --speed 1e6 --port 0",
         "sense calibrate rec --out again",
         "run --out pad",
@@ -87,7 +87,7 @@ def test_places_are_found_without_what_only_other_jobs_need(few) -> None:
     assert run[2].endswith("pip install 'padforge[design,cad,train]'\n")
 
 
-@pytest.mark.parametrize("words", ["record --rig ur5", "record --through-drivers", "doctor"])
+@pytest.mark.parametrize("words", ["record --rig ur5", "record --virtual-hardware", "doctor"])
 def test_a_rig_where_none_can_run_is_one_line(padforge_sense, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
     Morphology.straight(4).save("morphology.json")
     monkeypatch.setattr("platform.system", lambda: "Windows")

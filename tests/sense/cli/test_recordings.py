@@ -16,7 +16,7 @@ def test_csv_comes_in(padforge_sense, brief: Recording) -> None:
     assert out.endswith(" -> out/r/recording\n")
     assert Recording.open("out/r/recording") == brief
     start = json.loads(Path("out/r/recording/start.json").read_text())
-    assert start["format"] == "padforge-recording/1"
+    assert start["format"] == "padforge-recording/2"
     assert set(start["provenance"]["inputs"]) == {"r.csv"}
 
 
@@ -24,7 +24,7 @@ def test_what_a_lab_has_comes_in_by_a_mapping(padforge_sense) -> None:
     rows = [f"{100 * i};{1 + i % 7:d},5;2;{i // 10 + 1};0;{int(i % 10 > 5)}" for i in range(30)]
     Path("lab.txt").write_text("# bench 2\nt_ms;ch1;ch2;X;Y;down\n" + "\n".join(rows))
     mapping = "time=t_ms:ms,fibres=ch*,x=X:cm,y=Y,press=down"
-    code, out, err = padforge_sense("import", "lab.txt", "--map", mapping)
+    code, out, err = padforge_sense("import", "lab.txt", "--columns", mapping)
     assert (code, err) == (0, "")
     assert out == "3 presses, 30 readings of 2 fibres at 10.0 Hz -> out/lab/recording\n"
     recording = Recording.open("out/lab/recording")

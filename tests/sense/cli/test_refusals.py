@@ -27,7 +27,7 @@ import absent.csv --out r                       | absent.csv
 import empty                                    | or a rosbag2 folder
 import noise.csv --out pad.toml/r               | pad.toml
 import rec --out r                              | rec: ends in '', allowed are .mat
-import noise.csv --map time=t,fibres=b --out r  | noise.csv: time is 't', expected one of 'a', 'b'
+import noise.csv --columns time=t,fibres=b --out r  | noise.csv: time is 't', expected one of 'a', 'b'
 export rec set --model model                    | allowed are .csv, .h5, .mcap, or --format lerobot
 export rec r.bag --model model                  | allowed are .csv, .h5, .mcap, or --format lerobot
 export rec r.h5 --model model                   | r.h5: what a model says can be written as .mcap or lerobot only
@@ -37,22 +37,22 @@ calibrate . --out m                             | .: no recording, expected a fo
 calibrate absent --out m                        | absent: no recording, expected a folder with start.json
 calibrate pad.toml --out m                      | pad.toml: no recording, expected a folder
 calibrate rec --out pad.toml/model              | pad.toml is a file, expected a folder
-evaluate --model model rec --lost a             | 'a' is not a valid integer
-evaluate --model model rec --lost 0,1           | '0,1' is not a valid integer
-evaluate --model model rec --lost ''            | '' is not a valid integer
-evaluate --model model rec --lost {huge}        | {huge} is not in the range 0<=x<=8
-evaluate --model model other --lost 0           | readings are of 6 fibres, the localizer was learnt from 4
+evaluate --model model rec --max-failures a             | 'a' is not a valid integer
+evaluate --model model rec --max-failures 0,1           | '0,1' is not a valid integer
+evaluate --model model rec --max-failures ''            | '' is not a valid integer
+evaluate --model model rec --max-failures {huge}        | {huge} is not in the range 0<=x<=8
+evaluate --model model other --max-failures 0           | readings are of 6 fibres, the localizer was learnt from 4
 locate --model absent rec --out p.csv           | absent
 locate --model model rec --out pad.toml/p.csv   | pad.toml/p.csv: cannot be written
 locate --model model rec --out model            | directory
-locate --model model rec --mask 0 --out p.csv   | padforge: fibre 0: no such fibre, allowed are 1 to 4
-locate --model model rec --mask 5 --out p.csv   | padforge: fibre 5: no such fibre, allowed are 1 to 4
-locate --model model rec --mask -1 --out p.csv  | padforge: fibre -1: no such fibre, allowed are 1 to 4
-locate --model model rec --mask 1,0 --out p.csv | padforge: fibre 0: no such fibre, allowed are 1 to 4
-locate --model model rec --mask {huge}          | fibre {huge}: no such fibre
+locate --model model rec --exclude-fibres 0 --out p.csv   | padforge: fibre 0: no such fibre, allowed are 1 to 4
+locate --model model rec --exclude-fibres 5 --out p.csv   | padforge: fibre 5: no such fibre, allowed are 1 to 4
+locate --model model rec --exclude-fibres -1 --out p.csv  | padforge: fibre -1: no such fibre, allowed are 1 to 4
+locate --model model rec --exclude-fibres 1,0 --out p.csv | padforge: fibre 0: no such fibre, allowed are 1 to 4
+locate --model model rec --exclude-fibres {huge}          | fibre {huge}: no such fibre
 health --model model rec                        | health
 calibrate rec --seed 5 --out studied            | localizer.json: fibre_loss.json was made from it; choose another
-calibrate rec --features early --out studied    | localizer.json: fibre_loss.json was made from it; choose another
+calibrate rec --features onset --out studied    | localizer.json: fibre_loss.json was made from it; choose another
 recalibrate --model model rec --out studied     | localizer.json: fibre_loss.json was made from it; choose another
 identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
 recalibrate --model empty/../model model/recording | padforge: model: holds the old model; name a folder
@@ -71,15 +71,15 @@ deploy --model rec rec l.h                      | rec/localizer.json: cannot be 
 record --presses 0 --out r                      | [rig] presses
 record --out pad.toml/rec                       | pad.toml is a file, expected a folder
 record --seed 9 --out rec                       | never written over
-record --resume                                 | --resume, --dry-run and --model need --through-drivers or a real rig
+record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
-record --twin twin.json --through-drivers       | --twin is of the simulated pad
+record --twin twin.json --virtual-hardware       | --twin is of the simulated pad
 record --twin torn.json                         | torn.json:
 record --twin straight.json                     | straight.json:
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --twin absent.json                       | absent.json:
 record --twin twin.json --morphology large.json | [pad] grid: got 270, input should be less
-record --rig mine --through-drivers             | --through-drivers: got --rig mine, allowed are simulated, ur5, printer
+record --rig mine --virtual-hardware             | --virtual-hardware: got --rig mine, allowed are simulated, ur5, printer
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
 record --rig ur5 --spec none.toml               | --morphology is needed, of the pad under the arm: there is none at
 record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, the pad has 4 fibres

@@ -59,7 +59,7 @@ def test_a_printer_is_practised_on_through_its_drivers(padforge_sense) -> None:
     Path("pad.toml").write_text(PRINTER)
     Morphology.straight(2).save("morphology.json")
     pad = ("--morphology", "morphology.json", "--spec", "pad.toml")
-    code, out, _ = padforge_sense("record", "--rig", "printer", "--through-drivers", "--presses", "2", *pad)
+    code, out, _ = padforge_sense("record", "--rig", "printer", "--virtual-hardware", "--presses", "2", *pad)
     assert (code, out[:10]) == (0, "2 presses,")
     assert Recording.open("recording").source["rig"]["tcp_mm"] == [30.0, 0.0, -20.0]
 
@@ -101,7 +101,7 @@ HAND = '[pad]\ngrid = 2\n[rig]\npresses = 2\nreadings_per_press = 10\nport = "/d
 def test_a_finger_records_through_the_drivers(padforge_sense) -> None:
     """In real time, which the board needs."""
     Path("pad.toml").write_text(HAND)
-    by_hand = ("record", "--rig", "hand", "--through-drivers", "--out", "rec")
+    by_hand = ("record", "--rig", "hand", "--virtual-hardware", "--out", "rec")
     code, out, err = padforge_sense(*by_hand)
     assert code == 0
     assert "http://127.0.0.1:" in err
@@ -130,7 +130,7 @@ def test_each_device_is_looked_over_where_the_other_is_not_there(padforge_sense)
 @pytest.mark.slow
 def test_the_board_alone_is_looked_over_for_a_hand(padforge_sense) -> None:
     Path("pad.toml").write_text(HAND)
-    code, out, _ = padforge_sense("doctor", "--rig", "hand", "--through-drivers")
+    code, out, _ = padforge_sense("doctor", "--rig", "hand", "--virtual-hardware")
     assert code == 0
     assert "name padforge-due" in out
     assert "arm" not in out

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from padforge.sense import Localizer, Recording
+from padforge.sense import Recording
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.deploy.c_header import c_header
 from padforge.sense.deploy.streaming import Budget
 from padforge.sense.deploy.student import Student, as_int8, split, teach
+from padforge.sense.localizer.model import LocalizerModel
 from tests.sense.conftest import QUICK
 
 HERE = Path(__file__).parent
@@ -60,7 +61,7 @@ def compiled(source: Path, folder: Path, *flags: str) -> Path:
 
 
 @pytest.fixture(scope="session")
-def taught(recording: Recording, localizer: Localizer) -> Student:
+def taught(recording: Recording, localizer: LocalizerModel) -> Student:
     return teach(recording, localizer, split(recording, localizer, SHORT)[0], BUDGET, SHORT)
 
 
@@ -72,7 +73,7 @@ def quantized(taught: Student) -> Student:
 
 
 @pytest.fixture(scope="session")
-def deeply(deep_recording: Recording, deep_localizer: Localizer) -> Student:
+def deeply(deep_recording: Recording, deep_localizer: LocalizerModel) -> Student:
     """One that has learnt depth and force."""
     training, _ = split(deep_recording, deep_localizer, SHORT)
     return teach(deep_recording, deep_localizer, training, BUDGET, SHORT)

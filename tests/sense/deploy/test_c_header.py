@@ -20,10 +20,10 @@ OFF_MM = 1e-3
 def require_twin(told: Told, twin: tuple, lost: tuple[int, ...] = ()) -> None:
     """See that a program tells the same presses as its twin, at the same readings and places."""
     seen, found = twin
-    missing = ~seen.inputs.alive | np.isin(np.arange(4), lost)
+    missing = ~seen.inputs.fibre_mask | np.isin(np.arange(4), lost)
     assert np.isfinite(told.events).all()
     assert np.array_equal(told.places[:, 0], seen.told)
-    assert np.hypot(*(told.places[:, 2:4] - found.places_mm).T).max(initial=0) < OFF_MM
+    assert np.hypot(*(told.places[:, 2:4] - found.positions_mm).T).max(initial=0) < OFF_MM
     np.testing.assert_allclose(told.places[:, 4:6], np.column_stack([found.r50_mm, found.r90_mm]), rtol=1e-4)
     assert np.array_equal(told.places[:, 6], missing.sum(axis=1))
 
@@ -36,7 +36,7 @@ def test_places_are_those_of_the_python_student(weights: str, recording, tmp_pat
         told = run(recording.readings, held, lost)
         assert len(told.places) == 300
         require_twin(told, student.touches(recording.readings, held, lost), lost)
-    measures, levels = len(student.localizer.normalization.measures), len(student.localizer.factors)
+    measures, levels = len(student.localizer.scaler.measures), len(student.localizer.interval_factors)
     told = run(np.zeros((1, 4)))
     assert told.tables == table_bytes(4, measures, levels, student.hidden, student.quantized)
     assert told.tables + CODE <= 40_000
@@ -85,9 +85,9 @@ def test_the_program_of_the_tutorial_does_as_it_says(taught, recording, tmp_path
     numbers = np.array([re.findall(r"-?\d+\.\d", line) for line in lines], float)
     seen, found = taught.touches(recording.readings)
     assert len(lines) == len(seen.told)
-    np.testing.assert_allclose(numbers[:, 1:3], found.places_mm, atol=0.052)
+    np.testing.assert_allclose(numbers[:, 1:3], found.positions_mm, atol=0.052)
     np.testing.assert_allclose(numbers[:, 3], found.r90_mm, atol=0.052)
-    late = numbers[:, 0] - recording.times_s[seen.begun]
+    late = numbers[:, 0] - recording.times_s[seen.down_command]
     assert (late > -0.06).all()
     assert (late < 0.8).all()
 

@@ -14,11 +14,11 @@ import onnxruntime
 import pytest
 
 from padforge.design.common.validation import Fault, InputError
-from padforge.sense import Localizer, Recording, calibrate, export_csv
+from padforge.sense import Recording, calibrate, export_csv
 from padforge.sense.deploy import onnx_export as onnx_file
 from padforge.sense.deploy.onnx_export import MOST_OFF_MM, Exported, export_onnx, onnx_line
 from padforge.sense.localizer.features import bridged
-from padforge.sense.localizer.localizer import Found
+from padforge.sense.localizer.model import Localization, LocalizerModel
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import ROOT, tutorial
 
@@ -26,7 +26,7 @@ DIGEST = "a" * 64
 
 
 @pytest.fixture(scope="module")
-def exported(localizer: Localizer, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple:
+def exported(localizer: LocalizerModel, recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple:
     path = tmp_path_factory.mktemp("onnx") / "localizer.onnx"
     return path, export_onnx(localizer, DIGEST, path, recording)
 
@@ -40,51 +40,55 @@ def graph(exported: tuple[Path, Exported]) -> onnxruntime.InferenceSession:
     return opened(exported[0])
 
 
-def presses_of(recording: Recording, alive: np.ndarray) -> dict[str, np.ndarray]:
-    edges = {"begun": recording.begun, "lifted": recording.lifted}
-    return {"readings": bridged(recording.readings), **edges, "alive": alive}
+def presses_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
+    edges = {"down_command": recording.down_command, "up_command": recording.up_command}
+    return {"readings": bridged(recording.readings), **edges, "fibre_mask": fibre_mask}
 
 
-def require_places(places_mm: Any, found: Found) -> None:
-    assert np.shape(places_mm) == found.places_mm.shape
-    assert np.hypot(*(np.asarray(places_mm) - found.places_mm).T).max() < MOST_OFF_MM
+def require_places(positions_mm: Any, found: Localization) -> None:
+    assert np.shape(positions_mm) == found.positions_mm.shape
+    assert np.hypot(*(np.asarray(positions_mm) - found.positions_mm).T).max() < MOST_OFF_MM
 
 
 def test_places_and_radii_are_those_of_locate(graph, localizer, recording) -> None:
-    presses, names = localizer.inputs(recording), ["places_mm", "sd_mm", "r50_mm", "r90_mm"]
+    presses, names = localizer.scaled_features(recording), ["positions_mm", "std_mm", "r50_mm", "r90_mm"]
     for lost in ((), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)):
-        alive = presses.alive & ~np.isin(np.arange(4), lost)
-        found = localizer.locate(replace(presses, alive=alive))
-        places_mm, *others = graph.run(names, presses_of(recording, alive))
-        require_places(places_mm, found)
+        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), lost)
+        found = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
+        positions_mm, *others = graph.run(names, presses_of(recording, fibre_mask))
+        require_places(positions_mm, found)
         for name, values in zip(names[1:], others, strict=True):
             np.testing.assert_allclose(values, getattr(found, name), rtol=1e-4)
 
 
 def test_any_number_of_presses_and_readings_will_do(graph, localizer, brief) -> None:
     """The last press of a recording is found as it is in it by itself, where the one before stands by its end."""
-    presses = localizer.inputs(brief)
+    presses = localizer.scaled_features(brief)
     for count in (1, 2, 7):
-        part = {"begun": brief.begun[:count], "lifted": brief.lifted[:count], "alive": np.ones((count, 4), bool)}
-        given = {"readings": brief.readings[: brief.begun[count]], **part}
-        require_places(graph.run(["places_mm"], given)[0], localizer.locate(presses[np.arange(count)]))
+        part = {
+            "down_command": brief.down_command[:count],
+            "up_command": brief.up_command[:count],
+            "fibre_mask": np.ones((count, 4), bool),
+        }
+        given = {"readings": brief.readings[: brief.down_command[count]], **part}
+        require_places(graph.run(["positions_mm"], given)[0], localizer.predict_features(presses[np.arange(count)]))
 
 
-@pytest.mark.parametrize("features", ["causal", "early", "published"])
+@pytest.mark.parametrize("features", ["causal", "onset", "published"])
 def test_whatever_its_inputs_are_made_of(features: str, brief: Recording, tmp_path: Path) -> None:
     options = QUICK.model_copy(update={"features": features, "epochs": 2, "members": 1})
     found = export_onnx(calibrate(brief, options)[0], DIGEST, tmp_path / "l.onnx", brief)
-    assert found.places_mm < MOST_OFF_MM
+    assert found.positions_mm < MOST_OFF_MM
     assert found.presses == 40
 
 
 def test_depth_and_force_come_too(deep_localizer, deep_recording, tmp_path) -> None:
     export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", deep_recording)
-    presses = deep_localizer.inputs(deep_recording)
-    found, graph = deep_localizer.locate(presses), opened(tmp_path / "l.onnx")
+    presses = deep_localizer.scaled_features(deep_recording)
+    found, graph = deep_localizer.predict_features(presses), opened(tmp_path / "l.onnx")
     names = [each.name for each in graph.get_outputs()][4:]
     assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
-    told = graph.run(names, presses_of(deep_recording, presses.alive))
+    told = graph.run(names, presses_of(deep_recording, presses.fibre_mask))
     expected = [column for each in found.measures.values() for column in (each.values, each.r90)]
     np.testing.assert_allclose(np.array(told), np.array(expected), rtol=1e-4, atol=1e-4)
 
@@ -93,7 +97,7 @@ def test_the_file_says_what_it_is(exported: tuple[Path, Exported]) -> None:
     model = onnx.load(exported[0])
     onnx.checker.check_model(model, full_check=True)
     about = {each.key: each.value for each in model.metadata_props}
-    assert about["format"] == "padforge-onnx/1"
+    assert about["format"] == "padforge-onnx/2"
     assert about["localizer_sha256"] == DIGEST
     assert json.loads(about["fibres"]) == ["fibre_0_v", "fibre_1_v", "fibre_2_v", "fibre_3_v"]
     assert list(json.loads(about["inputs"])) == [each.name for each in model.graph.input]
@@ -118,9 +122,11 @@ def test_the_script_of_the_tutorial_does_as_it_says(localizer, brief, exported, 
     export_csv(brief, "presses.csv")
     found: dict[str, np.ndarray] = {}
     exec(tutorial("graph", "python"), found)
-    assert np.array_equal(found["begun"], brief.begun)
-    presses = localizer.inputs(brief)
-    require_places(found["places_mm"][:-1], localizer.locate(presses[np.arange(len(brief.begun) - 1)]))
+    assert np.array_equal(found["down_command"], brief.down_command)
+    presses = localizer.scaled_features(brief)
+    require_places(
+        found["positions_mm"][:-1], localizer.predict_features(presses[np.arange(len(brief.down_command) - 1)])
+    )
 
 
 def test_onnxruntime_is_kept_from_telling_its_maker_of_its_use(tmp_path: Path) -> None:

@@ -17,13 +17,13 @@ def nothing() -> Detector:
 
 def test_presses_are_seen_as_commanded_with_the_windows_of_the_features(recording, nothing) -> None:
     found = seen(recording.readings, nothing, held(recording))
-    assert np.array_equal(found.begun, recording.begun)
-    assert np.array_equal(found.ended, recording.lifted)
-    assert np.array_equal(found.told, recording.begun + press_stream.SEEN - 1)
-    assert found.inputs.alive.all()
+    assert np.array_equal(found.down_command, recording.down_command)
+    assert np.array_equal(found.ended, recording.up_command)
+    assert np.array_equal(found.told, recording.down_command + press_stream.SEEN - 1)
+    assert found.inputs.fibre_mask.all()
     assert (press_stream.WINDOWS, press_stream.MOST_V) == (features.DOWN, limits.MAX_VOLTS)
     assert features.REST == (-press_stream.REST, 0)
-    expected = features.window_inputs(recording.readings, recording.begun, recording.lifted, release=False)
+    expected = features.window_inputs(recording.readings, recording.down_command, recording.up_command, release=False)
     np.testing.assert_allclose(commanded(recording).windows, expected, atol=2e-6)
 
 
@@ -31,8 +31,8 @@ def test_history_is_what_averages_were_when_the_press_began(recording: Recording
     found = seen(recording.readings, nothing, held(recording))
     levels = np.repeat(recording.readings[:1, :, None], len(POLES), axis=2)[0]
     press = 0
-    for n, row in enumerate(recording.readings[: recording.begun[20]]):
-        if n == found.begun[press]:
+    for n, row in enumerate(recording.readings[: recording.down_command[20]]):
+        if n == found.down_command[press]:
             rest = recording.readings[n - press_stream.REST : n].mean(axis=0)
             np.testing.assert_allclose(found.inputs.history[press], levels - rest[:, None], atol=1e-5)
             press += 1
@@ -45,7 +45,7 @@ def test_short_presses_and_such_without_a_pause_are_seen(recording: Recording, n
     for first, end in ((0, 3), (5, 6), (7, 8), (40, 90), (91, 92)):
         pressed[first:end] = True
     found = seen(recording.readings[:200], nothing, pressed)
-    assert found.begun.tolist() == [1, 5, 7, 40, 91]
+    assert found.down_command.tolist() == [1, 5, 7, 40, 91]
     assert found.ended.tolist() == [3, 6, 8, 90, 92]
     assert found.told.tolist() == [3, 6, 8, 59, 92]
     assert np.isfinite(found.inputs.windows).all()
@@ -53,22 +53,22 @@ def test_short_presses_and_such_without_a_pause_are_seen(recording: Recording, n
     assert seen(recording.readings[:200], nothing, pressed).ended[-1] == 200
 
 
-def test_the_detector_finds_what_it_never_learnt_from(recording: Recording) -> None:
+def test_the_detector_finds_what_it_never_training_recording_sha256(recording: Recording) -> None:
     found = seen(recording.readings, Detector.fit(recording, np.arange(0, 200)))
-    press = owners(recording, found.begun)
+    press = owners(recording, found.down_command)
     assert np.isin(np.arange(200, 300), press).all()
     assert (press >= 0).all()
-    assert np.abs(found.begun - recording.begun[press]).max() <= 2
-    assert np.abs(found.ended[:-1] - recording.lifted[press[:-1]]).max() <= 5  # the simulated pad takes its time
+    assert np.abs(found.down_command - recording.down_command[press]).max() <= 2
+    assert np.abs(found.ended[:-1] - recording.up_command[press[:-1]]).max() <= 5  # the simulated pad takes its time
 
 
 def test_a_fibre_that_tells_nothing_is_no_noise(recording: Recording) -> None:
     readings = np.array(recording.readings)
     readings[:, 1], readings[:, 2] = 1.5, np.nan
-    dead = Recording(readings, recording.times_s, recording.presses_mm, recording.begun, recording.lifted)
+    dead = Recording(readings, recording.times_s, recording.presses_mm, recording.down_command, recording.up_command)
     detector = Detector.fit(dead, np.arange(300))
     assert np.isinf(detector.noise_v[[1, 2]]).all()
-    assert len(seen(readings, detector).begun) >= 280
+    assert len(seen(readings, detector).down_command) >= 280
 
 
 def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
@@ -76,13 +76,20 @@ def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
     readings = np.array(recording.readings)
     readings[2012:, 0] = 0.0
     found = seen(readings, Detector.fit(recording, np.arange(300)))
-    long = np.flatnonzero(found.ended - found.begun > press_stream.LONGEST)
+    long = np.flatnonzero(found.ended - found.down_command > press_stream.LONGEST)
     assert len(long) == 1
-    assert found.ended[long[0]] < recording.begun[100]
-    assert np.isin(np.arange(150, 300), owners(recording, found.begun)).mean() > 0.9
+    assert found.ended[long[0]] < recording.down_command[100]
+    assert np.isin(np.arange(150, 300), owners(recording, found.down_command)).mean() > 0.9
 
 
 def test_the_first_of_several_in_a_press_is_it(recording: Recording) -> None:
-    first = recording.begun[0]
-    begun = [first - 5, first - 1, first + 3, recording.lifted[0] + 2, recording.begun[1], recording.lifted[2]]
-    assert owners(recording, np.array(begun)).tolist() == [-1, 0, -1, -1, 1, -3]
+    first = recording.down_command[0]
+    down_command = [
+        first - 5,
+        first - 1,
+        first + 3,
+        recording.up_command[0] + 2,
+        recording.down_command[1],
+        recording.up_command[2],
+    ]
+    assert owners(recording, np.array(down_command)).tolist() == [-1, 0, -1, -1, 1, -3]

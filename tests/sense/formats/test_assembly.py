@@ -14,7 +14,7 @@ TIMES = np.arange(12) / 10
 VOLTS = np.arange(24.0).reshape(12, 2)
 PRESSED = np.array([0, 0, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0])
 PLACES = np.array([[1.0, 2], [-3, 4]])
-EDGES = {"begun": np.array([2, 7]), "lifted": np.array([5, 9])}
+EDGES = {"down_command": np.array([2, 7]), "up_command": np.array([5, 9])}
 AT = PLACES[[0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1]]
 """Where the probe was meanwhile."""
 
@@ -44,8 +44,8 @@ MISSING = np.where(PRESSED, NUMBERED, np.nan)
 )
 def test_presses_are_told_in_many_ways(arrays: dict[str, np.ndarray]) -> None:
     recording = made(arrays)
-    assert recording.begun.tolist() == [2, 7]
-    assert recording.lifted.tolist() == [5, 9]
+    assert recording.down_command.tolist() == [2, 7]
+    assert recording.up_command.tolist() == [5, 9]
     # two places for two presses may lie either way; then rows are taken
     assert recording.presses_mm.tolist() == (PLACES.T if arrays.get("places", AT).dtype == "f4" else PLACES).tolist()
 
@@ -58,27 +58,33 @@ def test_readings_lie_one_way_or_the_other_and_units_are_put_right() -> None:
     several = assembled(Path("f"), [*parts, *((Part(name, ""), EDGES[name]) for name in EDGES)], {})
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
     told = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "places": PLACES / 10}
-    edges = {"begun": np.array([150, 601]), "lifted": np.array([500, 801])}
-    recording = made(told | edges, **dict.fromkeys(("time", "fibres", "begun", "lifted"), 1e-3), places=10)
+    edges = {"down_command": np.array([150, 601]), "up_command": np.array([500, 801])}
+    recording = made(told | edges, **dict.fromkeys(("time", "fibres", "down_command", "up_command"), 1e-3), places=10)
     expected = made(EDGES | {"places": PLACES})
-    for name in ("times_s", "readings", "presses_mm", "begun", "lifted"):
+    for name in ("times_s", "readings", "presses_mm", "down_command", "up_command"):
         np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
-    times, begun = 0.0751879 * np.arange(4000), np.arange(20, 3900, 40)
-    told = {"time": times, "fibres": np.ones((4000, 1)), "places": np.zeros((len(begun), 2))}
-    recording = made(told | {"begun": 1000 * times[begun], "lifted": 1000 * times[begun + 20]}, begun=1e-3, lifted=1e-3)
-    assert np.array_equal([recording.begun, recording.lifted], [begun, begun + 20])  # a rounding off times of readings
+    times, down_command = 0.0751879 * np.arange(4000), np.arange(20, 3900, 40)
+    told = {"time": times, "fibres": np.ones((4000, 1)), "places": np.zeros((len(down_command), 2))}
+    recording = made(
+        told | {"down_command": 1000 * times[down_command], "up_command": 1000 * times[down_command + 20]},
+        down_command=1e-3,
+        up_command=1e-3,
+    )
+    assert np.array_equal(
+        [recording.down_command, recording.up_command], [down_command, down_command + 20]
+    )  # a rounding off times of readings
 
 
 def test_presses_that_nothing_tells_are_found(recording: Recording) -> None:
     at = np.full((len(recording.readings), 2), np.nan)
-    for place, begun in zip(recording.presses_mm, recording.begun, strict=True):
-        at[begun - 10 :] = place
+    for place, down_command in zip(recording.presses_mm, recording.down_command, strict=True):
+        at[down_command - 10 :] = place
     at[:10] = recording.presses_mm[0]
     content = {"time": recording.times_s[:800], "fibres": recording.readings[:800]}
     for places in (recording.presses_mm[:20], at[:800]):
         found = made(content | {"places": places})
         assert np.array_equal(found.presses_mm, recording.presses_mm[:20])
-        assert np.abs(found.begun - recording.begun[:20]).max() <= 3
+        assert np.abs(found.down_command - recording.down_command[:20]).max() <= 3
         assert FOUND.items() <= found.source.items()
     with pytest.raises(InputError, match="places are 19, expected one for each of 20 presses or 800 readings"):
         made(content | {"places": recording.presses_mm[:19]})
@@ -95,8 +101,8 @@ def test_presses_that_nothing_tells_are_found(recording: Recording) -> None:
         ({"press": 0 * PRESSED}, "press is nowhere above 0; without it, presses are found"),
         ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
         ({"press": np.array([0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0, 0])}, "press 1 goes from reading 4"),
-        (EDGES | {"lifted": np.array([5])}, "begun has 2 values and lifted 1"),
-        (EDGES | {"begun": np.array([2.5, 7])}, "begun are .* whole numbers"),
+        (EDGES | {"up_command": np.array([5])}, "begun has 2 values and lifted 1"),
+        (EDGES | {"down_command": np.array([2.5, 7])}, "begun are .* whole numbers"),
         (EDGES | {"places": np.ones((3, 2))}, "places are 3, expected one for each of 2 presses or 12 readings"),
         (EDGES | {"places": np.ones((2, 2, 2))}, r"places have shape \(2, 2, 2\)"),
         (EDGES | {"x": np.ones(2), "y": np.ones(3)}, "x has 2 values and y 3"),

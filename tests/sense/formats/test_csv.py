@@ -25,8 +25,8 @@ def test_unknown_places_and_missing_readings_are_told_by_their_cells(tmp_path: P
     (tmp_path / "r.csv").write_text(lines(rows))
     recording = import_csv(tmp_path / "r.csv")
     np.testing.assert_array_equal(recording.presses_mm, [[np.nan] * 2, [-1, 0], [np.nan] * 2])
-    assert recording.begun.tolist() == [1, 4, 6]
-    assert recording.lifted.tolist() == [3, 5, 7]
+    assert recording.down_command.tolist() == [1, 4, 6]
+    assert recording.up_command.tolist() == [3, 5, 7]
     assert np.argwhere(np.isnan(recording.readings)).tolist() == [[1, 0], [2, 0], [5, 1]]
 
 
@@ -38,8 +38,8 @@ def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_p
     (tmp_path / "r.csv").write_text(lines(rows, header))
     found = import_csv(tmp_path / "r.csv")
     assert not found.known.any()
-    assert len(found.begun) == 25
-    assert np.abs(found.begun - recording.begun[:25]).max() <= 3
+    assert len(found.down_command) == 25
+    assert np.abs(found.down_command - recording.down_command[:25]).max() <= 3
     export_csv(found, tmp_path / "again.csv")
     assert import_csv(tmp_path / "again.csv") == found
 
@@ -91,7 +91,7 @@ def test_a_mapping_tells_what_other_columns_hold_in_any_unit_and_by_names_with_s
     np.testing.assert_allclose(recording.times_s, np.arange(6) / 10)
     np.testing.assert_allclose(recording.readings[:, 0], [1.0005, 1.001, np.nan, 1, 1, 1])
     assert recording.presses_mm.tolist() == [[15, 20], [-5, 20]]
-    assert (recording.begun.tolist(), recording.lifted.tolist()) == ([1, 4], [3, 5])
+    assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([1, 4], [3, 5])
     assert recording.source == {"kind": "csv", "file": "lab.csv", "mapping": mapping}
     rows = ["0,1,,,12:30", "1,1,?,?,1_0", "2,1,,,?", "3,1,2,-1,", "4,1,,,"]
     (tmp_path / "lab.csv").write_text("\n".join(['"t;s;x","a;b",px,py,note', *rows]) + "\n")
@@ -128,7 +128,7 @@ MEASURED = ("depth_mm", "reached_mm", "force_n")
 def test_every_number_comes_back_and_measures_have_columns_where_they_are_known(
     brief: Recording, tmp_path: Path
 ) -> None:
-    count = len(brief.begun)
+    count = len(brief.down_command)
     forces = np.where(np.arange(count) < 9, np.nan, 2.5)
     for change, columns in (
         ({"depths_mm": np.empty(0)}, []),

@@ -33,7 +33,7 @@ def whole(eight: Recording, tmp_path_factory: pytest.TempPathFactory) -> dict[st
     write_bag(folder / "bag", said, packed=True).rename(folder / "packed.mcap")
     write_bag(folder / "bag2", said, "sqlite3").rename(folder / "plain.db3")
     eight.save(folder / "run", {})
-    assert all(len(open_recording(folder / name).begun) for name in (*FILES, "run"))
+    assert all(len(open_recording(folder / name).down_command) for name in (*FILES, "run"))
     files = [path for path in (*folder.iterdir(), *(folder / "run").iterdir()) if path.is_file()]
     return {path.name: path.read_bytes() for path in files}
 
@@ -59,8 +59,8 @@ def require_recording_or_one_line(read: Callable[[], Recording]) -> None:
     refused = ""
     try:
         found = read()
-        assert len(found.begun) > 0
-        assert found.lifted[-1] <= len(found.readings)
+        assert len(found.down_command) > 0
+        assert found.up_command[-1] <= len(found.readings)
     except InputError as error:
         refused = str(error) or "nothing is said\n"
     assert "\n" not in refused
@@ -105,7 +105,7 @@ def test_a_damaged_run_directory_gives_its_own_presses_or_one_line(
         return
     if name == "readings.bin":
         np.testing.assert_array_equal(found.readings, eight.readings[: len(found.readings)])
-        assert set(found.begun.tolist()) <= set(eight.begun.tolist())
+        assert set(found.down_command.tolist()) <= set(eight.down_command.tolist())
     with Recorder.resume(folder):
         pass
     assert Recording.open(folder) == found

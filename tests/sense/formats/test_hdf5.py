@@ -37,7 +37,7 @@ def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path: Path, eight
         assert again.source == each.source
         assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
         with h5py.File(tmp_path / "a.h5") as file:
-            assert set(file) - {"times_s", "readings_v", "presses_mm", "begun", "lifted"} == measures
+            assert set(file) - {"times_s", "readings_v", "presses_mm", "down_command", "up_command"} == measures
 
 
 def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
@@ -66,7 +66,7 @@ def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
         ({"times_s": "group"}, "times_s is no dataset"),
         ({"times_s": h5py.Empty("f8")}, "times_s holds None values"),
         ({"readings_v": "text"}, "readings_v holds object values, expected an array of real numbers"),
-        ({"begun": np.array([20.5])}, "begun are .*whole numbers"),
+        ({"down_command": np.array([20.5])}, "begun are .*whole numbers"),
         ({"readings_v": (10**6, 10**6, 100)}, "readings_v holds 1000000000000 values, allowed are 268435456"),
         ({"readings_v": (2**24, 1, 2**20)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
         ({"readings_v": (2**29, 1, 2**20)}, "readings_v holds 536870912 values, allowed are 268435456 in all"),
@@ -76,9 +76,9 @@ def test_datasets_that_do_not_fit_or_claim_much_are_one_line(
     tmp_path: Path, change: dict[str, Any], reason: str
 ) -> None:
     fine = {"times_s": np.arange(40.0), "readings_v": np.ones((40, 2)), "presses_mm": np.ones((1, 2))}
-    edges = {"begun": np.array([20]), "lifted": np.array([40])}
+    edges = {"down_command": np.array([20]), "up_command": np.array([40])}
     with h5py.File(tmp_path / "r.h5", "w") as file:
-        file.attrs["format"], file.attrs["source"] = "padforge-hdf5/1", "{}"
+        file.attrs["format"], file.attrs["source"] = "padforge-hdf5/2", "{}"
         for name, values in (fine | edges | change).items():
             if isinstance(values, str) and values == "group":
                 file.create_group(name)
@@ -118,7 +118,7 @@ def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_
     assert np.array_equal(recording.times_s, content["t"] * 1e-3)
     assert np.array_equal(recording.readings, content["data/volts"].T * 1e-3)
     assert recording.presses_mm.tolist() == [[10, 20], [-30, 40]]
-    assert (recording.begun.tolist(), recording.lifted.tolist()) == ([10, 25], [20, 35])
+    assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([10, 25], [20, 35])
     assert recording.source == {"kind": "hdf5", "file": "lab.h5", "mapping": mapping}
     lab(tmp_path, on=content["t"][content["on"]], off=content["t"][content["off"]])
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
@@ -127,7 +127,7 @@ def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_
     lab(tmp_path)
     there = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     for mapping, reason in (
-        ("", f"format is None, expected 'padforge-hdf5/1'; a mapping tells what other datasets hold, {there}"),
+        ("", f"format is None, expected 'padforge-hdf5/2'; a mapping tells what other datasets hold, {there}"),
         ("time=/s,fibres=data/volts", "time is 's', expected one of 'data/volts', 'note'"),
         ("time=t,fibres=data", "fibres is 'data', expected one of"),
         ("time=t,fibres=note", "note holds object values, expected an array of real numbers"),

@@ -119,8 +119,8 @@ def test_a_dataset_has_all_that_the_format_asks_for(eight: Recording, tmp_path: 
         told = [*eight.presses_mm[press], eight.depths_mm[press]]
         np.testing.assert_allclose(action[:, :3], np.tile(told, (len(action), 1)), rtol=1e-6)
         down = np.flatnonzero(action[:, 3])
-        first = (0 if press == 0 else (eight.lifted[press - 1] + eight.begun[press]) // 2) + down[0]
-        assert (first, len(down)) == (eight.begun[press], eight.lifted[press] - eight.begun[press])
+        first = (0 if press == 0 else (eight.up_command[press - 1] + eight.down_command[press]) // 2) + down[0]
+        assert (first, len(down)) == (eight.down_command[press], eight.up_command[press] - eight.down_command[press])
         start = first - down[0]
         state = columns["observation.state"][rows]
         np.testing.assert_array_equal(state, eight.readings[start : start + len(state)].astype(np.float32))

@@ -19,8 +19,8 @@ def test_the_published_recording_comes_in_as_it_is_and_a_part_is_refused(publish
     assert np.array_equal(recording.readings, content["voltage"])
     assert np.array_equal(recording.presses_mm, content["pos"].T)
     assert np.array_equal(recording.times_s, content["tim"].ravel())
-    assert recording.begun[:3].tolist() == [20, 60, 100]
-    assert recording.lifted[:3].tolist() == [40, 80, 120]
+    assert recording.down_command[:3].tolist() == [20, 60, 100]
+    assert recording.up_command[:3].tolist() == [40, 80, 120]
     whole = (published / MAT).read_bytes()
     for share in (0.0, 0.3, 0.99999):
         (tmp_path / "cut.mat").write_bytes(whole[: int(share * len(whole))])
@@ -58,7 +58,7 @@ def test_presses_and_readings_may_end_apart(
     recording = import_mat(tmp_path / "r.mat")
     assert np.array_equal(recording.readings, cut["voltage"])
     assert np.array_equal(recording.presses_mm, cut["pos"].T[:whole])
-    assert recording.lifted.tolist() == [40, 80, 120][:whole]
+    assert recording.up_command.tolist() == [40, 80, 120][:whole]
     assert recording.source.get("note") == note
 
 
@@ -95,7 +95,7 @@ def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
         recording = import_mat(path, mapping)
         assert np.array_equal(recording.readings, content["voltage"])
         np.testing.assert_allclose(recording.presses_mm, content["pos"].T)
-        assert recording.begun.tolist() == [20, 60, 100]
+        assert recording.down_command.tolist() == [20, 60, 100]
     with pytest.raises(InputError, match=r"old\.mat: time is 'z', expected one of 't', 'U', 'c', 'P'"):
         import_mat(tmp_path / "old.mat", "time=z,fibres=U")
 
@@ -149,7 +149,7 @@ def test_a_mat_may_hold_what_real_rigs_give_and_no_places(tmp_path: Path) -> Non
     scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
     blind = import_mat(tmp_path / "blind.mat")
     assert not blind.known.any()
-    assert blind.begun.tolist() == [20, 60, 100]
+    assert blind.down_command.tolist() == [20, 60, 100]
     pos = np.array(content["pos"], dtype=float)
     pos[:, 1] = np.nan
     scipy.io.savemat(tmp_path / "partly.mat", content | {"pos": pos})

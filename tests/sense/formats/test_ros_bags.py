@@ -129,11 +129,11 @@ DOCUMENTS = {
     "null": "null",
     "deep": "[" * 10**5,
     "wide": "[" + "[]," * 2**22 + "[]]",
-    "bare": '{"format": "padforge-ros/1"}',
+    "bare": '{"format": "padforge-ros/2"}',
     "zero": "\x00",
     "wrong": json.dumps(
-        {"format": "padforge-ros/1", "digest": "", "epoch_s": float("nan"), "source": {}, "times_s": [1e400]}
-        | {key: [{}] for key in ("presses_mm", "depths_mm", "begun", "lifted")}
+        {"format": "padforge-ros/2", "digest": "", "epoch_s": float("nan"), "source": {}, "times_s": [1e400]}
+        | {key: [{}] for key in ("presses_mm", "depths_mm", "down_command", "up_command")}
     ),
 }
 
@@ -154,7 +154,7 @@ def test_what_stands_beside_the_messages_is_used_only_where_it_goes_with_them(
     before = peak_bytes()
     found = import_bag(write_bag(tmp_path / "bag", told))
     assert peak_bytes() - before < 2**28
-    assert len(found.begun) == 1
+    assert len(found.down_command) == 1
     assert "was changed" in found.source["note"]
 
 

@@ -53,11 +53,11 @@ def test_an_independent_reader_finds_types_frames_stamps_and_values(eight: Recor
     (dim,) = messages[0].layout.dim
     assert (dim.label, dim.size, dim.stride) == ("fibre", 4, 4)
     assert [content.data for _, content in found["/pad/pressed"]] == [True, False] * 8
-    assert [stamp for stamp, _ in found["/pad/pressed"]][::2] == [stamps[at] for at in eight.begun]
+    assert [stamp for stamp, _ in found["/pad/pressed"]][::2] == [stamps[at] for at in eight.down_command]
     places = dict(zip(np.flatnonzero(eight.known).tolist(), found["/pad/place"], strict=True))
     for press, (stamp, place) in places.items():
         assert place.header.frame_id == "pad"
-        assert place.header.stamp.sec * 10**9 + place.header.stamp.nanosec == stamp == stamps[eight.begun[press]]
+        assert place.header.stamp.sec * 10**9 + place.header.stamp.nanosec == stamp == stamps[eight.down_command[press]]
         depth = 0.0 if press == 3 else -eight.depths_mm[press]
         expected = np.append(eight.presses_mm[press], depth) / 1000
         np.testing.assert_allclose(xyz(place.pose.pose.position), expected, rtol=1e-15)
@@ -69,7 +69,7 @@ def test_an_independent_reader_finds_types_frames_stamps_and_values(eight: Recor
     forces = [content.wrench.force.z for _, content in found["/pad/force"]]
     np.testing.assert_array_equal(forces, np.delete(eight.forces_n, 4))
     about = json.loads(found["/pad/recording"][0][1].data)
-    assert about["format"] == "padforge-ros/1"
+    assert about["format"] == "padforge-ros/2"
     assert about["digest"] == eight.digest
     assert about["topics"]["/pad/readings"].startswith("V, ")
     assert set(about["topics"]) | {"/pad/recording"} == set(kinds)
@@ -100,7 +100,7 @@ def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: 
     found, kinds = others_read(tmp_path / "r.mcap")
     assert kinds["/pad/touches"] == "geometry_msgs/msg/PoseWithCovarianceStamped"
     stamp, first = found["/pad/touches"][0]
-    assert stamp == found["/pad/readings"][eight.lifted[0]][0]
+    assert stamp == found["/pad/readings"][eight.up_command[0]][0]
     np.testing.assert_allclose(xyz(first.pose.pose.position), [0.003, 0.003, -0.002])
     spread = np.sqrt([first.pose.covariance[at] for at in (0, 7, 14)])
     np.testing.assert_allclose(spread, [5e-4, 2.5e-4, 5e-4 / 1.6449])

@@ -36,7 +36,7 @@ def close(found: Recording, expected: Recording) -> None:
     """See that a recording is another one, but for what messages round off, and for depths at unknown places."""
     expected = replace(expected, depths_mm=np.where(expected.known, expected.depths_mm, np.nan))
     np.testing.assert_array_equal(found.readings, expected.readings)
-    np.testing.assert_array_equal([found.begun, found.lifted], [expected.begun, expected.lifted])
+    np.testing.assert_array_equal([found.down_command, found.up_command], [expected.down_command, expected.up_command])
     for name in ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12, atol=1e-9)
 
@@ -68,7 +68,7 @@ def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path:
 def test_a_part_of_a_bag_is_what_its_messages_say_and_what_is_edited_counts(
     eight: Recording, bag: Path, tmp_path: Path
 ) -> None:
-    first, end = (int(stamps) for stamps in (eight.begun[1] + 3, eight.begun[6] + 2))
+    first, end = (int(stamps) for stamps in (eight.down_command[1] + 3, eight.down_command[6] + 2))
     span = eight.times_s[[first, end]] + [-1e-6, 1e-6]
     kept = lambda topic, time, _: topic == "/pad/recording" or span[0] <= time <= span[1]  # noqa: E731
     found = import_bag(changed(bag, tmp_path / "bag", kept))
@@ -78,8 +78,8 @@ def test_a_part_of_a_bag_is_what_its_messages_say_and_what_is_edited_counts(
         eight,
         readings=eight.readings[first : end + 1],
         times_s=eight.times_s[first : end + 1],
-        begun=eight.begun[2:7] - first,
-        lifted=np.append(eight.lifted[2:6] - first, end + 1 - first),
+        down_command=eight.down_command[2:7] - first,
+        up_command=np.append(eight.up_command[2:6] - first, end + 1 - first),
         **{name: getattr(eight, name)[2:7] for name in names},
     )
     close(found, part)
@@ -131,8 +131,8 @@ def test_a_bag_of_others_comes_in_by_a_mapping(tmp_path: Path, form: str) -> Non
     np.testing.assert_allclose(found.readings[123], [0.002, 0.123, 0.512])
     np.testing.assert_allclose(found.presses_mm, np.column_stack([10 * n, -10 * n]))
     np.testing.assert_allclose(found.forces_n, 2 * n)
-    assert found.begun.tolist() == (50 * n).tolist()
-    assert found.lifted.tolist() == (50 * n + 20).tolist()
+    assert found.down_command.tolist() == (50 * n).tolist()
+    assert found.up_command.tolist() == (50 * n + 20).tolist()
     assert found.source["mapping"] == ALL
 
 
@@ -141,7 +141,7 @@ def test_topics_of_one_number_are_fibres_too_and_hold_until_the_next(tmp_path: P
     found = import_bag(bag, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y")
     np.testing.assert_allclose(found.readings[60], [0.01, 59 / 200])  # the second one comes after the first
     assert np.isnan(found.readings[0, 1])
-    middle = (found.begun + found.lifted) // 2
+    middle = (found.down_command + found.up_command) // 2
     np.testing.assert_allclose(found.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 2 % 7)]))
 
 

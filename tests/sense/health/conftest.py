@@ -17,8 +17,8 @@ def pad(once: Once) -> Recording:
     """The first PRESSES on a simulated pad of six fibres."""
     rig = sense_settings.RigSettings(presses=900, seed=1, drift_mv=10)
     whole = once("health-pad", lambda folder: simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT))
-    end = int(whole.begun[PRESSES])
-    presses = {name: getattr(whole, name)[:PRESSES] for name in ("presses_mm", "begun", "lifted")}
+    end = int(whole.down_command[PRESSES])
+    presses = {name: getattr(whole, name)[:PRESSES] for name in ("presses_mm", "down_command", "up_command")}
     return Recording(whole.readings[:end], whole.times_s[:end], **presses)
 
 

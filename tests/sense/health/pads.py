@@ -18,17 +18,23 @@ LEARNT, PRESSES, BAD_FROM = 600, 760, 660
 
 def learn(readings: Array, pad: Recording, presses: int = LEARNT) -> HealthModel:
     """Health by a quick training on the first presses, of which, on this pad, LEARNT suffice to call a fibre weak."""
-    end = pad.begun[presses]
+    end = pad.down_command[presses]
     with mock.patch.object(fibre_prediction, "MOST_STEPS", 250), mock.patch.object(learning, "WEAK_PRESSES", LEARNT):
         return fit_health_model(
-            readings[:end], pad.times_s[:end], pad.begun[:presses], pad.lifted[:presses], rng=np.random.default_rng(0)
+            readings[:end],
+            pad.times_s[:end],
+            pad.down_command[:presses],
+            pad.up_command[:presses],
+            rng=np.random.default_rng(0),
         )
 
 
 def later(model: HealthModel, readings: Array, pad: Recording, first: int = LEARNT) -> list[FibreFault]:
     """Findings on the presses that health was not learnt from; press 0 is the first of them."""
-    start = pad.lifted[first - 1]
-    return examine(model, readings[start:], pad.times_s[start:], pad.begun[first:] - start, pad.lifted[first:] - start)
+    start = pad.up_command[first - 1]
+    return examine(
+        model, readings[start:], pad.times_s[start:], pad.down_command[first:] - start, pad.up_command[first:] - start
+    )
 
 
 Fault = Callable[[Array, Array, np.random.Generator], Array]
@@ -46,7 +52,7 @@ FAULTS: dict[str, Fault] = {
 
 def spoilt(pad: Recording, fault: str, press: int = BAD_FROM, readings: Array | None = None) -> Array:
     """Readings in which a fibre fails from a press on."""
-    found, at = (pad.readings if readings is None else readings).copy(), int(pad.begun[press])
+    found, at = (pad.readings if readings is None else readings).copy(), int(pad.down_command[press])
     if fault == "swapped":
         found[at:, [1, 4]] = found[at:, [4, 1]]
     else:

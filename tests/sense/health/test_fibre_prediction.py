@@ -98,11 +98,11 @@ def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int,
     rng = np.random.default_rng(seed)
     weights = random_weights(fibres, rng)
     inputs = rng.standard_normal((3, fibres, INPUTS)).astype(np.float32)
-    alive = rng.random((3, fibres)) < 0.7
-    mean, spread = fibre_prediction.expected(weights, inputs, alive)
+    fibre_mask = rng.random((3, fibres)) < 0.7
+    mean, spread = fibre_prediction.expected(weights, inputs, fibre_mask)
     for press in range(3):
         for fibre in range(fibres):
-            others = [c for c in range(fibres) if c != fibre and alive[press, c]]
+            others = [c for c in range(fibres) if c != fibre and fibre_mask[press, c]]
             means, variances = [], []
             for e in range(MEMBERS):
                 h = weights["first.b"][e].astype(float)
@@ -121,21 +121,21 @@ def test_a_fibre_has_no_part_in_its_own_prediction_nor_have_lost_ones(seed: int,
 
 def test_the_trace_of_a_press_keeps_to_it_and_what_was_not_recorded_of_its_release_is_missing() -> None:
     readings = np.arange(100.0)[:, None] * [1.0, 2.0]
-    whole = fibre_prediction.press_trace(readings, begun=30, lifted=55, low=0, high=100)
+    whole = fibre_prediction.press_trace(readings, down_command=30, up_command=55, low=0, high=100)
     assert whole.shape == (2, TRACE)
     assert whole[0].tolist() == [*range(20, 50), *range(55, 75)]
-    tight = fibre_prediction.press_trace(readings, begun=30, lifted=34, low=28, high=36)
+    tight = fibre_prediction.press_trace(readings, down_command=30, up_command=34, low=28, high=36)
     assert tight[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
     readings = np.arange(100.0)[:, None] * [1.0, 2.0]
     # The next press begins before a reading of the release was taken.
-    none = fibre_prediction.press_trace(readings, begun=30, lifted=55, low=0, high=55)
+    none = fibre_prediction.press_trace(readings, down_command=30, up_command=55, low=0, high=55)
     assert none[0, :-RELEASED].tolist() == [*range(20, 50)]
     assert np.isnan(none[:, -RELEASED:]).all()
-    begun, lifted = np.array([10, 50]), np.array([30, 70])
+    down_command, up_command = np.array([10, 50]), np.array([30, 70])
     for end in (70, 74, 90):
-        cut_off, last = fibre_prediction.traces_of(readings[:end], begun, lifted)[:, 0]
+        cut_off, last = fibre_prediction.traces_of(readings[:end], down_command, up_command)[:, 0]
         assert cut_off[-RELEASED:].tolist() == [*range(30, 50)]
         assert np.array_equal(last, [*range(40, 70), *range(70, end), *[np.nan] * (90 - end)], equal_nan=True)
     # One that the next press cuts short is filled.
-    cut_off, _ = fibre_prediction.traces_of(readings, begun, np.array([45, 70]))[:, 0]
+    cut_off, _ = fibre_prediction.traces_of(readings, down_command, np.array([45, 70]))[:, 0]
     assert cut_off[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]

@@ -18,14 +18,15 @@ import pytest
 
 from padforge.design.common import server as listening
 from padforge.design.common.validation import InputError
-from padforge.sense import Live, Localizer, Recording
+from padforge.sense import Live, Recording
 from padforge.sense.formats.ros_messages import HEALTH, KINDS, PRESSED, READINGS, TOUCHES, heights
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live import outputs as outlets
 from padforge.sense.live.outputs import FORMAT, Lines, Message, Messages, Osc
 from padforge.sense.live.pipeline import Estimate
+from padforge.sense.localizer.model import LocalizerModel
 
-PLACE = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "lost": []}
+PLACE = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "failed": []}
 TOUCH = Message(TOUCHES, {}, {"event": "touch", **PLACE})
 READING = Message(READINGS, {}, {"event": "readings", "time_s": 0.5, "volts": [1.0, None]})
 STATES = Message(HEALTH, {}, {"event": "health", "time_s": 0.0, "states": ["sound", "stuck"]})
@@ -34,12 +35,12 @@ TOKEN = "a word of sixteen"
 CLIENT = Path(__file__).parents[3] / "docs" / "live-protocol.md"
 
 
-def live(localizer: Localizer, recording: Recording) -> Live:
+def live(localizer: LocalizerModel, recording: Recording) -> Live:
     return Live([localizer], None, recording.fibres, recording.rate_hz)
 
 
 @pytest.fixture(scope="module")
-def told(brief: Recording, localizer: Localizer) -> list[Message]:
+def told(brief: Recording, localizer: LocalizerModel) -> list[Message]:
     pipeline = live(localizer, brief)
     messages, told = Messages(pipeline), []
     for first in range(0, len(brief.readings), 7):
@@ -86,7 +87,7 @@ def test_places_are_metres_with_variances(told) -> None:
 def test_a_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer, mirrored: bool) -> None:
     """Seen from above, y of the plan runs up and x to the right, or to the left where the pad lies with its tracks up;
     depth runs away from whoever looks."""
-    estimate = Estimate(0, 1.5, "full", True, 3, 4, 1, 1, 1, 2, (), depth_mm=2.5, depth_r90_mm=0.5)
+    estimate = Estimate(0, 1.5, "press_and_release", True, 3, 4, 1, 1, 1, 2, (), depth_mm=2.5, depth_r90_mm=0.5)
     events = Messages(live(localizer, brief), mirrored).of(brief.times_s[:1], brief.readings[:1], [estimate])
     (touch,) = of(TOUCHES, list(events))
     pose = touch.msg["pose"]
@@ -97,7 +98,7 @@ def test_a_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer
     assert pose["pose"]["position"]["z"] == heights(exported, np.array([2.5]))[0]
 
 
-def test_health_is_told_first_and_with_every_fault(told, brief: Recording, localizer: Localizer) -> None:
+def test_health_is_told_first_and_with_every_fault(told, brief: Recording, localizer: LocalizerModel) -> None:
     assert told[0].topic == HEALTH
     assert told[0].pad["states"] == ["unwatched"] * brief.fibres
     pipeline = live(localizer, brief)
@@ -203,12 +204,12 @@ def test_a_stranger_has_a_moment_to_say_the_token_however_slowly(monkeypatch: py
         lines.tell(STATES)
         known, stranger = (stack.enter_context(socket.create_connection(lines.address)) for _ in range(2))
         known.sendall(b"long" * 60 + b"\n")
-        begun = time.monotonic()
+        down_command = time.monotonic()
         with suppress(OSError):
-            while time.monotonic() < begun + 10:
+            while time.monotonic() < down_command + 10:
                 stranger.sendall(b"x")
                 time.sleep(0.1)
-        assert time.monotonic() < begun + 5
+        assert time.monotonic() < down_command + 5
         lines.tell(TOUCH)
         told = known.makefile()
         assert [json.loads(told.readline())["topic"] for _ in range(2)] == [HEALTH, TOUCHES]

@@ -9,7 +9,7 @@ from padforge.benchmarks import localizer as bench
 @pytest.mark.slow
 def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"PRESSES": 150, "TEST": 30, "EPOCHS": (1, 3), "ITERATIONS": (3, 20), "PASSES": (1,), "STEPS": (3,)}
-    for name, value in (small | {"HIDDEN": 6, "FEATURES": ("published", "full")}).items():
+    for name, value in (small | {"HIDDEN": 6, "FEATURES": ("published", "press_and_release")}).items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     bench.recorded.cache_clear()

@@ -8,20 +8,20 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.localizer.evaluation import by_place, conformal, error_row, errors_by_loss, idle_share
-from padforge.sense.localizer.localizer import Found, Measured
+from padforge.sense.localizer.model import Localization, Measured
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
 
 
-def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0) -> Found:
+def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0) -> Localization:
     """The four presses found to the side by so many mm."""
     away = np.column_stack([amounts, np.zeros(4)])
-    return Found(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
+    return Localization(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
 
 
 def test_rows_of_errors_are_made_of_the_means_of_every_set_and_of_measures_that_are_known() -> None:
     row = error_row(2, [off_by(0, 1, 2, 3), off_by(1, 1, 1, 9, r50=1.5, r90=8.0)], PLACES)
-    assert (row["lost"], row["subsets"]) == (2, 2)
+    assert (row["n_failed"], row["subsets"]) == (2, 2)
     assert (row["mean_mm"], row["std_mm"], row["max_mm"]) == pytest.approx((2.25, 0.75, 3.0))
     assert row["median_mm"] == 1
     assert row["p95_mm"] == pytest.approx(3 + 0.65 * 6)
@@ -36,12 +36,12 @@ def test_rows_of_errors_are_made_of_the_means_of_every_set_and_of_measures_that_
     assert conformal([found], PLACES, {"depth_mm": depths})[3] == pytest.approx(0.3 / 0.15)
     assert conformal([found], PLACES)[3] == 1
 
-    def locate(lost: tuple[int, ...]) -> Found:
+    def locate(lost: tuple[int, ...]) -> Localization:
         return off_by(*[float(sum(lost))] * 4)
 
     rows, by_subset = errors_by_loss(3, (0, 2), locate, PLACES)
-    assert [(row["lost"], row["subsets"], row["mean_mm"]) for row in rows] == [(0, 1, 0.0), (2, 3, 2.0)]
-    assert [(each["lost"], each["mean_mm"]) for each in by_subset] == [([], 0), ([0, 1], 1), ([0, 2], 2), ([1, 2], 3)]
+    assert [(row["n_failed"], row["subsets"], row["mean_mm"]) for row in rows] == [(0, 1, 0.0), (2, 3, 2.0)]
+    assert [(each["failed"], each["mean_mm"]) for each in by_subset] == [([], 0), ([0, 1], 1), ([0, 2], 2), ([1, 2], 3)]
     for level in (-1, 3):
         with pytest.raises(InputError, match=f"lost is {level}, allowed is a whole number from 0 to 2"):
             errors_by_loss(3, (level,), locate, PLACES)
@@ -51,12 +51,14 @@ def test_radii_grow_by_a_quantile_a_rank_higher_than_their_share() -> None:
     """Ninety-nine presses off by 0.01, 0.02 ... of their radius: the 50th and the 90th."""
     ranks = np.random.default_rng(0).permutation(np.arange(1, 100) / 100)
     places = np.zeros((99, 2))
-    found = Found(np.column_stack([6 * ranks, 0 * ranks]), np.full((99, 2), 3.0), np.full(99, 2.0), np.full(99, 4.0))
+    found = Localization(
+        np.column_stack([6 * ranks, 0 * ranks]), np.full((99, 2), 3.0), np.full(99, 2.0), np.full(99, 4.0)
+    )
     spread, r50, r90 = conformal([found], places)
     assert spread == pytest.approx(np.sqrt((np.square(2 * ranks)).mean() / 2))
     assert r50 == pytest.approx(3 * 0.50)
     assert r90 == pytest.approx(1.5 * 0.90)
-    few = Found(found.places_mm[:5], found.sd_mm[:5], found.r50_mm[:5], found.r90_mm[:5])
+    few = Localization(found.positions_mm[:5], found.std_mm[:5], found.r50_mm[:5], found.r90_mm[:5])
     assert conformal([few], places[:5])[2] == pytest.approx((1.5 * ranks[:5]).max())
 
 
@@ -64,15 +66,15 @@ def test_radii_grow_by_a_quantile_a_rank_higher_than_their_share() -> None:
 def test_radii_hold_what_they_say_on_average_also_of_few_presses_with_several_sets_lost(presses: int) -> None:
     rng = np.random.default_rng(presses)
 
-    def drawn(count: int) -> list[Found]:
+    def drawn(count: int) -> list[Localization]:
         one, hard = np.ones(count), rng.exponential(size=count)  # a press that is hard to find is so with every set
         off = [hard * rng.exponential(size=count) for _ in range(3)]
-        return [Found(np.column_stack([each, 0 * each]), np.ones((count, 2)), one, one) for each in off]
+        return [Localization(np.column_stack([each, 0 * each]), np.ones((count, 2)), one, one) for each in off]
 
     shares = []
     for _ in range(200):
         _, r50, r90 = conformal(drawn(presses), np.zeros((presses, 2)))
-        fresh = np.concatenate([each.places_mm[:, 0] for each in drawn(100)])
+        fresh = np.concatenate([each.positions_mm[:, 0] for each in drawn(100)])
         shares.append([(fresh <= r50).mean(), (fresh <= r90).mean()])
     half, most = np.mean(shares, axis=0)
     assert 0.48 < half < 0.52 + 1 / presses
@@ -92,8 +94,8 @@ def test_errors_by_place_are_those_of_a_fifth_and_a_fibre_is_idle_below_two_perc
     assert (row["x_mm"], row["y_mm"], row["presses"]) == (0.5, 0.5, 1)
     steps = np.array([[0.0, 1.0], [0.015, -1.0], [0.025, 0.03], [1.0, 0.05], [0.5, 0.5]])
     readings = np.zeros((200, 2))
-    begun, lifted = np.arange(5) * 40 + 15, np.arange(5) * 40 + 36
-    for step, down, up in zip(steps, begun, lifted, strict=True):
+    down_command, up_command = np.arange(5) * 40 + 15, np.arange(5) * 40 + 36
+    for step, down, up in zip(steps, down_command, up_command, strict=True):
         readings[down:up] = step
-    recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), begun, lifted)
+    recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), down_command, up_command)
     np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])

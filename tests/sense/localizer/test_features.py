@@ -15,8 +15,8 @@ from padforge.sense.localizer.features import (
     REST,
     SIZES,
     SLOW,
-    Inputs,
-    Normalization,
+    FeatureScaler,
+    PressFeatures,
     bridged,
     history,
     press_inputs,
@@ -38,25 +38,29 @@ def windows_of(readings: np.ndarray, features: str) -> np.ndarray:
 def test_windows_are_means_less_the_rest_and_published_inputs_are_medians() -> None:
     """Of noise; and of a ramp that counts itself, with a press from 5000 to 5020 and its rest 5.5 before it."""
     readings = noise()
-    found, rest = windows_of(readings, "full")[2], readings[90:100].mean(axis=0)
+    found, rest = windows_of(readings, "press_and_release")[2], readings[90:100].mean(axis=0)
     assert np.allclose(found[:, 7], readings[112:116].mean(axis=0) - rest)
     assert np.allclose(found[:, 9 + 6], readings[129:134].mean(axis=0) - rest)
     expected = [np.median(readings[at - 7 : at + 8], axis=0) for at in (90, 110, 130)]
     assert np.allclose(windows_of(readings, "published")[2], np.stack(expected, axis=1))
     ramp = np.arange(5100.0)[:, None]
-    begun, lifted = np.array([5000]), np.array([5020])
+    down_command, up_command = np.array([5000]), np.array([5020])
     down = [1, 2, 3, 4, 5, 6.5, 9.5, 13.5, 17.5]
     up = [20, 21, 22, 23, 24.5, 27, 31, 36.5]
     past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
     slow = [-402, -2010]
-    for features, windows in (("full", down + up), ("causal", down), ("early", down[:6])):
-        found = press_inputs(ramp, begun, lifted, features)
+    for features, windows in (("press_and_release", down + up), ("causal", down), ("onset", down[:6])):
+        found = press_inputs(ramp, down_command, up_command, features)
         np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
         np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
-    np.testing.assert_allclose(press_inputs(ramp, begun, lifted, "published").windows[0, 0], [4990 - 0, 5010, 5030])
+    np.testing.assert_allclose(
+        press_inputs(ramp, down_command, up_command, "published").windows[0, 0], [4990 - 0, 5010, 5030]
+    )
 
 
-@pytest.mark.parametrize(("name", "end"), [("full", 140), ("published", 140), ("causal", 120), ("early", 108)])
+@pytest.mark.parametrize(
+    ("name", "end"), [("press_and_release", 140), ("published", 140), ("causal", 120), ("onset", 108)]
+)
 def test_a_press_is_told_by_its_own_readings_and_a_fibre_by_its_own(name: str, end: int) -> None:
     """Up to the next press; without the release, up to its end; early, of the first 8 readings alone."""
     readings, press = noise(), 2
@@ -80,13 +84,13 @@ def test_presses_of_any_length_have_inputs_within_the_readings(name: str, gaps: 
     assert found.history.shape == (len(edges) // 2, 2, PASTS[name])
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
-    assert found.alive.all()
+    assert found.fibre_mask.all()
 
 
 def test_history_is_what_came_before_relative_to_the_rest() -> None:
     readings = np.random.default_rng(3).standard_normal((6000, 2))
-    begun = np.array([20, 5000])
-    found = history(readings, begun)
+    down_command = np.array([20, 5000])
+    found = history(readings, down_command)
     rest = readings[5000 + REST[0] : 5000].mean(axis=0)
     for number, (first, end) in enumerate(PAST):
         assert np.allclose(found[1, :, number], readings[5000 + first : 5000 + end].mean(axis=0) - rest)
@@ -95,7 +99,7 @@ def test_history_is_what_came_before_relative_to_the_rest() -> None:
     # before the first reading there is the first reading
     assert np.allclose(found[0, :, len(PAST) - 1], readings[0] - readings[10:20].mean(axis=0))
     readings[5000:] = 99
-    assert np.array_equal(history(readings, begun), found)
+    assert np.array_equal(history(readings, down_command), found)
 
 
 def test_short_gaps_are_bridged_and_do_not_spread() -> None:
@@ -107,11 +111,12 @@ def test_short_gaps_are_bridged_and_do_not_spread() -> None:
     assert np.array_equal(filled[:3, 1], np.repeat(readings[3, 1], 3))
     there = ~np.isnan(holed)
     assert np.array_equal(filled[there], readings[there])
-    assert press_inputs(holed, BEGUN, LIFTED, "full").alive.all()
+    assert press_inputs(holed, BEGUN, LIFTED, "press_and_release").fibre_mask.all()
 
 
 @pytest.mark.parametrize(
-    ("features", "first", "end"), [("full", -10, 40), ("causal", -10, 20), ("early", -10, 20), ("published", -10, 40)]
+    ("features", "first", "end"),
+    [("press_and_release", -10, 40), ("causal", -10, 20), ("onset", -10, 20), ("published", -10, 40)],
 )
 def test_a_fibre_counts_where_three_quarters_are_there(features: str, first: int, end: int) -> None:
     """Press 2 is sent down at 100 and up at 120; the last readings that count are what is missing."""
@@ -120,59 +125,61 @@ def test_a_fibre_counts_where_three_quarters_are_there(features: str, first: int
         for begin in (100 + first, 100 + end - missing):
             readings = noise()
             readings[begin : begin + missing, 1] = np.nan
-            assert press_inputs(readings, BEGUN, LIFTED, features).alive[2, 1] == there
+            assert press_inputs(readings, BEGUN, LIFTED, features).fibre_mask[2, 1] == there
     readings = noise()
     readings[50 : 100 + first, 1] = readings[100 + end : 140, 1] = np.nan
     readings[:, 2] = np.nan
     found = press_inputs(readings, BEGUN, LIFTED, features)
-    assert found.alive[2].tolist() == [True, True, False]
+    assert found.fibre_mask[2].tolist() == [True, True, False]
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
 
 
-def made(presses: int = 300) -> tuple[Inputs, np.ndarray]:
+def made(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
     """Presses without a history, each fibre and window of a size of its own, the last fibre dead in some of them."""
     rng = np.random.default_rng(0)
     sizes = rng.uniform(0.1, 2.0, (FIBRES, WINDOWS))
     windows = 3 + sizes * rng.standard_normal((presses, FIBRES, WINDOWS))
-    alive = np.ones((presses, FIBRES), dtype=bool)
-    alive[::4, 2] = False
+    fibre_mask = np.ones((presses, FIBRES), dtype=bool)
+    fibre_mask[::4, 2] = False
     windows[::4, 2] = 1e3
-    return Inputs(windows, np.empty((presses, FIBRES, 0)), alive), rng.uniform((-20, 0), (30, 10), (presses, 2))
+    return PressFeatures(windows, np.empty((presses, FIBRES, 0)), fibre_mask), rng.uniform(
+        (-20, 0), (30, 10), (presses, 2)
+    )
 
 
 def test_windows_are_scaled_by_their_spread_and_places_by_half_of_the_longer_side() -> None:
     inputs, places = made()
-    scaling, table = Normalization.fit(inputs, places)
+    scaling, table = FeatureScaler.fit(inputs, places)
     for fibre in range(FIBRES):
-        own = inputs.windows[inputs.alive[:, fibre], fibre]
+        own = inputs.windows[inputs.fibre_mask[:, fibre], fibre]
         variance = own.var(axis=0)
         np.testing.assert_allclose(scaling.centre[fibre], own.mean(axis=0))
         np.testing.assert_allclose(scaling.spread[fibre], np.sqrt(np.sqrt(variance) * np.sqrt(variance.mean())))
     scaled, expected = scaling.inputs(inputs), (inputs.windows[1] - scaling.centre) / scaling.spread
     np.testing.assert_allclose(scaled.inputs[1], expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(scaled.alive, inputs.alive)
+    np.testing.assert_array_equal(scaled.fibre_mask, inputs.fibre_mask)
     scaling.refuse_unsound(table)
     for sign in (1, -1):  # what lies far off is held
         assert (scaling.scaled(sign * np.full((1, FIBRES, WINDOWS), 1e9)) == sign * MAX_INPUT).all()
-    assert scaling.entries("masked") == FIBRES * WINDOWS + FIBRES
+    assert scaling.entries("ensemble") == FIBRES * WINDOWS + FIBRES
     assert scaling.entries("published") == FIBRES * WINDOWS
     places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]
-    scaling, _ = Normalization.fit(inputs, places)
-    np.testing.assert_allclose(scaling.middle_mm, [5, 5])
+    scaling, _ = FeatureScaler.fit(inputs, places)
+    np.testing.assert_allclose(scaling.origin_mm, [5, 5])
     assert scaling.span_mm == 25
     np.testing.assert_allclose(scaling.targets(places[:4]), [[-1, -0.2], [1, 0.2], [1, -0.2], [0, 0]], atol=1e-6)
-    np.testing.assert_allclose(scaling.places_mm(scaling.targets(places)), places, atol=1e-4)
+    np.testing.assert_allclose(scaling.positions_mm(scaling.targets(places)), places, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["silent", "never there", "rounding"])
 def test_a_fibre_that_tells_nothing_is_scaled_to_finite_numbers(kind: str) -> None:
     inputs, places = made(10)
-    windows, alive = inputs.windows.copy(), inputs.alive.copy()
+    windows, fibre_mask = inputs.windows.copy(), inputs.fibre_mask.copy()
     windows[:, 1] = 3.3 + (1e-15 * windows[:, 1] if kind == "rounding" else 0)
-    alive[:, 1] = kind != "never there"
-    inputs = replace(inputs, windows=windows, alive=alive)
-    scaling, table = Normalization.fit(inputs, places)
+    fibre_mask[:, 1] = kind != "never there"
+    inputs = replace(inputs, windows=windows, fibre_mask=fibre_mask)
+    scaling, table = FeatureScaler.fit(inputs, places)
     assert np.isfinite(scaling.inputs(inputs).inputs).all()
     assert np.isfinite(table).all()
     assert (scaling.spread[1] == 1).all()

@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Localizer, Recording
+from padforge.sense import Recording
+from padforge.sense.localizer.model import LocalizerModel
 from tools.kills import killed
 
 Change = Callable[[Any], dict[str, Any]]
@@ -28,31 +29,27 @@ WILD = (np.nan, np.inf, 1e13)
     [
         ("features", "smell", "features"),
         ("scaling", {}, "scaling"),
-        ("features", "published", r"scaling\.centre_v"),
-        ("fibres", 3, r"scaling\.centre_v"),
+        ("features", "published", r"scaling\.mean_v"),
+        ("fibres", 3, r"scaling\.mean_v"),
         ("fibres", 0, "fibres"),
         ("method", "guess", "method"),
         ("method", "published", "force_n of method published"),
-        ("factors", [], "factors"),
-        ("factors.0", [1.0, 1.0], "factors"),
-        ("factors.0.0", -1.0, "factors"),
+        ("interval_factors", [], "interval_factors"),
+        ("factors.0", [1.0, 1.0], "interval_factors"),
+        ("factors.0.0", -1.0, "interval_factors"),
         ("scaling.memory.0.0", [1.0], r"scaling\.memory"),
         ("scaling.memory.0.0.0", np.nan, "memory"),
-        ("scaling.usual_v.0", [1.0], r"scaling\.usual_v"),
+        ("scaling.history_mean_v.0", [1.0], r"scaling\.history_mean_v"),
         *(("rate_hz", value, "rate_hz") for value in (0, -1.0, "13", np.nan, np.inf, 1e-300, None)),
-        *(
-            (f"scaling.{key}.0.0", value, key)
-            for key in ("centre_v", "spread_v")
-            for value in (np.nan, np.inf, 1e9, "1")
-        ),
+        *((f"scaling.{key}.0.0", value, key) for key in ("mean_v", "spread_v") for value in (np.nan, np.inf, 1e9, "1")),
         ("scaling.spread_v.0.0", 0.0, "spread_v"),
         ("scaling.spread_v.0", [1.0], "spread_v"),
-        *(("scaling.middle_mm", value, "middle_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
+        *(("scaling.origin_mm", value, "origin_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
         *(("scaling.span_mm", value, "span_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
         ("split", "alphabetical", "split"),
         *(("test", value, "test") for value in ([], [0.5], ["a"], [-1], [True], {}, [3, 3], [7])),
         ("errors", [{}], r"errors\.0\.lost"),
-        ("learnt_from", 7, "learnt_from"),
+        ("training_recording_sha256", 7, "training_recording_sha256"),
         ("more", 1, "more"),
         ("scaling.measures", [{"name": "force_n", "middle": 1.0, "span": 1.0}], "force_n of method masked"),
         ("scaling.measures.0.name", "width_mm", "measures"),
@@ -63,7 +60,7 @@ WILD = (np.nan, np.inf, 1e13)
     ],
 )
 def test_a_document_out_of_bounds_is_refused(
-    deep_localizer: Localizer, tmp_path: Path, path: str, value: object, named: str
+    deep_localizer: LocalizerModel, tmp_path: Path, path: str, value: object, named: str
 ) -> None:
     deep_localizer.save(tmp_path)
     document = json.loads((tmp_path / "localizer.json").read_text())
@@ -71,7 +68,7 @@ def test_a_document_out_of_bounds_is_refused(
     reduce(getitem, way, document)[last] = value
     (tmp_path / "localizer.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=rf"localizer\.json: .*{named}") as caught:
-        Localizer.load(tmp_path)
+        LocalizerModel.load(tmp_path)
     assert len(str(caught.value)) < 400
 
 
@@ -84,28 +81,30 @@ def test_a_document_out_of_bounds_is_refused(
         lambda of: {"weights": of.weights | {"hidden.b": of.weights["hidden.b"].astype(np.float64)}},
         lambda of: {"weights": {name: weight for name, weight in of.weights.items() if name != "last.w"}},
         lambda of: {"weights": {}},
-        lambda of: {"corrector": {}},
-        lambda of: {"corrector": of.weights},
-        lambda of: {"corrector": {name: weight * np.nan for name, weight in of.corrector.items()}},
-        lambda of: {"observer": replace(of.observer, grid=of.observer.grid[1:])},
-        *(lambda of, x=x: {"observer": replace(of.observer, terms=np.full_like(of.observer.terms, x))} for x in WILD),
-        lambda of: {"observer": replace(of.observer, answers=-of.observer.answers)},
+        lambda of: {"residual_network": {}},
+        lambda of: {"residual_network": of.weights},
+        lambda of: {"residual_network": {name: weight * np.nan for name, weight in of.residual_network.items()}},
+        lambda of: {"bayes": replace(of.bayes, grid=of.bayes.grid[1:])},
+        *(lambda of, x=x: {"bayes": replace(of.bayes, terms=np.full_like(of.bayes.terms, x))} for x in WILD),
+        lambda of: {"bayes": replace(of.bayes, answers=-of.bayes.answers)},
     ],
 )
-def test_arrays_that_do_not_fit_the_document_are_refused(localizer: Localizer, tmp_path: Path, change: Change) -> None:
-    assert localizer.observer is not None
+def test_arrays_that_do_not_fit_the_document_are_refused(
+    localizer: LocalizerModel, tmp_path: Path, change: Change
+) -> None:
+    assert localizer.bayes is not None
     replace(localizer, **change(localizer)).save(tmp_path)
     with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
-        Localizer.load(tmp_path)
+        LocalizerModel.load(tmp_path)
 
 
-def test_files_keep_every_bit(localizer: Localizer, recording: Recording, tmp_path: Path) -> None:
+def test_files_keep_every_bit(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
     localizer.save(tmp_path)
-    found = Localizer.load(tmp_path)
-    presses = localizer.inputs(recording)
-    assert np.array_equal(found.inputs(recording).inputs, presses.inputs)
-    again, before = found.locate(presses, [2]), localizer.locate(presses, [2])
-    assert np.array_equal(again.places_mm, before.places_mm)
+    found = LocalizerModel.load(tmp_path)
+    presses = localizer.scaled_features(recording)
+    assert np.array_equal(found.scaled_features(recording).inputs, presses.inputs)
+    again, before = found.predict_features(presses, [2]), localizer.predict_features(presses, [2])
+    assert np.array_equal(again.positions_mm, before.positions_mm)
     assert np.array_equal(again.r90_mm, before.r90_mm)
     assert (found.errors, found.test) == (localizer.errors, localizer.test)
     found.save(tmp_path / "again")
@@ -116,16 +115,16 @@ def test_files_keep_every_bit(localizer: Localizer, recording: Recording, tmp_pa
     assert not [key for row in document["errors"] for key in row if key.startswith(("depth", "force"))]
     (tmp_path / "localizer.json").write_text(json.dumps(document | {"method": "published"}))
     with pytest.raises(InputError, match="features"):
-        Localizer.load(tmp_path)
+        LocalizerModel.load(tmp_path)
 
 
-def test_files_keep_depth_and_force(deep_localizer: Localizer, deep_recording: Recording, tmp_path: Path) -> None:
+def test_files_keep_depth_and_force(deep_localizer: LocalizerModel, deep_recording: Recording, tmp_path: Path) -> None:
     deep_localizer.save(tmp_path)
-    again = Localizer.load(tmp_path)
-    assert again.normalization.measures == deep_localizer.normalization.measures
-    presses = deep_localizer.inputs(deep_recording)
-    found = again.locate(presses).measures
-    for name, before in deep_localizer.locate(presses).measures.items():
+    again = LocalizerModel.load(tmp_path)
+    assert again.scaler.measures == deep_localizer.scaler.measures
+    presses = deep_localizer.scaled_features(deep_recording)
+    found = again.predict_features(presses).measures
+    for name, before in deep_localizer.predict_features(presses).measures.items():
         assert np.array_equal(before.values, found[name].values)
         assert np.array_equal(before.r90, found[name].r90)
 
@@ -134,7 +133,7 @@ def test_files_keep_depth_and_force(deep_localizer: Localizer, deep_recording: R
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(0, 255), cut=st.integers(0, 300))
 def test_damaged_bytes_are_refused_or_read(
-    localizer: Localizer, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int
+    localizer: LocalizerModel, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int
 ) -> None:
     """A byte is changed, and some behind it are lost."""
     localizer.save(tmp_path)
@@ -145,15 +144,17 @@ def test_damaged_bytes_are_refused_or_read(
     sound = (tmp_path / name).read_bytes() == content
     (tmp_path / name).write_bytes(content)
     try:
-        read = Localizer.load(tmp_path)
+        read = LocalizerModel.load(tmp_path)
     except InputError:
         return
     assert sound or name == "localizer.json"
-    assert np.isfinite(read.locate(read.inputs(brief)).places_mm).all()
+    assert np.isfinite(read.predict_features(read.scaled_features(brief)).positions_mm).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, object()])
-def test_a_save_that_fails_leaves_the_model_that_was_there(localizer: Localizer, tmp_path: Path, value: object) -> None:
+def test_a_save_that_fails_leaves_the_model_that_was_there(
+    localizer: LocalizerModel, tmp_path: Path, value: object
+) -> None:
     localizer.save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = {name: weight + 1 for name, weight in localizer.weights.items()}
@@ -162,7 +163,7 @@ def test_a_save_that_fails_leaves_the_model_that_was_there(localizer: Localizer,
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer, tmp_path: Path) -> None:
+def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     (tmp_path / "localizer.json").unlink()
     (tmp_path / "localizer.json").mkdir()
@@ -175,21 +176,23 @@ def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: Localizer,
         localizer.save(tmp_path / "file")
     nowhere: Any
     for nowhere in (None, 3, ["a"], np.ones(3), ""):
-        for use in (Localizer.load, localizer.save):
+        for use in (LocalizerModel.load, localizer.save):
             with pytest.raises(InputError, match=r"folder is .*, expected a path"):
                 use(nowhere)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
-def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_one(localizer: Localizer, tmp_path: Path) -> None:
+def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_one(
+    localizer: LocalizerModel, tmp_path: Path
+) -> None:
     later = replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()})
     name, found = next(iter(localizer.weights)), []
     for number in count():
         folder = tmp_path / str(number)
         replace(localizer, split="random").save(folder)
         ended = not killed(lambda folder=folder: replace(later, split="chronological").save(folder), number, folder)
-        loaded = Localizer.load(folder)
+        loaded = LocalizerModel.load(folder)
         is_new = np.array_equal(loaded.weights[name], later.weights[name])
         assert is_new == (loaded.split == "chronological")
         found.append(is_new)

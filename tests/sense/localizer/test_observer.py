@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.bayes import BEFOREHAND, TOLD, Observer
+from padforge.sense.localizer.bayes import BEFOREHAND, TOLD, BayesianLocalizer
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Answer = Callable[[np.ndarray], np.ndarray]
@@ -34,12 +34,12 @@ def fitted(answer: Answer, noise: float = NOISE, seed: int = 0) -> "Fitted":
     table = answer(at).reshape(SIDE, SIDE, FIBRES, WINDOWS).astype(np.float32)
     places = rng.uniform(-1, 1, (2 * PRESSES, 2))
     inputs = answer(places) + noise * rng.standard_normal((2 * PRESSES, FIBRES, WINDOWS))
-    alive = np.ones((PRESSES, FIBRES), dtype=bool)
-    observer = Observer.fit(table, inputs[:PRESSES], alive, places[:PRESSES])
-    return observer, inputs[PRESSES:], places[PRESSES:]
+    fibre_mask = np.ones((PRESSES, FIBRES), dtype=bool)
+    bayes = BayesianLocalizer.fit(table, inputs[:PRESSES], fibre_mask, places[:PRESSES])
+    return bayes, inputs[PRESSES:], places[PRESSES:]
 
 
-Fitted = tuple[Observer, np.ndarray, np.ndarray]
+Fitted = tuple[BayesianLocalizer, np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -54,12 +54,12 @@ def observed_line() -> Fitted:
 
 @pytest.mark.parametrize("lost", [(), (0,), (1, 3), (0, 1, 2)])
 def test_linear_answers_are_solved_as_by_least_squares(observed_line: Fitted, lost: tuple[int, ...]) -> None:
-    observer, inputs, places = observed_line
+    bayes, inputs, places = observed_line
     inner = (np.abs(places) < 0.7).all(axis=1)
     inputs, places = inputs[inner], places[inner]
-    alive = np.ones((len(inputs), FIBRES), dtype=bool)
-    alive[:, list(lost)] = False
-    found, told = observer(inputs, alive)
+    fibre_mask = np.ones((len(inputs), FIBRES), dtype=bool)
+    fibre_mask[:, list(lost)] = False
+    found, told = bayes(inputs, fibre_mask)
     kept = [fibre for fibre in range(FIBRES) if fibre not in lost]
     slopes = linear(np.eye(2))[:, kept].reshape(2, -1)
     solved = np.linalg.solve(slopes @ slopes.T, slopes @ inputs[:, kept].reshape(len(inputs), -1).T).T
@@ -72,9 +72,9 @@ def test_linear_answers_are_solved_as_by_least_squares(observed_line: Fitted, lo
 
 
 def test_other_answers_are_found_as_on_a_fine_grid(observed: Fitted) -> None:
-    observer, inputs, places = observed
+    bayes, inputs, places = observed
     inputs, places = inputs[:40], places[:40]
-    found, _ = observer(inputs, np.ones((40, FIBRES), dtype=bool))
+    found, _ = bayes(inputs, np.ones((40, FIBRES), dtype=bool))
     fine = np.linspace(-1, 1, 201)
     at = np.stack(np.meshgrid(fine, fine, indexing="ij"), axis=-1).reshape(-1, 2)
     answers = waves(at).reshape(len(at), -1)
@@ -90,9 +90,9 @@ def test_places_that_answer_alike_are_all_thought_of() -> None:
     def even(places: np.ndarray) -> np.ndarray:
         return linear(np.stack([np.square(places[:, 0]), places[:, 1]], axis=1))
 
-    observer, _, _ = fitted(even)
+    bayes, _, _ = fitted(even)
     press = even(np.array([[0.6, 0.1]]))
-    found, told = observer(press, np.ones((1, FIBRES), dtype=bool))
+    found, told = bayes(press, np.ones((1, FIBRES), dtype=bool))
     on_grid = np.exp(2 * (told[0, 6:8] - 1))  # standard deviations
     assert abs(told[0, 4]) / 2 < 0.1
     assert on_grid[0] == pytest.approx(0.6, rel=0.1)
@@ -101,10 +101,10 @@ def test_places_that_answer_alike_are_all_thought_of() -> None:
     rng = np.random.default_rng(0)
     table = np.zeros((SIDE, SIDE, 2, WINDOWS), np.float32)
     places = rng.uniform(-1, 1, (50, 2))
-    alive = np.tile([True, False], (50, 1))
-    observer = Observer.fit(table, np.zeros((50, 2, WINDOWS)), alive, places)
-    found, told = observer(rng.standard_normal((5, 2, WINDOWS)), np.ones((5, 2), dtype=bool))
-    np.testing.assert_allclose(found, np.tile(observer.grid.mean(axis=0), (5, 1)), atol=1e-6)
+    fibre_mask = np.tile([True, False], (50, 1))
+    bayes = BayesianLocalizer.fit(table, np.zeros((50, 2, WINDOWS)), fibre_mask, places)
+    found, told = bayes(rng.standard_normal((5, 2, WINDOWS)), np.ones((5, 2), dtype=bool))
+    np.testing.assert_allclose(found, np.tile(bayes.grid.mean(axis=0), (5, 1)), atol=1e-6)
     assert np.isfinite(told).all()
 
 
@@ -114,9 +114,9 @@ def test_a_grid_position_stands_for_its_whole_cell() -> None:
     table = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)[:, :, None]
     rng = np.random.default_rng(0)
     positions = rng.uniform(-1, 1, (PRESSES, 2))
-    observer = Observer.fit(table, positions[:, None], np.ones((PRESSES, 1), dtype=bool), positions)
+    bayes = BayesianLocalizer.fit(table, positions[:, None], np.ones((PRESSES, 1), dtype=bool), positions)
     presses = rng.uniform(-0.8, 0.8, (50, 2))
-    _, told = observer(presses[:, None], np.ones((50, 1), dtype=bool))
+    _, told = bayes(presses[:, None], np.ones((50, 1), dtype=bool))
     cell = nodes[1] - nodes[0]
     # Beside it the scatter that is taken for usual where there is none is little.
     likelihood = np.exp(-0.5 * (presses[:, :, None] - nodes) ** 2 / (cell**2 / 12))
@@ -130,23 +130,23 @@ def test_a_grid_position_stands_for_its_whole_cell() -> None:
 @given(seed=st.integers(0, 999), size=st.sampled_from([0.1, 1.0, 1e4]))
 def test_lost_fibres_are_not_looked_at_and_torch_finds_the_same(observed: Fitted, seed: int, size: float) -> None:
     """Of presses of the pad; others, however large, are put somewhere on it by both."""
-    observer, inputs, _ = observed
+    bayes, inputs, _ = observed
     rng = np.random.default_rng(seed)
-    alive = rng.random((20, FIBRES)) < 0.7
+    fibre_mask = rng.random((20, FIBRES)) < 0.7
     press = inputs[rng.integers(len(inputs), size=20)].astype(np.float32)
-    spoilt = np.where(alive[:, :, None], press, rng.choice([np.nan, np.inf, 1e4]))
-    expected = observer(press.astype(np.float64), alive)
-    for one, other in zip(expected, observer(spoilt, alive), strict=True):
+    spoilt = np.where(fibre_mask[:, :, None], press, rng.choice([np.nan, np.inf, 1e4]))
+    expected = bayes(press.astype(np.float64), fibre_mask)
+    for one, other in zip(expected, bayes(spoilt, fibre_mask), strict=True):
         assert np.isfinite(one).all()
         assert np.array_equal(one, other)
-    in_torch = observer.changed(torch.from_numpy)
-    found, told = in_torch(torch.from_numpy(press), torch.from_numpy(alive), torch)
+    in_torch = bayes.changed(torch.from_numpy)
+    found, told = in_torch(torch.from_numpy(press), torch.from_numpy(fibre_mask), torch)
     np.testing.assert_allclose(found.numpy(), expected[0], atol=2e-3)
     np.testing.assert_allclose(told.numpy(), expected[1], atol=1e-2)
     assert told.shape == (20, TOLD)
     wild = (size * rng.standard_normal(press.shape)).astype(np.float32)
-    for xp, one, values in ((np, observer, wild.astype(np.float64)), (torch, in_torch, torch.from_numpy(wild))):
-        place, about = one(values, alive if xp is np else torch.from_numpy(alive), xp)
+    for xp, one, values in ((np, bayes, wild.astype(np.float64)), (torch, in_torch, torch.from_numpy(wild))):
+        place, about = one(values, fibre_mask if xp is np else torch.from_numpy(fibre_mask), xp)
         assert np.abs(np.asarray(place)).max() <= 1 + 1e-6
         assert np.isfinite(np.asarray(about)).all()
 
@@ -156,16 +156,20 @@ def test_presses_at_one_place_or_on_a_line_will_do(places: np.ndarray) -> None:
     grid = np.linspace(-1, 1, SIDE)
     table = linear(np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2))
     table = table.reshape(SIDE, SIDE, FIBRES, WINDOWS)
-    observer = Observer.fit(table, linear(places), np.ones((9, FIBRES), dtype=bool), places)
-    found, told = observer(linear(places), np.ones((9, FIBRES), dtype=bool))
+    bayes = BayesianLocalizer.fit(table, linear(places), np.ones((9, FIBRES), dtype=bool), places)
+    found, told = bayes(linear(places), np.ones((9, FIBRES), dtype=bool))
     np.testing.assert_allclose(found, places, atol=0.02)
     assert np.isfinite(told).all()
 
 
 def test_places_may_be_called_otherwise_more_than_once(observed: Fitted) -> None:
-    observer, inputs, _ = observed
-    turn, shift, alive = np.array([[0.9, -0.2], [0.3, 1.1]]), np.array([0.1, -0.4]), np.ones((30, FIBRES), dtype=bool)
-    place, told = observer(inputs[:30], alive)
-    moved, as_before = observer.moved(turn, shift).moved(turn, shift)(inputs[:30], alive)
+    bayes, inputs, _ = observed
+    turn, shift, fibre_mask = (
+        np.array([[0.9, -0.2], [0.3, 1.1]]),
+        np.array([0.1, -0.4]),
+        np.ones((30, FIBRES), dtype=bool),
+    )
+    place, told = bayes(inputs[:30], fibre_mask)
+    moved, as_before = bayes.moved(turn, shift).moved(turn, shift)(inputs[:30], fibre_mask)
     np.testing.assert_allclose(moved, (place @ turn.T + shift) @ turn.T + shift, atol=1e-6)
     assert np.array_equal(told, as_before)

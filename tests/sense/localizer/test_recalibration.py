@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Localizer, Recording, evaluate
+from padforge.sense import Recording, evaluate
 from padforge.sense.localizer import training as fine_tuning
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.localizer.features import TrainingPresses, looked_up
-from padforge.sense.localizer.localizer import Found
+from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.recalibration import CrossValidation, fit_correction, recalibrate
 from padforge.sense.localizer.training import adapt
 from tests.helpers.door import called
@@ -34,9 +34,9 @@ def known_only(recording: Recording, presses: slice) -> Recording:
     return replace(recording, presses_mm=places)
 
 
-def error(localizer: Localizer, recording: Recording, presses: slice, lost: tuple[int, ...] = ()) -> float:
-    found = localizer.locate(localizer.inputs(recording)[presses], lost)
-    return float(distances(found.places_mm, recording.presses_mm[presses]).mean())
+def error(localizer: LocalizerModel, recording: Recording, presses: slice, lost: tuple[int, ...] = ()) -> float:
+    found = localizer.predict_features(localizer.scaled_features(recording)[presses], lost)
+    return float(distances(found.positions_mm, recording.presses_mm[presses]).mean())
 
 
 NEW, LATER = slice(0, 50), slice(60, 300)
@@ -50,11 +50,11 @@ def short() -> Iterator[None]:
         yield
 
 
-def off_by(*amounts: float, radius: float = 1.0) -> Found:
+def off_by(*amounts: float, radius: float = 1.0) -> Localization:
     """Presses in the middle, found to the side by so many mm."""
     count = len(amounts)
     radii = np.full(count, radius)
-    return Found(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
+    return Localization(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
 
 
 def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> CrossValidation:
@@ -74,8 +74,8 @@ def test_what_presses_left_out_say_of_a_change() -> None:
     np.testing.assert_allclose(widened, [[1, 1, 1], [3 / np.sqrt(2), 3, 3]])
     seen: list[list[int]] = []
 
-    def change(localizer: int, raw: np.ndarray, places_mm: np.ndarray, measures: dict[str, np.ndarray]) -> int:
-        assert places_mm.shape == (2, 2)
+    def change(localizer: int, raw: np.ndarray, positions_mm: np.ndarray, measures: dict[str, np.ndarray]) -> int:
+        assert positions_mm.shape == (2, 2)
         seen.append(raw.tolist())
         return localizer + 1
 
@@ -84,11 +84,13 @@ def test_what_presses_left_out_say_of_a_change() -> None:
 
 
 @pytest.fixture(scope="module")
-def followed(localizer: Localizer, recording: Recording) -> tuple[Localizer, dict]:
+def followed(localizer: LocalizerModel, recording: Recording) -> tuple[LocalizerModel, dict]:
     return recalibrate(localizer, known_only(remade(recording), NEW))
 
 
-def test_a_remade_pad_is_followed(localizer: Localizer, recording: Recording, followed: tuple, tmp_path: Path) -> None:
+def test_a_remade_pad_is_followed(
+    localizer: LocalizerModel, recording: Recording, followed: tuple, tmp_path: Path
+) -> None:
     now, document = followed
     pad = remade(recording)
     for lost in ((), (0,), (2,), (1, 3)):
@@ -102,16 +104,19 @@ def test_a_remade_pad_is_followed(localizer: Localizer, recording: Recording, fo
     assert min(shrunk) > 0
     assert document["gain_mm"] == pytest.approx(np.mean(shrunk))  # every number of lost fibres counts alike
     # Radii only grow, and hold for the new presses.
-    assert (now.factors >= localizer.factors).all()
-    assert np.allclose(now.factors, localizer.factors * document["widened"])
-    found = now.locate(now.inputs(pad)[LATER])
-    assert (distances(found.places_mm, pad.presses_mm[LATER]) <= found.r90_mm).mean() > 0.8
+    assert (now.interval_factors >= localizer.interval_factors).all()
+    assert np.allclose(now.interval_factors, localizer.interval_factors * document["widened"])
+    found = now.predict_features(now.scaled_features(pad)[LATER])
+    assert (distances(found.positions_mm, pad.presses_mm[LATER]) <= found.r90_mm).mean() > 0.8
     # it is a model like any other, that has seen its presses
     now.save(tmp_path)
-    again = Localizer.load(tmp_path)
+    again = LocalizerModel.load(tmp_path)
     assert np.array_equal(again.table, now.table)
     assert again.recalibrated_by == (known_only(pad, NEW).digest,)
-    assert np.array_equal(again.locate(again.inputs(pad)).places_mm, now.locate(now.inputs(pad)).places_mm)
+    assert np.array_equal(
+        again.predict_features(again.scaled_features(pad)).positions_mm,
+        now.predict_features(now.scaled_features(pad)).positions_mm,
+    )
     json.dumps(document, allow_nan=False)
     twice = replace(again, recalibrated_by=("of before", *again.recalibrated_by))
     assert recalibrate(twice, known_only(pad, NEW))[0].recalibrated_by[:2] == twice.recalibrated_by
@@ -120,14 +125,14 @@ def test_a_remade_pad_is_followed(localizer: Localizer, recording: Recording, fo
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same(localizer: Localizer, recording: Recording, followed: tuple) -> None:
+def test_the_same_seed_gives_the_same(localizer: LocalizerModel, recording: Recording, followed: tuple) -> None:
     (one, document), (two, again) = followed, recalibrate(localizer, known_only(remade(recording), NEW))
     assert document == again
     assert all(np.array_equal(one.weights[name], two.weights[name]) for name in one.weights)
 
 
 def test_an_unchanged_pad_is_not_spoilt_and_too_few_presses_are_refused(
-    localizer: Localizer, recording: Recording
+    localizer: LocalizerModel, recording: Recording
 ) -> None:
     now, document = recalibrate(localizer, known_only(recording, NEW))
     assert "corrected" not in document["changes"]
@@ -141,19 +146,24 @@ def test_an_unchanged_pad_is_not_spoilt_and_too_few_presses_are_refused(
             recalibrate(localizer, known_only(recording, slice(0, presses)))
 
 
-def test_a_known_correction_is_found(localizer: Localizer, recording: Recording) -> None:
-    scaling, gains, shift = localizer.normalization, np.array([1.2, 0.8, 1.1, 0.9]), np.array([0.06, -0.08])
+def test_a_known_correction_is_found(localizer: LocalizerModel, recording: Recording) -> None:
+    scaling, gains, shift = localizer.scaler, np.array([1.2, 0.8, 1.1, 0.9]), np.array([0.06, -0.08])
     turn = 1.02 * np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]])
     pad = replace(recording, readings=recording.readings * gains)
     # Places are those that the localizer itself finds, so that nothing but the correction is to be found.
-    places = localizer.locate(localizer.inputs(recording)).places_mm
-    moved = ((places - scaling.middle_mm) / scaling.span_mm) @ turn.T + shift
-    moved = moved * scaling.span_mm + scaling.middle_mm
-    found = fit_correction(localizer, localizer.raw_inputs(pad), moved)
-    np.testing.assert_allclose(found.normalization.spread[:, 0] / scaling.spread[:, 0], gains, rtol=0.02)
-    np.testing.assert_allclose(found.inputs(pad).inputs, localizer.inputs(recording).inputs, atol=0.15)
-    off = distances(found.locate(found.inputs(pad)).places_mm, moved)
-    assert off.mean() < 0.1 * distances(localizer.locate(localizer.inputs(pad)).places_mm, moved).mean()
+    places = localizer.predict_features(localizer.scaled_features(recording)).positions_mm
+    moved = ((places - scaling.origin_mm) / scaling.span_mm) @ turn.T + shift
+    moved = moved * scaling.span_mm + scaling.origin_mm
+    found = fit_correction(localizer, localizer.raw_features(pad), moved)
+    np.testing.assert_allclose(found.scaler.spread[:, 0] / scaling.spread[:, 0], gains, rtol=0.02)
+    np.testing.assert_allclose(
+        found.scaled_features(pad).inputs, localizer.scaled_features(recording).inputs, atol=0.15
+    )
+    off = distances(found.predict_features(found.scaled_features(pad)).positions_mm, moved)
+    assert (
+        off.mean()
+        < 0.1 * distances(localizer.predict_features(localizer.scaled_features(pad)).positions_mm, moved).mean()
+    )
     # The table is turned with the pad.
     at = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
     one, other = (each.table.reshape(*each.table.shape[:2], -1) for each in (localizer, found))
@@ -162,36 +172,36 @@ def test_a_known_correction_is_found(localizer: Localizer, recording: Recording)
 
 
 def test_adapting_weighs_new_presses_and_leaves_lost_fibres_alone(localizer, recording, monkeypatch) -> None:
-    presses = localizer.inputs(recording)[NEW]
-    targets = localizer.normalization.targets(recording.presses_mm[NEW])
-    spoilt, dead = presses.inputs.copy(), presses.alive.copy()
+    presses = localizer.scaled_features(recording)[NEW]
+    targets = localizer.scaler.targets(recording.presses_mm[NEW])
+    spoilt, dead = presses.inputs.copy(), presses.fibre_mask.copy()
     spoilt[:, 1], dead[:, 1] = np.nan, False
     samples = TrainingPresses(spoilt, dead, targets)
     weights = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
     assert all(np.isfinite(weight).all() for weight in weights.values())
     assert not np.array_equal(weights["last.w"], localizer.weights["last.w"])
-    places = localizer.normalization.targets(recording.presses_mm[NEW] + 3.0)
-    samples = TrainingPresses(presses.inputs, presses.alive, places)
+    places = localizer.scaler.targets(recording.presses_mm[NEW] + 3.0)
+    samples = TrainingPresses(presses.inputs, presses.fibre_mask, places)
     shifts = []
     for old in (0.0, 1e18):
         monkeypatch.setattr(fine_tuning, "OLD_PRESSES", old)
         now = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
-        found = replace(localizer, weights=now, observer=None, corrector={}).locate(presses).places_mm
-        plain = replace(localizer, observer=None, corrector={}).locate(presses).places_mm
+        found = replace(localizer, weights=now, bayes=None, residual_network={}).predict_features(presses).positions_mm
+        plain = replace(localizer, bayes=None, residual_network={}).predict_features(presses).positions_mm
         shifts.append((found - plain).mean())
     assert shifts[0] > 0.03
     assert abs(shifts[1]) < 0.2 * shifts[0]
 
 
-def test_the_command_writes_a_whole_model(localizer: Localizer, recording: Recording, tmp_path: Path) -> None:
+def test_the_command_writes_a_whole_model(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
     localizer.save(tmp_path / "old")
     known_only(remade(recording), slice(0, 20)).save(tmp_path / "new", {})
     command = ("sense", "recalibrate", "--model", "old", "new", "--out")
     ended = called(*command, "now", "--json", cwd=tmp_path)
     document = json.loads(ended.out)
     assert (ended.code, document) == (0, json.loads((tmp_path / "now/recalibration.json").read_text()))
-    assert (document["format"], document["presses"]) == ("padforge-recalibration/1", 20)
-    assert Localizer.load(tmp_path / "now").fibres == 4
+    assert (document["format"], document["presses"]) == ("padforge-recalibration/2", 20)
+    assert LocalizerModel.load(tmp_path / "now").fibres == 4
     (tmp_path / "old/health.json").write_text("{}")
     ended = called(*command, "later", cwd=tmp_path)
     assert (ended.code, ended.err[:28]) == (2, "padforge: old/health.json: f")
@@ -199,15 +209,15 @@ def test_the_command_writes_a_whole_model(localizer: Localizer, recording: Recor
 
 
 @pytest.mark.slow
-def test_several_depths_are_followed_known_or_not(deep_localizer: Localizer, deep_recording: Recording) -> None:
-    names = ("presses_mm", "begun", "lifted", "depths_mm", "forces_n")
+def test_several_depths_are_followed_known_or_not(deep_localizer: LocalizerModel, deep_recording: Recording) -> None:
+    names = ("presses_mm", "down_command", "up_command", "depths_mm", "forces_n")
     few = {name: getattr(deep_recording, name)[:40] for name in names}
     later = replace(deep_recording, **few, reached_mm=np.empty(0))
     now, document = recalibrate(deep_localizer, later)
-    assert now.factors.shape == deep_localizer.factors.shape
-    assert (now.factors >= deep_localizer.factors).all()
+    assert now.interval_factors.shape == deep_localizer.interval_factors.shape
+    assert (now.interval_factors >= deep_localizer.interval_factors).all()
     assert document["after"][0]["depth_mean_mm"] < 0.5
     unknown, document = recalibrate(deep_localizer, replace(later, depths_mm=np.empty(0), forces_n=np.empty(0)))
     assert "depth_mean_mm" not in document["after"][0]
-    depths = unknown.locate(unknown.inputs(deep_recording)).measures["depth_mm"].values
+    depths = unknown.predict_features(unknown.scaled_features(deep_recording)).measures["depth_mm"].values
     assert np.abs(depths - deep_recording.depths_mm).mean() < 0.5

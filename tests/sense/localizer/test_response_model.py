@@ -66,8 +66,8 @@ def test_gains_are_told_by_the_history_and_answers_in_proportion_to_depth_are_on
     stronger = np.zeros((FIBRES, PASTS, WINDOWS))
     stronger[0, 0], stronger[0, 1] = [0.3, 0.3, 0.0, 0.0], [0.0, 0.0, 0.1, 0.1]
     windows = answer(places) * (1 + np.einsum("qcj,cjf->qcf", history, stronger))
-    alive, phases = np.ones((FEW, FIBRES), dtype=bool), (slice(0, 2), slice(2, 4))
-    found = ResponseModel.fit(places, windows, history, alive, phases=phases)
+    fibre_mask, phases = np.ones((FEW, FIBRES), dtype=bool), (slice(0, 2), slice(2, 4))
+    found = ResponseModel.fit(places, windows, history, fibre_mask, phases=phases)
     assert found.table.shape[3] == WINDOWS + len(phases)
     assert not found.table[..., WINDOWS:].any()
     shown = settled(windows, history, found.memory, found.usual)
@@ -87,16 +87,16 @@ def test_gains_are_told_by_the_history_and_answers_in_proportion_to_depth_are_on
 
 def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
     places, windows, history, _ = (part[:FEW] for part in made)
-    alive = np.ones((FEW, FIBRES), dtype=bool)
-    alive[::3, 0] = False
-    before = ResponseModel.fit(places, windows, history, alive)
+    fibre_mask = np.ones((FEW, FIBRES), dtype=bool)
+    fibre_mask[::3, 0] = False
+    before = ResponseModel.fit(places, windows, history, fibre_mask)
     windows[::3, 0], history[::3, 0] = 99.0, -99.0
-    after = ResponseModel.fit(places, windows, history, alive)
+    after = ResponseModel.fit(places, windows, history, fibre_mask)
     assert np.array_equal(before.table, after.table)
     assert np.array_equal(before.memory, after.memory)
-    assert after.usual[0] == pytest.approx(history[alive[:, 0], 0].mean(axis=0))
-    alive[:, 1] = False
-    gone = ResponseModel.fit(places, windows, history, alive)
+    assert after.usual[0] == pytest.approx(history[fibre_mask[:, 0], 0].mean(axis=0))
+    fibre_mask[:, 1] = False
+    gone = ResponseModel.fit(places, windows, history, fibre_mask)
     assert not gone.table[:, :, 1].any()
     assert np.isfinite(gone.table).all()
 
@@ -121,15 +121,15 @@ def pressed() -> tuple[np.ndarray, np.ndarray]:
 
 
 def table_of(places: np.ndarray, windows: np.ndarray) -> np.ndarray:
-    nothing, alive = np.empty((len(places), FIBRES, 0)), np.ones((len(places), FIBRES), dtype=bool)
-    return ResponseModel.fit(places, windows, nothing, alive).table.astype(np.float32)
+    nothing, fibre_mask = np.empty((len(places), FIBRES, 0)), np.ones((len(places), FIBRES), dtype=bool)
+    return ResponseModel.fit(places, windows, nothing, fibre_mask).table.astype(np.float32)
 
 
 def test_presses_are_as_far_off_as_from_a_table_fitted_without_them() -> None:
     places, windows = pressed()
-    alive = np.ones((90, FIBRES), dtype=bool)
+    fibre_mask = np.ones((90, FIBRES), dtype=bool)
     table = table_of(places, windows)
-    presses = TrainingPresses(windows.astype(np.float32), alive, places.astype(np.float32))
+    presses = TrainingPresses(windows.astype(np.float32), fibre_mask, places.astype(np.float32))
     flat = table.reshape(*table.shape[:2], -1)
     rest = as_unseen(presses, table).inputs - looked_up(flat, places).reshape(windows.shape)
     for press in (0, 4, 17):
@@ -142,5 +142,5 @@ def test_presses_are_as_far_off_as_from_a_table_fitted_without_them() -> None:
     # What no table expects is left as it was.
     more = np.pad(windows, ((0, 0), (0, 0), (0, 1)), constant_values=0.7).astype(np.float32)
     padded = np.pad(table, ((0, 0), (0, 0), (0, 0), (0, 1)))
-    found = as_unseen(TrainingPresses(more, alive, places.astype(np.float32)), padded).inputs
+    found = as_unseen(TrainingPresses(more, fibre_mask, places.astype(np.float32)), padded).inputs
     assert np.array_equal(found[:, :, -1], more[:, :, -1])

@@ -23,10 +23,10 @@ def test_numpy_and_torch_agree(seed: int, layers: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     weights = masked_network.initial(3 * 5 + 3, Options(layers=layers, hidden=24), generator)
     inputs = torch.randn(7, 3, 5, generator=generator)
-    alive = torch.rand(7, 3, generator=generator) < 0.6
-    expected = masked_network.forward(weights, masked_network.masked(inputs, alive)[None]).detach().numpy()
+    fibre_mask = torch.rand(7, 3, generator=generator) < 0.6
+    expected = masked_network.forward(weights, masked_network.masked(inputs, fibre_mask)[None]).detach().numpy()
     plain = {name: weight.detach().numpy() for name, weight in weights.items()}
-    found = network.forward(plain, network.masked(inputs.numpy(), alive.numpy()))
+    found = network.forward(plain, network.masked(inputs.numpy(), fibre_mask.numpy()))
     assert found.dtype == np.float32
     assert np.allclose(found, expected, atol=2e-5)
 
@@ -48,8 +48,8 @@ def test_the_spread_of_members_adds_to_what_they_expect() -> None:
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
 def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed: int) -> None:
     lost = min(lost, fibres - 1)
-    alive = draw_alive(800, fibres, lost, torch.Generator().manual_seed(seed))
-    gone = (~alive).sum(dim=1)
+    fibre_mask = draw_alive(800, fibres, lost, torch.Generator().manual_seed(seed))
+    gone = (~fibre_mask).sum(dim=1)
     assert gone.max() <= lost
     assert set(gone.unique().tolist()) == set(range(lost + 1))
 
@@ -68,7 +68,7 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
         return looked_up(table, places, xp)
 
     monkeypatch.setattr(masked_network, "looked_up", spy)
-    options = Options(members=1, hidden=8, layers=1, lost=0, batch=256, epochs=1)
+    options = Options(members=1, hidden=8, layers=1, max_failures=0, batch=256, epochs=1)
     monkeypatch.setattr(training, "MOVED", 0.1)
     table = np.zeros((3, 3, 1, 1), np.float32)
     training.train_members(samples, table, options, np.random.default_rng(0), lambda done, total: None)
@@ -77,7 +77,7 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
 
 
-@pytest.mark.parametrize(("features", "longer"), [("full", 1), ("causal", 2), ("early", 2)])
+@pytest.mark.parametrize(("features", "longer"), [("press_and_release", 1), ("causal", 2), ("onset", 2)])
 def test_without_the_release_networks_learn_for_twice_as_many_steps(features: Features, longer: int) -> None:
     rng = np.random.default_rng(0)
     places = rng.uniform(-1, 1, (40, 2)).astype(np.float32)

@@ -8,19 +8,24 @@ import numpy as np
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Localizer, Recording, calibrate, evaluate, locate, recalibrate
+from padforge.sense import Recording, calibrate, evaluate, recalibrate
 from padforge.sense.localizer import training as fine_tuning
 from padforge.sense.localizer.features import FEATURES, ResponseModel
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
 
-TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, lost=2, test_share=0.3)
+TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=2, test_share=0.3)
 
 
 def worst(seed: int, recording: Recording) -> Recording:
     """Its readings with faults, and its presses oddly placed, timed or short."""
     rng = np.random.default_rng(seed)
-    places, begun, lifted = recording.presses_mm.copy(), recording.begun.copy(), recording.lifted.copy()
+    places, down_command, up_command = (
+        recording.presses_mm.copy(),
+        recording.down_command.copy(),
+        recording.up_command.copy(),
+    )
     times_s = recording.times_s
     match rng.integers(7):
         case 0:
@@ -38,22 +43,22 @@ def worst(seed: int, recording: Recording) -> Recording:
     if rng.random() < 0.3:  # a pause
         times_s = times_s + np.where(np.arange(len(times_s)) > len(times_s) // 2, rng.choice([10.0, 1e6]), 0.0)
     if rng.random() < 0.3:  # as short as they may be
-        lifted = begun + 1
+        up_command = down_command + 1
     if rng.random() < 0.2:  # at the very ends
-        begun[0], lifted[-1] = 1, len(times_s)
-    return Recording(faulty(rng, recording.readings), times_s, places, begun, lifted)
+        down_command[0], up_command[-1] = 1, len(times_s)
+    return Recording(faulty(rng, recording.readings), times_s, places, down_command, up_command)
 
 
-def require_finite(localizer: Localizer, recording: Recording, document: Any = ()) -> None:
-    found = locate(localizer, recording)
-    assert np.isfinite(np.column_stack([found.places_mm, found.sd_mm, found.r50_mm, found.r90_mm])).all()
-    assert (found.sd_mm > 0).all()
+def require_finite(localizer: LocalizerModel, recording: Recording, document: Any = ()) -> None:
+    found = localizer.predict(recording)
+    assert np.isfinite(np.column_stack([found.positions_mm, found.std_mm, found.r50_mm, found.r90_mm])).all()
+    assert (found.std_mm > 0).all()
     assert (found.r50_mm > 0).all()
     json.dumps(document, allow_nan=False)
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_the_worst_recordings_are_located_and_evaluated(localizer: Localizer, brief: Recording, seed: int) -> None:
+def test_the_worst_recordings_are_located_and_evaluated(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
     one = worst(seed, brief)
     require_finite(localizer, one, evaluate(localizer, one, (0, 3)) if one.known.any() else ())
 
@@ -70,7 +75,7 @@ def test_the_worst_recordings_teach_or_are_refused(brief: Recording, seed: int, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_the_worst_recordings_are_followed_or_refused(localizer: Localizer, brief: Recording, seed: int) -> None:
+def test_the_worst_recordings_are_followed_or_refused(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
     one = worst(seed, brief)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(fine_tuning, "STEPS", 15)
@@ -79,17 +84,17 @@ def test_the_worst_recordings_are_followed_or_refused(localizer: Localizer, brie
         except InputError:
             return
     require_finite(now, one, document)
-    assert (now.factors >= localizer.factors).all()
+    assert (now.interval_factors >= localizer.interval_factors).all()
 
 
 @pytest.mark.slow
 def test_many_presses_take_memory_in_parts() -> None:
     """The bumps of all of them at once would take 350 MB, and as much again beside their history."""
     rng, presses = np.random.default_rng(0), 100_000
-    windows, alive = rng.standard_normal((presses, 1, 3)), np.ones((presses, 1), dtype=bool)
+    windows, fibre_mask = rng.standard_normal((presses, 1, 3)), np.ones((presses, 1), dtype=bool)
     tracemalloc.start()
     try:
-        ResponseModel.fit(rng.uniform(-1, 1, (presses, 2)), windows, np.empty((presses, 1, 0)), alive)
+        ResponseModel.fit(rng.uniform(-1, 1, (presses, 2)), windows, np.empty((presses, 1, 0)), fibre_mask)
         assert tracemalloc.get_traced_memory()[1] < 300e6
     finally:
         tracemalloc.stop()

@@ -28,8 +28,8 @@ def test_a_torn_journal_line_and_one_that_begins_again_lose_their_press_only(
         *(('"reading": 20,', f'"reading": {value},') for value in ("1e30", "20.0", "true", '"20"', "-1", "NaN")),
         *(('"press": 0,', f'"press": {value},') for value in ("0.0", "false", '"0"', "null", "9" * 30)),
         *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"')),
-        ('"event": "begun", ', ""),
-        ('"event": "begun"', '"event": "began"'),
+        ('"event": "started", ', ""),
+        ('"event": "started"', '"event": "began"'),
         ('{"event"', "[" * 100_000 + '{"event"'),
         ('{"event"', '3\n{"event"'),
         *(

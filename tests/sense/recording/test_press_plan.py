@@ -23,7 +23,7 @@ def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
 def test_a_plan_survives_json_and_comes_from_a_file(tmp_path):
     plan = made(presses=7, depths_mm=[2.0, 4.0])
     again = PressPlan.of(plan.document())
-    assert np.array_equal(again.places_mm, plan.places_mm)
+    assert np.array_equal(again.positions_mm, plan.positions_mm)
     assert again.depths_mm.tolist() == [2, 4, 2, 4, 2, 4, 2]
     assert set(made(presses=30).depths_mm) == {5.0}
     (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
@@ -35,12 +35,12 @@ def test_a_plan_survives_json_and_comes_from_a_file(tmp_path):
 def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row():
     line = [-22.5, 0.0, 22.5]
     rows = [(x, y) for y in line for x in line]
-    assert made(presses=9, plan="grid").places_mm.tolist() == [list(place) for place in rows]
-    assert made(presses=8, plan="grid").places_mm.tolist() == [list(place) for place in rows[:8]]
+    assert made(presses=9, plan="grid").positions_mm.tolist() == [list(place) for place in rows]
+    assert made(presses=8, plan="grid").positions_mm.tolist() == [list(place) for place in rows[:8]]
     turned = [*rows[:3], *rows[5:2:-1], *rows[6:]]
-    assert made(presses=9, plan="boustrophedon").places_mm.tolist() == [list(place) for place in turned]
-    assert made(presses=1, plan="grid").places_mm.tolist() == [[0, 0]]
-    uniform = made(presses=2000).places_mm
+    assert made(presses=9, plan="boustrophedon").positions_mm.tolist() == [list(place) for place in turned]
+    assert made(presses=1, plan="grid").positions_mm.tolist() == [[0, 0]]
+    uniform = made(presses=2000).positions_mm
     assert np.abs(uniform).max() > 22.4
     np.testing.assert_allclose(uniform.mean(axis=0), 0, atol=1.5)
 
@@ -52,7 +52,7 @@ def test_plans_keep_to_what_is_pressed_of_the_pad(kind: str) -> None:
 
     def places(**size) -> np.ndarray:
         rig = validate(RigSettings, presses, "rig")
-        return planned(pad, rig, np.random.default_rng(0), PadSettings(**size)).places_mm
+        return planned(pad, rig, np.random.default_rng(0), PadSettings(**size)).positions_mm
 
     strip = places(sensed_mm=(50.0, 8.0))
     np.testing.assert_allclose(np.abs(strip).max(axis=0), [25, 4], rtol=0.02)
@@ -66,13 +66,13 @@ def test_plans_fill_a_rectangle_and_keep_out_of_holes(kind: str) -> None:
 
     def in_the_hole(plan: PressPlan) -> np.ndarray:
         low, high = np.array(HOLE).min(axis=0), np.array(HOLE).max(axis=0)
-        return ((plan.places_mm > low) & (plan.places_mm < high)).all(axis=1)
+        return ((plan.positions_mm > low) & (plan.positions_mm < high)).all(axis=1)
 
     plan = made(size, presses=300, plan=kind)
     assert len(plan) == 300
     assert not in_the_hole(plan).any()
     # half a pitch beyond the outermost of 2 verticals, 8 mm apart, and of 3 horizontals, 15 mm apart
-    np.testing.assert_allclose(np.abs(plan.places_mm).max(axis=0), [8.0, 22.5], rtol=0.05)
+    np.testing.assert_allclose(np.abs(plan.positions_mm).max(axis=0), [8.0, 22.5], rtol=0.05)
     assert in_the_hole(made(size.model_copy(update={"keep_out_mm": ()}), presses=300, plan=kind)).any()
 
 
@@ -80,7 +80,7 @@ def test_plans_fill_a_rectangle_and_keep_out_of_holes(kind: str) -> None:
 def test_places_of_a_grid_are_as_far_apart_along_both_axes(counts: tuple[int, int]) -> None:
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 15.0))
     for presses in (1, 2, 7, 60, 1500):
-        places = made(size, presses=presses, plan="grid").places_mm
+        places = made(size, presses=presses, plan="grid").positions_mm
         assert len(places) == len(np.unique(places, axis=0)) == presses
         steps = [np.diff(np.unique(places[:, axis])) for axis in range(2)]
         if min(map(len, steps)) >= 8:
@@ -102,8 +102,8 @@ def test_a_hole_is_not_pressed_because_a_file_says_so(tmp_path: Path) -> None:
 def test_depths_of_a_grid_tell_nothing_of_the_place(plan, presses):
     made_so = made(presses=presses, plan=plan, depths_mm=[0.5, 1, 2, 3, 5])
     for axis in (0, 1):
-        for value in np.unique(made_so.places_mm[:, axis]):
-            assert len(set(made_so.depths_mm[made_so.places_mm[:, axis] == value])) == 5
+        for value in np.unique(made_so.positions_mm[:, axis]):
+            assert len(set(made_so.depths_mm[made_so.positions_mm[:, axis] == value])) == 5
 
 
 @pytest.mark.parametrize(

@@ -53,9 +53,11 @@ def five(tmp_path_factory):
 
 def require_as_recorded(recording):
     """See that every press has its place and the readings that `record` gave it."""
-    for (x, y), begun, lifted in zip(recording.presses_mm, recording.begun, recording.lifted, strict=True):
+    for (x, y), down_command, up_command in zip(
+        recording.presses_mm, recording.down_command, recording.up_command, strict=True
+    ):
         assert x == -y
-        assert (recording.readings[begun:lifted] == x + 0.5).all()
+        assert (recording.readings[down_command:up_command] == x + 0.5).all()
     assert (np.diff(recording.times_s) > 0).all()
 
 
@@ -174,7 +176,7 @@ def test_an_aborted_press_is_made_again(tmp_path):
         recorder.abort("the arm was stopped")
         recorder.abort("told twice")
     events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
-    assert events[-2:] == ["begun", "aborted"]
+    assert events[-2:] == ["started", "aborted"]
     assert len(Recording.open(tmp_path / "run").presses_mm) == 2
     with Recorder.resume(tmp_path / "run") as recorder:
         assert recorder.done == {0, 1}
@@ -220,7 +222,7 @@ def test_two_programs_cannot_record_into_one_folder(tmp_path):
             Recorder(path, FIBRES, {}, {})
         assert (path / READINGS).read_bytes() == before
         record(first, range(5, 7), 10.0)
-    assert len(Recording.open(path).begun) == 7
+    assert len(Recording.open(path).down_command) == 7
 
 
 def test_a_full_disk_leaves_nothing_of_a_birth_and_on_closing_does_not_hide_what_went_wrong(tmp_path, monkeypatch):
@@ -297,20 +299,20 @@ def die_being_born(path, step):
 
 def test_a_recording_that_was_killed_while_being_born_can_be_made_again(tmp_path):
     """Until `start.json` is there it begins anew, then it goes on."""
-    begun = []
+    down_command = []
     for step in range(4):
         path = tmp_path / str(step) / "run"
         path.parent.mkdir()
         die_being_born(path, step)
-        begun.append((path / START).exists())
-        if begun[-1]:
+        down_command.append((path / START).exists())
+        if down_command[-1]:
             with pytest.raises(InputError, match="never written over"):
                 Recorder(path, FIBRES, {}, {})
-        with Recorder.resume(path) if begun[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
+        with Recorder.resume(path) if down_command[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
             record(recorder, range(2), 0.0)
         assert len(Recording.open(path).presses_mm) == 2
         assert {file.name for file in path.iterdir()} == {START, READINGS, STATES, JOURNAL}
-    assert begun == [False, True, True, True]
+    assert down_command == [False, True, True, True]
 
 
 @pytest.mark.parametrize("name", [READINGS, "notes.txt", ".unfinished-0123456789abcdef.json"])

@@ -92,7 +92,7 @@ def test_what_a_live_recorder_synced_can_be_read_before_it_ends(tmp_path: Path) 
     assert np.array_equal(found.readings, readings[: len(found.readings)])
     assert len(found.readings) == 26
     assert found.presses_mm.tolist() == [[1.5, -2.5]]
-    assert (found.begun.tolist(), found.lifted.tolist()) == ([10], [20])
+    assert (found.down_command.tolist(), found.up_command.tolist()) == ([10], [20])
 
 
 def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
@@ -112,9 +112,9 @@ def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
         (lambda r: {"times_s": r.times_s[:-1]}, r"times have shape"),
         (lambda r: {"readings": r.readings[:, :0]}, r"readings have shape"),
         (lambda r: {"presses_mm": r.presses_mm[:0]}, "at least one press"),
-        (lambda r: {"begun": spoiled(r.begun, 2, 70)}, "press 2 goes from"),
-        (lambda r: {"begun": spoiled(r.begun, 0, 0)}, "press 0 goes from reading 0"),
-        (lambda r: {"lifted": spoiled(r.lifted, -1, len(r.readings) + 1)}, "press 299 goes from"),
+        (lambda r: {"down_command": spoiled(r.down_command, 2, 70)}, "press 2 goes from"),
+        (lambda r: {"down_command": spoiled(r.down_command, 0, 0)}, "press 0 goes from reading 0"),
+        (lambda r: {"up_command": spoiled(r.up_command, -1, len(r.readings) + 1)}, "press 299 goes from"),
         (lambda r: {"times_s": spoiled(r.times_s, 11, np.nan)}, r"times hold NaN or infinity \(first in row 11\), exp"),
         (lambda r: {"depths_mm": [1.0, 2.0]}, r"depths_mm have shape \(2,\), expected \(300,\)"),
         (lambda r: {"depths_mm": np.full(300, 0.0)}, "depths_mm of press 0 is 0 mm, allowed is more than 0"),
@@ -126,7 +126,10 @@ def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
         (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e5}, "times give 1e-05 readings a second, allowed"),
         (lambda r: {"readings": [[1.0], [1.0, 2.0]]}, "readings are .*expected an array of real numbers"),
         (lambda r: {"readings": r.readings + 1j}, "readings are .*complex128"),
-        (lambda r: {"lifted": spoiled(r.lifted.astype(float), -1, 2.0**53 + 2)}, "lifted are .*whole numbers up to"),
+        (
+            lambda r: {"up_command": spoiled(r.up_command.astype(float), -1, 2.0**53 + 2)},
+            "lifted are .*whole numbers up to",
+        ),
         (lambda r: {"times_s": None}, "times_s are None"),
         (lambda r: {"source": "a rig"}, "source is 'a rig', expected a mapping"),
         (lambda r: {"source": {"gain": np.nan}}, "source is .*expected what JSON can hold"),
@@ -151,7 +154,7 @@ def test_one_missing_reading_is_as_another(recording: Recording) -> None:
 
 
 def test_what_is_uneven_little_or_at_the_ends_of_what_is_allowed_is_fine(recording: Recording, tmp_path: Path) -> None:
-    assert replace(recording, begun=recording.begun.astype(float)) == recording
+    assert replace(recording, down_command=recording.down_command.astype(float)) == recording
     for name, index, most in (("readings", (7, 0), 1e3), ("presses_mm", (3, 1), 1e5), ("times_s", -1, 1e10)):
         for value in {most, -most if name != "times_s" else most}:
             assert getattr(replace(recording, **{name: spoiled(getattr(recording, name), index, value)}), name).size
@@ -195,7 +198,7 @@ def test_of_two_saves_into_one_folder_the_first_stays_and_the_second_is_told(
 
 
 def test_depth_and_force_belong_to_a_press_but_not_to_the_digest(recording: Recording, tmp_path: Path) -> None:
-    count = len(recording.begun)
+    count = len(recording.down_command)
     unknown = replace(recording, depths_mm=np.empty(0))
     assert np.isnan([unknown.depths_mm, unknown.reached_mm, unknown.forces_n]).all()
     reached = np.where(np.arange(count) % 2 == 0, np.nan, 4.9)

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.run_directory import STATE_COLUMNS
-from padforge.sense.rig.config import Frame
-from padforge.sense.rig.devices import ArmState, ConverterSamples, Pose, RigFault
+from padforge.sense.rig.config import RobotFrame
+from padforge.sense.rig.devices import ArmState, BoardSamples, Pose, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import LivePad
 
 PAD = Morphology.straight(2)
 FIBRES = 4
 RIG = RigSettings.model_validate(
-    {"presses": 6, "rate_hz": 100, "converter_rate_hz": 1000, "readings_per_press": 40}
+    {"presses": 6, "rate_hz": 100, "board_rate_hz": 1000, "readings_per_press": 40}
     | {"pad_mm": (0.0, -400.0), "contact_mm": 50.0, "box_mm": (-100, 100, -500, -300, 40, 120)}
     | {"travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 2000}
 )
@@ -98,8 +98,8 @@ class FakeArm:
     def _advance(self) -> None:
         if self._from is None or self.protective_stop or self.emergency_stop:
             return
-        start, end, begun, done = self._from
-        share = 1.0 if done <= begun else min((self.time() - begun) / (done - begun), 1.0)
+        start, end, down_command, done = self._from
+        share = 1.0 if done <= down_command else min((self.time() - down_command) / (done - down_command), 1.0)
         x, y, z = (np.array(start[:3]) + share * np.subtract(end[:3], start[:3])).tolist()
         self.pose = (x, y, z, *end[3:])
         if share == 1.0:
@@ -110,16 +110,16 @@ class FakeConverter:
     """Samples the simulated pad under a fake arm; samples may be lost, and the board may stall or go."""
 
     def __init__(self, arm: FakeArm, rig: RigSettings = RIG, pad: Morphology = PAD) -> None:
-        self.arm, self.rig, self.frame = arm, rig, Frame.of(rig)
-        self.model = LivePad(pad, PUBLISHED_CONTACT, rig, rig.converter_rate_hz, np.random.default_rng(1))
-        self.rate_hz, self.taken_s = rig.converter_rate_hz, arm.time()
+        self.arm, self.rig, self.frame = arm, rig, RobotFrame.of(rig)
+        self.model = LivePad(pad, PUBLISHED_CONTACT, rig, rig.board_rate_hz, np.random.default_rng(1))
+        self.rate_hz, self.taken_s = rig.board_rate_hz, arm.time()
         self.lose = 0
         self.lost = self.stalled = False
 
     def connect(self) -> dict[str, Any]:
         return {"rate_hz": self.rate_hz, "inputs": list(range(FIBRES)), "supply_v": 3.3}
 
-    def read(self) -> ConverterSamples:
+    def read(self) -> BoardSamples:
         if self.lost:
             raise RigFault("lost", "the board is gone")
         if self.stalled and self.arm.time() - self.taken_s > 1:
@@ -133,7 +133,7 @@ class FakeConverter:
         if len(times):
             missing[0] = skipped
         places, depths = self.frame.tip(self.arm.pose_at(times))
-        return ConverterSamples(times, self.model.volts(places, depths), missing)
+        return BoardSamples(times, self.model.volts(places, depths), missing)
 
     def close(self) -> None:
         pass
@@ -143,12 +143,12 @@ def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> floa
     """Call `action` until it raises the fault; returns how long that took by the wall's clock."""
 
     def repeat() -> None:
-        while time.monotonic() < begun + 10:
+        while time.monotonic() < down_command + 10:
             action()
             time.sleep(0.005)
 
-    begun = time.monotonic()
+    down_command = time.monotonic()
     with pytest.raises(RigFault, match=match) as caught:
         repeat()
     assert caught.value.cause == cause
-    return time.monotonic() - begun
+    return time.monotonic() - down_command

@@ -4,7 +4,7 @@ from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.press_plan import PressPlan, planned
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from padforge.sense.rig.operation import EVERY, Steering, uncertainty
+from padforge.sense.rig.operation import EVERY, AdaptivePlanner, uncertainty
 from padforge.sense.rig.press_loop import Session
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.rig.fakes import FIBRES, PAD, RIG, FakeArm, FakeConverter, Time
@@ -29,19 +29,21 @@ def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
     options = RIG.model_copy(update={"presses": EVERY + 10, "plan": "adaptive", **fast})
     plan = planned(PAD, options, np.random.default_rng(3))
     learnt = planned(PAD, options, np.random.default_rng(4))
-    known = PressPlan(np.column_stack([-np.abs(learnt.places_mm[:, 0]), learnt.places_mm[:, 1]]), learnt.depths_mm)
+    known = PressPlan(
+        np.column_stack([-np.abs(learnt.positions_mm[:, 0]), learnt.positions_mm[:, 1]]), learnt.depths_mm
+    )
     converter = FakeConverter(arm)
     with Recorder(tmp_path / "known", FIBRES, {}, {}) as recorder:
         Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(known)
-    small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=30, lost=0)
+    small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=30, max_failures=0)
     localizer, _ = calibrate(Recording.open(tmp_path / "known"), small)
     with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
-        steering = Steering(
-            localizer, tmp_path / "run", np.random.default_rng(5), lambda places_mm: np.ones(len(places_mm), bool)
+        steering = AdaptivePlanner(
+            localizer, tmp_path / "run", np.random.default_rng(5), lambda positions_mm: np.ones(len(positions_mm), bool)
         )
         Session(arm, converter, recorder, options, clock=time, sleep=time.sleep).run(plan, steer=steering)
     made = Recording.open(tmp_path / "run").presses_mm
-    assert np.array_equal(made[:EVERY], plan.places_mm[:EVERY])
-    assert (made[EVERY:] != plan.places_mm[EVERY:]).any(axis=1).all()
-    assert np.abs(made).max() <= np.abs(plan.places_mm).max()
+    assert np.array_equal(made[:EVERY], plan.positions_mm[:EVERY])
+    assert (made[EVERY:] != plan.positions_mm[EVERY:]).any(axis=1).all()
+    assert np.abs(made).max() <= np.abs(plan.positions_mm).max()
     assert (made[EVERY:, 0] > 0).mean() > 2 / 3

@@ -23,7 +23,7 @@ from padforge.sense.rig.by_hand import (
     targets_of,
     view_lines,
 )
-from padforge.sense.rig.config import Setup
+from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings
 
@@ -40,8 +40,8 @@ VIEW |= {"target": (16.875, 16.875), "refused": None}
 VIEW |= {"presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}]}
 
 
-def setup_of(**settings: object) -> Setup:
-    return Setup(Morphology.straight(4), Contact(), RigSettings(**settings), Path("out"), "test")  # type: ignore[arg-type]
+def setup_of(**settings: object) -> RigConfig:
+    return RigConfig(Morphology.straight(4), Contact(), RigSettings(**settings), Path("out"), "test")  # type: ignore[arg-type]
 
 
 def test_uniform_places_are_gone_through_by_short_ways_all_over_the_pad() -> None:
@@ -120,9 +120,9 @@ def test_a_map_of_a_rectangle_is_as_wide_and_high_as_the_pad() -> None:
 
 
 @pytest.fixture
-def begun(tmp_path: Path) -> Setup:
+def down_command(tmp_path: Path) -> RigConfig:
     """A recording whose first two presses are made, and one at an unknown place."""
-    setup = Setup(Morphology.straight(2), Contact(), RigSettings(presses=5), tmp_path / "run", "test", [])
+    setup = RigConfig(Morphology.straight(2), Contact(), RigSettings(presses=5), tmp_path / "run", "test", [])
     recorder, targets, left = opened(setup, BOARD, resume=False)
     assert left is targets
     with recorder:
@@ -133,12 +133,12 @@ def begun(tmp_path: Path) -> Setup:
     return setup
 
 
-def test_what_is_missing_is_asked_for_of_the_plan_that_was_kept(begun: Setup) -> None:
-    source = json.loads((begun.out / "start.json").read_text())["source"]
+def test_what_is_missing_is_asked_for_of_the_plan_that_was_kept(down_command: RigConfig) -> None:
+    source = json.loads((down_command.out / "start.json").read_text())["source"]
     assert (source["kind"], source["devices"]["board"]) == ("hand", BOARD)
     assert source["plan"]["columns"] == ["x_mm", "y_mm"]
     assert len(source["plan"]["presses"]) == 5
-    recorder, targets, left = opened(begun, BOARD, resume=True)
+    recorder, targets, left = opened(down_command, BOARD, resume=True)
     with recorder:
         assert targets.tolist() == source["plan"]["presses"]
         np.testing.assert_array_equal(left, targets[2:])
@@ -153,12 +153,12 @@ def test_what_is_missing_is_asked_for_of_the_plan_that_was_kept(begun: Setup) ->
         ({"plan": {"presses": [["a", 1]]}}, "places of the plan"),
     ],
 )
-def test_another_recording_is_not_gone_on_with(begun: Setup, change: dict, said: str) -> None:
-    path = begun.out / "start.json"
+def test_another_recording_is_not_gone_on_with(down_command: RigConfig, change: dict, said: str) -> None:
+    path = down_command.out / "start.json"
     document = json.loads(path.read_text())
     path.write_text(json.dumps(document | {"source": document["source"] | change}))
     with pytest.raises(InputError, match=said):
-        opened(begun, BOARD, resume=True)
+        opened(down_command, BOARD, resume=True)
 
 
 def test_a_recording_killed_while_it_was_being_born_is_not_in_the_way(tmp_path: Path) -> None:

@@ -19,16 +19,16 @@ from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand as session
 from padforge.sense.rig.by_hand import record_by_hand, targets_of
-from padforge.sense.rig.config import Setup
-from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.config import RigConfig
+from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.settings import RigSettings
-from padforge.sense.signals.press_detection import Event, Finder
+from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
 from tests.sense.conftest import QUICK
 from tests.sense.rig.fakes import Time
 
 PAD = Morphology.random(3, knots=3, seed=5)
-RIG = RigSettings(presses=6, readings_per_press=16, converter_rate_hz=40.0)
+RIG = RigSettings(presses=6, readings_per_press=16, board_rate_hz=40.0)
 
 
 class Board:
@@ -39,13 +39,13 @@ class Board:
 
     def connect(self) -> dict[str, Any]:
         self._began_s, self._count = self._clock(), 0
-        return {"name": "virtual", "channels": 2 * PAD.grid, "rate_hz": RIG.converter_rate_hz}
+        return {"name": "virtual", "channels": 2 * PAD.grid, "rate_hz": RIG.board_rate_hz}
 
-    def read(self) -> ConverterSamples:
-        count = int((self._clock() - self._began_s) * RIG.converter_rate_hz)
-        times_s = self._began_s + np.arange(self._count + 1, count + 1) / RIG.converter_rate_hz
+    def read(self) -> BoardSamples:
+        count = int((self._clock() - self._began_s) * RIG.board_rate_hz)
+        times_s = self._began_s + np.arange(self._count + 1, count + 1) / RIG.board_rate_hz
         self._count = count
-        return ConverterSamples(times_s, self._finger.volts(times_s), np.zeros(len(times_s), np.int64))
+        return BoardSamples(times_s, self._finger.volts(times_s), np.zeros(len(times_s), np.int64))
 
     def close(self) -> None:
         """Nothing is open."""
@@ -61,8 +61,8 @@ class Hands:
     def __init__(self, folder: Path, finger: type[Finger] = Finger, mishaps: float = 0.0, **settings: Any) -> None:
         rig = RIG.model_copy(update=settings)
         self.out, self.clock = folder / "hand", Time(least_s=0.025)
-        self.finger = finger(PAD, Contact(), rig, rig.converter_rate_hz, mishaps=mishaps)
-        self.setup = Setup(PAD, Contact(), rig, self.out, "test")
+        self.finger = finger(PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
+        self.setup = RigConfig(PAD, Contact(), rig, self.out, "test")
         self.targets = targets_of(self.setup)
         self.told: list[str] = []
         self.views: list[dict[str, Any]] = []
@@ -90,7 +90,7 @@ class Hands:
         """The stroke of each press of a recording that was made at once."""
         zero_s = 100.0 + 1 / RIG.rate_hz
         downs = np.array([stroke.down_s - zero_s for stroke in self.finger.strokes])
-        times_s = recording.times_s[recording.begun]
+        times_s = recording.times_s[recording.down_command]
         return [self.finger.strokes[int(np.argmin(np.abs(downs - time_s)))] for time_s in times_s]
 
     def broken_off(self, done: int, phase: str) -> None:
@@ -142,21 +142,21 @@ def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hand
     off_mm = off_from(recording, strokes)
     assert max(off_mm) < 4 * SCATTER_MM
     assert np.sqrt(np.mean(np.square(off_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
-    held_s = (recording.lifted - recording.begun)[recording.known] / RIG.rate_hz
+    held_s = (recording.up_command - recording.down_command)[recording.known] / RIG.rate_hz
     assert held_s.min() > 0.45
     assert all(line.startswith(("counted: x ", "not counted: it ", "not counted: nothing")) for line in hand.told)
     assert hand.views[-1]["done"] == hand.views[-1]["of"] == 60
 
 
 @pytest.mark.slow
-def test_presses_by_hand_are_learnt_from(clumsy: tuple[Hands, Recording]) -> None:
+def test_presses_by_hand_are_training_recording_sha256(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
     _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     spread_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert document["errors"][0]["mean_mm"] < 0.55 * spread_mm
 
 
-class Turned(Finder):
+class Turned(PressDetector):
     """Takes a slide of the finger in the eighth press for its end, the end for a touch, and so on. Once."""
 
     once = True
@@ -165,19 +165,19 @@ class Turned(Finder):
         super().__init__(fibres)
         self._reading, self._turned, self._touched = 0, False, list[int]()
 
-    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
+    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
         """Of one reading."""
         events = super().feed(times_s, readings)
         self._reading += 1
         self._touched += [event.reading for event in events if event.down]
         if Turned.once and len(self._touched) == 8 and self._reading == self._touched[-1] + 5:
             self._turned, Turned.once = True, False
-            return [Event(False, self._reading - 1)]
-        return [Event(event.down != self._turned, event.reading) for event in events]
+            return [PressEvent(False, self._reading - 1)]
+        return [PressEvent(event.down != self._turned, event.reading) for event in events]
 
 
 def test_a_finder_that_lost_its_way_is_not_believed(hands, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "Finder", Turned)
+    monkeypatch.setattr(session, "PressDetector", Turned)
     hand = hands(presses=14)
     monkeypatch.setattr(hand.finger, "said", list)  # nobody helps
     recording = hand.record()

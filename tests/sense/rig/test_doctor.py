@@ -19,8 +19,8 @@ class Rig:
     def spoil(self, channel, volts) -> None:
         read = self.converter.model.volts
 
-        def spoiled(places_mm, depths_mm):
-            values = read(places_mm, depths_mm)
+        def spoiled(positions_mm, depths_mm):
+            values = read(positions_mm, depths_mm)
             values[:, channel - 1] = volts(values[:, channel - 1])
             return values
 

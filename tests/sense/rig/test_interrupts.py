@@ -8,7 +8,7 @@ import pytest
 
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.rig import operation
-from padforge.sense.rig.config import Setup
+from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import RigFault
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 from tests.sense.rig.test_press_loop import FOUR, run
@@ -80,5 +80,5 @@ def test_a_second_ctrl_c_is_heard_where_the_session_has_done_its_part(
     monkeypatch.setattr(operation, "opened_rig", lambda *setup: rig)
     monkeypatch.setattr(operation, "Session", Interrupted)
     with pytest.raises(KeyboardInterrupt):
-        operation.record("ur5", Setup(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test"))
+        operation.record("ur5", RigConfig(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test"))
     assert heard == [signal.SIGINT] * 2

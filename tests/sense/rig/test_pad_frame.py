@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from padforge.design.twin import PlanTransform as TwinFrame
-from padforge.sense.rig.config import Frame
+from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import RigFault
 from tests.sense.rig.fakes import RIG
 
@@ -17,7 +17,7 @@ from tests.sense.rig.fakes import RIG
 def test_a_pad_turned_to_the_left_has_its_x_axis_along_the_arms_y_axis(mirrored, y_mm):
     """With its tracks up it keeps its y axis, and x runs the other way."""
     lies = {"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2), "mirrored": mirrored}
-    frame = Frame.of(RIG.model_copy(update=lies))
+    frame = RobotFrame.of(RIG.model_copy(update=lies))
     assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, y_mm, 46, 0.1, 3.1, 0.2))
     assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
 
@@ -29,7 +29,9 @@ PLACES = st.lists(st.tuples(NUMBERS, NUMBERS, st.floats(-20, 20)), min_size=1, m
 @given(st.booleans(), st.floats(-360, 360), st.tuples(NUMBERS, NUMBERS), PLACES)
 def test_a_tip_is_where_its_pose_was_asked_for_and_a_twins_frame_says_the_same(mirrored, angle_deg, centre_mm, asked):
     """No length changes, however the pad lies; a twin's frame takes an arm's places that was told nothing of it."""
-    frame = Frame.of(RIG.model_copy(update={"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}))
+    frame = RobotFrame.of(
+        RIG.model_copy(update={"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm})
+    )
     places, depths = np.array(asked)[:, :2], np.array(asked)[:, 2]
     poses = np.array([frame.pose(place, depth) for place, depth in zip(places, depths, strict=True)])
     np.testing.assert_allclose(np.hypot(*(poses[:, :2] - centre_mm).T), np.hypot(*places.T), atol=1e-9)
@@ -43,4 +45,4 @@ def test_a_tip_is_where_its_pose_was_asked_for_and_a_twins_frame_says_the_same(m
 
 def test_an_unknown_height_is_refused():
     with pytest.raises(RigFault, match="contact_mm is unknown"):
-        Frame.of(RIG.model_copy(update={"contact_mm": None}))
+        RobotFrame.of(RIG.model_copy(update={"contact_mm": None}))

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
-from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.press_loop import Averager, Session, require_safe_plan
 from tests.sense.rig.fakes import RIG, FakeArm, FakeConverter, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
-FOUR = PressPlan(PLAN.places_mm[:4], PLAN.depths_mm[:4])
+FOUR = PressPlan(PLAN.positions_mm[:4], PLAN.depths_mm[:4])
 
 
 def rig(**settings):
@@ -48,17 +48,17 @@ def finished(path):
 def test_every_press_of_the_plan_is_recorded_and_lost_samples_leave_a_gap_and_shift_nothing(tmp_path):
     run(tmp_path / "run", *rig())
     recording = Recording.open(tmp_path / "run")
-    assert np.array_equal(recording.presses_mm, PLAN.places_mm)
+    assert np.array_equal(recording.presses_mm, PLAN.positions_mm)
     assert recording.rate_hz == pytest.approx(100, rel=0.01)
     assert np.diff(recording.times_s).max() < 0.011
-    held = recording.lifted - recording.begun
+    held = recording.up_command - recording.down_command
     assert ((held >= 18) & (held <= 24)).all()
-    rest = np.stack([recording.readings[b - 10 : b - 1].mean(axis=0) for b in recording.begun])
-    down = np.stack([recording.readings[u - 6 : u - 1].mean(axis=0) for u in recording.lifted])
+    rest = np.stack([recording.readings[b - 10 : b - 1].mean(axis=0) for b in recording.down_command])
+    down = np.stack([recording.readings[u - 6 : u - 1].mean(axis=0) for u in recording.up_command])
     assert (np.abs(down - rest).max(axis=1) > 0.02).all()
     journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in journal if event["event"] == "done"])
-    assert reached == pytest.approx(np.column_stack([PLAN.places_mm, PLAN.depths_mm]), abs=0.1)
+    assert reached == pytest.approx(np.column_stack([PLAN.positions_mm, PLAN.depths_mm]), abs=0.1)
     arm, converter, options = rig()
     arm.hook = lambda arm: setattr(converter, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
     run(tmp_path / "lost", arm, converter, options)
@@ -79,10 +79,10 @@ def test_a_press_begins_with_the_first_reading_after_the_command(tmp_path):
         move(pose, speed_mm_s, acceleration_mm_s2)
 
     arm.move = noted
-    options = RIG.model_copy(update={"rate_hz": 128, "converter_rate_hz": 128})
+    options = RIG.model_copy(update={"rate_hz": 128, "board_rate_hz": 128})
     run(tmp_path / "run", arm, FakeConverter(arm, options), options, FOUR)
     recording = Recording.open(tmp_path / "run")
-    assert recording.times_s[recording.begun] - downs == pytest.approx(1 / 128)
+    assert recording.times_s[recording.down_command] - downs == pytest.approx(1 / 128)
 
 
 def test_a_dry_run_never_touches_the_pad_and_lifts_a_tool_that_was_left_on_it(tmp_path):
@@ -119,7 +119,7 @@ def test_nothing_moves_before_all_is_safe(tmp_path, settings, plan, arm_is, said
 
 def test_a_steered_plan_is_checked_before_its_next_press(tmp_path):
     arm, converter, options = rig()
-    astray = PressPlan(PLAN.places_mm + 150.0, PLAN.depths_mm)
+    astray = PressPlan(PLAN.positions_mm + 150.0, PLAN.depths_mm)
     with recorder(tmp_path / "run") as keep:
         session = Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep)
         with pytest.raises(RigFault, match="x 150 mm"):
@@ -146,7 +146,7 @@ def test_a_fault_of_the_arm_loses_no_finished_press(tmp_path, moment_s, what):
     done = finished(tmp_path / "run")
     arm, converter, options = rig()
     run(tmp_path / "run", arm, converter, options, FOUR)
-    assert np.array_equal(Recording.open(tmp_path / "run").presses_mm, FOUR.places_mm)
+    assert np.array_equal(Recording.open(tmp_path / "run").presses_mm, FOUR.positions_mm)
     assert len(arm.moves) == 3 * (len(FOUR) - done)
 
 
@@ -284,7 +284,7 @@ def test_what_came_before_a_recording_goes_on_is_none_of_it(tmp_path):
     for presses in (1, 2):
         arm, converter, options = rig()
         arm.time.sleep(3.0)
-        run(tmp_path / "run", arm, converter, options, PressPlan(PLAN.places_mm[:presses], PLAN.depths_mm[:presses]))
+        run(tmp_path / "run", arm, converter, options, PressPlan(PLAN.positions_mm[:presses], PLAN.depths_mm[:presses]))
     recording = Recording.open(tmp_path / "run")
     assert recording.times_s[0] < 0.05
     assert np.sort(np.diff(recording.times_s))[-2:] == pytest.approx([0.01, 1.01], abs=0.02)
@@ -294,7 +294,7 @@ def test_depth_and_force_of_a_held_press_are_kept(tmp_path):
     """Of an arm without a sensor, which moves once it is said that nobody watches, there is no force."""
     arm, converter, options = rig()
     arm.hook = lambda arm: setattr(arm, "force_n", -7.5 if arm.pose[2] <= 46.001 else 0.0)
-    plan = PressPlan(PLAN.places_mm[:2], np.array([4.0, 5.0]))
+    plan = PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0]))
     run(tmp_path / "run", arm, converter, options, plan)
     recording = Recording.open(tmp_path / "run")
     assert recording.depths_mm.tolist() == [4.0, 5.0]
@@ -315,7 +315,7 @@ def test_readings_are_means_of_whole_stretches_whatever_the_pieces(ratio, count,
     cuts = sorted(data.draw(st.lists(st.integers(0, len(kept)), max_size=6)))
     averager = Averager(ratio, 2)
     pieces = [
-        averager.feed(ConverterSamples(whole[0][a:b], whole[1][a:b], whole[2][a:b]))
+        averager.feed(BoardSamples(whole[0][a:b], whole[1][a:b], whole[2][a:b]))
         for a, b in zip([0, *cuts], [*cuts, len(kept)], strict=True)
     ]
     times, volts = (np.concatenate(column) for column in zip(*pieces, strict=True))

@@ -12,7 +12,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START
-from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.streams import RECORDED, connected, lies_mirrored, replayed, simulated
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
@@ -52,11 +52,11 @@ def test_samples_are_averaged_to_the_rate_of_the_localizer(still: Time) -> None:
         def connect(self) -> dict:
             return {"channels": 2, "rate_hz": 1000.0}
 
-        def read(self) -> ConverterSamples:
+        def read(self) -> BoardSamples:
             if still() > 102:
                 raise RigFault("lost", "the board is gone")
             times_s = np.arange(still(), still() + 0.01, 0.001)[:10]
-            return ConverterSamples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
+            return BoardSamples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
 
         def close(self) -> None:
             pass

@@ -12,7 +12,7 @@ from padforge.design import Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import Counts
 from padforge.sense import Recording, RigSettings, import_mat, simulate
-from padforge.sense.signals.press_detection import Finder, Presses, as_commanded, as_detected, find_presses
+from padforge.sense.signals.press_detection import PressDetector, Presses, as_commanded, as_detected, detect_presses
 from padforge.sense.simulation.pad_model import Divider
 
 RATE_HZ = 14.0
@@ -26,13 +26,13 @@ Spans = list[tuple[float, float]]
 
 def score(presses: Presses, recording: Recording) -> tuple[float, float, np.ndarray, np.ndarray]:
     """Shares of presses found, and of false ones; offsets of touches and releases from their commands, readings."""
-    begun, lifted = recording.begun, recording.lifted
-    of = np.searchsorted(begun - EARLY, presses.touched, side="right") - 1
-    inside = (of >= 0) & (presses.touched < lifted[of])
+    down_command, up_command = recording.down_command, recording.up_command
+    of = np.searchsorted(down_command - EARLY, presses.touched, side="right") - 1
+    inside = (of >= 0) & (presses.touched < up_command[of])
     found, first = np.unique(of[inside], return_index=True)
-    touches = presses.touched[inside][first] - begun[found]
-    releases = presses.released[inside][first] - lifted[found]
-    return len(found) / len(begun), (len(presses.touched) - len(found)) / len(begun), touches, releases
+    touches = presses.touched[inside][first] - down_command[found]
+    releases = presses.released[inside][first] - up_command[found]
+    return len(found) / len(down_command), (len(presses.touched) - len(found)) / len(down_command), touches, releases
 
 
 def test_presses_of_the_published_recording_are_found(published: Path) -> None:
@@ -40,17 +40,17 @@ def test_presses_of_the_published_recording_are_found(published: Path) -> None:
     # converter, root of the sum of squares. Touches show 2.2 (spread 1.0) readings after the first that followed their
     # command, releases 0.5.
     recording = import_mat(published / "para5_long_first4500.mat")
-    presses = find_presses(recording.readings, recording.times_s)
+    presses = detect_presses(recording.readings, recording.times_s)
     found, false, touches, releases = score(presses, recording)
     assert found >= 0.995
     assert false <= 0.002
     assert np.median(touches) == 2
     assert touches.std() < 1.2
     assert np.mean(np.abs(releases - 0.5) <= 1.5) > 0.995
-    begun, lifted = as_commanded(presses, recording.times_s)
-    of = np.searchsorted(recording.begun - EARLY, presses.touched, side="right") - 1
-    assert abs(np.mean(begun - recording.begun[of])) < 0.5
-    assert abs(np.median(lifted - recording.lifted[of])) < 1
+    down_command, up_command = as_commanded(presses, recording.times_s)
+    of = np.searchsorted(recording.down_command - EARLY, presses.touched, side="right") - 1
+    assert abs(np.mean(down_command - recording.down_command[of])) < 0.5
+    assert abs(np.median(up_command - recording.up_command[of])) < 1
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_presses_of_the_published_recording_are_found(published: Path) -> None:
 )
 def test_presses_of_simulated_pads_are_found(grid: Counts, rig: RigSettings) -> None:
     recording = simulate(Morphology.straight(grid), rig)
-    found, false, touches, releases = score(find_presses(recording.readings, recording.times_s), recording)
+    found, false, touches, releases = score(detect_presses(recording.readings, recording.times_s), recording)
     assert found >= 0.985
     assert false <= 0.015
     for offsets in (touches, releases):  # commands take 0.08 to 0.2 s to show, and a look or two of 0.07 s is taken
@@ -117,7 +117,7 @@ def evenly(presses: int, held_s: float, apart_s: float) -> Spans:
 def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> None:
     """A press without an end lasts to the end."""
     times, readings = recorded(spans, rate_hz=rate_hz, ramp_s=ramp_s)
-    touched, released = find_presses(readings, times)
+    touched, released = detect_presses(readings, times)
     assert abs(len(touched) - len(spans)) <= 0.05 * len(spans)
     allowed_s = ramp_s + 2.5 / rate_hz + 2 * LOOK_S
     for told, true in zip((times[touched], np.append(times, np.inf)[released]), zip(*spans, strict=True), strict=True):
@@ -125,7 +125,7 @@ def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> No
         assert np.mean(off < allowed_s) >= 0.95
     if spans[-1][1] - spans[-1][0] >= 1:
         cut = int(np.mean(spans[-1]) * rate_hz)
-        presses = find_presses(readings[:cut], times[:cut])
+        presses = detect_presses(readings[:cut], times[:cut])
         assert presses.released[-1] == as_commanded(presses, times[:cut])[1][-1] == cut
 
 
@@ -144,7 +144,7 @@ def test_noise_is_no_press(fibres: int, sd: float, step: float, rate_hz: float, 
     readings = 2 + sd * np.random.default_rng(seed).standard_normal((5000, fibres))
     readings = np.rint(readings / step) * step if step else readings
     for nothing in (readings, np.full((300, 3), np.nan), np.zeros((1, 3))):
-        assert len(find_presses(nothing, np.arange(len(nothing)) / rate_hz).touched) == 0
+        assert len(detect_presses(nothing, np.arange(len(nothing)) / rate_hz).touched) == 0
 
 
 def spoilt(kind: str, readings: np.ndarray) -> np.ndarray:
@@ -173,16 +173,16 @@ KINDS = ("dead", "missing", "saturating", "breaking", "jumping", "noisy", "growi
 @pytest.mark.parametrize("kind", KINDS)
 def test_presses_are_found_in_spoilt_readings(kind: str) -> None:
     recording = simulate(Morphology.straight(4), RigSettings(presses=300, seed=3))
-    found, false, *_ = score(find_presses(spoilt(kind, recording.readings), recording.times_s), recording)
+    found, false, *_ = score(detect_presses(spoilt(kind, recording.readings), recording.times_s), recording)
     assert found >= 0.98
     assert false <= 0.02
 
 
 @pytest.mark.parametrize("cut", [25, 30])
 def test_a_recording_that_begins_under_a_press_is_set_right(recording: Recording, cut: int) -> None:
-    presses = recording.presses_mm[1:], recording.begun[1:] - cut, recording.lifted[1:] - cut
+    presses = recording.presses_mm[1:], recording.down_command[1:] - cut, recording.up_command[1:] - cut
     later = Recording(recording.readings[cut:], recording.times_s[cut:], *presses)
-    found, false, *_ = score(find_presses(later.readings, later.times_s), later)
+    found, false, *_ = score(detect_presses(later.readings, later.times_s), later)
     assert found >= 0.95
     assert false <= 0.05
 
@@ -191,17 +191,17 @@ def test_a_recording_that_begins_under_a_press_is_set_right(recording: Recording
 @given(cuts=st.lists(st.integers(0, 2000), max_size=20))
 def test_it_does_not_matter_how_readings_are_cut(recording: Recording, cuts: list[int]) -> None:
     readings, times = recording.readings[:2000], recording.times_s[:2000]
-    finder = Finder(recording.fibres)
+    finder = PressDetector(recording.fibres)
     edges = [0, *sorted(cuts), 2000]
     told = [event for first, end in pairwise(edges) for event in finder.feed(times[first:end], readings[first:end])]
-    touched, released = find_presses(readings, times)
+    touched, released = detect_presses(readings, times)
     assert [event.reading for event in told if event.down] == touched.tolist()
     assert [event.reading for event in told if not event.down] == released[released < 2000].tolist()
     assert [event.down for event in told] == [True, False] * (len(told) // 2) + [True] * (len(told) % 2)
 
 
 def test_events_are_told_soon_and_what_is_no_stream_of_readings_is_refused(recording: Recording) -> None:
-    finder = Finder(recording.fibres)
+    finder = PressDetector(recording.fibres)
     lags = [
         at - event.reading
         for at in range(2000)
@@ -212,13 +212,13 @@ def test_events_are_told_soon_and_what_is_no_stream_of_readings_is_refused(recor
     assert np.mean(np.array(lags) <= 2) > 0.95
     for times, readings in ((np.zeros(3), (3, 2)), (np.zeros(2), (3, 4)), (np.zeros((2, 2)), (2, 4))):
         with pytest.raises(InputError, match=r"times have shape .* and readings .*, expected \(n,\) and \(n, 4\)"):
-            Finder(4).feed(times, np.zeros(readings))
+            PressDetector(4).feed(times, np.zeros(readings))
     with pytest.raises(InputError, match="fibres is 0, allowed is a whole number from 1 to 512"):
-        Finder(0)
+        PressDetector(0)
     for value in (np.inf, 1001.0):
         with pytest.raises(InputError, match="readings hold"):
-            Finder(1).feed([0.0], [[value]])
-    finder = Finder(2)
+            PressDetector(1).feed([0.0], [[value]])
+    finder = PressDetector(2)
     finder.feed([0.0, 0.1], np.zeros((2, 2)))
     for again in (0.05, 0.1):
         with pytest.raises(InputError, match=f"times begin at {again} s, expected later than the last reading, 0.1 s"):
@@ -237,8 +237,8 @@ def test_offset_polarity_scale_and_clock_make_no_difference(
     recording: Recording, scale: float, shift: float, start_s: float
 ) -> None:
     readings, times = recording.readings[:2000], recording.times_s[:2000]
-    plain = find_presses(readings, times)
-    other = find_presses(scale * readings + shift, times + start_s)
+    plain = detect_presses(readings, times)
+    other = detect_presses(scale * readings + shift, times + start_s)
     assert len(plain.touched) == 50
     assert np.abs(other.touched - plain.touched).max() <= 1
     assert np.abs(other.released - plain.released).max() <= 1
@@ -255,14 +255,14 @@ def test_presses_found_make_a_recording(gaps: list[int], after: int, rate_hz: fl
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     presses = Presses(edges[::2], edges[1::2])
     times = np.cumsum(np.random.default_rng(seed).exponential(1 / rate_hz, edges[-1] + max(after, 1)) + 1e-4)
-    begun, lifted = as_commanded(presses, times)
-    Recording(np.ones((len(times), 1)), times, np.full((len(begun), 2), np.nan), begun, lifted)
-    assert (begun <= presses.touched).all()
-    assert (lifted <= presses.released).all()
-    assert (lifted > presses.touched).all()
-    waited = begun == np.concatenate([[0], lifted[:-1]]) + 1
-    assert (waited | (times[presses.touched] - times[begun] <= SENT_DOWN_S)).all()
-    assert ((lifted == presses.touched + 1) | (times[presses.released] - times[lifted] <= SENT_UP_S)).all()
+    down_command, up_command = as_commanded(presses, times)
+    Recording(np.ones((len(times), 1)), times, np.full((len(down_command), 2), np.nan), down_command, up_command)
+    assert (down_command <= presses.touched).all()
+    assert (up_command <= presses.released).all()
+    assert (up_command > presses.touched).all()
+    waited = down_command == np.concatenate([[0], up_command[:-1]]) + 1
+    assert (waited | (times[presses.touched] - times[down_command] <= SENT_DOWN_S)).all()
+    assert ((up_command == presses.touched + 1) | (times[presses.released] - times[up_command] <= SENT_UP_S)).all()
 
 
 def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -314,28 +314,32 @@ SCENES = {
 def test_presses_of_scenes_are_found_where_they_always_were(seed: tuple[int, float, int]) -> None:
     """Readings at which presses are dated reach models that were learnt from them: a change is to be meant."""
     times, readings = scene(*seed)
-    found = find_presses(readings, times)
+    found = detect_presses(readings, times)
     assert (len(found.touched), int(found.touched.sum()), int(found.released.sum())) == SCENES[seed]
 
 
 def test_presses_are_aligned_with_what_the_readings_show_of_them_or_stay_as_commanded(recording: Recording) -> None:
-    begun, lifted = as_detected(recording.readings, recording.times_s, recording.begun, recording.lifted)
-    for found, commanded in ((begun, recording.begun), (lifted, recording.lifted)):
+    down_command, up_command = as_detected(
+        recording.readings, recording.times_s, recording.down_command, recording.up_command
+    )
+    for found, commanded in ((down_command, recording.down_command), (up_command, recording.up_command)):
         off = found - commanded
         assert np.abs(off).max() <= 6
         assert 0 < np.abs(off).mean() < 3  # the simulated probe takes up to 0.35 s to be gone
-    assert (lifted > begun).all()
-    assert (begun[1:] >= lifted[:-1]).all()
+    assert (up_command > down_command).all()
+    assert (down_command[1:] >= up_command[:-1]).all()
     silent = recording.readings.copy()
-    first, last = int(recording.begun[10]) - 3, int(recording.begun[12]) - 10
+    first, last = int(recording.down_command[10]) - 3, int(recording.down_command[12]) - 10
     silent[first:last] = silent[first - 1]
-    begun, lifted = as_detected(silent, recording.times_s, recording.begun, recording.lifted)
-    np.testing.assert_array_equal(begun[10:12], recording.begun[10:12])
-    np.testing.assert_array_equal(lifted[10:11], recording.lifted[10:11])
+    down_command, up_command = as_detected(silent, recording.times_s, recording.down_command, recording.up_command)
+    np.testing.assert_array_equal(down_command[10:12], recording.down_command[10:12])
+    np.testing.assert_array_equal(up_command[10:11], recording.up_command[10:11])
     held = recording.readings.copy()
-    first, last = int(recording.lifted[20]) - 2, int(recording.begun[21]) + 10
+    first, last = int(recording.up_command[20]) - 2, int(recording.down_command[21]) + 10
     held[first:last] = held[first - 1]  # two presses show as one, which is neither of them
-    begun, lifted = as_detected(held, recording.times_s, recording.begun, recording.lifted)
-    np.testing.assert_array_equal((begun[20], lifted[20]), (recording.begun[20], recording.lifted[20]))
-    flat = as_detected(np.ones_like(silent), recording.times_s, recording.begun, recording.lifted)
-    np.testing.assert_array_equal(flat, (recording.begun, recording.lifted))
+    down_command, up_command = as_detected(held, recording.times_s, recording.down_command, recording.up_command)
+    np.testing.assert_array_equal(
+        (down_command[20], up_command[20]), (recording.down_command[20], recording.up_command[20])
+    )
+    flat = as_detected(np.ones_like(silent), recording.times_s, recording.down_command, recording.up_command)
+    np.testing.assert_array_equal(flat, (recording.down_command, recording.up_command))

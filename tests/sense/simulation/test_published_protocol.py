@@ -30,8 +30,8 @@ STILL: dict[str, Any] = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hyster
 def test_it_has_the_published_form_and_presses_no_more_than_is_sensed() -> None:
     recording = simulate(PAD, RigSettings(presses=400))
     assert recording.readings.shape == (16_000, 8)
-    assert np.array_equal(recording.begun, 40 * np.arange(400) + 20)
-    assert np.array_equal(recording.lifted, recording.begun + 20)
+    assert np.array_equal(recording.down_command, 40 * np.arange(400) + 20)
+    assert np.array_equal(recording.up_command, recording.down_command + 20)
     assert np.abs(recording.presses_mm).max() <= 22.5
     assert np.abs(recording.presses_mm).max(axis=0).min() > 21
     assert recording.rate_hz == pytest.approx(13.3, rel=0.02)

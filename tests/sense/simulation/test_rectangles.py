@@ -8,7 +8,8 @@ import pytest
 
 from padforge.design import Morphology
 from padforge.design.settings import PadSettings
-from padforge.sense import Localizer, Recording, calibrate, evaluate, locate
+from padforge.sense import Recording, calibrate, evaluate
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import told_pad
 from padforge.sense.rig.streams import simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
@@ -17,7 +18,7 @@ from padforge.sense.simulation.simulated_recording import simulate
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
 PAD = Morphology.random(SIZE.layout, knots=3, seed=2)
-QUICK = LocalizerSettings(members=1, hidden=32, layers=2, epochs=20, batch=64, lost=1)
+QUICK = LocalizerSettings(members=1, hidden=32, layers=2, epochs=20, batch=64, max_failures=1)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def calibrated(recording: Recording) -> tuple[Localizer, dict]:
+def calibrated(recording: Recording) -> tuple[LocalizerModel, dict]:
     return calibrate(recording, QUICK)
 
 
@@ -42,15 +43,15 @@ def test_a_recording_says_which_pad_it_is_of(recording: Recording, tmp_path: Pat
     assert json.dumps(told_pad(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
 
 
-def test_places_are_found_in_mm(recording: Recording, calibrated: tuple[Localizer, dict]) -> None:
+def test_places_are_found_in_mm(recording: Recording, calibrated: tuple[LocalizerModel, dict]) -> None:
     localizer, document = calibrated
-    found = locate(localizer, recording)
-    off = np.linalg.norm(found.places_mm - recording.presses_mm, axis=1)
+    found = localizer.predict(recording)
+    off = np.linalg.norm(found.positions_mm - recording.presses_mm, axis=1)
     assert off.mean() < 3.0  # of a pad of 24 by 60 mm
-    test = np.array(document["test"]["pressed_mm"]) - document["test"]["found_mm"]
+    test = np.array(document["test"]["pressed_mm"]) - document["test"]["predicted_mm"]
     assert document["errors"][0]["mean_mm"] == pytest.approx(np.linalg.norm(test, axis=1).mean(), rel=1e-6)
     rows = evaluate(localizer, recording, levels=(0, 1))["errors"]
-    assert [row["lost"] for row in rows] == [0, 1]
+    assert [row["n_failed"] for row in rows] == [0, 1]
     within = [np.mean(off <= radius) for radius in (found.r50_mm, found.r90_mm)]
     assert within == pytest.approx([0.5, 0.9], abs=0.2)
 
@@ -61,9 +62,9 @@ def test_a_strip_finds_what_its_fibres_tell(counts: tuple[int, int]) -> None:
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 8.0))
     recording = simulate(Morphology.straight(size.layout), RigSettings(presses=200, seed=1), size=size)
     localizer, document = calibrate(recording, QUICK)
-    off = np.abs(locate(localizer, recording).places_mm - recording.presses_mm).mean(axis=0) / 4.0
+    off = np.abs(localizer.predict(recording).positions_mm - recording.presses_mm).mean(axis=0) / 4.0
     along, across = off if counts[0] else off[::-1]
     assert along > 0.15  # 4 mm are pressed, whose middle is off by a quarter of them
     assert sum(counts) == 1 or across < 0.25
     # nothing is left to locate by where all fibres are lost
-    assert [row["lost"] for row in document["errors"]] == ([0, 1] if sum(counts) > 1 else [0])
+    assert [row["n_failed"] for row in document["errors"]] == ([0, 1] if sum(counts) > 1 else [0])

@@ -111,6 +111,6 @@ def test_few_presses_and_channels_that_miss_readings_or_never_change_tell_nothin
     recording = simulate(PAD, RigSettings(presses=200))
     spoilt = np.column_stack([recording.readings, np.full(len(recording.readings), 1.5), recording.readings[:, 0]])
     spoilt[1000, 5] = np.nan
-    presses = {name: getattr(recording, name) for name in ("presses_mm", "begun", "lifted")}
+    presses = {name: getattr(recording, name) for name in ("presses_mm", "down_command", "up_command")}
     assert strengths(Recording(spoilt, recording.times_s, **presses)) == strengths(recording)
     assert strengths(Recording(spoilt[:, 4:], recording.times_s, **presses)) == {}

@@ -34,8 +34,10 @@ def recorded() -> Recording:
 
 def begin(recording: Recording, presses: int) -> Recording:
     """The first presses of a recording."""
-    end = int(recording.lifted[presses - 1])
-    first = {name: getattr(recording, name)[:presses] for name in ("presses_mm", "begun", "lifted", "depths_mm")}
+    end = int(recording.up_command[presses - 1])
+    first = {
+        name: getattr(recording, name)[:presses] for name in ("presses_mm", "down_command", "up_command", "depths_mm")
+    }
     return replace(recording, readings=recording.readings[:end], times_s=recording.times_s[:end], **first)
 
 
@@ -67,9 +69,9 @@ def test_values_are_the_readings_10_30_and_50_of_the_cycle_and_of_a_short_one_st
     assert taken.shape == (CYCLES, 2, 3)
     np.testing.assert_array_equal(taken[1], [[50, 70, 90], [-50, -70, -90]])
     np.testing.assert_array_equal(taken[-1, 0], [170, 190, 199])  # nothing was read after the last press
-    begun, lifted = np.array([3, 9, 15]), np.array([6, 12, 18])
+    down_command, up_command = np.array([3, 9, 15]), np.array([6, 12, 18])
     np.testing.assert_array_equal(
-        values(np.arange(20.0)[:, None], begun, lifted)[:, 0], [[0, 5, 8], [6, 11, 14], [12, 17, 19]]
+        values(np.arange(20.0)[:, None], down_command, up_command)[:, 0], [[0, 5, 8], [6, 11, 14], [12, 17, 19]]
     )
 
 

@@ -11,7 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Localizer, Recording, evaluate
+from padforge.sense import Recording, evaluate
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings as Options
 from padforge.sense.studies import fibre_loss as fibre_loss_figure
 from padforge.sense.studies import fibre_loss as loss_study
@@ -31,35 +32,40 @@ def mean_of(part: dict) -> float:
     return float(np.average([cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells]))
 
 
-def test_one_network_is_judged_as_by_evaluate(localizer: Localizer, recording: Recording) -> None:
-    document, expected = fibre_loss_study(recording, localizer, lost=2), evaluate(localizer, recording, (0, 1, 2))
+def test_one_network_is_judged_as_by_evaluate(localizer: LocalizerModel, recording: Recording) -> None:
+    document, expected = (
+        fibre_loss_study(recording, localizer, max_failures=2),
+        evaluate(localizer, recording, (0, 1, 2)),
+    )
     assert list(document["ways"]) == [ONE]
     way = document["ways"][ONE]
     assert (way["errors"], way["by_subset"]) == (expected["errors"], expected["by_subset"])
-    assert way["maps"][0] == {"lost": [], "by_place": expected["by_place"]}
-    worst = max((each for each in expected["by_subset"] if len(each["lost"]) == 2), key=lambda each: each["mean_mm"])
-    assert way["maps"][2]["lost"] == worst["lost"]
+    assert way["maps"][0] == {"failed": [], "by_place": expected["by_place"]}
+    worst = max((each for each in expected["by_subset"] if len(each["failed"]) == 2), key=lambda each: each["mean_mm"])
+    assert way["maps"][2]["failed"] == worst["failed"]
     assert mean_of(way["maps"][2]) == pytest.approx(worst["mean_mm"])
     assert document["test_presses"] == expected["test_presses"]
 
 
-def test_both_ways_stand_side_by_side_and_a_chosen_set_is_mapped(localizer: Localizer, recording: Recording) -> None:
+def test_both_ways_stand_side_by_side_and_a_chosen_set_is_mapped(
+    localizer: LocalizerModel, recording: Recording
+) -> None:
     """Of more fibres, too, than are lost in the errors."""
-    document = fibre_loss_study(recording, localizer, retrain=True, lost=1, failed=(3, 1, 3))
-    plain = fibre_loss_study(recording, localizer, retrain=True, lost=1)
+    document = fibre_loss_study(recording, localizer, retrain=True, max_failures=1, failed=(3, 1, 3))
+    plain = fibre_loss_study(recording, localizer, retrain=True, max_failures=1)
     assert list(document["ways"]) == [ONE, MANY]
     for name, way in document["ways"].items():
         assert [row["subsets"] for row in way["errors"]] == [1, 4]
-        assert [each["lost"] for each in way["by_subset"]] == [[], [0], [1], [2], [3]]
+        assert [each["failed"] for each in way["by_subset"]] == [[], [0], [1], [2], [3]]
         *worst, chosen = way["maps"]
-        assert chosen["lost"] == [1, 3]
+        assert chosen["failed"] == [1, 3]
         assert {**way, "maps": worst} == plain["ways"][name]
     assert document["test_presses"] == len(localizer.test)
     assert document["training_presses"] == 300 - len(localizer.test)
     json.dumps(document, allow_nan=False)
     assert len(loss_study.fibre_loss_lines(document)) == 6
     expected = evaluate(localizer, recording, (2,))["by_subset"]
-    (mean_mm,) = (each["mean_mm"] for each in expected if each["lost"] == [1, 3])
+    (mean_mm,) = (each["mean_mm"] for each in expected if each["failed"] == [1, 3])
     assert mean_of(document["ways"][ONE]["maps"][-1]) == pytest.approx(mean_mm)
     for failed, message in (
         ((4,), "failed fibre is 4, allowed is a whole number from 0 to 3"),
@@ -71,14 +77,14 @@ def test_both_ways_stand_side_by_side_and_a_chosen_set_is_mapped(localizer: Loca
 
 def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recording: Recording) -> None:
     def retrained(changed: Recording) -> dict:
-        return fibre_loss_study(changed, retrain=True, lost=1)["ways"][MANY]
+        return fibre_loss_study(changed, retrain=True, max_failures=1)["ways"][MANY]
 
     plain = retrained(recording)
     spoilt = recording.readings.copy()
     spoilt[:, 2] = np.random.default_rng(1).uniform(0, 3, len(spoilt))
     deaf = retrained(replace(recording, readings=spoilt))
     for each, other in zip(plain["by_subset"], deaf["by_subset"], strict=True):
-        assert (each["mean_mm"] == other["mean_mm"]) == (each["lost"] == [2])
+        assert (each["mean_mm"] == other["mean_mm"]) == (each["failed"] == [2])
     test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
     far = recording.presses_mm.copy()
     far[test] = 2e4  # whoever had learnt from one of them would find all of it elsewhere
@@ -109,7 +115,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
 
 
 def test_broken_off_work_goes_on_and_gives_the_same(recording: Recording, tmp_path: Path, trained: list) -> None:
-    wanted = {"retrain": True, "lost": 1, "failed": (0, 1)}
+    wanted = {"retrain": True, "max_failures": 1, "failed": (0, 1)}
     whole = fibre_loss_study(recording, **wanted)
     kept = tmp_path / "unfinished"
     with pytest.raises(KeyboardInterrupt):
@@ -117,7 +123,7 @@ def test_broken_off_work_goes_on_and_gives_the_same(recording: Recording, tmp_pa
     finished = len(list(kept.glob("start_*.npz")))
     assert finished >= 2
     with pytest.raises(InputError, match="begun with fibre-loss"):
-        fibre_loss_study(recording, retrain=True, lost=1, options=Options(seed=1), keep_in=kept)
+        fibre_loss_study(recording, retrain=True, max_failures=1, options=Options(seed=1), keep_in=kept)
     trained.clear()
     for _ in range(2):
         assert fibre_loss_study(recording, **wanted, keep_in=kept) == whole
@@ -127,7 +133,7 @@ def test_broken_off_work_goes_on_and_gives_the_same(recording: Recording, tmp_pa
 
 
 @pytest.fixture
-def here(localizer: Localizer, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def here(localizer: LocalizerModel, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The current folder holds a `model` and a recording `rec`."""
     localizer.save(tmp_path / "model")
     recording.save(tmp_path / "rec", {})
@@ -140,8 +146,8 @@ def loss(*arguments: str) -> Ended:
 
 @pytest.mark.usefixtures("here")
 def test_the_command_writes_a_document_and_a_figure() -> None:
-    ended = loss("--model", "model", "--retrain", "--lost", "1", "--failed", "2,4", "--out", "out", "--json")
-    assert (ended.code, json.loads(ended.out)["ways"][ONE]["maps"][-1]["lost"]) == (0, [1, 3])
+    ended = loss("--model", "model", "--retrain", "--max-failures", "1", "--failed", "2,4", "--out", "out", "--json")
+    assert (ended.code, json.loads(ended.out)["ways"][ONE]["maps"][-1]["failed"]) == (0, [1, 3])
     assert json.loads(ended.out) == json.loads(Path("out", "fibre_loss.json").read_text())
     assert Path("out", "fibre_loss.png").read_bytes()[:4] == b"\x89PNG"
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
@@ -160,7 +166,7 @@ def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatc
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    command = ("--retrain", "--lost", "1", "--out", "out")
+    command = ("--retrain", "--max-failures", "1", "--out", "out")
     with monkeypatch.context() as broken:
         broken.setattr("padforge.sense.studies.fibre_loss.draw_fibre_loss", full)
         ended = loss(*command)
@@ -175,9 +181,9 @@ def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatc
 def test_maps_of_errors_have_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Figure] = []
     monkeypatch.setattr(fibre_loss_figure, "save_figure", lambda figure, path: drawn.append(figure))
-    errors = {"errors": [{"lost": 0, "subsets": 1, "mean_mm": 1.0}], "by_subset": [{"lost": [], "mean_mm": 1.0}]}
+    errors = {"errors": [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}], "by_subset": [{"failed": [], "mean_mm": 1.0}]}
     cells = [{"x_mm": 0.0, "y_mm": y_mm, "mean_mm": mean_mm} for y_mm, mean_mm in ((-5.0, 1.0), (5.0, 9.0))]
-    ways = {"one network": errors | {"maps": [{"lost": [], "by_place": cells}]}}
+    ways = {"one network": errors | {"maps": [{"failed": [], "by_place": cells}]}}
     fibre_loss_figure.draw_fibre_loss({"ways": ways, "test_presses": 2}, Path("none.png"))
     (image,) = (image for axes in drawn[0].axes for image in axes.images)
     assert image.origin == "lower"

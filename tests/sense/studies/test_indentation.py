@@ -42,7 +42,7 @@ def test_depth_and_force_are_found_better_than_guessed_and_noise_costs_accuracy(
     expected = [(label, noise) for label in PADS for noise in (1.0, 30.0)]
     assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == expected
     curve, row, press = force["curves"][0], force["rows"][0], Indenter()
-    made, found = (press.force_n(np.array(curve[key]) / 11.25, 11.25) for key in ("pressed_mm", "found_mm"))
+    made, found = (press.force_n(np.array(curve[key]) / 11.25, 11.25) for key in ("pressed_mm", "predicted_mm"))
     assert np.abs(found - made).mean() == pytest.approx(row["force_n"], rel=1e-3)
     assert len(curve["place_mm"]) == len(curve["middles_mm"])
 

@@ -27,7 +27,7 @@ from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 LEAST: dict[str, Callable[[], Study]] = {
-    "robustness": lambda: robustness_study(PADS, lost=1, hidden=4, presses=16, test=20),
+    "robustness": lambda: robustness_study(PADS, max_failures=1, hidden=4, presses=16, test=20),
     "drift": lambda: drift.drift_study(
         *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
         **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},

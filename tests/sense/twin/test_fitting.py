@@ -26,9 +26,9 @@ def fitted(start, answers):
 
 def test_a_fit_explains_fresh_presses_and_is_nearer_to_the_truth_than_the_plan_is(printed, start, fitted, answers):
     fresh = responses_of(printed, 300, seed=1)
-    explained = fresh.explained(fitted.pad.predict(fresh.places_mm))
+    explained = fresh.explained(fitted.pad.predict(fresh.positions_mm))
     assert explained.min() > 0.97
-    assert explained.mean() > fresh.explained(fit(start, fresh, Freedom()).pad.predict(fresh.places_mm)).mean()
+    assert explained.mean() > fresh.explained(fit(start, fresh, Freedom()).pad.predict(fresh.positions_mm)).mean()
     off, planned = [], []
     for channel, fibre in enumerate(fitted.pad.fibres):
         plan = fitted.pad.plan
@@ -65,7 +65,7 @@ def test_share_common_and_floor_of_the_scatter_are_found(printed, fitted, share,
     gain = 1 + share * (np.sqrt(1 - common) * own + np.sqrt(common) * shared)
     volts = exact.volts * gain + floor * full_scale * rng.standard_normal(exact.volts.shape)
     noise_v = (volts - exact.volts).std(axis=0)
-    found = response_scatter(fitted.pad, Responses(exact.places_mm, volts, exact.there), noise_v)
+    found = response_scatter(fitted.pad, Responses(exact.positions_mm, volts, exact.there), noise_v)
     assert found.share == pytest.approx(share, abs=0.03)
     # a floor far below what grows is hidden by it, but never mistaken for much
     assert found.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35, abs=0.25 * noise_v.mean())
@@ -101,7 +101,7 @@ def test_channels_and_frame_are_found_first_of_all(printed, answers, missing) ->
     if missing:
         volts, there = answers.volts.copy(), answers.there.copy()
         volts[::3, 0], there[::3, 0] = 5.0, False
-        answers = Responses(answers.places_mm, volts, there)
+        answers = Responses(answers.positions_mm, volts, there)
     found = wirings(PadPlan.of(PLAN), answers, np.random.default_rng(0))[0]
     assert found.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
     assert found.frame.mirrored

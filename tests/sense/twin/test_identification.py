@@ -66,10 +66,10 @@ def test_the_pad_is_found_and_its_twin_answers_as_was_measured(printed: Twin, fo
             # within a press comes on top
             assert 0.8 * true.noise_v < channel.noise_v < 3 * true.noise_v
     twin, presses = found.twin(), found.held_out
-    signals = twin.as_built_stretch(presses.places_mm)
+    signals = twin.as_built_stretch(presses.positions_mm)
     columns = [(twin.channels[channel].gain_v, twin.channels[channel].fibre) for channel in found.live]
     told = np.column_stack([gain * signals[:, fibre] for gain, fibre in columns])
-    fitted = found.fit.pad.predict(presses.places_mm) - found.fit.pad.own[:, 1]
+    fitted = found.fit.pad.predict(presses.positions_mm) - found.fit.pad.own[:, 1]
     assert told == pytest.approx(fitted, abs=0.05 * np.abs(fitted).max())
 
 

@@ -13,11 +13,12 @@ from padforge.sense.twin.as_built import information, of_one_depth, responses
 QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
 
 
-def known_information(twin: Twin, places_mm: np.ndarray) -> np.ndarray:
+def known_information(twin: Twin, positions_mm: np.ndarray) -> np.ndarray:
     """(C',) 1/mm^2 of the live channels: squares of how answers change with the place, over their noise."""
     live = [channel for channel in twin.channels if channel.fibre is not None]
     steps = [
-        twin.as_built_stretch(places_mm + step) - twin.as_built_stretch(places_mm - step) for step in 0.5 * np.eye(2)
+        twin.as_built_stretch(positions_mm + step) - twin.as_built_stretch(positions_mm - step)
+        for step in 0.5 * np.eye(2)
     ]
     slopes = np.sum(np.square(steps), axis=0).mean(axis=0)
     return np.array([slopes[c.fibre] * (c.gain_v / c.noise_v) ** 2 for c in live])
@@ -46,8 +47,8 @@ def test_presses_tell_what_their_answers_tell_of_channels_that_are_there(noisy: 
     assert found == pytest.approx(known, rel=0.6)
     channel = next(c.channel for c in noisy.channels if c.fibre is not None)
     readings = np.array(recording.readings)
-    readings[: recording.begun[300], channel] = np.nan
-    presses = {name: getattr(recording, name) for name in ("presses_mm", "begun", "lifted")}
+    readings[: recording.down_command[300], channel] = np.nan
+    presses = {name: getattr(recording, name) for name in ("presses_mm", "down_command", "up_command")}
     spoilt = Recording(readings, recording.times_s, **presses)
     only = np.array([channel])
     assert information(spoilt, only) == pytest.approx(information(recording, only), rel=0.35)
@@ -57,7 +58,7 @@ def test_an_answer_is_what_is_held_less_the_rest_and_short_presses_tell_of_their
     """Readings of 2 V, of 5 V while the tip comes to rest, and of 3 V then."""
     recording = simulate(Morphology.straight(2), RigSettings(presses=80, seed=0))
     readings = np.full_like(recording.readings, 2.0)
-    for down, up in zip(recording.begun, recording.lifted, strict=True):
+    for down, up in zip(recording.down_command, recording.up_command, strict=True):
         readings[down : down + 4], readings[down + 4 : up] = 5.0, 3.0
     found = responses(replace(recording, readings=readings), np.arange(80) < 60)
     np.testing.assert_allclose(found.volts, 1.0, atol=0.02)  # of which memory takes a little

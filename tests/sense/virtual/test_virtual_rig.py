@@ -23,7 +23,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig.arms.rtde import RTDE_PORT
 from padforge.sense.rig.boards import board_reader as block_reader
-from padforge.sense.rig.config import Frame, Setup
+from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.operation import look_over
 from padforge.sense.rig.press_loop import HEIGHT_MM, Report, Session
@@ -133,11 +133,11 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 def assert_whole(run: Path, plan: PressPlan, within_mm: float = 0.1) -> None:
     """All presses are there, where and as deep as planned, without a gap, and the fibres felt each."""
     recording = Recording.open(run)
-    assert np.array_equal(recording.presses_mm, plan.places_mm)
+    assert np.array_equal(recording.presses_mm, plan.positions_mm)
     events = [json.loads(line) for line in (run / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in events if event["event"] == "done"])
-    assert reached == pytest.approx(np.column_stack([plan.places_mm, plan.depths_mm]), abs=within_mm)
-    spans = list(zip(recording.begun, recording.lifted, strict=True))
+    assert reached == pytest.approx(np.column_stack([plan.positions_mm, plan.depths_mm]), abs=within_mm)
+    spans = list(zip(recording.down_command, recording.up_command, strict=True))
     rest = [recording.readings[max(b - 4, 0) : b - 1].mean(axis=0) for b, _ in spans]
     felt = [np.abs(recording.readings[b:u] - rest[press]).max() for press, (b, u) in enumerate(spans)]
     assert min(felt) > 0.01
@@ -155,7 +155,7 @@ def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_
     recording, truth = Recording.open(tmp_path / "run"), rig.robot.truth.rows()
     assert np.diff(recording.times_s).max() < 1.5 / recording.rate_hz
     truth = truth[truth[:, 0] > began]
-    _, depths = Frame.of(ARM).tip(truth[:, 1:4])
+    _, depths = RobotFrame.of(ARM).tip(truth[:, 1:4])
     touched = np.flatnonzero((depths[1:] > 0) & (depths[:-1] <= 0))
     change = np.abs(recording.readings - np.median(recording.readings, axis=0)).max(axis=1) > 2e-3
     onsets = np.flatnonzero(change[1:] & ~change[:-1]) + 1
@@ -173,8 +173,8 @@ def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(rig: Rig,
     assert_whole(tmp_path / "run", plan, 0.06)
     made = rig.robot.firmware.made
     turned = np.array([move.move.at(move.lasted_s) for move in made]) + PRINTER.tcp_mm
-    places, depths = Frame.of(PRINTER).tip(turned)
-    presses = np.column_stack([plan.places_mm, plan.depths_mm])
+    places, depths = RobotFrame.of(PRINTER).tip(turned)
+    presses = np.column_stack([plan.positions_mm, plan.depths_mm])
     assert np.column_stack([places, depths])[depths > 0] == pytest.approx(presses, abs=0.06)
 
 
@@ -238,7 +238,7 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
         said = converter.connect()
         assert said["inputs"] == list(rig.channels)
         volts = np.median(converter.read().volts, axis=0)
-    still = LivePad(pad, PUBLISHED_CONTACT, rig, rig.converter_rate_hz, np.random.default_rng(rig.seed))
+    still = LivePad(pad, PUBLISHED_CONTACT, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
     rests_v = still.volts(np.zeros((1, 2)), np.full(1, -10.0))[0]
     assert volts == pytest.approx(rests_v, abs=3.3 / 4095)
     assert np.unique(volts).size > grid
@@ -246,7 +246,7 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
 
 def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("padforge.sense.rig.doctor.LOOK_S", 0.3)
-    setup = Setup(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
+    setup = RigConfig(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
     found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
     assert found["channel 1"].found.startswith("input 14 rests at")
     assert found["channel 2"].found.startswith("input 3 rests at")
@@ -284,7 +284,7 @@ def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     settings = "\n".join(f"{name} = {value}" for name, value in (QUICK | {"rate_hz": 125.0}).items())
     Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{settings}\n", encoding="utf-8")
-    words = ["sense", "record", "--through-drivers", "--presses", "5", "--out", "run", "--resume"]
+    words = ["sense", "record", "--virtual-hardware", "--presses", "5", "--out", "run", "--resume"]
     journal = Path("run", "journal.ndjson")
     process = subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
     end = time.monotonic() + 60

@@ -68,10 +68,10 @@ def test_a_printer_says_who_it_is_where_its_tip_is_and_how_fast_its_axes_are():
 def test_the_tip_goes_straight_and_its_place_is_known_all_the_way(realtime):
     with connected(realtime=realtime) as (arm, printer):
         arm.drain()
-        begun = time.monotonic()
+        down_command = time.monotonic()
         arm.move(pose(115, 100, 32), 20.0, 500.0)
         assert to_rest(arm).pose == pytest.approx(pose(115, 100, 32), abs=1e-9)
-        assert time.monotonic() - begun == pytest.approx(0.1 + 13.75 / 20 + 20 / 500, abs=0.2)
+        assert time.monotonic() - down_command == pytest.approx(0.1 + 13.75 / 20 + 20 / 500, abs=0.2)
         rows = arm.drain()
         truth = printer.nozzle_at(rows[:, 0]) + TCP
         assert truth[-1] == pytest.approx((115, 100, 32), abs=1e-3)
@@ -86,9 +86,9 @@ def test_a_stop_is_one_at_once_and_the_place_is_known_after_it(emergency_parser)
     with connected(emergency_parser=emergency_parser) as (arm, printer):
         arm.move(pose(110, 110, 20), 20.0, 3000.0)
         time.sleep(0.3)
-        begun = time.monotonic()
+        down_command = time.monotonic()
         arm.stop()
-        assert time.monotonic() - begun < 0.5
+        assert time.monotonic() - down_command < 0.5
         stood = printer.nozzle_at(time.monotonic())[0] + TCP
         assert 27 < stood[2] < 39
         assert arm.state().pose[:3] == pytest.approx(stood, abs=0.01)
@@ -121,14 +121,14 @@ def test_a_stop_that_is_not_confirmed_halts_the_printer_and_a_place_beyond_its_r
         arm.move(pose(110, 110, 10), 10.0, 3000.0)
         time.sleep(0.3)
         printer.busy(10)
-        begun = time.monotonic()
+        down_command = time.monotonic()
         with pytest.raises(RigFault, match="did not confirm the stop, and was told to halt"):
             arm.stop()
         with pytest.raises(RigFault, match="told to halt; see that it stands"):  # whoever looks next is told why
             arm.state()
         time.sleep(0.05)
         assert printer.firmware.halted
-        assert printer.nozzle_at(begun + 0.6)[0] == pytest.approx(printer.nozzle_at(begun + 5)[0])
+        assert printer.nozzle_at(down_command + 0.6)[0] == pytest.approx(printer.nozzle_at(down_command + 5)[0])
     with connected() as (arm, printer):
         with pytest.raises(RigFault, match=r"is about to go to 220\.00, .* but was sent to 230\.00") as fault:
             arm.move(pose(260, 110, 40), 50.0, 3000.0)

@@ -130,7 +130,7 @@ def test_a_controller_that_talks_nonsense_is_an_os_or_value_error(which: int, da
 @settings(max_examples=60)
 @given(st.lists(st.booleans(), min_size=1, max_size=6), DAMAGE)
 def test_what_the_child_of_the_arm_writes_is_read_up_to_where_it_is_damaged(kinds: list[bool], damage) -> None:
-    row = messages.Row._make(np.arange(14.0).tolist())
+    row = messages.StateRow._make(np.arange(14.0).tolist())
     answer = {"id": 1, "is": [1.5, "a"]}
     sent = b"".join(messages.pack_row(row) if kind else messages.pack_answer(answer) for kind in kinds)
 
@@ -145,4 +145,4 @@ def test_what_the_child_of_the_arm_writes_is_read_up_to_where_it_is_damaged(kind
 
     assert read(sent) == [row if kind else answer for kind in kinds]
     for found in read(spoiled(sent, damage)):
-        assert isinstance(found, messages.Row) or json.dumps(found)
+        assert isinstance(found, messages.StateRow) or json.dumps(found)

@@ -58,11 +58,11 @@ def rested_s(robot: UrEmulator) -> float:
 
 def within(seconds: float, call: Callable[..., T], *arguments: object) -> T:
     """The result of a call that may not take longer."""
-    begun = time.monotonic()
+    down_command = time.monotonic()
     try:
         return call(*arguments)
     finally:
-        assert time.monotonic() - begun < seconds
+        assert time.monotonic() - down_command < seconds
 
 
 def fault_of(call: Callable[..., object], *arguments: object, seconds: float = LONGEST_CALL_S) -> str:
@@ -114,10 +114,10 @@ def test_stop(robot: UrEmulator, arm: UR5) -> None:
     begin(arm)
     assert fault_of(arm.move, HOME, 10, 10) == "refused"  # one move at a time
     assert arm.state().moving
-    begun = time.monotonic()
+    down_command = time.monotonic()
     within(REST_S, arm.stop)
     within(REST_S, arm.stop)
-    assert rested_s(robot) < begun + REST_S
+    assert rested_s(robot) < down_command + REST_S
     assert not arm.state().moving
     assert arm.state().speed_mm_s == 0
 
@@ -252,16 +252,16 @@ QUICK = ("protective stop", "stream frozen", "program stopped", "child killed")
 def test_faults_during_a_move(robot: UrEmulator, arm: UR5, name: str) -> None:
     inject, causes, notice_s, cure = FAULTS[name]
     begin(arm)
-    begun = time.monotonic()
+    down_command = time.monotonic()
     inject(robot, arm)
     assert fault_of(wait_until_still, arm, LIMITS, seconds=notice_s) in causes.split()
     with suppress(RigFault):  # there may be nobody to confirm it
         within(REST_S, arm.stop)
-    time.sleep(max(0.0, begun + 0.55 - time.monotonic()))
-    assert rested_s(robot) < begun + REST_S
+    time.sleep(max(0.0, down_command + 0.55 - time.monotonic()))
+    assert rested_s(robot) < down_command + REST_S
     cure(robot)
     time.sleep(0.1)
-    assert rested_s(robot) < begun + REST_S
+    assert rested_s(robot) < down_command + REST_S
     within(LONGEST_CALL_S, arm.connect)
     x, y, z = arm.state().pose[:3]
     go(arm, (x, y, z + 1, *HOME[3:]))
@@ -271,10 +271,10 @@ def test_a_protective_stop_ends_a_move_for_good_though_nobody_looks(robot: UrEmu
     begin(arm)
     robot.protective_stop()
     time.sleep(0.4)
-    begun = time.monotonic()
+    down_command = time.monotonic()
     unlock_and_play(robot)
     time.sleep(0.2)
-    assert rested_s(robot) < begun
+    assert rested_s(robot) < down_command
     arm.connect()
 
 
@@ -285,10 +285,10 @@ def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> No
     robot.protective_stop()
     assert fault_of(wait_until_still, arm, LIMITS, seconds=0.5) == "protective_stop"
     assert fault_of(arm.stop, seconds=REST_S) == "lost"
-    begun = time.monotonic()
+    down_command = time.monotonic()
     unlock_and_play(robot)
     time.sleep(0.7)
-    assert rested_s(robot) < begun + REST_S
+    assert rested_s(robot) < down_command + REST_S
     robot.refuse(False)
     arm.connect()
 
@@ -322,11 +322,11 @@ def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str
         assert program.stdout is not None
         assert program.stdout.readline() == "moving\n"
         time.sleep(0.15)
-        begun = time.monotonic()
+        down_command = time.monotonic()
         program.send_signal(signal.Signals[name])
         time.sleep(0.55)
         program.kill()
-    assert begun < rested_s(robot) < begun + REST_S
+    assert down_command < rested_s(robot) < down_command + REST_S
 
 
 @pytest.mark.slow
@@ -334,9 +334,9 @@ def test_a_program_that_does_not_look(robot: UrEmulator, arm: UR5, monkeypatch: 
     monkeypatch.setattr(ur5_link, "LOOK_S", 0.4)
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    begun = time.monotonic()
+    down_command = time.monotonic()
     time.sleep(1.0)
-    assert begun + 0.4 < rested_s(robot) < begun + 1.0
+    assert down_command + 0.4 < rested_s(robot) < down_command + 1.0
     assert fault_of(arm.state) == "deadline"
 
 

@@ -18,7 +18,7 @@ from padforge.sense.rig.boards import line_board as line_driver
 from padforge.sense.rig.boards.due import Arduino
 from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.boards.line_framing import LineHeader
-from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
@@ -60,11 +60,11 @@ def soon_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(block_reader, "SETTLE_S", 0.15)
 
 
-def joined(*parts: ConverterSamples) -> ConverterSamples:
-    return ConverterSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+def joined(*parts: BoardSamples) -> BoardSamples:
+    return BoardSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
-def read_for(converter: Driver, seconds: float) -> ConverterSamples:
+def read_for(converter: Driver, seconds: float) -> BoardSamples:
     parts, end = [converter.read()], time.monotonic() + seconds
     while time.monotonic() < end:
         time.sleep(0.02)
@@ -73,7 +73,7 @@ def read_for(converter: Driver, seconds: float) -> ConverterSamples:
 
 
 def check(
-    samples: ConverterSamples, board: Board, within_s: float = 0.05, inputs: Sequence[int] = (), step_v: float = STEP_V
+    samples: BoardSamples, board: Board, within_s: float = 0.05, inputs: Sequence[int] = (), step_v: float = STEP_V
 ) -> None:
     """Every reading is what the board read at that index, at the right time.
 
@@ -88,8 +88,8 @@ def check(
     if isinstance(board, EmulatedLineBoard):
         index -= index[0]
         period_s = float(board.truth_s(1) - board.truth_s(0))
-        begun = max(round((samples.times_s[0] - float(board.truth_s(0))) / period_s), 60)
-        near = range(begun - 60, begun + 60)
+        down_command = max(round((samples.times_s[0] - float(board.truth_s(0))) / period_s), 60)
+        near = range(down_command - 60, down_command + 60)
         index += next(first for first in near if worst_v(first + index[:5]) < 0.502 * step_v)
     assert worst_v(index) < 0.502 * step_v
     assert (np.diff(samples.times_s) > 0).all()
@@ -115,9 +115,9 @@ def test_a_second_without_a_gap_right_to_a_step_and_on_time(kind: str, monkeypat
         assert said["rate_hz"] == pytest.approx(1000)
         assert said["inputs"] == list(range(SAYS[kind]["channels"]))
         assert "warning" not in said
-        begun = time.process_time(), time.monotonic()
+        down_command = time.process_time(), time.monotonic()
         samples = read_for(converter, 0.6)
-        share = (time.process_time() - begun[0]) / (time.monotonic() - begun[1])
+        share = (time.process_time() - down_command[0]) / (time.monotonic() - down_command[1])
         assert len(samples.times_s) > 900
         assert not samples.missing.any()
         check(samples, board, within_s=5e-3)
@@ -247,7 +247,7 @@ def test_lines_of_other_columns_are_never_taken_and_told() -> None:
         ("due", {"firmware": (9, 1, 0)}, 1000, {}, r"firmware 9\.1\.0"),
         ("due", {}, 10_000, {"averaging": 16}, "12 channels at 10000 Hz"),
         ("line", {"silent": True}, 1000, {}, "no board that speaks.*baud"),
-        ("line", {}, 500, {}, "takes 1000 samples a second, .rig. says 500; set converter_rate_hz = 1000"),
+        ("line", {}, 500, {}, "takes 1000 samples a second, .rig. says 500; set board_rate_hz = 1000"),
         ("line", {}, 1000, {"inputs": (3, 16)}, "channels: fibre 2 is on input 16, the board has 0 to 15"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 from padforge.sense.rig.boards import line_framing as framing
 from padforge.sense.rig.boards.line_board import LineAssembler, LineReader
 from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, Sample, header_line, sample_line
-from padforge.sense.rig.devices import ConverterSamples
+from padforge.sense.rig.devices import BoardSamples
 from tests.sense.rig.boards.compiling import compiled, sent
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"
@@ -37,7 +37,7 @@ def samples_of(found: list[LineHeader | Sample]) -> list[Sample]:
     return [each for each in found if isinstance(each, Sample)]
 
 
-def taken_of(header: LineHeader, samples: list[Sample]) -> ConverterSamples:
+def taken_of(header: LineHeader, samples: list[Sample]) -> BoardSamples:
     lines = LineReader([each.time_us for each in samples], [each.counts for each in samples])
     return LineAssembler(header, range(header.channels)).samples([(1.0, lines)])
 

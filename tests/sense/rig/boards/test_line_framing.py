@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from padforge.sense.rig.boards import line_framing as framing
 from padforge.sense.rig.boards.line_board import LineAssembler, LineReader
 from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, Sample, header_line, sample_line
-from padforge.sense.rig.devices import ConverterSamples, RigFault
+from padforge.sense.rig.devices import BoardSamples, RigFault
 
 HEADER = LineHeader(500, 12, 3.3, 4, said=(("name", "my-board"),))
 SAMPLES = [Sample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
@@ -139,7 +139,7 @@ def test_a_header_that_cannot_be_is_told(text: str, complaint: str) -> None:
 THREE = LineHeader(1000, 10, 5.0, 3)
 
 
-def read(times_us: list[int] | np.ndarray, assembler: LineAssembler | None = None) -> ConverterSamples:
+def read(times_us: list[int] | np.ndarray, assembler: LineAssembler | None = None) -> BoardSamples:
     """The samples of lines of these times, all come at once; the first count is the number of the line."""
     assembler = assembler or LineAssembler(THREE, (0, 1, 2))
     counts = [(k, 10, 1023) for k in range(len(times_us))]
