@@ -14,12 +14,12 @@ Features = Literal["press_and_release", "causal", "onset", "published"]
 Method = Literal["ensemble", "published"]
 Split = Literal["random", "chronological"]
 
-PLANS = ("uniform", "grid", "boustrophedon", "adaptive")
+PLANS = ("uniform", "grid", "serpentine", "adaptive")
 
 
 def _plan(value: str) -> str:
     if value not in PLANS and not value.lower().endswith(".csv"):
-        raise PydanticCustomError("plan", "expected uniform, grid, boustrophedon, adaptive or a .csv file of places")
+        raise PydanticCustomError("plan", "expected uniform, grid, serpentine, adaptive or a .csv file of places")
     return value
 
 
@@ -51,7 +51,7 @@ class RigSettings(Settings):
     plan: Annotated[str, AfterValidator(_plan)] = Field(
         default="uniform",
         max_length=4096,
-        description="where they go: uniform, grid, boustrophedon, adaptive (by --model), or a .csv file of places",
+        description="where they go: uniform, grid, serpentine, adaptive (by --model), or a .csv file of places",
     )
     rate_hz: float = Field(default=13.3, ge=0.1, le=10_000, description="readings per second")
     readings_per_press: int = Field(

@@ -178,11 +178,11 @@ def _converter(rig: str, model: Path, localizer: "LocalizerModel", spec: Path | 
         from padforge.sense.rig.streams import simulated
 
         return simulated(model)
-    from padforge.sense.rig.devices import device
+    from padforge.sense.rig.devices import load_device
     from padforge.sense.settings import RigSettings
 
     options = load_spec(spec).section(RigSettings)
-    return device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
+    return load_device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
 
 
 def _health(model: Path) -> "HealthModel | None":

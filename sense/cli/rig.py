@@ -1,6 +1,7 @@
-"""`padforge sense record` and `doctor`: the edge where rigs come in."""
+"""The commands `padforge sense record` and `doctor`."""
 
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from padforge.design.twin import Twin
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
+    from padforge.sense.rig.doctor import Diagnosis
+    from padforge.sense.rig.operation import OpenedRig
 
 
 rig_option = click.option(
@@ -24,10 +27,10 @@ rig_option = click.option(
     metavar="NAME",
     default="simulated",
     show_default=True,
-    help="simulated, ur5, printer, hand, or an arm that is installed.",
+    help="simulated, ur5, printer, hand, or an installed arm.",
 )
 _warn = partial(click.echo, err=True)
-drivers_option = click.option(
+virtual_hardware_option = click.option(
     "--virtual-hardware", is_flag=True, help="Emulated devices in real time, behind the drivers of the real ones."
 )
 
@@ -37,15 +40,15 @@ drivers_option = click.option(
 @click.option(
     "--morphology",
     type=FILE,
-    help="morphology.json or published .mat (default: the twin's, or straight fibres; of a real rig, beside --out).",
+    help="morphology.json or published .mat (default: the twin's, or straight fibres; with a real rig, beside --out).",
 )
-@click.option("--twin", type=FILE, help="twin.json of a measured pad, which the simulated pad answers like.")
+@click.option("--twin", type=FILE, help="twin.json of a measured pad, which the simulated pad responds like.")
 @click.option("--presses", type=int, help="Presses to record.")
-@click.option("--plan", help="As [rig] plan: uniform, grid, boustrophedon, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
-@click.option("--model", type=FOLDER, help="Localizer that an adaptive plan is steered by.")
+@click.option("--plan", help="As [rig] plan: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
+@click.option("--model", type=FOLDER, help="Localizer of an adaptive plan.")
 @click.option("--dry-run", is_flag=True, help="Go through the whole plan above the pad, touching nothing.")
-@click.option("--resume", is_flag=True, help="Go on with a recording that was left unfinished.")
-@drivers_option
+@click.option("--resume", is_flag=True, help="Go on with an unfinished recording.")
+@virtual_hardware_option
 @common.seed_option
 @common.spec_option
 @common.out_option(what="Folder of the recording; must be new or empty")
@@ -71,7 +74,7 @@ def record(
 
     \b
     --rig simulated                     a simulated pad, at once
-    --virtual-hardware                   any of them in real time, through emulated devices
+    --virtual-hardware                  any of them in real time, through emulated devices
     --rig ur5, --rig printer            a UR robot or a 3D printer, and the board, as [rig] says
     --rig hand                          you and the board: a page and the terminal show where to press
 
@@ -84,46 +87,53 @@ def record(
     from padforge.design.settings import Contact, PadSettings
     from padforge.sense.rig import operation
     from padforge.sense.rig.config import RigConfig
-    from padforge.sense.rig.devices import require_rig_system
+    from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
 
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
     target = out or folder / "recording"
-    like = _twin(twin, at_once=rig == "simulated" and not virtual_hardware)
+    at_once = rig == "simulated" and not virtual_hardware
+    if twin and not at_once:
+        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --virtual-hardware")
+    like = _load_twin(twin)
     if not (rig == "simulated" or virtual_hardware or morphology):
-        morphology = _beside(target)
+        morphology = _morphology_beside(target)
         folder = common.pad_folder(morphology)
-    pad = _pad(morphology, settings.section(PadSettings))
+    pad = _load_pad(morphology, settings.section(PadSettings))
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
-    if rig == "simulated" and not virtual_hardware:
+    if at_once:
         if resume or dry_run or model:
             raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
-        shown = like if like and not morphology else pad
-        if like and morphology and (left := like.ignored_effects()):
-            click.echo(f"{twin}: {left}", err=True)
-        recording = operation.record_simulated(settings, shown, target, overrides, inputs, like)
+        pressed = like if like and not morphology else pad
+        if like and morphology and (ignored := like.ignored_effects()):
+            _warn(f"{twin}: {ignored}")
+        recording = operation.record_simulated(settings, pressed, target, overrides, inputs, like)
     else:
-        require_rig_system()
+        check_platform()
         options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
-        size = settings.section(PadSettings, **pad.layout.settings)
-        setup = RigConfig(pad, settings.section(Contact), options, target, command, inputs, size, folder)
-        recording = _record_with(rig, setup, model, dry_run, resume, virtual_hardware)
+        pad_settings = settings.section(PadSettings, **pad.layout.settings)
+        config = RigConfig(pad, settings.section(Contact), options, target, command, inputs, pad_settings, folder)
+        recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
 
 
-def _twin(path: Path | None, at_once: bool) -> "Twin | None":
+def _load_twin(path: Path | None) -> "Twin | None":
     from padforge.design.twin import Twin
 
-    if path and not at_once:
-        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --virtual-hardware")
     return Twin.load(path) if path else None
 
 
-def _beside(recording: Path) -> Path:
-    """The morphology.json in the folder that a recording goes to: a real pad is known, never guessed."""
+def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morphology":
+    from padforge.design.morphology import Morphology
+
+    return Morphology.load(morphology) if morphology else Morphology.straight(pad_settings.layout)
+
+
+def _morphology_beside(recording: Path) -> Path:
+    """The morphology.json in the folder that a recording goes to: a real pad is named, never guessed."""
     path = recording.parent / "morphology.json"
     if not path.is_file():
         raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {path}")
@@ -131,108 +141,131 @@ def _beside(recording: Path) -> Path:
 
 
 def _record_with(
-    rig: str, setup: "RigConfig", model: Path | None, dry_run: bool, resume: bool, virtual_hardware: bool
+    rig: str, config: "RigConfig", model: Path | None, dry_run: bool, resume: bool, virtual_hardware: bool
 ) -> "Recording | None":
     """Record with an arm, or by hand."""
     from padforge.sense.recording.run_directory import START
     from padforge.sense.rig import operation
 
-    if resume and not (setup.out / START).exists():
-        _warn(f"{setup.out}: nothing to resume, a new recording begins")
+    if resume and not (config.out / START).exists():
+        _warn(f"{config.out}: nothing to resume, a new recording begins")
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
-        return _record_by_hand(setup, resume, virtual_hardware)
-    with reported("presses") as report:
-        how = {"dry": dry_run, "resume": resume, "virtual_hardware": virtual_hardware, "report": report, "say": _warn}
-        return operation.record(rig, setup, model, **how)
+        return _record_by_hand(config, resume, virtual_hardware)
+    opened = _opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)), virtual_hardware)
+    with reported("presses") as on_progress:
+        return operation.record(
+            config, opened, model=model, dry=dry_run, resume=resume, on_progress=on_progress, on_message=_warn
+        )
 
 
-def _record_by_hand(setup: "RigConfig", resume: bool, emulated: bool) -> "Recording":
-    """Show a person where to press, on a page and in the terminal, and take what is said on both."""
+def _opened_rig(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "OpenedRig":
+    if rig == "simulated" or virtual_hardware:
+        from padforge.sense.virtual.virtual_rig import opened_virtual_rig
+
+        return opened_virtual_rig(rig, config, inputs)
+    from padforge.sense.rig import operation
+
+    return operation.opened_rig(rig, config, inputs)
+
+
+def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -> "Recording":
+    """Show a person where to press, on a page and in the terminal, and take commands of both."""
     from padforge.sense.live.outputs import LivePage
-    from padforge.sense.rig.by_hand import WORDS, pad_view, record_by_hand, view_lines
+    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
     from padforge.sense.rig.operation import opened_board
     from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
-    words = {each["key"]: each["word"] for each in WORDS}
+    commands = {row["key"]: row["command"] for row in COMMANDS}
     with ExitStack() as stack:
-        if emulated:
-            converter, finger = stack.enter_context(pressed_by_finger(setup.pad, setup.contact, setup.rig))
-            look, answer = finger.look, finger.said
+        finger = None
+        if virtual_hardware:
+            board, finger = stack.enter_context(pressed_by_finger(config.pad, config.contact, config.rig))
         else:
-            converter = stack.enter_context(opened_board(setup, setup.rig.inputs(len(setup.pad.knots))))
-            look, answer = (lambda view: None), list
-        page = stack.enter_context(LivePage(0, "hand.html", words.values()))
+            board = stack.enter_context(opened_board(config, config.rig.inputs(len(config.pad.knots))))
+        page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(drawn_anew()), stack.enter_context(typed_keys())
-        latest = pad = pad_view(setup.pad, str(setup.out), bool(setup.rig.mirrored))
+        latest = pad = pad_view(config.pad, str(config.out), bool(config.rig.mirrored))
 
         @stack.push
-        def tell_the_end(kind: object, error: BaseException | None, trace: object) -> None:
+        def show_end(kind: object, error: BaseException | None, trace: object) -> None:
             if latest is not pad:
                 page.show(latest | {"ended": str(error or "") or "ended"})
 
         def show(view: dict[str, Any]) -> None:
             nonlocal latest
-            if draw is None and view["told"] != latest.get("told", ""):
-                click.echo(view["told"])
+            if draw is None and view["message"] != latest.get("message", ""):
+                click.echo(view["message"])
             if draw is not None and view["phase"] == "lift" != latest.get("phase"):
                 click.echo("\a", nl=False)  # eyes are on the pad
             latest = pad | view
             page.show(latest)
-            look(latest)
+            if finger is not None:
+                finger.look(latest)
             if draw is not None:
                 draw(view_lines(latest))
 
-        def said() -> list[str]:
-            return [*page.said(), *(words[key] for key in typed() if key in words), *answer()]
+        def poll_commands() -> list[str]:
+            by_key = (commands[key] for key in typed() if key in commands)
+            return [*page.said(), *by_key, *(finger.said() if finger is not None else ())]
 
-        return record_by_hand(setup, converter, show, said, resume)
-
-
-def _pad(morphology: Path | None, of_pad: "PadSettings") -> "Morphology":
-    from padforge.design.morphology import Morphology
-
-    return Morphology.load(morphology) if morphology else Morphology.straight(of_pad.layout)
+        return record_by_hand(config, board, show, poll_commands, resume)
 
 
 @click.command()
 @rig_option
-@click.option("--morphology", type=FILE, help="Pad whose fibres are looked at (default: all inputs that are named).")
-@drivers_option
+@click.option("--morphology", type=FILE, help="Pad whose fibres are examined (default: all inputs that are named).")
+@virtual_hardware_option
 @common.spec_option
 @common.json_option
 @click.pass_context
 def doctor(
     ctx: click.Context, rig: str, morphology: Path | None, virtual_hardware: bool, spec: Path | None, as_json: bool
 ) -> None:
-    """Look the rig over before a long run; nothing moves. Exit 1 where something fails.
+    """Examine the rig before a long run; nothing moves. Exit 1 if something fails.
 
     \b
     padforge sense doctor --rig ur5
 
     Ports, versions, rates, latency, and every channel's rest and noise; channels count from 1, as fibres do, inputs as
-    they are printed on the board. Without --morphology the inputs that [rig] channels names, or all, are looked at.
+    they are printed on the board. Without --morphology the inputs that [rig] channels names, or all, are examined.
     """
     from dataclasses import asdict
 
     from padforge.design.settings import Contact, PadSettings
     from padforge.sense.rig.config import RigConfig
-    from padforge.sense.rig.devices import require_rig_system
-    from padforge.sense.rig.operation import look_over
+    from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
 
-    require_rig_system()
+    check_platform()
     settings = common.load_spec(spec)
-    pad, options = _pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
-    known = morphology is not None or rig == "simulated" or virtual_hardware
-    inputs = options.inputs(len(pad.knots)) if known else options.channels
-    setup = RigConfig(
+    pad, options = _load_pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
+    has_pad = morphology is not None or rig == "simulated" or virtual_hardware
+    inputs = options.inputs(len(pad.knots)) if has_pad else options.channels
+    config = RigConfig(
         pad, settings.section(Contact), options, Path(), "padforge sense doctor", folder=common.pad_folder(morphology)
     )
-    found = look_over(rig, setup, inputs, virtual_hardware)
-    passed = all(diagnosis.status != "fail" for diagnosis in found)
-    lines = [f"{d.status:<4} {d.name}: {d.found}" for d in found]
-    common.show_result({"passed": passed, "found": [asdict(d) for d in found]}, lines, as_json)
+    diagnoses = _diagnose(rig, config, inputs, virtual_hardware)
+    passed = all(diagnosis.status != "fail" for diagnosis in diagnoses)
+    lines = [f"{diagnosis.status:<4} {diagnosis.name}: {diagnosis.message}" for diagnosis in diagnoses]
+    rows = [asdict(diagnosis) for diagnosis in diagnoses]
+    common.show_result({"passed": passed, "diagnoses": rows}, lines, as_json)
     ctx.exit(0 if passed else 1)
+
+
+def _diagnose(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "list[Diagnosis]":
+    from padforge.sense.rig.operation import diagnose, opened_arm, opened_board
+
+    if rig == "hand" and virtual_hardware:
+        from padforge.sense.virtual.virtual_hand import pressed_by_finger
+
+        with pressed_by_finger(config.pad, config.contact, config.rig) as (board, _):
+            return diagnose(nullcontext(board))
+    if rig == "hand":
+        return diagnose(opened_board(config, inputs))
+    if rig == "simulated" or virtual_hardware:
+        with _opened_rig(rig, config, inputs, virtual_hardware) as (arm, board, settings):
+            return diagnose(nullcontext(board), nullcontext((arm, settings)))
+    return diagnose(opened_board(config, inputs), opened_arm(rig, config, inputs))

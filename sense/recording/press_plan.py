@@ -111,7 +111,7 @@ def planned_in(corners_mm: Array, rig: RigSettings, rng: np.random.Generator, fr
     """The plan that `[rig]` asks for: that of a file, or `presses` places between two corners (2, 2), low and high.
 
     A grid has so many rows and columns that neighbours are about as far apart either way (as many of both over a
-    square), and at least `presses` places that are free, of which the first are taken; boustrophedon runs forth and
+    square), and at least `presses` places that are free, of which the first are taken; serpentine runs forth and
     back along its rows. Depths are taken in turn along a row, and each row begins one further on: columns of one depth
     would tie depth to place. An adaptive plan is uniform until a localizer steers it.
 
@@ -121,10 +121,10 @@ def planned_in(corners_mm: Array, rig: RigSettings, rng: np.random.Generator, fr
     if rig.plan_file is not None:
         return all_free(read_plan(rig.plan_file, rig.depth_mm), rig.plan_file, free)
     depths = np.array(rig.depths_mm or (rig.depth_mm,))
-    if rig.plan in ("grid", "boustrophedon"):
+    if rig.plan in ("grid", "serpentine"):
         asked = rig.presses
         while True:
-            places, turns = _rows(corners_mm, asked, forth_and_back=rig.plan == "boustrophedon")
+            places, turns = _rows(corners_mm, asked, forth_and_back=rig.plan == "serpentine")
             there = free(places)
             if there.sum() >= rig.presses:
                 break

@@ -1,12 +1,8 @@
-"""Where a person is asked to press, in an order that is kind to the hand and fair to what is learnt.
+"""Recording by hand: a person is asked where to press, presses are detected in the readings, and all of it is kept.
 
-The run directory of a recording by hand: a new one, or one to go on with.
-
-A session by hand: what the fibres give is kept, presses are found in it, and a person is told what to do next.
-A press that does not count stays in the recording, as one at an unknown place: what it does to the pad shows in the
-presses around it.
-
-What of a session by hand is shown besides its own view: the pad as it is planned, and all of it as text.
+Targets come in an order with short ways that still covers the whole pad every few presses. A rejected press stays in
+the recording at an unknown position: its effect on the pad shows in the presses around it. The view of a session is
+JSON, for the page (`live/pages/hand.html`) and as text for the terminal.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,170 +10,187 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design import Morphology
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.features import REST, bridged
 from padforge.sense.recording.press_plan import free_of, planned, size_of
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, read_journal, refuse_begun
-from padforge.sense.rig.by_hand_presses import GONE_S, MOST, SOON_S, Judge, Phase, Place, Turns, answers
-from padforge.sense.rig.config import RigConfig, begun_source, require_same_devices, source_of
+from padforge.sense.rig.by_hand_presses import (
+    MAX_HOLD,
+    RELEASE_S,
+    SINK_S,
+    HandPhase,
+    Position,
+    PressSequence,
+    PressValidator,
+    press_responses,
+)
+from padforge.sense.rig.config import RigConfig, check_same_devices, make_source, read_source
 from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, Ring, connected
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
+KIND = "hand"
+"""Of the source of such a recording, whose depths are unknown."""
 ROUND = 25
-"""Places of a uniform plan that are gone through by a short way, before the next ones. Whoever stops early has been
-all over the pad, and what drifts with time is not taken for what changes with the place."""
+"""Targets of a uniform plan that are ordered by a short way before the next ones: a session that ends early has covered
+the whole pad, and drift with time is not confused with position."""
+TRAIL = 12
+"""Presses that the view shows."""
+UNKNOWN = (np.nan, np.nan)
+COMMANDS = (
+    {"key": "b", "command": "back", "text": "Take the last press back"},
+    {"key": "s", "command": "skip", "text": "Skip this place"},
+    {"key": "f", "command": "free", "text": "Nothing touches the pad"},
+    {"key": "q", "command": "quit", "text": "End"},
+)
+"""Commands of a person, by a key or a button."""
+PATH_TOLERANCE = 0.02
+"""Of the paths drawn, grid units."""
+MAP_COLUMNS, MAP_ROWS = 49, 21
+"""Of the map on a terminal, whose characters are about twice as high as wide; of a pad that is not square, at most."""
+BAR = 30
+"""Characters of the progress bar."""
+
+OnView = Callable[[dict[str, Any]], None]
+PollCommands = Callable[[], Sequence[str]]
 
 
-def targets_of(setup: RigConfig) -> Array:
-    """(Q, 2) places in mm as `[rig]` asks for them: of a grid or a file in that order, or uniform ones in short rounds.
+def plan_targets(config: RigConfig) -> Array:
+    """Return the targets that `[rig]` asks for: of a grid or a file in that order, or uniform ones in short rounds.
 
-    Uniform places are whole millimetres: nobody hits fractions, and whole ones are found on squared paper.
+    Uniform targets are whole millimetres: nobody hits fractions, and whole ones are found on squared paper.
+
+    Returns:
+        Positions, mm; shape (Q, 2).
 
     Raises:
-        InputError: an adaptive plan, or a file of places that is none.
+        InputError: An adaptive plan, or a file that is no plan.
     """
-    rig = setup.rig
+    rig = config.rig
     if rig.plan == "adaptive":
-        raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, boustrophedon or a .csv of places")
-    positions_mm = planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size).positions_mm
+        raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, serpentine or a .csv of places")
+    positions_mm = planned(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings).positions_mm
     if rig.plan != "uniform":
         return positions_mm
-    whole_mm = np.rint(positions_mm)
-    free = free_of(setup.pad, size_of(setup.pad, setup.size))(whole_mm)
-    return in_rounds(np.where(free[:, None], whole_mm, positions_mm))
+    rounded_mm = np.rint(positions_mm)
+    free = free_of(config.pad, size_of(config.pad, config.pad_settings))(rounded_mm)
+    return order_in_rounds(np.where(free[:, None], rounded_mm, positions_mm))
 
 
-def in_rounds(positions_mm: Array) -> Array:
-    """(Q, 2) places, `ROUND` at a time, each round from where the last one ended always to the nearest that is left."""
+def order_in_rounds(positions_mm: Array) -> Array:
+    """Order positions (Q, 2) by nearest neighbour, `ROUND` at a time, each round from where the last one ended."""
     ordered = np.empty_like(positions_mm)
-    at = positions_mm[0]
+    position = positions_mm[0]
     for first in range(0, len(positions_mm), ROUND):
-        left = positions_mm[first : first + ROUND]
-        for row in range(first, first + len(left)):
-            nearest = int(np.argmin(np.linalg.norm(left - at, axis=1)))
-            at = ordered[row] = left[nearest]
-            left = np.delete(left, nearest, axis=0)
+        remaining = positions_mm[first : first + ROUND]
+        for row in range(first, first + len(remaining)):
+            nearest = int(np.argmin(np.linalg.norm(remaining - position, axis=1)))
+            position = ordered[row] = remaining[nearest]
+            remaining = np.delete(remaining, nearest, axis=0)
     return ordered
 
 
-def still_to_make(targets_mm: Array, made_mm: Array) -> Array:
-    """(P, 2) those of the targets (Q, 2), in their order, that are not among the places (R, 2) of presses made."""
-    made = [tuple(place) for place in made_mm.tolist()]
-    left = []
-    for place in targets_mm.tolist():
-        if tuple(place) in made:
-            made.remove(tuple(place))
+def remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
+    """Return those of the targets (Q, 2), in order, without the positions (R, 2) already pressed, one for one."""
+    pressed = [tuple(position) for position in pressed_mm.tolist()]
+    remaining = []
+    for position in targets_mm.tolist():
+        if tuple(position) in pressed:
+            pressed.remove(tuple(position))
         else:
-            left.append(place)
-    return np.array(left).reshape(-1, 2)
+            remaining.append(position)
+    return np.array(remaining).reshape(-1, 2)
 
 
-KIND = "hand"
-"""Of the source of such a recording: nobody knows how deep its presses were."""
-
-
-def opened(setup: RigConfig, converter: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
-    """The recorder, the places (Q, 2) mm of its plan, and those (P, 2) that are still to be pressed.
+def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
+    """Open the run directory of a recording by hand, a new one or one to resume.
 
     Args:
-        converter: what it says of itself. resume: go on with what is in `setup.out`, if anything is.
+        config: What is recorded.
+        board: Identity of the board.
+        resume: Whether to resume what is in `config.out`, if anything is.
+
+    Returns:
+        The recorder, the targets (Q, 2) of its plan, and those (P, 2) still to press, mm.
 
     Raises:
-        InputError: places that cannot be, another recording in the way, or one that was begun otherwise.
+        InputError: Targets that cannot be, another recording in the way, or one that was begun otherwise.
     """
-    board = {"board": converter}
-    if resume and (setup.out / START).exists():
-        source = begun_source(setup, setup.rig, KIND)
-        targets = _kept_targets(setup, source)
-        require_same_devices(setup.out, source, board)
-        recorder = Recorder.resume(setup.out)
-        made = [press[:2] for press in read_journal(setup.out / JOURNAL).values()]
-        return recorder, targets, still_to_make(targets, np.array(made).reshape(-1, 2))
-    targets = targets_of(setup)
-    plan = {"columns": ["x_mm", "y_mm"], "presses": targets.tolist()}
-    made_by = provenance(setup.command, setup.rig.seed, setup.inputs)
-    source = source_of(setup, setup.rig, KIND, plan, board)
-    return Recorder(setup.out, converter["channels"], source, made_by), targets, targets
-
-
-def _kept_targets(setup: RigConfig, source: Mapping[str, Any]) -> Array:
-    """The places of a recording that is to be gone on with."""
-    targets = check_numbers(source["plan"]["presses"], np.float64, "places of the plan")
-    if targets.ndim != 2 or targets.shape[1] != 2:
-        raise InputError(f"{setup.out}: its plan has shape {targets.shape}, expected (Q, 2)")
-    check_magnitude("places of the plan", targets, MAX_MM, "mm")
-    return targets
-
-
-TRAIL = 12
-"""Presses that are kept to be shown."""
-UNKNOWN = (np.nan, np.nan)
-WORDS = (
-    {"key": "b", "word": "back", "text": "Take the last press back"},
-    {"key": "s", "word": "skip", "text": "Skip this place"},
-    {"key": "f", "word": "free", "text": "Nothing touches the pad"},
-    {"key": "q", "word": "quit", "text": "End"},
-)
-"""What a person may say, by a key or a button."""
-
-Show = Callable[[dict[str, Any]], None]
-Said = Callable[[], Sequence[str]]
+    identities = {"board": board}
+    if resume and (config.out / START).exists():
+        source = read_source(config, config.rig, KIND)
+        targets_mm = check_numbers(source["plan"]["presses"], np.float64, "places of the plan")
+        if targets_mm.ndim != 2 or targets_mm.shape[1] != 2:
+            raise InputError(f"{config.out}: its plan has shape {targets_mm.shape}, expected (Q, 2)")
+        check_magnitude("places of the plan", targets_mm, MAX_MM, "mm")
+        check_same_devices(config.out, source, identities)
+        recorder = Recorder.resume(config.out)
+        pressed_mm = np.array([press[:2] for press in read_journal(config.out / JOURNAL).values()]).reshape(-1, 2)
+        return recorder, targets_mm, remaining_targets(targets_mm, pressed_mm)
+    targets_mm = plan_targets(config)
+    plan = {"columns": ["x_mm", "y_mm"], "presses": targets_mm.tolist()}
+    source = make_source(config, config.rig, KIND, plan, identities)
+    made_by = provenance(config.command, config.rig.seed, config.inputs)
+    return Recorder(config.out, board["channels"], source, made_by), targets_mm, targets_mm
 
 
 class HandSession:
-    """One stretch of recording by hand.
+    """A session of recording by hand.
 
     Args:
-        recorder: new or resumed, of so many fibres. targets_mm: (Q, 2) places to press, in this order; `made` presses
-            were made before them.
-        hold_s: for how long a press is to be held, and the pad left alone after it.
+        recorder: New or resumed.
+        n_fibres: C.
+        targets_mm: Positions to press, in this order; shape (Q, 2).
+        hold_s: For how long a press is to be held, and the pad left alone after it.
+        n_done: Presses made before.
     """
 
-    def __init__(self, recorder: Recorder, fibres: int, targets_mm: Array, hold_s: float, made: int = 0) -> None:
-        self._recorder, self._fibres = recorder, fibres
-        # Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
+    def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
+        self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done
+        # Times of a recording begin at 0, and go on a second after the last ones if it is resumed.
         self._start_s = recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0
         self._zero_s: float | None = None
-        self._first = recorder.readings
+        self._first = recorder.readings  # of this session, in the recording; other indices count from it
         self._number = max(recorder.done, default=-1) + 1
-        self._made = made
-        self._turns = Turns(targets_mm, hold_s, self._start_s)
-        self._ring, self._now_s = Ring(1 + fibres), self._start_s
-        self._finder: PressDetector | None = PressDetector(fibres)  # None while it has lost its way
-        self._found_from, self._judge = 0, Judge()
-        self._touched = self._down_command = self._free = 0
-        self._free_s = self._start_s
-        self._rest = np.zeros(fibres)  # before the press under way
-        self._kept: list[tuple[int, int, int]] = []  # number, begun and lifted in the recording
-        self._most_v = 1e-3
-        self._told, self._refused = "", None
+        self._sequence = PressSequence(targets_mm, hold_s, self._start_s)
+        self._ring, self._now_s = Ring(1 + n_fibres), self._start_s
+        self._detector: PressDetector | None = PressDetector(n_fibres)  # None while it is not to be believed
+        self._detector_start, self._validator = 0, PressValidator()
+        self._touched = self._down_command = self._released = 0
+        self._released_s = self._start_s
+        self._baseline = np.zeros(n_fibres)  # before the press under way
+        self._accepted: list[tuple[int, int, int]] = []  # number, down and up command in the recording
+        self._max_response_v = 1e-3
+        self._message, self._rejected_mm = "", None
 
-    def run(self, blocks: Iterable[tuple[Array, Array]], show: Show, said: Said = lambda: ()) -> None:
-        """Go on until all presses are made, or it is said to end.
+    def run(
+        self, blocks: Iterable[tuple[Array, Array]], on_view: OnView, poll_commands: PollCommands = lambda: ()
+    ) -> None:
+        """Record until all presses are made or the command quit comes.
 
         Args:
-            blocks: times (n,) s and readings (n, C) V as they come. show: given what there is to show, see `view`.
-            said: the words of `WORDS` that were said since it was called last.
+            blocks: Times (n,) s and readings (n, C) V as they come.
+            on_view: Receives what there is to show, see `view`.
+            poll_commands: Returns the commands, of `COMMANDS`, since its last call.
 
         Raises:
-            RigFault: the board failed, or the disk; what is done is on the disk.
+            RigFault: The board failed, or the disk; what is done is on the disk.
         """
         try:
             for times_s, readings in blocks:
-                for word in said():
-                    if word == "quit":
+                for command in poll_commands():
+                    if command == "quit":
                         return
-                    self._obey(word)
+                    self._execute(command)
                 if len(times_s):
                     self.feed(times_s, readings)
-                    show(self.view())
-                if self._phase() == "done":
+                    on_view(self.view())
+                if self._phase() is HandPhase.DONE:
                     return
         except OSError as error:
             raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
@@ -185,7 +198,7 @@ class HandSession:
             self._recorder.abort("the session ended")
 
     def feed(self, times_s: Array, readings: Array) -> None:
-        """Take readings, and what they bring to light."""
+        """Record readings (n, C) V at times (n,) s, and handle the touches and releases in them."""
         if self._zero_s is None:
             self._zero_s = float(times_s[0]) - self._start_s
         times_s = times_s - self._zero_s
@@ -193,225 +206,225 @@ class HandSession:
         for row in np.column_stack([times_s, readings]):
             self._ring.append(row)
             self._now_s = float(row[0])
-            for event in self._finder.feed(row[:1], row[None, 1:]) if self._finder else ():
-                reading = self._found_from + event.reading
+            for event in self._detector.feed(row[:1], row[None, 1:]) if self._detector else ():
+                reading = self._detector_start + event.reading
                 self._touch(reading) if event.down else self._release(reading)
-        self._doubt()
+        self._check_detector()
 
     def _touch(self, touched: int) -> None:
-        place = self._turns.touch(self._time_s(touched))
+        target = self._sequence.touch(self._time_s(touched))
         self._touched = touched
-        self._down_command = max(self._ring.sent(touched, SENT_DOWN_S), self._free + 1)
-        self._rest = self._rest_before(self._down_command)
-        self._refused = None
-        self._recorder.begin(place or UNKNOWN, self._first + self._down_command, self._number)
+        self._down_command = max(self._ring.sent(touched, SENT_DOWN_S), self._released + 1)
+        self._baseline = self._mean_before(self._down_command)
+        self._rejected_mm = None
+        self._recorder.begin(target or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
 
     def _release(self, released: int) -> None:
         up_command = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
-        target, fault = self._turns.target, self._turns.release(self._time_s(released))
-        answered = self._answers(up_command)
-        fault = fault or self._judge.fault_of(answered)
-        if fault:
-            self._refuse(self._number, self._first + self._down_command, self._first + up_command, fault)
-            self._told, self._refused = f"not counted: {fault}", target
+        target, rejection = self._sequence.target, self._sequence.release(self._time_s(released))
+        responses = self._responses(up_command)
+        rejection = rejection or self._validator.rejection(responses)
+        press = self._number, self._first + self._down_command, self._first + up_command
+        if rejection:
+            self._record_rejected(*press, rejection)
+            self._message, self._rejected_mm = f"not counted: {rejection}", target
         else:
             self._recorder.finish(self._first + up_command)
-            self._kept.append((self._number, self._first + self._down_command, self._first + up_command))
-            self._judge.keep(answered, self._rest)
-            self._most_v = max(self._most_v, float(np.abs(answered).max()))
-            self._turns.keep(self._now_s)
-            self._told = f"counted: {shown(target)}"
+            self._accepted.append(press)
+            self._validator.accept(responses, self._baseline)
+            self._max_response_v = max(self._max_response_v, float(np.abs(responses).max()))
+            self._sequence.accept(self._now_s)
+            self._message = f"counted: {position_text(target)}"
         self._recorder.sync()
-        self._number, self._free = self._number + 1, up_command
-        self._free_s = self._now_s
+        self._number, self._released, self._released_s = self._number + 1, up_command, self._now_s
 
-    def _refuse(self, press: int, down_command: int, up_command: int, why: str) -> None:
-        """Note that a press was at an unknown place."""
+    def _record_rejected(self, press: int, down_command: int, up_command: int, reason: str) -> None:
+        """Record that a press was at an unknown position."""
         self._recorder.begin(UNKNOWN, down_command, press)
-        self._recorder.finish(up_command, refused=why)
+        self._recorder.finish(up_command, rejected=reason)
 
-    def _obey(self, word: str) -> None:
-        if word == "skip":
-            self._turns.skip(self._now_s)
-        elif word == "back":
-            if self._turns.take_back(self._now_s):
-                self._refuse(*self._kept.pop(), "it was taken back")
+    def _execute(self, command: str) -> None:
+        if command == "skip":
+            self._sequence.skip(self._now_s)
+        elif command == "back":
+            if self._sequence.undo(self._now_s):
+                self._record_rejected(*self._accepted.pop(), "it was taken back")
                 self._recorder.sync()
-                self._judge.take_back()
-                self._told = "the last press was taken back"
-        elif word == "free":
-            self._judge.rest_anew()
-            self._let_go()
+                self._validator.undo()
+                self._message = "the last press was taken back"
+        elif command == "free":
+            self._validator.reset_baseline()
+            self._restart_detector()
 
-    def _doubt(self) -> None:
-        """Where readings say otherwise than the finder of presses, believe them and begin to find anew."""
-        volts = self._late()
-        if self._turns.pressed:
-            if self._judge.untouched(volts, self._rest, self._turns.held_s(self._now_s)):
-                self._let_go()
-        elif self._now_s - self._free_s > GONE_S:
-            touched = self._judge.touched(volts)
-            if touched and self._finder is not None:
-                self._finder = None
-            elif touched is False and self._finder is None:
-                self._let_go()
-
-    def _let_go(self) -> None:
-        """Nothing touches the pad, whatever was found."""
-        if self._turns.pressed:
-            self._turns.drop()
-            self._release(self._ring.end - 1)
-        self._turns.wait(self._now_s)
-        self._finder, self._found_from = PressDetector(self._fibres), self._ring.end
-
-    def _late(self) -> Array:
-        """(C,) V, mean of the latest readings."""
+    def _check_detector(self) -> None:
+        """Believe the readings if they contradict the detector, and restart it."""
         rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
-        return bridged(rows[np.searchsorted(rows[:, 0], self._now_s - SOON_S) :, 1:]).mean(axis=0)
+        volts = bridged(rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]).mean(axis=0)  # the latest
+        if self._sequence.is_pressed:
+            if self._validator.is_untouched(volts, self._baseline, self._sequence.held_s(self._now_s)):
+                self._restart_detector()
+        elif self._now_s - self._released_s > RELEASE_S:
+            is_touched = self._validator.is_touched(volts)
+            if is_touched and self._detector is not None:
+                self._detector = None
+            elif is_touched is False and self._detector is None:
+                self._restart_detector()
+
+    def _restart_detector(self) -> None:
+        """Nothing touches the pad, whatever was detected."""
+        if self._sequence.is_pressed:
+            self._sequence.reject("nothing touches the pad")
+            self._release(self._ring.end - 1)
+        self._sequence.wait(self._now_s)
+        self._detector, self._detector_start = PressDetector(self._n_fibres), self._ring.end
 
     def _time_s(self, reading: int) -> float:
         return float(self._ring.rows(reading, reading + 1)[0, 0])
 
-    def _answers(self, up_command: int) -> Array:
-        """See `judging.answers`; of a press of which the begin is forgotten, by its end alone."""
-        first = max(self._down_command + REST[0], self._free, self._ring.end - HISTORY - SLACK)
+    def _responses(self, up_command: int) -> Array:
+        """See `press_responses`; of a press whose begin is no longer in the ring, by its end alone."""
+        first = max(self._down_command + REST[0], self._released, self._ring.end - HISTORY - SLACK)
         readings = self._ring.rows(first, self._ring.end)[:, 1:]
-        return answers(readings, max(self._down_command - first, 1), up_command - first)
+        return press_responses(readings, max(self._down_command - first, 1), up_command - first)
 
-    def _rest_before(self, at: int) -> Array:
-        """(C,) V, mean of the readings just before index `at`."""
-        return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
+    def _mean_before(self, reading: int) -> Array:
+        """(C,) V, mean of the readings just before an index."""
+        return bridged(self._ring.rows(reading + REST[0], reading)[:, 1:]).mean(axis=0)
 
     def view(self) -> dict[str, Any]:
-        """What there is to show now, as JSON.
+        """Return what there is to show now, as JSON.
 
         Returns:
-            "phase" and "progress", see `Turns`; "said", what is asked for, and "told", what became of the last press,
-            a line each; "target", and "refused", the place of the last press if that did not count, [x, y] mm or None;
-            "done" and "of" presses; "presses" kept last, "x_mm" and "y_mm"; "fibres", for each its "swing" (from its
-            rest, as a share of the largest so far; None where there is no reading) and "state".
+            "phase", a `HandPhase`, and "progress", 0 to 1; "prompt", what is asked for, and "message", the outcome of
+            the last press, a line each; "target", and "rejected", the target of the last press if that was rejected,
+            [x, y] mm or None; "done" and "total", numbers of presses; "presses" accepted last, "x_mm" and "y_mm";
+            "fibres", each with "swing" (from its baseline, as a share of the largest response; None if missing) and
+            "state".
         """
-        turns, now_s = self._turns, self._now_s
-        end = self._ring.end
-        rest = self._rest if turns.pressed else self._rest_before(end)
-        swings = (self._ring.rows(end - 1, end)[0, 1:] - rest) / self._most_v
-        done = self._made + len(turns.kept)
+        sequence, end = self._sequence, self._ring.end
+        baseline = self._baseline if sequence.is_pressed else self._mean_before(end)
+        swings = (self._ring.rows(end - 1, end)[0, 1:] - baseline) / self._max_response_v
+        done = self._n_done + len(sequence.accepted_mm)
         return {
             "phase": self._phase(),
-            "progress": round(turns.progress(now_s), 3),
-            "said": self._asked(),
-            "told": self._told,
-            "target": turns.target,
-            "refused": self._refused,
+            "progress": round(sequence.progress(self._now_s), 3),
+            "prompt": self._prompt(),
+            "message": self._message,
+            "target": sequence.target,
+            "rejected": self._rejected_mm,
             "done": done,
-            "of": done + turns.left,
-            "presses": [{"x_mm": x, "y_mm": y} for x, y in turns.kept[-TRAIL:]],
+            "total": done + sequence.n_remaining,
+            "presses": [{"x_mm": x, "y_mm": y} for x, y in sequence.accepted_mm[-TRAIL:]],
             "fibres": [
                 {"swing": None, "state": "missing"} if np.isnan(swing) else {"swing": round(swing, 3), "state": ""}
                 for swing in swings.tolist()
             ],
         }
 
-    def _phase(self) -> Phase:
-        return "lift" if self._finder is None else self._turns.phase(self._now_s)
+    def _phase(self) -> HandPhase:
+        return HandPhase.LIFT if self._detector is None else self._sequence.phase(self._now_s)
 
-    def _asked(self) -> str:
-        """What is asked for now, in a line."""
-        turns, phase = self._turns, self._phase()
-        at = shown(turns.target)
-        if self._finder is None or turns.held_s(self._now_s) > MOST * turns.hold_s:
+    def _prompt(self) -> str:
+        sequence = self._sequence
+        if self._detector is None or sequence.held_s(self._now_s) > MAX_HOLD * sequence.hold_s:
             return "lift; if nothing touches the pad, say so (f)"
+        target = position_text(sequence.target)
         return {
-            "settle": "hands off the pad",
-            "wait": f"next {at}: wait" if at else "hands off the pad",
-            "press": f"press {at}",
-            "hold": "hold",
-            "lift": "lift",
-            "done": "all presses are made",
-        }[phase]
+            HandPhase.SETTLE: "hands off the pad",
+            HandPhase.WAIT: f"next {target}: wait" if target else "hands off the pad",
+            HandPhase.PRESS: f"press {target}",
+            HandPhase.HOLD: "hold",
+            HandPhase.LIFT: "lift",
+            HandPhase.DONE: "all presses are made",
+        }[self._phase()]
 
 
 def record_by_hand(
-    setup: RigConfig, converter: Board, show: Show, said: Said = lambda: (), resume: bool = False
+    config: RigConfig,
+    board: Board,
+    on_view: OnView,
+    poll_commands: PollCommands = lambda: (),
+    resume: bool = False,
 ) -> Recording:
-    """Record presses by hand into `setup.out`; what is done is on the disk whatever happens.
+    """Record presses by hand into `config.out`; what is done is on the disk whatever happens.
 
     Args:
-        converter: not yet connected. show, said: see `HandSession.run`. resume: go on with what is in `setup.out`.
+        config: What is recorded.
+        board: Not yet connected.
+        on_view: See `HandSession.run`.
+        poll_commands: See `HandSession.run`.
+        resume: Whether to resume what is in `config.out`.
+
+    Returns:
+        The recording.
 
     Raises:
-        InputError: settings, places or a run directory that cannot be, or no press was made.
-        RigFault: the board failed, or the disk.
+        InputError: Settings, targets or a run directory that cannot be, or no press was made.
+        RigFault: The board failed, or the disk.
     """
     if not resume:
-        refuse_begun(setup.out)
-    rig = setup.rig
-    source = connected(converter, rig.rate_hz)
-    recorder, targets, left = opened(setup, source.converter, resume)
+        refuse_begun(config.out)
+    rig = config.rig
+    source = connected(board, rig.rate_hz)
+    recorder, targets_mm, remaining_mm = open_recorder_by_hand(config, source.converter, resume)
     with recorder:
         hold_s = rig.readings_per_press / 2 / source.rate_hz
-        HandSession(recorder, source.fibres, left, hold_s, len(targets) - len(left)).run(source.blocks, show, said)
-    return Recording.open(setup.out)
+        n_done = len(targets_mm) - len(remaining_mm)
+        session = HandSession(recorder, source.fibres, remaining_mm, hold_s, n_done)
+        session.run(source.blocks, on_view, poll_commands)
+    return Recording.open(config.out)
 
 
-def shown(place: Place | None) -> str:
-    """A place as a person reads it."""
-    return "" if place is None else "x {}, y {} mm".format(*(f"{value:.1f}".removesuffix(".0") for value in place))
-
-
-TOLERANCE = 0.02
-"""Of the courses drawn, grid units."""
-COLUMNS, ROWS = 49, 21
-"""Of the map of a square pad on a terminal, whose characters are about twice as high as wide; of another one at most so
-many."""
-BAR = 30
-"""Characters of the bar of a wait or a hold."""
+def position_text(position_mm: Position | None) -> str:
+    """Write a position for people."""
+    if position_mm is None:
+        return ""
+    return "x {}, y {} mm".format(*(f"{value:.1f}".removesuffix(".0") for value in position_mm))
 
 
 def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, Any]:
-    """The part of the view that stays, as JSON: frame, fibres' courses in mm, and what may be said.
+    """Return the constant part of the view, as JSON: frame, paths of the fibres in mm, and commands.
 
-    Places are those of the plan; of a pad that lies `mirrored`, with its tracks up, x runs to the left.
+    Positions are those of the plan; of a pad that lies `mirrored`, with its tracks up, x runs to the left.
     """
-    courses = [np.round(pad.to_mm(course), 1).tolist() for course in flatten(pad, TOLERANCE)]
     return {
         "title": title,
         "origin_mm": [0.0, 0.0],
         "half_mm": [side / 2 for side in pad.layout.size_mm],
         "mirrored": mirrored,
-        "courses": courses,
-        "words": WORDS,
+        "paths": [np.round(pad.to_mm(path), 1).tolist() for path in flatten(pad, PATH_TOLERANCE)],
+        "commands": COMMANDS,
         "ended": "",
     }
 
 
 def view_lines(view: Mapping[str, Any]) -> list[str]:
-    """All there is to show (`pad_view` and `HandSession.view`) as text; the pad as a map seen from above."""
+    """Write the view (`pad_view` and `HandSession.view`) as text, with the pad as a map seen from above."""
     full = round(BAR * view["progress"])
     return [
-        view["said"].upper(),
+        view["prompt"].upper(),
         f"[{'#' * full}{'.' * (BAR - full)}]",
-        *_map(view),
-        f"{view['done']} of {view['of']} presses   {view['told']}",
-        "   ".join(f"{each['key']}: {each['text'].lower()}" for each in WORDS),
+        *_map_lines(view),
+        f"{view['done']} of {view['total']} presses   {view['message']}",
+        "   ".join(f"{row['key']}: {row['text'].lower()}" for row in COMMANDS),
     ]
 
 
-def _map(view: Mapping[str, Any]) -> list[str]:
-    """The pad's edge, the places pressed last (.), one that did not count (x), and the next (O)."""
+def _map_lines(view: Mapping[str, Any]) -> list[str]:
+    """The pad's edge, the last accepted presses (.), a rejected one (x), and the target (O)."""
     width, height = view["half_mm"]
-    columns = max(round(COLUMNS * width / max(width, height)), 3)
-    rows = [[" "] * columns for _ in range(max(round(ROWS * height / max(width, height)), 3))]
+    columns = max(round(MAP_COLUMNS * width / max(width, height)), 3)
+    rows = [[" "] * columns for _ in range(max(round(MAP_ROWS * height / max(width, height)), 3))]
 
-    def put(place: tuple[float, float], mark: str) -> None:
-        x, y = np.clip((np.array(place) / (width, height) + 1) / 2, 0, 1).tolist()
+    def put(position_mm: Position, mark: str) -> None:
+        x, y = np.clip((np.array(position_mm) / (width, height) + 1) / 2, 0, 1).tolist()
         right = 1 - x if view["mirrored"] else x
         rows[round((1 - y) * (len(rows) - 1))][round(right * (columns - 1))] = mark
 
     for press in view["presses"]:
         put((press["x_mm"], press["y_mm"]), ".")
-    for name, mark in (("refused", "x"), ("target", "O")):
+    for name, mark in (("rejected", "x"), ("target", "O")):
         if view[name] is not None:
             put(view[name], mark)
     edge = f"+{'-' * columns}+"

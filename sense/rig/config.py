@@ -1,8 +1,7 @@
-"""Where the pad lies before the arm: from places on the pad to poses of the tool and back.
+"""Configuration of a recording on a rig: how the pad lies before the arm, what is recorded, and whether it may resume.
 
-Where the pad lies on a printer's bed: in the holder, which was printed there and left, so that nobody teaches it.
-
-What is to be recorded, and the run directory it goes to: a new one, or one to go on with.
+The pad's frame comes from `[rig]`, or on a printer's bed from the holder that was printed there. A recording keeps its
+settings, plan and devices in `start.json`; it is resumed only with those that do not change what a press is.
 """
 
 import json
@@ -10,21 +9,40 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from padforge.design.common.files import provenance, read_json
 from padforge.design.common.validation import InputError, short_repr
+from padforge.design.morphology import Morphology
+from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import Array
+from padforge.sense.recording.press_plan import COLUMNS, PressPlan, all_free, free_of, planned, size_of, told_pad
+from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
 from padforge.sense.settings import RigSettings
 
-if TYPE_CHECKING:
-    from padforge.design.morphology import Morphology
-    from padforge.design.settings import Contact, PadSettings
-    from padforge.sense.recording.press_plan import PressPlan
-    from padforge.sense.recording.run_directory import Recorder
+Identities = Mapping[str, Mapping[str, Any]]
+"""What "arm" and "board" returned on connecting."""
+
+FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/2"
+_FRAME_LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "surface_mm": 1, "walls_mm": 1}
+"""Numbers of each entry of the frame of a pad in its holder."""
+_ROUNDING_MM = 1e-6
+
+KIND = "rig"
+"""Of the source of a recording that an arm pressed."""
+_PLAN_KEYS = ("presses", "plan", "seed")
+_CHANGEABLE = {
+    *_PLAN_KEYS,  # the plan is stored
+    *("host", "port", "baud", "printer_port", "printer_baud"),  # serial numbers are compared
+    *("box_mm", "max_depth_mm", "max_force_n"),
+    *("noise_mv", "drift_mv", "creep", "hysteresis", "hysteresis_s"),
+}
+"""Settings that may change within a recording; any other changes what a press is."""
+_IDENTITY_KEYS = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "firmware")}
+"""Of the identity of a device, what all of a recording shares."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +50,11 @@ class RobotFrame:
     """The pad's frame in the arm's base frame.
 
     Attributes:
-        centre_mm: of the pad, x and y. turn_rad: from the base's y axis to the pad's.
-        contact_mm: height of the pad's surface. tool_rad: rotation vector of the tool.
-        mirrored: whether the pad lies with its tracks up: its y axis as on the plan, its x axis the other way.
+        centre_mm: x and y of the pad's centre.
+        turn_rad: From the base's y axis to the pad's.
+        contact_mm: Height of the pad's surface.
+        tool_rad: Rotation vector of the tool.
+        mirrored: Whether the pad lies with its tracks up: its y axis as on the plan, its x axis the other way.
     """
 
     centre_mm: tuple[float, float]
@@ -44,8 +64,8 @@ class RobotFrame:
     mirrored: bool = False
 
     @classmethod
-    def of(cls, rig: RigSettings) -> "RobotFrame":
-        """The frame that `[rig]` says; raises RigFault where the contact height or the pad's place is unknown."""
+    def from_settings(cls, rig: RigSettings) -> "RobotFrame":
+        """Return the frame that `[rig]` sets; raises RigFault if the contact height or the pad's position is unknown."""
         if rig.contact_mm is None:
             raise RigFault(
                 "refused",
@@ -60,96 +80,86 @@ class RobotFrame:
             )
         return cls(rig.pad_mm, math.radians(rig.pad_angle_deg), rig.contact_mm, rig.tool_rad, bool(rig.mirrored))
 
-    def pose(self, place_mm: Array, depth_mm: float) -> Pose:
-        """The tool's pose at a place (2,) on the pad's plan, `depth_mm` below its surface (above: less than 0)."""
-        x, y = np.asarray(place_mm, dtype=np.float64) @ self._axes + self.centre_mm
+    def pose(self, position_mm: Array, depth_mm: float) -> Pose:
+        """Return the tool's pose at a position (2,) on the plan, `depth_mm` below the surface (above it: negative)."""
+        x, y = np.asarray(position_mm, dtype=np.float64) @ self._axes + self.centre_mm
         return (float(x), float(y), self.contact_mm - depth_mm, *self.tool_rad)
 
     def tip(self, poses: Array) -> tuple[Array, Array]:
-        """Places (n, 2) on the pad's plan and depths (n,) of poses (n, 3 or more), mm."""
-        places = (poses[:, :2] - self.centre_mm) @ self._axes.T
-        return places, self.contact_mm - poses[:, 2]
+        """Return positions (n, 2) on the plan and depths (n,) of poses (n, 3 or more), mm."""
+        positions_mm = (poses[:, :2] - self.centre_mm) @ self._axes.T
+        return positions_mm, self.contact_mm - poses[:, 2]
 
     @property
     def _axes(self) -> Array:
-        """(2, 2) the axes of the plan, x and y, in the base frame, a row each."""
+        """(2, 2) x and y axis of the plan in the base frame, a row each."""
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
         return np.array([[-c, -s] if self.mirrored else [c, s], [-s, c]])
 
 
-FILE, FORMAT = "fabrication.json", "padforge-fabrication/2"
-_LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "surface_mm": 1, "walls_mm": 1}
-_SLACK_MM = 1e-6
-
-
-def on_bed(rig: RigSettings, folder: Path) -> RigSettings:
-    """`rig` with the pad's place, side and height, and the workspace above it, where it leaves them open.
+def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
+    """Fill in where the pad lies on a printer's bed, and the workspace above it, from its holder.
 
     The workspace is the pad seen from above, as far as the nozzle gets; down to `max_depth_mm`, but never below the top
-    of the holder's walls.
+    of the holder's walls. What `[rig]` sets takes precedence.
 
     Args:
-        folder: with the `fabrication.json` of a pad with a holder, see "frame" in it.
+        rig: `[rig]`.
+        folder: Has the `fabrication.json` of a pad with a holder; see "frame" in it.
 
     Raises:
-        RigFault: "refused" where something is open, and the folder or the tip's place does not tell it.
-        InputError: the file is damaged.
+        RigFault: "refused" if something is unknown that neither the folder nor `[rig]` tells.
+        InputError: The file is damaged.
     """
     if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
         return rig
     if rig.tcp_mm is None:
         message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
         raise RigFault("refused", message, "measure them with the probe in place")
-    frame = _frame(folder)
+    frame = _read_holder_frame(folder)
     (x, y), surface = rig.pad_mm or frame["centre_mm"], frame["surface_mm"]
     contact = surface if rig.contact_mm is None else rig.contact_mm
-    (right, top), (width, depth, height) = _halves(frame), frame["bed_mm"]
+    side = frame["pad_mm"]
+    half_x, half_y = (length / 2 for length in (side if isinstance(side, tuple) else (side, side)))
+    if round(frame["angle_deg"] / 90) % 2:  # the pad lies turned by quarters on the bed
+        half_x, half_y = half_y, half_x
+    width, depth, height = frame["bed_mm"]
     dx, dy, dz = rig.tcp_mm
     box = (
-        *(max(x - right, dx), min(x + right, width + dx)),
-        *(max(y - top, dy), min(y + top, depth + dy)),
-        *(max(contact - rig.max_depth_mm, frame["walls_mm"]) - _SLACK_MM, height + dz),
+        *(max(x - half_x, dx), min(x + half_x, width + dx)),
+        *(max(y - half_y, dy), min(y + half_y, depth + dy)),
+        *(max(contact - rig.max_depth_mm, frame["walls_mm"]) - _ROUNDING_MM, height + dz),
     )
-    mirrored = frame["mirrored"] if rig.mirrored is None else rig.mirrored
-    place = {"pad_mm": (x, y), "mirrored": mirrored, "contact_mm": contact, "box_mm": rig.box_mm or box}
-    return rig.model_copy(update=place | {"pad_angle_deg": rig.pad_angle_deg + frame["angle_deg"]})
+    return rig.model_copy(
+        update={
+            "pad_mm": (x, y),
+            "mirrored": frame["mirrored"] if rig.mirrored is None else rig.mirrored,
+            "contact_mm": contact,
+            "box_mm": rig.box_mm or box,
+            "pad_angle_deg": rig.pad_angle_deg + frame["angle_deg"],
+        }
+    )
 
 
-def _frame(folder: Path) -> Mapping[str, Any]:
-    """The frame in the folder's fabrication.json, checked: numbers, rows of them as tuples, and whether it is mirrored.
-
-    Holders of before that was said took the pad with its tracks down.
-    """
-    path = folder / FILE
+def _read_holder_frame(folder: Path) -> dict[str, Any]:
+    """Read and check "frame" of the folder's fabrication.json: numbers, rows of them as tuples, and "mirrored"."""
+    path, advice = folder / FABRICATION_FILE, "measure them, or make the pad's holder: [mould] holder = true"
     if not path.is_file():
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and there is no {path}"
-        raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
-    frame = read_json(path, FORMAT).get("frame")
+        raise RigFault("refused", message, advice)
+    frame = read_json(path, FABRICATION_FORMAT).get("frame")
     if not isinstance(frame, Mapping):
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {path} is of a pad without a holder"
-        raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
-    counts = _LENGTHS | {"pad_mm": 2 if isinstance(frame.get("pad_mm"), list) else 1}
-    read = {name: _numbers(frame.get(name), count) for name, count in counts.items()}
-    if wrong := [name for name, value in read.items() if value is None]:
-        raise InputError(f"{path}: frame has no {wrong[0]}, expected {counts[wrong[0]]} finite numbers")
-    if type(mirrored := frame.get("mirrored", False)) is not bool:
+        raise RigFault("refused", message, advice)
+    values: dict[str, Any] = {}
+    for name, count in (_FRAME_LENGTHS | {"pad_mm": 2 if isinstance(frame.get("pad_mm"), list) else 1}).items():
+        row = value if isinstance(value := frame.get(name), list) else [value]
+        if len(row) != count or not all(type(number) in (int, float) and abs(number) <= 1e4 for number in row):
+            raise InputError(f"{path}: frame has no {name}, expected {count} finite numbers")
+        values[name] = tuple(map(float, row)) if count > 1 else float(row[0])
+    if type(mirrored := frame.get("mirrored")) is not bool:
         raise InputError(f"{path}: mirrored of frame is {short_repr(mirrored)}, expected true or false")
-    return read | {"mirrored": mirrored}
-
-
-def _halves(frame: Mapping[str, Any]) -> tuple[float, float]:
-    """Half of what the pad spans along the axes of the bed, on which it lies turned by quarters."""
-    side = frame["pad_mm"]
-    width, height = side if isinstance(side, tuple) else (side, side)
-    return (height / 2, width / 2) if round(frame["angle_deg"] / 90) % 2 else (width / 2, height / 2)
-
-
-def _numbers(value: object, count: int) -> Any:
-    """The value as a number or as a tuple of so many; None where it is something else."""
-    values: list[Any] = value if isinstance(value, list) else [value]
-    if len(values) != count or not all(type(one) in (int, float) and abs(one) <= 1e4 for one in values):
-        return None
-    return tuple(map(float, values)) if count > 1 else float(values[0])
+    return values | {"mirrored": mirrored}
 
 
 @dataclass(frozen=True)
@@ -157,141 +167,106 @@ class RigConfig:
     """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from.
 
     Attributes:
-        size: which part of the pad is pressed, unless a file says where, and which is not; the default if None.
-        folder: of the pad, with what fabricate has written.
+        pad: The pad.
+        contact: What a press deforms.
+        rig: `[rig]`.
+        out: The run directory.
+        command: Command line, for the provenance.
+        inputs: Files it was made from, for the provenance.
+        pad_settings: Which part of the pad is pressed, unless a file says where, and which is not; None for the default.
+        folder: Of the pad, with what fabricate has written.
     """
 
-    pad: "Morphology"
-    contact: "Contact"
-    rig: "RigSettings"
+    pad: Morphology
+    contact: Contact
+    rig: RigSettings
     out: Path
     command: str
     inputs: Sequence[Path] = ()
-    size: "PadSettings | None" = None
+    pad_settings: PadSettings | None = None
     folder: Path = Path()
 
 
-def plan_of(setup: RigConfig, rig: "RigSettings", resume: bool) -> "PressPlan":
-    """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
-    import numpy as np
-
-    from padforge.sense.recording.press_plan import PressPlan, all_free, free_of, planned, size_of
-    from padforge.sense.recording.run_directory import START
-
-    if resume and (setup.out / START).exists():
-        plan = PressPlan.of(begun_source(setup, rig, KIND)["plan"]["presses"])
-        return all_free(plan, setup.out, free_of(setup.pad, size_of(setup.pad, setup.size)))
-    return planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size)
+def make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
+    """Return the stored plan of a resumed recording, otherwise the one that `rig` asks for."""
+    if resume and (config.out / START).exists():
+        plan = PressPlan.of(read_source(config, rig, KIND)["plan"]["presses"])
+        return all_free(plan, config.out, free_of(config.pad, size_of(config.pad, config.pad_settings)))
+    return planned(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings)
 
 
-KIND = "rig"
-"""Of the source of a recording that an arm pressed."""
-_PLANNED = ("presses", "plan", "seed")
-_FREE = {
-    *_PLANNED,  # the plan is kept
-    *("host", "port", "baud", "printer_port", "printer_baud"),  # serial numbers are compared
-    *("box_mm", "max_depth_mm", "max_force_n"),
-    *("noise_mv", "drift_mv", "creep", "hysteresis", "hysteresis_s"),
-}
-"""Settings that may change within a recording; any other changes what a press is."""
-_ONCE = {"mirrored": False}
-"""What held before there was a setting, for recordings of that time."""
-_IDENTITY = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "firmware")}
-"""What devices say of themselves that all of a recording has to share."""
-
-
-def begun_source(setup: RigConfig, rig: "RigSettings", kind: str) -> dict[str, Any]:
-    """The source of the recording in `setup.out`, which is to be gone on with.
+def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
+    """Return the source of the recording in `config.out`, which is to be resumed.
 
     Raises:
-        InputError: it is of another kind, has no plan, or was begun with other settings or another pad.
+        InputError: It is of another kind, has no plan, or was begun with other settings or another pad.
     """
-    from padforge.sense.recording.run_directory import FORMAT, START
-
-    source = read_json(setup.out / START, FORMAT).get("source")
+    source = read_json(config.out / START, FORMAT).get("source")
     source = source if isinstance(source, dict) else {}
     if not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
-        raise InputError(f"{setup.out}: has no plan, so that it cannot be resumed")
+        raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
     if source.get("kind") != kind:
-        raise InputError(f"{setup.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
-    was, now = source.get("rig"), _told(setup, rig)
+        raise InputError(f"{config.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
+    now = _settings_and_pad(config, rig)
     if source.get("morphology") != now["morphology"]:
-        raise InputError(f"{setup.out}: was begun with another pad than the one given")
-    for key in sorted(now["rig"].keys() - _FREE):
-        before = was.get(key, _ONCE.get(key)) if isinstance(was, dict) else None
-        if before != (got := now["rig"][key]):
-            raise InputError(f"[rig] {key}: got {got}, the recording in {setup.out} was begun with {before}")
+        raise InputError(f"{config.out}: was begun with another pad than the one given")
+    for key in sorted(now["rig"].keys() - _CHANGEABLE):
+        before, value = _get(source.get("rig"), key), now["rig"][key]
+        if before != value:
+            raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {before}")
     return source
 
 
-def kept_plan(setup: RigConfig) -> str:
-    """What to tell where other presses are asked for than the recording was begun with, whose plan is kept; else ""."""
-    from padforge.sense.recording.run_directory import FORMAT, START
-
-    if not (setup.out / START).exists():
+def plan_notice(config: RigConfig) -> str:
+    """Say that a recording to be resumed keeps its plan though `[rig]` asks for another; "" if there is nothing to say."""
+    if not (config.out / START).exists():
         return ""
-    source, now = read_json(setup.out / START, FORMAT)["source"], setup.rig.model_dump(mode="json")
-    other = [f"{key} = {source['rig'].get(key)}" for key in _PLANNED if source["rig"].get(key) != now[key]]
-    return f"{setup.out}: goes on by the plan it was begun with, [rig] {', '.join(other)}" if other else ""
+    before, now = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
+    changed = [f"{key} = {before.get(key)}" for key in _PLAN_KEYS if before.get(key) != now[key]]
+    return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
 
 
-def require_same_devices(out: Path, source: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raise InputError where a recording would be gone on with with another arm, tool or board; see `source_of`."""
-    kept = source.get("devices")
-    for device, about in devices.items():
-        was = kept.get(device) if isinstance(kept, dict) else None
-        for key in _IDENTITY[device]:
-            before = was.get(key) if isinstance(was, dict) else None
-            if before != (now := _plain(about).get(key)):
+def check_same_devices(out: Path, source: Mapping[str, Any], identities: Identities) -> None:
+    """Raise InputError if a recording would be resumed with another arm, tool or board; see `make_source`."""
+    for device, identity in identities.items():
+        stored = _get(source.get("devices"), device)
+        for key in _IDENTITY_KEYS[device]:
+            if (before := _get(stored, key)) != (now := _as_json(identity).get(key)):
                 raise InputError(f"{device}: {key} is {now}, the recording in {out} was begun with {before}")
 
 
-def source_of(
-    setup: RigConfig, rig: "RigSettings", kind: str, plan: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]
+def make_source(
+    config: RigConfig, rig: RigSettings, kind: str, plan: Mapping[str, Any], identities: Identities
 ) -> dict[str, Any]:
-    """What a new recording says of where it came from.
-
-    Args:
-        plan: its presses, and the names of their columns. devices: what "arm" and "board" said of themselves.
-    """
-    said = {name: _plain(about) for name, about in devices.items()}
-    return {"kind": kind, "devices": said, **_told(setup, rig), "plan": dict(plan)}
+    """Return the source of a new recording: kind, devices, settings, pad, and the plan with its columns."""
+    devices = {name: _as_json(identity) for name, identity in identities.items()}
+    return {"kind": kind, "devices": devices, **_settings_and_pad(config, rig), "plan": dict(plan)}
 
 
-def _told(setup: RigConfig, rig: "RigSettings") -> dict[str, Any]:
-    """Settings, with the inputs of the board as they are wired and the side of the pad as it counts, and the pad."""
-    from padforge.sense.recording.press_plan import told_pad
-
-    wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots)), "mirrored": bool(rig.mirrored)})
-    return {"rig": wired.model_dump(mode="json"), "morphology": told_pad(setup.pad)}
-
-
-def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What a device said, as it is read from JSON again."""
-    return json.loads(json.dumps(dict(about)))
-
-
-def recorder_of(
-    setup: RigConfig,
-    rig: "RigSettings",
-    plan: "PressPlan",
-    folder: Path,
-    resume: bool,
-    devices: Mapping[str, Mapping[str, Any]],
-) -> "Recorder":
-    """The recorder of a new recording, or of the one in `folder` that is gone on with.
-
-    Args:
-        devices: what "arm" and "board" said of themselves on connecting.
+def open_recorder(
+    config: RigConfig, rig: RigSettings, plan: PressPlan, folder: Path, resume: bool, identities: Identities
+) -> Recorder:
+    """Return the recorder of a new recording in `folder`, or of the one there that is resumed.
 
     Raises:
-        InputError: the recording cannot be gone on with, or was begun with other devices.
+        InputError: The recording cannot be resumed, or was begun with other devices.
     """
-    from padforge.sense.recording.press_plan import COLUMNS
-    from padforge.sense.recording.run_directory import FORMAT, START, Recorder
-
     if resume and (folder / START).exists():
-        require_same_devices(folder, read_json(folder / START, FORMAT).get("source", {}), devices)
+        check_same_devices(folder, read_json(folder / START, FORMAT).get("source", {}), identities)
         return Recorder.resume(folder)
-    source = source_of(setup, rig, KIND, {"columns": list(COLUMNS), "presses": plan.document()}, devices)
-    return Recorder(folder, len(setup.pad.knots), source, provenance(setup.command, rig.seed, setup.inputs))
+    source = make_source(config, rig, KIND, {"columns": list(COLUMNS), "presses": plan.document()}, identities)
+    return Recorder(folder, len(config.pad.knots), source, provenance(config.command, rig.seed, config.inputs))
+
+
+def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
+    """Settings, with the wired inputs and the side of the pad filled in, and the pad."""
+    wired = rig.model_copy(update={"channels": rig.inputs(len(config.pad.knots)), "mirrored": bool(rig.mirrored)})
+    return {"rig": wired.model_dump(mode="json"), "morphology": told_pad(config.pad)}
+
+
+def _get(mapping: object, key: str) -> Any:
+    return mapping.get(key) if isinstance(mapping, dict) else None
+
+
+def _as_json(identity: Mapping[str, Any]) -> dict[str, Any]:
+    return json.loads(json.dumps(dict(identity)))

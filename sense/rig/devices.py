@@ -1,14 +1,9 @@
-"""What a rig is made of, behind two small protocols: an arm that presses and a converter that reads the fibres.
-Real and simulated devices are used alike. All times are seconds of one clock, the host's `time.monotonic`; lengths are
-mm in the arm's base frame, angles radians.
+"""Devices of a rig behind two small protocols: an arm that presses and a board that reads the fibres.
 
-Arms and boards by their names: those of padforge, and those of any installed package, found by entry points.
-`padforge.arms` names functions of the settings of `[rig]` that give an `Arm`; `padforge.boards` functions of these
-settings and of the inputs to read, in the order of the fibres, that give a `Board`.
-
-Starts a module of this package as a process of its own.
-
-Serial ports of this host, with pyserial's ways to fail told apart for a person.
+Real, emulated and third-party devices are used alike. Times are seconds of one clock, the host's `time.monotonic`;
+lengths are mm in the arm's base frame, angles radians. Arms and boards are found by name, as entry points of installed
+packages: `padforge.arms` names functions of `RigSettings` that return an `Arm`; `padforge.boards` functions of
+`RigSettings` and the inputs to read, in the order of the fibres, that return a `Board`.
 """
 
 import errno
@@ -28,15 +23,18 @@ from padforge.sense.arrays import Array, Indices
 
 Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""
-
 Cause = Literal["refused", "lost", "stale", "protective_stop", "emergency_stop", "deadline", "force", "data", "disk"]
+Group = Literal["padforge.arms", "padforge.boards"]
+ROOT = Path(__file__).parents[3]
+"""The folder that `padforge` is imported from."""
 
 
 class RigFault(Fault):
-    """Something about the rig that ends or prevents a recording: what it is, and what a person can do about it.
+    """A fault of the rig that ends or prevents a recording: what happened, and what a person can do about it.
 
     Attributes:
-        cause: kind of fault, for programs.
+        cause: Kind of fault, for programs.
+        exit_code: Of a command that ends with it: 2 if nothing was begun, otherwise 1.
     """
 
     def __init__(self, cause: Cause, message: str, advice: str = "") -> None:
@@ -47,14 +45,17 @@ class RigFault(Fault):
 
 @dataclass(frozen=True)
 class ArmState:
-    """One state of the arm.
+    """State of the arm at one moment.
 
     Attributes:
-        time_s: when it arrived. pose: of the tool. speed_mm_s: of the tool, >= 0.
-        force_n: at the tool, along z, None without a sensor; then `[rig]` has to say that nobody watches it.
-        protective_stop, emergency_stop: whether the controller has stopped the arm.
-        moving: whether the last move that was begun is still under way.
-        sideways_n: force on the tool across z, >= 0; 0 without a sensor.
+        time_s: When it arrived.
+        pose: Of the tool.
+        speed_mm_s: Of the tool, >= 0.
+        force_n: At the tool, along z; None without a sensor, which `[rig] max_force_n` has to permit.
+        protective_stop: Whether the controller has stopped the arm.
+        emergency_stop: Whether a person has stopped the arm.
+        moving: Whether the last move is still under way.
+        sideways_n: Force on the tool across z, >= 0; 0 without a sensor.
     """
 
     time_s: float
@@ -67,8 +68,8 @@ class ArmState:
     sideways_n: float = 0.0
 
     @property
-    def pushed_n(self) -> float | None:
-        """Force on the tool in all, whatever its direction, >= 0; None without a sensor."""
+    def total_force_n(self) -> float | None:
+        """Magnitude of the force on the tool, >= 0; None without a sensor."""
         return None if self.force_n is None else math.hypot(self.force_n, self.sideways_n)
 
 
@@ -76,23 +77,27 @@ class Arm(Protocol):
     """A robot arm. Methods raise `RigFault` within 5 s rather than wait for ever."""
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the link; returns what the arm says of itself (model, versions, rates) as JSON.
+        """Open the link.
 
-        `serial` and, where the tool is something the arm is told of, `tcp` (the tip from the flange, mm and rad) are
-        compared where a recording is gone on with. An arm that others use is refused, not taken from them.
+        Returns:
+            The arm's identity (model, versions, rates) as JSON. `serial` and, where the controller keeps the tool,
+            `tcp` (the tip from the flange, mm and rad) are compared when a recording is resumed.
+
+        Raises:
+            RigFault: "refused" if another program controls the arm.
         """
         ...
 
     def state(self) -> ArmState:
-        """The latest state; raises RigFault("stale") where it is older than 0.5 s, "lost" where the link is down."""
+        """Return the latest state; raises RigFault("stale") if it is older than 0.5 s, "lost" if the link is down."""
         ...
 
     def drain(self) -> Array:
-        """(n, 10) states since the last call, by `STATE_COLUMNS`, none twice."""
+        """Return the (n, 10) states since the last call, by `STATE_COLUMNS`, none twice."""
         ...
 
     def move(self, pose: Pose, speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Begin a straight move and return; the caller has checked it against the limits."""
+        """Start a straight move and return; the caller has checked it against the limits."""
         ...
 
     def stop(self) -> None:
@@ -106,11 +111,12 @@ class Arm(Protocol):
 
 @dataclass(frozen=True)
 class BoardSamples:
-    """Readings as they come from a converter.
+    """Samples as a board delivers them.
 
     Attributes:
-        times_s: (n,) host times, ascending. volts: (n, C).
-        missing: how many samples were lost before each of them, (n,) whole numbers; a gap is never filled.
+        times_s: Host times, ascending; shape (n,).
+        volts: Readings of C channels; shape (n, C).
+        missing: Number of samples lost before each of them; shape (n,). A gap is never filled.
     """
 
     times_s: Array
@@ -125,14 +131,18 @@ class Board(Protocol):
         """Open the link and start sampling.
 
         Returns:
-            What the board says of itself (name, versions, bits ...) as JSON; of it `rate_hz`, samples a second,
-            `channels`, the number C, `inputs`, which of the board they are, and `supply_v`, the reading at full scale,
-            are used. A `warning` is shown to whoever looks the rig over.
+            The board's identity (name, versions, bits ...) as JSON. Of it are used: `rate_hz`, samples a second;
+            `channels`, the number C; `inputs`, which of the board they are; `supply_v`, the reading at full scale;
+            and `warning`, which `doctor` shows.
         """
         ...
 
     def read(self) -> BoardSamples:
-        """All samples since the last call, without waiting; RigFault("stale") after 1 s without any, "lost" if gone."""
+        """Return all samples since the last call, without waiting.
+
+        Raises:
+            RigFault: "stale" after 1 s without any, "lost" if the board is gone.
+        """
         ...
 
     def close(self) -> None:
@@ -140,44 +150,38 @@ class Board(Protocol):
         ...
 
 
-Group = Literal["padforge.arms", "padforge.boards"]
-
-
 def device_names(group: Group) -> list[str]:
-    """Names of all arms or boards that are installed."""
+    """List the installed arms or boards."""
     return sorted({point.name for point in entry_points(group=group)})
 
 
-def device(group: Group, name: str) -> Callable[..., Any]:
-    """The function that makes an arm or a board.
+def load_device(group: Group, name: str) -> Callable[..., Any]:
+    """Return the function that makes an arm or a board.
 
     Raises:
-        InputError: none has that name, or its package cannot be imported.
+        InputError: No device has that name, or its package cannot be imported.
     """
-    found = [point for point in entry_points(group=group) if point.name == name]
-    if not found:
+    points = [point for point in entry_points(group=group) if point.name == name]
+    if not points:
         allowed = ", ".join(device_names(group)) or "none: padforge is not installed, run pip install ."
         raise InputError(f"{group.removeprefix('padforge.')}: got {name!r}, allowed are {allowed}")
     try:
-        return found[0].load()
-    except Exception as error:  # a package of somebody else may fail in any way
-        raise InputError(f"{name}: {found[0].value} cannot be loaded ({type(error).__name__}: {error})") from error
+        return points[0].load()
+    except Exception as error:  # a third-party package may fail in any way
+        raise InputError(f"{name}: {points[0].value} cannot be loaded ({type(error).__name__}: {error})") from error
 
 
-ROOT = Path(__file__).parents[3]
-
-
-def require_rig_system() -> None:
-    """Raise InputError where rigs and their emulators, which need what POSIX has, cannot run."""
-    if (here := platform.system()) not in ("Linux", "Darwin"):
-        raise InputError(f"a rig needs Linux or macOS, this is {here}; allowed here is --rig simulated")
+def check_platform() -> None:
+    """Raise InputError if rigs and their emulators, which need POSIX, cannot run here."""
+    if (system := platform.system()) not in ("Linux", "Darwin"):
+        raise InputError(f"a rig needs Linux or macOS, this is {system}; allowed here is --rig simulated")
 
 
 def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
-    """Run `python -m module` with pipes to its stdin and stdout.
+    """Start `python -m module` with pipes to its stdin and stdout.
 
-    It finds this package wherever it is started from, and no code of the folder it is started in, which may be
-    anybody's. An interrupt from the keyboard does not reach it: its parent decides what is to end first.
+    It finds this package wherever it is started from, and imports nothing from the current folder (`-P`). An interrupt
+    from the keyboard does not reach it: its parent decides what ends first.
     """
     path = os.pathsep.join((str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))))
     return subprocess.Popen(
@@ -191,32 +195,32 @@ def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess
 
 
 def host_ports() -> list[Any]:
-    """All serial ports of this host, as pyserial lists them: `device`, `vid`, `pid`, `serial_number`, `description`.
+    """List the serial ports of this host, as pyserial does: `device`, `vid`, `pid`, `serial_number`, `description`.
 
     Raises:
         RigFault: "refused" without pyserial.
     """
-    _pyserial()
+    _import_pyserial()
     from serial.tools.list_ports import comports
 
     return list(comports())
 
 
 def open_port(port: str, baud: int, timeout_s: float) -> Any:
-    """Open `port` for this process alone, as a `serial.Serial` whose reads wait for at most `timeout_s`.
+    """Open a serial port exclusively, as a `serial.Serial` whose reads wait for at most `timeout_s`.
 
     Raises:
-        RigFault: "refused" where that cannot be, and why.
+        RigFault: "refused" if it cannot be opened, and why.
     """
-    serial = _pyserial()
+    serial = _import_pyserial()
     try:
         return serial.Serial(port, baud, timeout=timeout_s, write_timeout=1, exclusive=True)
     except Exception as error:  # pyserial lets termios.error through, which is no OSError
-        raise refusal(port, error) from error
+        raise port_fault(port, error) from error
 
 
-def refusal(port: str, error: Exception) -> RigFault:
-    """What pyserial's `error` on opening `port` means and what to do about it."""
+def port_fault(port: str, error: Exception) -> RigFault:
+    """Translate pyserial's `error` on opening `port` into a fault with advice."""
     number, text = getattr(error, "errno", None), str(error)  # Windows has the kind in the text only
     if number == errno.ENOENT or "FileNotFoundError" in text:
         advice = "check the cable; `padforge sense doctor` lists the ports there are"
@@ -230,7 +234,7 @@ def refusal(port: str, error: Exception) -> RigFault:
     return RigFault("refused", f"{port}: cannot be opened ({error})", "check that it is the right port")
 
 
-def _pyserial() -> Any:
+def _import_pyserial() -> Any:
     try:
         import serial
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""What to know of a rig before a long run: whether it answers, how fast, and which channels are alive."""
+"""Diagnoses of a rig before a long run: whether it responds, how fast, and which channels have a working fibre."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,127 +8,142 @@ import numpy as np
 
 from padforge.sense.arrays import Array
 from padforge.sense.rig.devices import Arm, Board, RigFault
-from padforge.sense.rig.safety import require_tool
+from padforge.sense.rig.safety import check_tcp
 from padforge.sense.settings import RigSettings
 
 Status = Literal["ok", "warn", "fail"]
 
-LOOK_S = 2.0
-"""How long channels and states are looked at."""
+OBSERVE_S = 2.0
+"""For how long channels and states are observed."""
 _DEAD_V = 0.02
 """A channel nearer than this to either end of the range is open, shorted or saturated."""
-_STUCK_V = 1e-6
-"""An ADC that reads a fibre shows noise; a spread below this is a stuck channel."""
-_NOISY_V = 0.02
+_STUCK_V, _NOISY_V = 1e-6, 0.02
+"""Standard deviations below and above which a channel is stuck or noisy: an ADC that reads a fibre shows noise."""
 _LATE_S = 0.1
+_RATE_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One thing looked at: its name, whether it is well, and what was found, in one line."""
+    """One diagnosis.
+
+    Attributes:
+        name: What was examined.
+        status: Whether it is well.
+        message: What was measured, in one line.
+    """
 
     name: str
     status: Status
-    found: str
+    message: str
 
 
-def examine_converter(converter: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> list[Diagnosis]:
-    """Whether a converter answers, at its rate, without a gap, and each of its channels."""
+def examine_board(board: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> list[Diagnosis]:
+    """Connect and close a board: whether it responds, its rate, gaps and latency, and each of its channels."""
     try:
-        info = converter.connect()
-        times, volts, missing = _samples(converter, clock, sleep)
-        delay = clock() - times[-1] if len(times) else np.inf
+        identity = board.connect()
+        times_s, volts, n_missing = _read_samples(board, clock, sleep)
+        delay_s = clock() - times_s[-1] if len(times_s) else np.inf
     except RigFault as fault:
         return [Diagnosis("board", "fail", str(fault))]
     finally:
-        converter.close()
-    rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
-    wanted = float(info.get("rate_hz", rate))
+        board.close()
+    rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
+    nominal_hz = float(identity.get("rate_hz", rate_hz))
+    is_on_rate = abs(rate_hz / nominal_hz - 1) < _RATE_TOLERANCE
+    inputs, supply_v = identity["inputs"], identity["supply_v"]
     return [
-        Diagnosis("board", "warn" if "warning" in info else "ok", _said(info)),
-        Diagnosis("rate", "ok" if abs(rate / wanted - 1) < 0.01 else "fail", f"{rate:.1f} Hz of {wanted:g}"),
-        Diagnosis("samples", "fail" if missing else "ok", f"{missing} of {len(times) + missing} lost"),
-        Diagnosis("latency", "ok" if delay < _LATE_S else "warn", f"{1e3 * delay:.1f} ms from sample to program"),
-        *(_channel(k + 1, info["inputs"][k], column, info["supply_v"]) for k, column in enumerate(volts.T)),
+        Diagnosis("board", "warn" if "warning" in identity else "ok", _identity_text(identity)),
+        Diagnosis("rate", "ok" if is_on_rate else "fail", f"{rate_hz:.1f} Hz of {nominal_hz:g}"),
+        Diagnosis("samples", "fail" if n_missing else "ok", f"{n_missing} of {len(times_s) + n_missing} lost"),
+        Diagnosis("latency", "ok" if delay_s < _LATE_S else "warn", f"{1e3 * delay_s:.1f} ms from sample to program"),
+        *(_examine_channel(k + 1, inputs[k], column, supply_v) for k, column in enumerate(volts.T)),
     ]
 
 
 def examine_arm(
     arm: Arm, rig: RigSettings, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> list[Diagnosis]:
-    """Whether an arm answers, how often it tells its state, and whether anything has stopped it. It is not moved.
+    """Connect and close an arm: whether it responds, its states, and whether anything has stopped it. It does not move.
 
-    What of `[rig]` would keep `record` from moving it fails here, too: its tool, and a force that nobody can watch.
+    What would keep `record` from moving it fails here, too: its tool, and a force that nobody can watch.
     """
     try:
-        info = arm.connect()
+        identity = arm.connect()
         arm.drain()
-        sleep(LOOK_S)
-        states, state, now = arm.drain(), arm.state(), clock()
+        sleep(OBSERVE_S)
+        states, state, now_s = arm.drain(), arm.state(), clock()
     except RigFault as fault:
         return [Diagnosis("arm", "fail", str(fault))]
     finally:
         arm.close()
-    gaps = np.diff(states[:, 0])
-    stopped = state.protective_stop or state.emergency_stop
-    what = "emergency stop" if state.emergency_stop else "protective stop" if stopped else "normal"
-    rate = 1 / float(np.median(gaps)) if len(gaps) else 0.0
-    worst = float(gaps.max()) if len(gaps) else np.inf
-    pose = ", ".join(f"{value:.1f}" for value in state.pose[:3])
+    gaps_s = np.diff(states[:, 0])
+    is_stopped = state.protective_stop or state.emergency_stop
+    safety = "emergency stop" if state.emergency_stop else "protective stop" if is_stopped else "normal"
+    rate_hz = 1 / float(np.median(gaps_s)) if len(gaps_s) else 0.0
+    gap_s = float(gaps_s.max()) if len(gaps_s) else np.inf
+    age_s = now_s - state.time_s
+    position = ", ".join(f"{value:.1f}" for value in state.pose[:3])
     return [
-        Diagnosis("arm", "ok", _said(info)),
-        Diagnosis("safety", "fail" if stopped else "ok", what),
-        Diagnosis("states", "ok" if worst < _LATE_S else "warn", f"{rate:.0f} Hz, longest gap {1e3 * worst:.0f} ms"),
-        Diagnosis("age", "ok" if now - state.time_s < _LATE_S else "warn", f"{1e3 * (now - state.time_s):.1f} ms"),
-        Diagnosis("tool", "ok", f"at {pose} mm"),
-        *_tip(info, rig),
-        _force(state.force_n, rig.max_force_n),
+        Diagnosis("arm", "ok", _identity_text(identity)),
+        Diagnosis("safety", "fail" if is_stopped else "ok", safety),
+        Diagnosis("states", _on_time(gap_s), f"{rate_hz:.0f} Hz, longest gap {1e3 * gap_s:.0f} ms"),
+        Diagnosis("age", _on_time(age_s), f"{1e3 * age_s:.1f} ms"),
+        Diagnosis("tool", "ok", f"at {position} mm"),
+        *_examine_tcp(identity, rig),
+        _examine_force(state.force_n, rig.max_force_n),
     ]
 
 
-def _tip(info: Mapping[str, Any], rig: RigSettings) -> list[Diagnosis]:
-    """Whether the arm and `[rig]` agree where the tip is; nothing of an arm that keeps no such place."""
+def _on_time(delay_s: float) -> Status:
+    return "ok" if delay_s < _LATE_S else "warn"
+
+
+def _examine_tcp(identity: Mapping[str, Any], rig: RigSettings) -> list[Diagnosis]:
+    """Whether the arm and `[rig]` agree on the tip; nothing of an arm that keeps none."""
+    if "tcp" not in identity:
+        return []
     try:
-        require_tool(rig.tcp_mm, info)
+        check_tcp(rig.tcp_mm, identity)
     except RigFault as fault:
         return [Diagnosis("tcp", "fail", str(fault))]
-    return [Diagnosis("tcp", "ok", f"{list(rig.tcp_mm or ())} mm, as the controller says")] if "tcp" in info else []
+    return [Diagnosis("tcp", "ok", f"{list(rig.tcp_mm or ())} mm, as the controller says")]
 
 
-def _force(force_n: float | None, max_force_n: float | None) -> Diagnosis:
+def _examine_force(force_n: float | None, max_force_n: float | None) -> Diagnosis:
     """Whether the force is watched."""
-    told = "the arm tells no force" if force_n is None else f"{force_n:.1f} N"
+    measured = "the arm measures no force" if force_n is None else f"{force_n:.1f} N"
     if max_force_n is None:
-        return Diagnosis("force", "warn", f'{told}; [rig] max_force_n is "unwatched": no force stops the arm')
+        return Diagnosis("force", "warn", f'{measured}; [rig] max_force_n is "unwatched": no force stops the arm')
     if force_n is None:
-        return Diagnosis("force", "fail", f'{told}; [rig] max_force_n is {max_force_n:g}, allowed is "unwatched"')
-    return Diagnosis("force", "ok", f"{told}, stopped beyond {max_force_n:g} N")
+        return Diagnosis("force", "fail", f'{measured}; [rig] max_force_n is {max_force_n:g}, allowed is "unwatched"')
+    return Diagnosis("force", "ok", f"{measured}, stopped beyond {max_force_n:g} N")
 
 
-def _samples(converter: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> tuple[Array, Array, int]:
-    end, pieces = clock() + LOOK_S, []
-    while clock() < end:
-        pieces.append(converter.read())
+def _read_samples(board: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> tuple[Array, Array, int]:
+    end_s, blocks = clock() + OBSERVE_S, []
+    while clock() < end_s:
+        blocks.append(board.read())
         sleep(0.01)
-    times = np.concatenate([piece.times_s for piece in pieces])
-    volts = np.vstack([piece.volts for piece in pieces if len(piece.times_s)] or [np.empty((0, 0))])
-    return times, volts, int(sum(piece.missing.sum() for piece in pieces))
+    times_s = np.concatenate([block.times_s for block in blocks])
+    volts = np.vstack([block.volts for block in blocks if len(block.times_s)] or [np.empty((0, 0))])
+    return times_s, volts, int(sum(block.missing.sum() for block in blocks))
 
 
-def _channel(number: int, board_input: int, volts: Array, supply_v: float) -> Diagnosis:
-    """Whether a channel looks like one with a fibre on it."""
-    rest, noise = float(np.median(volts)), float(volts.std())
-    text = f"input {board_input} rests at {rest:.3f} V, noise {1e3 * noise:.2f} mV"
-    if rest < _DEAD_V:
-        return Diagnosis(f"channel {number}", "fail", f"{text}: dead, open or shorted to ground")
-    if rest > supply_v - _DEAD_V:
-        return Diagnosis(f"channel {number}", "fail", f"{text}: saturated, or shorted to the supply")
+def _examine_channel(number: int, board_input: int, volts: Array, supply_v: float) -> Diagnosis:
+    """Whether a channel reads like one with a fibre on it."""
+    name, baseline, noise = f"channel {number}", float(np.median(volts)), float(volts.std())
+    text = f"input {board_input} rests at {baseline:.3f} V, noise {1e3 * noise:.2f} mV"
+    if baseline < _DEAD_V:
+        return Diagnosis(name, "fail", f"{text}: dead, open or shorted to ground")
+    if baseline > supply_v - _DEAD_V:
+        return Diagnosis(name, "fail", f"{text}: saturated, or shorted to the supply")
     if noise < _STUCK_V:
-        return Diagnosis(f"channel {number}", "warn", f"{text}: never changes")
+        return Diagnosis(name, "warn", f"{text}: never changes")
     if noise > _NOISY_V:
-        return Diagnosis(f"channel {number}", "warn", f"{text}: noisy, look at its contacts")
-    return Diagnosis(f"channel {number}", "ok", text)
+        return Diagnosis(name, "warn", f"{text}: noisy, look at its contacts")
+    return Diagnosis(name, "ok", text)
 
 
-def _said(info: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in info.items())
+def _identity_text(identity: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in identity.items())

@@ -1,12 +1,12 @@
-"""Pressing where a localizer is least certain: an adaptive plan moves its presses there as the recording goes on.
+"""Operation of a rig: devices are opened, diagnosed, and made to record; or a recording is simulated at once.
 
-A rig at work: its devices are opened, looked over, and made to record; or a recording is simulated at once.
+An adaptive plan moves its presses, as the recording goes on, to where a localizer errs most.
 """
 
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,60 +25,70 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import Free, PressPlan, free_of, size_of, uniform
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import refuse_begun, refuse_existing
-from padforge.sense.rig.config import RigConfig, kept_plan, on_bed, plan_of, recorder_of
-from padforge.sense.rig.devices import Arm, Board, RigFault, device, host_ports
-from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_converter
-from padforge.sense.rig.press_loop import Interrupts, Report, Session, require_safe_plan
-from padforge.sense.rig.safety import Limits, require_ready, require_tool
+from padforge.sense.rig.config import RigConfig, locate_on_bed, make_plan, open_recorder, plan_notice
+from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
+from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
+from padforge.sense.rig.press_loop import Interrupts, OnProgress, PressLoop, check_plan
+from padforge.sense.rig.safety import Limits, check_start_state, check_tcp
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 
-EVERY = 20
-"""Presses between two looks at how well the localizer finds them."""
-_CANDIDATES = 500
-_NEIGHBOURS = 5
+ADAPT_EVERY = 20
+"""Presses between two evaluations of the localizer by an adaptive plan."""
+_N_CANDIDATES = 500
+_N_NEIGHBOURS = 5
+_DRY_PREFIX = "padforge-dry-"
+"""Of the temporary folders that dry runs record into."""
+
+OpenedRig = AbstractContextManager[tuple[Arm, Board, RigSettings]]
+"""An arm and a board, not yet connected, and the settings for them, which name the inputs of the board."""
 
 
 class AdaptivePlanner:
-    """Chooses presses: those candidates where errors nearby, times the way to the nearest press, are largest.
+    """Moves presses to those candidates where errors nearby, times the distance to the nearest press, are largest.
 
     Args:
-        localizer: calibrated on an earlier recording of the pad. run: run directory that is being written, synced after
-            every press. rng: of the candidates. free: which of them may be pressed.
+        localizer: Calibrated on an earlier recording of the pad.
+        run: Run directory that is being written, synced after every press.
+        rng: Of the candidates.
+        free: Which of them may be pressed.
     """
 
     def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: Free) -> None:
         self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
 
     def __call__(self, plan: PressPlan, press: int) -> PressPlan:
-        """The plan with its next presses, from `press` on, moved; unchanged between two looks."""
-        if press == 0 or press % EVERY:
+        """Return the plan with its next presses, from `press` on, moved; unchanged between two evaluations."""
+        if press == 0 or press % ADAPT_EVERY:
             return plan
         recording = Recording.open(self._run)
-        errors = np.linalg.norm(self._localizer.predict(recording).positions_mm - recording.presses_mm, axis=1)
-        places = plan.positions_mm.copy()
-        high = np.abs(plan.positions_mm).max(axis=0)
-        candidates = uniform(np.array([-high, high]), _CANDIDATES, self._rng, self._free)
+        errors_mm = np.linalg.norm(self._localizer.predict(recording).positions_mm - recording.presses_mm, axis=1)
+        positions_mm = plan.positions_mm.copy()
+        corner_mm = np.abs(plan.positions_mm).max(axis=0)
+        candidates = uniform(np.array([-corner_mm, corner_mm]), _N_CANDIDATES, self._rng, self._free)
         pressed = recording.presses_mm
-        for number in range(press, min(press + EVERY, len(plan))):
-            places[number] = candidates[np.argmax(uncertainty(candidates, recording.presses_mm, errors, pressed))]
-            pressed = np.vstack([pressed, places[number]])
-        return PressPlan(places, plan.depths_mm)
+        for number in range(press, min(press + ADAPT_EVERY, len(plan))):
+            score = acquisition(candidates, recording.presses_mm, errors_mm, pressed)
+            positions_mm[number] = candidates[np.argmax(score)]
+            pressed = np.vstack([pressed, positions_mm[number]])
+        return PressPlan(positions_mm, plan.depths_mm)
 
 
-def uncertainty(candidates: Array, known: Array, errors: Array, pressed: Array) -> Array:
-    """(K,) how much there is to learn at candidates (K, 2): mean error of the nearest presses times the way to any.
+def acquisition(candidates: Array, evaluated: Array, errors: Array, pressed: Array) -> Array:
+    """Score candidates: mean error of the nearest evaluated presses times the distance to the nearest press.
 
     Args:
-        known, errors: (Q, 2) places whose errors (Q,) are known. pressed: (P, 2) all places, of which none is repeated.
+        candidates: Positions; shape (K, 2).
+        evaluated: Positions whose errors are known; shape (Q, 2).
+        errors: Of those; shape (Q,).
+        pressed: All positions pressed so far, none of which scores; shape (P, 2).
+
+    Returns:
+        Scores; shape (K,).
     """
-    _, near = KDTree(known).query(candidates, k=min(_NEIGHBOURS, len(known)))
-    way, _ = KDTree(pressed).query(candidates)
-    return errors[near].reshape(len(candidates), -1).mean(axis=1) * way
-
-
-_DRY = "padforge-dry-"
-"""What folders for recordings that nobody keeps begin with, among temporary ones."""
+    _, nearest = KDTree(evaluated).query(candidates, k=min(_N_NEIGHBOURS, len(evaluated)))
+    distance, _ = KDTree(pressed).query(candidates)
+    return errors[nearest].reshape(len(candidates), -1).mean(axis=1) * distance
 
 
 def record_simulated(
@@ -90,158 +100,163 @@ def record_simulated(
     like: Twin | None = None,
     replacing: bool = False,
 ) -> Recording:
-    """Record presses on the simulated rig, at once, with the settings of `spec`, into the run directory `out`.
+    """Record presses on a simulated pad, at once.
 
     Args:
-        pad, like: see `simulate`.
-        replacing: whether a simulated recording that is there gives way.
+        spec: Settings.
+        pad: See `simulate`.
+        out: Run directory.
+        overrides: Settings of `[rig]` that take precedence.
+        inputs: Files it is made from, for the provenance.
+        like: See `simulate`.
+        replacing: Whether a simulated recording in `out` is replaced.
+
+    Returns:
+        The recording.
 
     Raises:
-        InputError: settings that cannot be, a twin that reads no fibre, or a recording in the way.
+        InputError: Settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
     if not replacing:
         refuse_existing(out)
-    options = spec.section(RigSettings, **overrides)
+    rig = spec.section(RigSettings, **overrides)
     plan = pad.morphology if isinstance(pad, Twin) else pad
-    size = spec.section(PadSettings, **plan.layout.settings)
+    pad_settings = spec.section(PadSettings, **plan.layout.settings)
     with stage("simulate"):
-        recording = simulate(pad, options, spec.section(Contact), size, like)
-    inputs = [*inputs, *([options.plan_file] if options.plan_file else [])]
-    recording.save(out, provenance("padforge sense record --rig simulated", options.seed, inputs), replacing)
+        recording = simulate(pad, rig, spec.section(Contact), pad_settings, like)
+    inputs = [*inputs, *([rig.plan_file] if rig.plan_file else [])]
+    recording.save(out, provenance("padforge sense record --rig simulated", rig.seed, inputs), replacing)
     return recording
 
 
 @contextmanager
-def opened_rig(
-    kind: str, setup: RigConfig, inputs: Sequence[int], virtual_hardware: bool = False
-) -> Iterator[tuple[Arm, Board, RigSettings]]:
-    """Arm and converter of a rig, "simulated" or the name of an arm, not yet connected, and the settings for them.
+def opened_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, Board, RigSettings]]:
+    """Open a rig with real devices, see `OpenedRig`.
 
     Args:
-        inputs: of the board, fibre by fibre; all of them where empty. The settings then name these.
-        virtual_hardware: emulated devices behind the drivers of the rig, as the simulated one always has them.
+        kind: Name of the arm.
+        config: What is recorded.
+        inputs: Of the board, in the order of the fibres; all of them if empty.
     """
-    rig = setup.rig.model_copy(update={"channels": tuple(inputs)})
-    if kind == "simulated" or virtual_hardware:
-        from padforge.sense.virtual.virtual_rig import RIGS
-
-        if kind not in RIGS:
-            raise InputError(f"--virtual-hardware: got --rig {kind}, allowed are {', '.join(RIGS)}")
-        settle, emulated = RIGS[kind]
-        chosen = settle(rig, setup.pad)
-        with emulated(setup.pad, setup.contact, chosen) as (arm, converter, _, _):
-            yield arm, converter, chosen
-        return
-    arm, rig = _arm(kind, setup, rig)
-    with closing(_board(rig, inputs)) as converter, closing(arm):
-        yield arm, converter, rig
+    arm, rig = _make_arm(kind, config, inputs)
+    # The arm is closed, and so stopped, before the board.
+    with closing(_make_board(rig, inputs)) as board, closing(arm):
+        yield arm, board, rig
 
 
-def _arm(kind: str, setup: RigConfig, rig: RigSettings) -> tuple[Arm, RigSettings]:
-    """An arm by its name, and the settings for it."""
-    make = device("padforge.arms", kind)
-    rig = on_bed(rig, setup.folder) if kind == "printer" else rig
+@contextmanager
+def opened_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, RigSettings]]:
+    """Open the arm alone, not yet connected, with the settings for it; see `opened_rig`."""
+    arm, rig = _make_arm(kind, config, inputs)
+    with closing(arm):
+        yield arm, rig
+
+
+@contextmanager
+def opened_board(config: RigConfig, inputs: Sequence[int]) -> Iterator[Board]:
+    """Open the board alone, not yet connected; see `opened_rig`."""
+    with closing(_make_board(config.rig, inputs)) as board:
+        yield board
+
+
+def _make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm, RigSettings]:
+    make = load_device("padforge.arms", kind)
+    rig = config.rig.model_copy(update={"channels": tuple(inputs)})
+    if kind == "printer":
+        rig = locate_on_bed(rig, config.folder)
     return make(rig), rig
 
 
-def _board(rig: RigSettings, inputs: Sequence[int]) -> Board:
-    return device("padforge.boards", rig.board)(rig, inputs)
-
-
-@contextmanager
-def opened_board(setup: RigConfig, inputs: Sequence[int]) -> Iterator[Board]:
-    """The board alone, not yet connected: the pad is pressed by hand. `inputs` as of `opened_rig`."""
-    with closing(_board(setup.rig, inputs)) as converter:
-        yield converter
-
-
-@contextmanager
-def _emulated_board(setup: RigConfig) -> Iterator[Board]:
-    from padforge.sense.virtual.virtual_hand import pressed_by_finger
-
-    with pressed_by_finger(setup.pad, setup.contact, setup.rig) as (converter, _):
-        yield converter
+def _make_board(rig: RigSettings, inputs: Sequence[int]) -> Board:
+    return load_device("padforge.boards", rig.board)(rig, inputs)
 
 
 def record(
-    kind: str,
-    setup: RigConfig,
-    model: Path | None = None,
+    config: RigConfig,
+    opened: OpenedRig,
     *,
+    model: Path | None = None,
     dry: bool = False,
     resume: bool = False,
-    virtual_hardware: bool = False,
-    report: Report = lambda done, of: None,
-    say: Callable[[str], None] = lambda line: None,
+    on_progress: OnProgress = lambda done, total: None,
+    on_message: Callable[[str], None] = lambda line: None,
 ) -> Recording | None:
-    """Record with the drivers of a rig, see `opened_rig`; what is done is on the disk whatever happens.
+    """Record with a rig; what is done is on the disk whatever happens.
 
     Args:
-        model: folder of the localizer that an adaptive plan is steered by.
-        dry: go through the plan without touching the pad; nothing is kept. resume: go on with what is in `setup.out`.
-        virtual_hardware: see `opened_rig`.
-        report: told of presses done, and in all. say: told what a person should know before the arm moves.
+        config: What is recorded.
+        opened: The rig, of `opened_rig` or `virtual.virtual_rig.opened_virtual_rig`.
+        model: Folder of the localizer of an adaptive plan.
+        dry: Go through the plan without touching the pad; nothing is kept.
+        resume: Resume what is in `config.out`.
+        on_progress: Receives the number of presses done, and of all.
+        on_message: Receives what a person should know before the arm moves.
 
     Returns:
-        The recording, None of a dry run.
+        The recording; None of a dry run.
 
     Raises:
-        InputError: settings, a plan or a run directory that cannot be.
-        RigFault: the rig failed, or the plan is not safe.
+        InputError: Settings, a plan or a run directory that cannot be.
+        RigFault: The rig failed, or the plan is not safe.
     """
-    inputs = setup.rig.inputs(len(setup.pad.knots))
-    with opened_rig(kind, setup, inputs, virtual_hardware) as (arm, converter, rig):
+    with opened as (arm, board, rig):
         with Interrupts() as interrupts:
-            plan = plan_of(setup, rig, resume)
-            steer = _steering(setup, rig, model)
-            require_safe_plan(plan, rig)
-            if resume and (told := kept_plan(setup)):
-                say(told)
+            plan = make_plan(config, rig, resume)
+            planner = _make_planner(config, rig, model)
+            check_plan(plan, rig)
+            if resume and (notice := plan_notice(config)):
+                on_message(notice)
             if not (resume or dry):
-                refuse_begun(setup.out)
-            devices = {"board": converter.connect(), "arm": arm.connect()}
-            require_tool(rig.tcp_mm, devices["arm"])
-            require_ready(arm.state(), Limits.of(rig))  # before there is a folder that would be in the way
+                refuse_begun(config.out)
+            identities = {"board": board.connect(), "arm": arm.connect()}
+            check_tcp(rig.tcp_mm, identities["arm"])
+            # Before there is a folder that would be in the way.
+            check_start_state(arm.state(), Limits.from_settings(rig))
             interrupts.check()
         if rig.max_force_n is None:
-            say('[rig] max_force_n is "unwatched": no force stops the arm')
-        with temporary_folder(Path(tempfile.gettempdir()), _DRY) if dry else nullcontext(setup.out) as folder:
-            with recorder_of(setup, rig, plan, folder, resume, devices) as recorder:
-                report(len(recorder.done), len(plan))
-                Session(arm, converter, recorder, rig, dry=dry).run(plan, report, steer)
-            return None if dry else Recording.open(folder)
+            on_message('[rig] max_force_n is "unwatched": no force stops the arm')
+        folder = temporary_folder(Path(tempfile.gettempdir()), _DRY_PREFIX) if dry else nullcontext(config.out)
+        with folder as out:
+            with open_recorder(config, rig, plan, out, resume, identities) as recorder:
+                on_progress(len(recorder.done), len(plan))
+                PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
+            return None if dry else Recording.open(out)
 
 
-def _steering(setup: RigConfig, rig: RigSettings, model: Path | None) -> Callable[[PressPlan, int], PressPlan]:
+def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Callable[[PressPlan, int], PressPlan]:
     if rig.plan != "adaptive":
         return lambda plan, press: plan
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
-    free = free_of(setup.pad, size_of(setup.pad, setup.size))
-    return AdaptivePlanner(LocalizerModel.load(model), setup.out, np.random.default_rng(rig.seed), free)
+    free = free_of(config.pad, size_of(config.pad, config.pad_settings))
+    return AdaptivePlanner(LocalizerModel.load(model), config.out, np.random.default_rng(rig.seed), free)
 
 
-def look_over(kind: str, setup: RigConfig, inputs: Sequence[int], virtual_hardware: bool = False) -> list[Diagnosis]:
-    """What to know of a rig, see `opened_rig`, or of the board alone for "hand", before a long run; nothing moves."""
+def diagnose(
+    board: AbstractContextManager[Board], arm: AbstractContextManager[tuple[Arm, RigSettings]] | None = None
+) -> list[Diagnosis]:
+    """Diagnose a rig, or the board alone, before a long run; nothing moves.
+
+    Args:
+        board: Of `opened_board`.
+        arm: Of `opened_arm`. One device is examined even if the other cannot be opened.
+
+    Raises:
+        RigFault: The board is alone, and cannot be opened.
+    """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
-    found = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
-    if kind == "hand":
-        with _emulated_board(setup) if virtual_hardware else opened_board(setup, inputs) as converter:
-            return found + examine_converter(converter, time.monotonic, time.sleep)
-    if kind == "simulated" or virtual_hardware:
-        with opened_rig(kind, setup, inputs, virtual_hardware) as (arm, converter, rig):
-            found += examine_converter(converter, time.monotonic, time.sleep)
-            return found + examine_arm(arm, rig, time.monotonic, time.sleep)
-
-    def board() -> list[Diagnosis]:
-        return examine_converter(_board(setup.rig, inputs), time.monotonic, time.sleep)
-
-    def arm_alone() -> list[Diagnosis]:
-        return examine_arm(*_arm(kind, setup, setup.rig), time.monotonic, time.sleep)
-
-    for name, examined in (("board", board), ("arm", arm_alone)):  # one is looked at where the other is not there
+    diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
+    try:
+        with board as device:
+            diagnoses += examine_board(device, time.monotonic, time.sleep)
+    except RigFault as fault:
+        if arm is None:
+            raise
+        diagnoses.append(Diagnosis("board", "fail", str(fault)))
+    if arm is not None:
         try:
-            found += examined()
+            with arm as (device, rig):
+                diagnoses += examine_arm(device, rig, time.monotonic, time.sleep)
         except RigFault as fault:
-            found.append(Diagnosis(name, "fail", str(fault)))
-    return found
+            diagnoses.append(Diagnosis("arm", "fail", str(fault)))
+    return diagnoses

@@ -1,25 +1,38 @@
-"""Checks of a target before the arm moves, of its state while it moves, and the one wait that all moves use."""
+"""Safety of the arm: limits, checks of a target before it moves and of its state while it moves, and the retreat.
+
+Nothing moves to a target that `check_target` has not passed. Every move is waited for by `wait_until_still`, which
+checks every state and stops the arm before it raises. After a fault `retreat` lifts the stopped tool off the pad.
+"""
 
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
-from padforge.sense.rig.devices import Arm, ArmState, RigFault
+from padforge.sense.rig.devices import Arm, ArmState, Pose, RigFault
 from padforge.sense.settings import RigSettings
 
 Vector = tuple[float, float, float]
 DOWN: Vector = (0.0, math.pi, 0.0)
 """Rotation vector of a tool that points straight down."""
 MAX_LEAN_DEG = 10.0
-"""Largest angle between the expected tool axis and straight down: depths are measured along the base's z axis."""
-TCP_SLACK_MM = 0.1
+"""Between the expected tool axis and straight down: depths are measured along the base's z axis."""
+TCP_TOLERANCE_MM = 0.1
 STILL_MM_S = 1.0
-DEPTH_SLACK_MM = 0.3
+DEPTH_TOLERANCE_MM = 0.3
 """How much deeper than allowed a moving tip may read: noise and overshoot, not a wrong target."""
 POLL_S = 0.004
+
+RETREAT_MM_S, RETREAT_MM = 10.0, 10.0
+"""Speed of a retreat, and its height above the pad, or above the place where the force was too great."""
+FALL_START_S, FALL_END_S = 0.2, 1.0
+"""When, in a retreat, a force that was too great has to begin to fall, and when it has to be below its limit."""
+MAX_RISE_N = 5.0
+"""How far that force may rise above its minimum: the error of force sensors."""
+EDGE_MM = 1.0
+"""How far outside the box a tool may stand that was sent to its edge: arms stop near their target, not on it."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +40,20 @@ class Limits:
     """What the arm may do; lengths in the base frame.
 
     Attributes:
-        box_mm: lowest and highest x, y and z of the tip. contact_mm: z of the pad's surface; None while it is unknown,
-            and then no target is safe. max_depth_mm: below it. max_speed_mm_s, max_acceleration_mm_s2: of the tip.
-        tool: rotation vector of the tool as it should be held. max_tilt_deg: between its axis and a target's.
-        max_turn_deg: about its axis, from how the arm holds it before the first move.
-        max_force_n: on the tool, whatever its direction; None where nobody watches it.
-        max_state_age_s: of the latest state. deadline_s: longest duration of a move.
+        box_mm: Lowest and highest x, y and z of the tip.
+        contact_mm: z of the pad's surface; while it is None no target is safe.
+        max_depth_mm: Of the tip below the surface.
+        max_speed_mm_s: Of the tip.
+        max_acceleration_mm_s2: Of the tip.
+        tool: Rotation vector of the tool as it should be held.
+        max_tilt_deg: Between its axis and a target's.
+        max_turn_deg: About its axis, from how the arm holds it before the first move.
+        max_force_n: On the tool, in any direction; None if no force is watched.
+        max_state_age_s: Of the latest state.
+        deadline_s: Longest duration of a move.
+
+    Raises:
+        ValueError: A limit that limits nothing.
     """
 
     box_mm: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -48,8 +69,8 @@ class Limits:
     deadline_s: float = 30.0
 
     @classmethod
-    def of(cls, rig: RigSettings) -> "Limits":
-        """The limits that `[rig]` says; RigFault("refused") where the workspace is unknown."""
+    def from_settings(cls, rig: RigSettings) -> "Limits":
+        """Return the limits that `[rig]` sets; raises RigFault("refused") if the workspace is unknown."""
         if rig.box_mm is None:
             raise RigFault(
                 "refused",
@@ -71,7 +92,6 @@ class Limits:
             raise RigFault("refused", f"[rig] {error}") from None
 
     def __post_init__(self) -> None:
-        """ValueError for limits that limit nothing."""
         for axis, (low, high) in zip("xyz", self.box_mm, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise ValueError(f"box_mm: {axis} from {low} to {high}; expected two finite numbers, ascending")
@@ -80,9 +100,9 @@ class Limits:
         for name in ("max_depth_mm", *speeds, *force, "max_state_age_s", "deadline_s"):
             if not (math.isfinite(value := getattr(self, name)) and value > 0):
                 raise ValueError(f"{name} is {value}; expected a finite number above 0")
-        for name, most in (("max_tilt_deg", 90), ("max_turn_deg", 180)):
-            if not 0 <= (value := getattr(self, name)) <= most:
-                raise ValueError(f"{name} is {value}; allowed 0 to {most}")
+        for name, maximum in (("max_tilt_deg", 90), ("max_turn_deg", 180)):
+            if not 0 <= (value := getattr(self, name)) <= maximum:
+                raise ValueError(f"{name} is {value}; allowed 0 to {maximum}")
         if self.contact_mm is not None and not math.isfinite(self.contact_mm):
             raise ValueError(f"contact_mm is {self.contact_mm}; expected a finite number or None")
         if not tilt_deg(self.tool, DOWN) <= MAX_LEAN_DEG:
@@ -90,21 +110,21 @@ class Limits:
 
 
 def tilt_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
-    """Angle in degrees between the axes of two tools given by their rotation vectors."""
+    """Return the angle in degrees between the axes of two tools given by their rotation vectors."""
     a, b = _axis(tool), _axis(expected)
     cross = math.hypot(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     return math.degrees(math.atan2(cross, sum(p * q for p, q in zip(a, b, strict=True))))
 
 
 def turn_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
-    """Angle in degrees, 0 to 180, by which two tools given by their rotation vectors differ about their axis."""
+    """Return the angle in degrees, 0 to 180, by which two tools, rotation vectors, differ about their axis (twist)."""
     (w, x, y, z), (p, q, r, s) = _quaternion(tool), _quaternion(expected)
     about, along = w * s - z * p - x * r + y * q, w * p + x * q + y * r + z * s
     return math.degrees(2 * math.atan2(abs(about), abs(along)))
 
 
-def require_numbers(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-    """RigFault("refused") unless these are six finite numbers and two positive ones."""
+def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
+    """Raise RigFault("refused") unless the pose is six finite numbers, and speed and acceleration are positive."""
     if len(pose) != 6:
         _refuse(f"a pose of {len(pose)} numbers", "6")
     if not all(math.isfinite(value) for value in pose):
@@ -114,17 +134,19 @@ def require_numbers(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2
             _refuse(f"the {name} {value}", "more than 0")
 
 
-def require_safe(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float, limits: Limits) -> None:
+def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float, limits: Limits) -> None:
     """Check a target before any motion.
 
     Args:
-        pose: x, y, z in mm and a rotation vector in rad. speed_mm_s, acceleration_mm_s2: of the move.
-        limits: what is allowed.
+        pose: x, y, z in mm and a rotation vector in rad.
+        speed_mm_s: Of the move.
+        acceleration_mm_s2: Of the move.
+        limits: What is allowed.
 
     Raises:
         RigFault: "refused", naming what is out of limits, its value and what is allowed.
     """
-    require_numbers(pose, speed_mm_s, acceleration_mm_s2)
+    check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
     if limits.contact_mm is None:
         _refuse("the height of the pad's surface unknown", "a measured height")
     for axis, value, (low, high) in zip("xyz", pose[:3], limits.box_mm, strict=True):
@@ -140,55 +162,60 @@ def require_safe(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
         _refuse(f"the tool tilted by {tilt:.1f} degrees", f"at most {limits.max_tilt_deg:g}")
 
 
-def require_ready(state: ArmState, limits: Limits) -> None:
-    """Check how the arm stands before it moves for the first time.
+def check_start_state(state: ArmState, limits: Limits) -> None:
+    """Check how the arm stands before its first move.
 
     Raises:
-        RigFault: "refused" where the first move would turn the tool too far, and with it its cable, or where the force
-            is to be watched and the arm tells none.
+        RigFault: "refused" if that move would turn the tool, and with it its cable, too far; or if the force is to be
+            watched and the arm measures none.
     """
     if not (turn := turn_deg(state.pose[3:], limits.tool)) <= limits.max_turn_deg:
         _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {limits.max_turn_deg:g}")
     if state.force_n is None and limits.max_force_n is not None:
-        _refuse(f"[rig] max_force_n is {limits.max_force_n:g}, but this arm tells no force", '"unwatched"')
+        _refuse(f"[rig] max_force_n is {limits.max_force_n:g}, but this arm measures no force", '"unwatched"')
 
 
-def require_tool(tcp_mm: Vector | None, about: Mapping[str, Any]) -> None:
-    """Check `[rig]` tcp_mm against what an arm said of itself on connecting; some, such as printers, have no tcp.
+def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
+    """Check `[rig]` tcp_mm, the tool centre point, against the identity of a connected arm; printers keep none.
 
     Raises:
-        RigFault: "refused" where it is unknown, or another than the arm's.
+        RigFault: "refused" if it is unknown, or differs from the arm's.
     """
-    if "tcp" not in about:
+    if "tcp" not in arm:
         return
-    told = tuple(round(float(value), 3) for value in about["tcp"][:3])
+    measured = tuple(round(float(value), 3) for value in arm["tcp"][:3])
     if tcp_mm is None:
-        _refuse("[rig] tcp_mm is unknown", f"x, y and z of the tip as measured; the controller says {list(told)}")
-    if not all(abs(a - b) <= TCP_SLACK_MM for a, b in zip(tcp_mm, told, strict=True)):
-        _refuse(f"[rig] tcp_mm is {list(tcp_mm)}", f"what the controller says, {list(told)}, to {TCP_SLACK_MM} mm")
+        _refuse("[rig] tcp_mm is unknown", f"x, y and z of the tip as measured; the controller says {list(measured)}")
+    if not all(abs(a - b) <= TCP_TOLERANCE_MM for a, b in zip(tcp_mm, measured, strict=True)):
+        _refuse(
+            f"[rig] tcp_mm is {list(tcp_mm)}", f"what the controller says, {list(measured)}, to {TCP_TOLERANCE_MM} mm"
+        )
 
 
-def watch(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
+def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
     """Check a state during a move.
 
     Args:
-        state: the latest. limits: what is allowed. now_s: the time. until_s: when the move has to be over.
+        state: The latest.
+        limits: What is allowed.
+        now_s: The time.
+        until_s: When the move has to be over.
 
     Raises:
         RigFault: "emergency_stop", "protective_stop", "stale", "force", "refused" (too deep), or "deadline".
     """
-    look = "look at the arm, unlock it at the pendant, then connect again"
+    advice = "look at the arm, unlock it at the pendant, then connect again"
     if state.emergency_stop:
-        raise RigFault("emergency_stop", "the arm is in an emergency stop", look)
+        raise RigFault("emergency_stop", "the arm is in an emergency stop", advice)
     if state.protective_stop:
-        raise RigFault("protective_stop", "the arm is in a protective stop", look)
+        raise RigFault("protective_stop", "the arm is in a protective stop", advice)
     if not (age := now_s - state.time_s) <= limits.max_state_age_s:
         raise RigFault("stale", f"the arm's last state is {age:.2f} s old; allowed {limits.max_state_age_s:g} s")
-    force_n, most_n = state.pushed_n, limits.max_force_n
-    if force_n is not None and most_n is not None and not force_n <= most_n:
-        raise RigFault("force", f"the force is {force_n:.1f} N; allowed {most_n:g} N")
+    force_n, max_n = state.total_force_n, limits.max_force_n
+    if force_n is not None and max_n is not None and not force_n <= max_n:
+        raise RigFault("force", f"the force is {force_n:.1f} N; allowed {max_n:g} N")
     depth = -math.inf if limits.contact_mm is None else limits.contact_mm - state.pose[2]
-    if not depth <= limits.max_depth_mm + DEPTH_SLACK_MM:
+    if not depth <= limits.max_depth_mm + DEPTH_TOLERANCE_MM:
         raise RigFault("refused", f"the tip is {depth:.2f} mm deep; allowed {limits.max_depth_mm:g} mm")
     if now_s > until_s:
         raise RigFault("deadline", f"the move was not over after {limits.deadline_s:g} s")
@@ -201,23 +228,26 @@ def wait_until_still(
     sleep: Callable[[float], None] = time.sleep,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> ArmState:
-    """Wait until the arm has ended its move; whatever goes wrong, the arm is stopped before that is raised.
+    """Wait until the arm has ended its move; whatever goes wrong, it is stopped before that is raised.
 
     Args:
-        arm: which moves. limits: checked at every state. clock, sleep: time in s and a pause.
-        meanwhile: what is to be done between two states, such as reading a converter.
+        arm: It moves.
+        limits: Checked at every state.
+        clock: Returns the time, s.
+        sleep: Pauses for a time, s.
+        meanwhile: Called between two states, to read a board for instance.
 
     Returns:
         The first state at rest.
 
     Raises:
-        RigFault: see `watch`, and the arm's own faults.
+        RigFault: See `check_state`, and the arm's own faults.
     """
     until_s = clock() + limits.deadline_s
     try:
         while True:
             state = arm.state()
-            watch(state, limits, clock(), until_s)
+            check_state(state, limits, clock(), until_s)
             if not state.moving and state.speed_mm_s <= STILL_MM_S:
                 return state
             meanwhile()
@@ -228,18 +258,73 @@ def wait_until_still(
         raise
 
 
+def retreat(
+    arm: Arm, limits: Limits, acceleration_mm_s2: float, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> None:
+    """Lift the tool straight up, unless it is above the pad already and no force is too great.
+
+    Everything is checked as in any move, except that a force or depth beyond its limit has to decrease, and that the
+    tool may stand at the edge of the box. The arm is stopped if the force does not decrease.
+
+    Raises:
+        RigFault: See `check_state` and `check_target`; "force" if the force does not fall.
+    """
+    state = arm.state()
+    if limits.contact_mm is None:
+        return
+    z, max_n = state.pose[2], limits.max_force_n
+    overloaded = max_n is not None and _force_n(state) > max_n
+    sides = ((low - EDGE_MM, high + EDGE_MM) for low, high in limits.box_mm[:2])
+    relaxed = replace(
+        limits,
+        box_mm=(*sides, limits.box_mm[2]),
+        max_force_n=None if overloaded else max_n,
+        max_depth_mm=max(limits.max_depth_mm, limits.contact_mm - z),
+    )
+    check_state(state, relaxed, clock())
+    clear_mm = max(limits.contact_mm, z if overloaded else z - RETREAT_MM) + RETREAT_MM
+    up: Pose = (*state.pose[:2], min(clear_mm, limits.box_mm[2][1]), *state.pose[3:])
+    if up[2] <= z:
+        return
+    speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
+    check_target(up, speed_mm_s, acceleration_mm_s2, relaxed)
+    arm.move(up, speed_mm_s, acceleration_mm_s2)
+    meanwhile = _falling_force_check(arm, _force_n(state), max_n, clock) if overloaded and max_n else lambda: None
+    check_state(wait_until_still(arm, relaxed, clock, sleep, meanwhile), limits, clock())
+
+
+def _falling_force_check(arm: Arm, first_n: float, max_n: float, clock: Callable[[], float]) -> Callable[[], None]:
+    """Return a check that raises RigFault("force") unless the force falls from now on."""
+    start_s, min_n = clock(), first_n
+
+    def check() -> None:
+        nonlocal min_n
+        force_n = _force_n(arm.state())
+        min_n = min(min_n, force_n)
+        # The allowed force falls along a line, from the first one to the limit, and stays near its minimum so far.
+        remaining = min((start_s + FALL_END_S - clock()) / (FALL_END_S - FALL_START_S), 1.0)
+        if not force_n <= max(max_n, min(min_n + MAX_RISE_N, max_n + (first_n + MAX_RISE_N - max_n) * remaining)):
+            raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
+
+    return check
+
+
+def _force_n(state: ArmState) -> float:
+    return state.total_force_n or 0.0
+
+
 def _axis(rotation: Sequence[float]) -> Vector:
-    """Where a rotation vector takes the z axis."""
+    """Rotate the z axis by a rotation vector (Rodrigues)."""
     angle = math.hypot(*rotation)
     if angle == 0:
         return 0.0, 0.0, 1.0
     x, y, z = (value / angle for value in rotation)
-    sine, rest = math.sin(angle), 1 - math.cos(angle)
-    return y * sine + x * z * rest, -x * sine + y * z * rest, math.cos(angle) + z * z * rest
+    sine, versine = math.sin(angle), 1 - math.cos(angle)
+    return y * sine + x * z * versine, -x * sine + y * z * versine, math.cos(angle) + z * z * versine
 
 
 def _quaternion(rotation: Sequence[float]) -> tuple[float, float, float, float]:
-    """A rotation vector as a unit quaternion, its scalar first."""
+    """Convert a rotation vector to a unit quaternion, its scalar first."""
     angle = math.hypot(*rotation)
     share = math.sin(angle / 2) / angle if angle else 0.0
     x, y, z = (share * value for value in rotation)

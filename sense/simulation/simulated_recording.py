@@ -195,7 +195,7 @@ def simulate(
     if rig.plan == "adaptive":
         raise InputError(
             "[rig] plan is adaptive, which only a recording in real time is steered by; allowed where presses are "
-            "simulated at once are uniform, grid, boustrophedon or a .csv file"
+            "simulated at once are uniform, grid, serpentine or a .csv file"
         )
     model = _modelled(pad, contact, size, like)
     rig = rig.model_copy(update=model.strengths)

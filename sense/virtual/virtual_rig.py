@@ -1,7 +1,7 @@
 """A whole rig without hardware: the real drivers talk to an emulated arm and board, which share one simulated pad."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
 import numpy as np
@@ -14,7 +14,8 @@ from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards.due import Arduino
 from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.boards.line_framing import LineHeader
-from padforge.sense.rig.config import RobotFrame
+from padforge.sense.rig.config import RigConfig, RobotFrame
+from padforge.sense.rig.devices import Arm, Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, LivePad
 from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard, Source
@@ -49,7 +50,7 @@ def emulated(
     Raises:
         InputError, RigFault: a board that is not emulated, or has too few inputs.
     """
-    start = RobotFrame.of(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
+    start = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
     with UrEmulator("e", start, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
         _await_pose(robot)
@@ -62,7 +63,7 @@ def emulated_printer(
     pad: Morphology, contact: Contact, rig: RigSettings
 ) -> Iterator[tuple[Printer, Driver, EmulatedPrinter, EmulatedBoards]]:
     """As `emulated`, with a printer for the arm and `rig` as `emulated_printer_rig` makes it."""
-    tip = RobotFrame.of(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
+    tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp = np.array(rig.tcp_mm)
     x, y, z = (tip[:3] - tcp).tolist()
     with EmulatedPrinter((x, y, z), bed_mm=(BED_MM, BED_MM, BED_MM)) as robot:
@@ -80,7 +81,7 @@ def _read_below(
     pad: Morphology, contact: Contact, rig: RigSettings, tips: Source
 ) -> Iterator[tuple[Driver, EmulatedBoards]]:
     """The driver of a board and the board, which reads the pad below a tip whose x, y, z `tips` gives for times."""
-    frame, inputs = RobotFrame.of(rig), rig.inputs(len(pad.knots))
+    frame, inputs = RobotFrame.from_settings(rig), rig.inputs(len(pad.knots))
     there = max(MUX_INPUTS, 1 + max(inputs))
     model = LivePad(pad, contact, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
@@ -157,3 +158,23 @@ RIGS = {
     "printer": (emulated_printer_rig, emulated_printer),
 }
 """What is emulated, by the name of the rig: its settings, and its devices."""
+
+
+@contextmanager
+def opened_virtual_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, Board, RigSettings]]:
+    """Open emulated devices behind the drivers of a rig, not yet connected, and the settings for them.
+
+    Args:
+        kind: One of `RIGS`.
+        config: What is recorded.
+        inputs: Of the board, in the order of the fibres; all of them if empty.
+
+    Raises:
+        InputError: There is no such rig.
+    """
+    if kind not in RIGS:
+        raise InputError(f"--virtual-hardware: got --rig {kind}, allowed are {', '.join(RIGS)}")
+    settings, emulated_devices = RIGS[kind]
+    rig = settings(config.rig.model_copy(update={"channels": tuple(inputs)}), config.pad)
+    with emulated_devices(config.pad, config.contact, rig) as (arm, board, _, _):
+        yield arm, board, rig

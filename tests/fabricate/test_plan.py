@@ -187,7 +187,7 @@ def test_numbers_of_the_mould_are_legible_on_the_pad(pad):
     """The heights of the mould's floor, which the tracks' side of the pad is cast from, seen as an arm sees the pad."""
     plan, mould = Plan(pad), with_settings({}).mould
     floor = shapely.union_all([prism.area for prism in mould_body(plan).adds if prism.top_mm > mould.floor_mm])
-    lying = RobotFrame.of(RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, mirrored=True))
+    lying = RobotFrame.from_settings(RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, mirrored=True))
     rows = [row.split() for row in DIGITS.split("\n") if row]
     for number, outline in enumerate(plan.numbers, 1):
         assert outline is not None

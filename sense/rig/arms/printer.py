@@ -25,7 +25,7 @@ from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig.arms import printer_link as marlin
 from padforge.sense.rig.arms.printer_link import HOME, MarlinLink, Place, StraightMove
 from padforge.sense.rig.devices import ArmState, Array, Pose, RigFault
-from padforge.sense.rig.safety import require_numbers
+from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
 LOOK_S = 0.03
@@ -322,7 +322,7 @@ class Printer:
         Raises:
             RigFault: "refused" for what is no pose or speed, or another turn of the tool; "lost", "stale".
         """
-        require_numbers(pose, speed_mm_s, acceleration_mm_s2)
+        check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
             raise RigFault("refused", f"a turn of the tool to {list(pose[3:])} rad; a printer cannot turn it")
         x, y, z = (float(value) - offset for value, offset in zip(pose, self._tcp, strict=False))

@@ -21,7 +21,7 @@ from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig.arms import rtde as wire
 from padforge.sense.rig.arms.rtde import stop_program
 from padforge.sense.rig.devices import ArmState, Array, Cause, RigFault, start
-from padforge.sense.rig.safety import require_numbers
+from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
 KEPT = 300_000
@@ -242,7 +242,7 @@ class UR5:
         Raises:
             RigFault: "refused" for what is no pose or speed, or where the arm does not take it; "lost", "deadline".
         """
-        require_numbers(pose, speed_mm_s, acceleration_mm_s2)
+        check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         link = self._running()
         link.look()
         try:

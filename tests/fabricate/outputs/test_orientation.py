@@ -46,7 +46,7 @@ def test_panels_match_frame_of_rig(pad, name):
     (use,) = group.findall(f"{SVG}use")
     linear, shift = matrix(use.get("transform", ""))
     rig = RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, pad_angle_deg=turn_deg, mirrored=mirrored)
-    frame, scale = RobotFrame.of(rig), np.sqrt(abs(np.linalg.det(linear)))
+    frame, scale = RobotFrame.from_settings(rig), np.sqrt(abs(np.linalg.det(linear)))
     starts = np.array([line.coords[0] for line in plan.lines])
     expected = np.array([frame.pose(start, 0.0)[:2] for start in starts])
     drawn = starts * (1, -1) @ linear + shift

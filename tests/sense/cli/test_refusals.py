@@ -86,7 +86,7 @@ record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, 
 record --rig ur5 --spec 3.toml --out mine       | --morphology is needed
 record --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
 record --rig ur5 --spec none.toml {seven}       | fibre 13 is on input 12, an Arduino Due has 0 to 11
-record --rig ur5 {straight} --plan serpentine   | [rig] plan: got 'serpentine', expected uniform, grid, boustrophedon,
+record --rig ur5 {straight} --plan diagonal     | [rig] plan: got 'diagonal', expected uniform, grid, serpentine,
 record --rig ur5 {unread} --plan absent.csv     | absent.csv: cannot be read
 record --rig ur5 {unread} --plan adaptive       | [rig] plan is adaptive, which needs --model
 record --rig hand {straight} --dry-run          | --dry-run and --model need an arm

@@ -17,7 +17,7 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.rig import operation
 from padforge.sense.settings import RigSettings
-from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
+from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
 
 def test_a_recording_lies_in_the_folder_of_its_pad(padforge_sense) -> None:
@@ -80,9 +80,9 @@ def test_nothing_moves_before_the_tool_is_known(
     arm, session = FakeArm(Time()), Mock()
     monkeypatch.setattr(arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
     monkeypatch.setattr(
-        operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeConverter(arm), setup.rig))
+        operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeBoard(arm), setup.rig))
     )
-    monkeypatch.setattr(operation, "Session", session)
+    monkeypatch.setattr(operation, "PressLoop", session)
     rig = RIG.model_copy(update={"tcp_mm": tcp_mm, "max_force_n": max_force_n})
     tables = {"pad": PadSettings(grid=PAD.grid), "rig": rig}
     Path("rig.toml").write_text(commented_toml({"pad": PadSettings, "rig": RigSettings}, tables))

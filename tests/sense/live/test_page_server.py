@@ -200,9 +200,9 @@ def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     assert bad == [False, True, True]
 
 
-HAND = VIEW | {"courses": [[[-20, 0], [0, 1], [20, 0]]], "words": [{"key": "s", "word": "skip", "text": HOSTILE}]}
-HAND |= {"said": "press x 1, y -2 mm", "told": HOSTILE, "phase": "press", "progress": 0.5, "done": 2, "of": 8}
-HAND |= {"target": [1.0, -2.0], "refused": None}
+HAND = VIEW | {"paths": [[[-20, 0], [0, 1], [20, 0]]], "commands": [{"key": "s", "command": "skip", "text": HOSTILE}]}
+HAND |= {"prompt": "press x 1, y -2 mm", "message": HOSTILE, "phase": "press", "progress": 0.5, "done": 2, "total": 8}
+HAND |= {"target": [1.0, -2.0], "rejected": None}
 
 
 @pytest.mark.slow
@@ -211,9 +211,9 @@ def test_a_browser_shows_where_to_press_on_the_pad_as_it_lies_and_says_what_is_s
 ) -> None:
     asking.show(HAND)
     browser.open(asking.url)
-    browser.wait_for("document.getElementById('said').textContent == 'press x 1, y -2 mm'")
+    browser.wait_for("document.getElementById('prompt').textContent == 'press x 1, y -2 mm'")
     assert "2 of 8 presses" in browser.ask("document.body.innerText")
-    assert browser.ask("document.querySelectorAll('.course').length") == 1
+    assert browser.ask("document.querySelectorAll('.path').length") == 1
     browser.ask("document.querySelector('button').click()")
     browser.press("s")
     browser.wait_for("document.getElementById('bar').value == .25")

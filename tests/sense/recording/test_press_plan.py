@@ -12,7 +12,7 @@ from padforge.sense.recording.press_plan import PressPlan, planned, read_plan
 from padforge.sense.settings import RigSettings
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
-KINDS = ("uniform", "grid", "boustrophedon", "adaptive")
+KINDS = ("uniform", "grid", "serpentine", "adaptive")
 
 
 def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
@@ -38,7 +38,7 @@ def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row
     assert made(presses=9, plan="grid").positions_mm.tolist() == [list(place) for place in rows]
     assert made(presses=8, plan="grid").positions_mm.tolist() == [list(place) for place in rows[:8]]
     turned = [*rows[:3], *rows[5:2:-1], *rows[6:]]
-    assert made(presses=9, plan="boustrophedon").positions_mm.tolist() == [list(place) for place in turned]
+    assert made(presses=9, plan="serpentine").positions_mm.tolist() == [list(place) for place in turned]
     assert made(presses=1, plan="grid").positions_mm.tolist() == [[0, 0]]
     uniform = made(presses=2000).positions_mm
     assert np.abs(uniform).max() > 22.4
@@ -97,7 +97,7 @@ def test_a_hole_is_not_pressed_because_a_file_says_so(tmp_path: Path) -> None:
         made(size.model_copy(update={"keep_out_mm": (everything,)}))
 
 
-@pytest.mark.parametrize("plan", ["grid", "boustrophedon"])
+@pytest.mark.parametrize("plan", ["grid", "serpentine"])
 @pytest.mark.parametrize("presses", [400, 361])
 def test_depths_of_a_grid_tell_nothing_of_the_place(plan, presses):
     made_so = made(presses=presses, plan=plan, depths_mm=[0.5, 1, 2, 3, 5])

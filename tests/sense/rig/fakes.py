@@ -1,4 +1,4 @@
-"""An arm and a converter in virtual time, on one simulated pad: minutes of pressing take moments."""
+"""An arm and a board in virtual time, on one simulated pad: minutes of pressing take moments."""
 
 import time
 from collections.abc import Callable
@@ -28,7 +28,7 @@ RIG = RigSettings.model_validate(
 
 @dataclass
 class Time:
-    """A clock that only goes on when someone sleeps, and then by `least_s`: the longer, the fewer polls."""
+    """A clock that goes on only in `sleep`, and then by at least `least_s`: the longer, the fewer polls."""
 
     now: float = 100.0
     least_s: float = 0.008
@@ -98,19 +98,19 @@ class FakeArm:
     def _advance(self) -> None:
         if self._from is None or self.protective_stop or self.emergency_stop:
             return
-        start, end, down_command, done = self._from
-        share = 1.0 if done <= down_command else min((self.time() - down_command) / (done - down_command), 1.0)
+        start, end, start_s, end_s = self._from
+        share = 1.0 if end_s <= start_s else min((self.time() - start_s) / (end_s - start_s), 1.0)
         x, y, z = (np.array(start[:3]) + share * np.subtract(end[:3], start[:3])).tolist()
         self.pose = (x, y, z, *end[3:])
         if share == 1.0:
             self._from = None
 
 
-class FakeConverter:
-    """Samples the simulated pad under a fake arm; samples may be lost, and the board may stall or go."""
+class FakeBoard:
+    """Samples the simulated pad under a fake arm; samples may be lost, and the board may stall or vanish."""
 
     def __init__(self, arm: FakeArm, rig: RigSettings = RIG, pad: Morphology = PAD) -> None:
-        self.arm, self.rig, self.frame = arm, rig, RobotFrame.of(rig)
+        self.arm, self.rig, self.frame = arm, rig, RobotFrame.from_settings(rig)
         self.model = LivePad(pad, PUBLISHED_CONTACT, rig, rig.board_rate_hz, np.random.default_rng(1))
         self.rate_hz, self.taken_s = rig.board_rate_hz, arm.time()
         self.lose = 0
@@ -132,8 +132,8 @@ class FakeConverter:
         missing = np.zeros(len(times), np.int64)
         if len(times):
             missing[0] = skipped
-        places, depths = self.frame.tip(self.arm.pose_at(times))
-        return BoardSamples(times, self.model.volts(places, depths), missing)
+        positions, depths = self.frame.tip(self.arm.pose_at(times))
+        return BoardSamples(times, self.model.volts(positions, depths), missing)
 
     def close(self) -> None:
         pass
@@ -143,12 +143,12 @@ def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> floa
     """Call `action` until it raises the fault; returns how long that took by the wall's clock."""
 
     def repeat() -> None:
-        while time.monotonic() < down_command + 10:
+        while time.monotonic() < start_s + 10:
             action()
             time.sleep(0.005)
 
-    down_command = time.monotonic()
+    start_s = time.monotonic()
     with pytest.raises(RigFault, match=match) as caught:
         repeat()
     assert caught.value.cause == cause
-    return time.monotonic() - down_command
+    return time.monotonic() - start_s

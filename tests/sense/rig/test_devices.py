@@ -10,36 +10,35 @@ from types import SimpleNamespace
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense.rig import devices as plugins
+from padforge.sense.rig import devices
 from padforge.sense.rig.arms.ur5 import UR5
-from padforge.sense.rig.boards import due as due_link
-from padforge.sense.rig.boards import line_board as line_driver
+from padforge.sense.rig.boards import due, line_board
 from padforge.sense.rig.boards.due import Arduino
-from padforge.sense.rig.devices import RigFault, device, device_names, refusal, start
+from padforge.sense.rig.devices import RigFault, device_names, load_device, port_fault, start
 from padforge.sense.settings import RigSettings
 
 serial = pytest.importorskip("serial")
 
 
-def test_devices_are_found_by_name_and_others_are_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_device_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"due", "line"} <= set(device_names("padforge.boards"))
-    assert isinstance(device("padforge.arms", "ur5")(RigSettings()), UR5)
+    assert isinstance(load_device("padforge.arms", "ur5")(RigSettings()), UR5)
     with pytest.raises(InputError, match=r"^arms: got 'crane', allowed are .*printer.*ur5"):
-        device("padforge.arms", "crane")
+        load_device("padforge.arms", "crane")
     broken = EntryPoints([EntryPoint("crane", "no.such.module:Crane", "padforge.arms")])
-    monkeypatch.setattr(plugins, "entry_points", lambda group: broken)
+    monkeypatch.setattr(devices, "entry_points", lambda group: broken)
     with pytest.raises(InputError, match=r"^crane: no.such.module:Crane cannot be loaded"):
-        device("padforge.arms", "crane")
+        load_device("padforge.arms", "crane")
 
 
 @pytest.mark.parametrize("python_path", [None, ":", "/nowhere::"])
-def test_code_in_the_current_folder_is_not_run(
+def test_start_imports_nothing_from_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, python_path: str | None
 ) -> None:
-    spoil = "open('pwned', 'w').close()\n"
+    hostile = "open('pwned', 'w').close()\n"
     (tmp_path / "sense").mkdir()
     for name in ("queue.py", "sense/__init__.py", "selectors.py"):
-        (tmp_path / name).write_text(spoil, encoding="utf-8")
+        (tmp_path / name).write_text(hostile, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     if python_path is None:
         monkeypatch.delenv("PYTHONPATH", raising=False)
@@ -47,9 +46,9 @@ def test_code_in_the_current_folder_is_not_run(
         monkeypatch.setenv("PYTHONPATH", python_path)
     process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", stderr=subprocess.PIPE)
     assert os.getsid(process.pid) == process.pid, "an interrupt from the keyboard would reach it"
-    _, said = process.communicate(timeout=20)  # the end of its stdin ends it
-    assert not (tmp_path / "pwned").exists(), said
-    assert process.returncode == 0, said
+    _, stderr = process.communicate(timeout=20)  # the end of its stdin ends it
+    assert not (tmp_path / "pwned").exists(), stderr
+    assert process.returncode == 0, stderr
 
 
 @pytest.mark.parametrize(
@@ -61,9 +60,9 @@ def test_code_in_the_current_folder_is_not_run(
         (serial.SerialException("a device attached to the system is not functioning"), "not functioning.*right port"),
     ],
 )
-def test_every_way_in_which_a_port_is_refused_comes_with_advice(error: Exception, match: str) -> None:
+def test_port_fault_gives_advice(error: Exception, match: str) -> None:
     with pytest.raises(RigFault, match=match):
-        raise refusal("COM7", error)
+        raise port_fault("COM7", error)
 
 
 BUILT_IN = SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None)
@@ -72,29 +71,29 @@ PROGRAMMING = SimpleNamespace(device="/dev/ttyACM1", vid=0x2341, pid=0x003D, ser
 NATIVE = SimpleNamespace(device="/dev/ttyACM3", vid=0x2341, pid=0x003E, serial_number=None)
 
 
-def test_the_ports_of_a_due_are_found_native_first_and_that_of_a_line_board_where_there_is_one(
+def test_ports_of_boards_are_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def ports(*there: SimpleNamespace) -> None:
-        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [BUILT_IN, *there])
+    def connect(*ports: SimpleNamespace) -> None:
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [BUILT_IN, *ports])
 
-    ports(PROGRAMMING, NATIVE, UNO)
-    native = due_link.BoardPort("/dev/ttyACM3", "native", "")
-    assert due_link.find_ports() == [native, due_link.BoardPort("/dev/ttyACM1", "programming", "7")]
-    assert due_link.port_of(RigSettings()) == "/dev/ttyACM3"
+    connect(PROGRAMMING, NATIVE, UNO)
+    native = due.BoardPort("/dev/ttyACM3", "native", "")
+    assert due.find_ports() == [native, due.BoardPort("/dev/ttyACM1", "programming", "7")]
+    assert due.port_of(RigSettings()) == "/dev/ttyACM3"
     with pytest.raises(RigFault, match="3 serial ports on USB; name one of /dev/ttyACM1, /dev/ttyACM2, /dev/ttyACM3"):
-        line_driver.port_of(RigSettings())
-    ports(UNO)
-    assert line_driver.port_of(RigSettings()) == "/dev/ttyACM2"
+        line_board.port_of(RigSettings())
+    connect(UNO)
+    assert line_board.port_of(RigSettings()) == "/dev/ttyACM2"
     with pytest.raises(RigFault, match="no board is found; plug it in"):
-        due_link.port_of(RigSettings())
-    ports()
+        due.port_of(RigSettings())
+    connect()
     with pytest.raises(RigFault, match="0 serial ports on USB; plug the board in"):
-        line_driver.port_of(RigSettings())
-    for port_of in (due_link.port_of, line_driver.port_of):
+        line_board.port_of(RigSettings())
+    for port_of in (due.port_of, line_board.port_of):
         assert port_of(RigSettings(port="COM3")) == "COM3"
     monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (Arduino("/dev/ttyACM0", 1000).connect, due_link.find_ports):
+    for action in (Arduino("/dev/ttyACM0", 1000).connect, due.find_ports):
         with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
             action()
         assert caught.value.cause == "refused"

@@ -1,47 +1,47 @@
-"""What is said of a rig before a long run; nothing moves."""
+"""Diagnoses of a rig before a long run; nothing moves."""
 
 import numpy as np
 import pytest
 
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.rig.doctor import examine_arm, examine_converter
-from tests.sense.rig.fakes import FIBRES, RIG, FakeArm, FakeConverter, Time
+from padforge.sense.rig.doctor import examine_arm, examine_board
+from tests.sense.rig.fakes import FIBRES, RIG, FakeArm, FakeBoard, Time
 
 
 class Rig:
-    """An arm and a board in virtual time; what the board reads of the first channel that is `spoiled` is replaced."""
+    """An arm and a board in virtual time; readings of a channel can be replaced."""
 
     def __init__(self) -> None:
         self.time = Time()
         self.arm = FakeArm(self.time)
-        self.converter = FakeConverter(self.arm)
+        self.board = FakeBoard(self.arm)
 
-    def spoil(self, channel, volts) -> None:
-        read = self.converter.model.volts
+    def replace_readings(self, channel, volts) -> None:
+        read = self.board.model.volts
 
-        def spoiled(positions_mm, depths_mm):
+        def replaced(positions_mm, depths_mm):
             values = read(positions_mm, depths_mm)
             values[:, channel - 1] = volts(values[:, channel - 1])
             return values
 
-        self.converter.model.volts = spoiled
+        self.board.model.volts = replaced
 
-    def board(self):
-        return {each.name: each for each in examine_converter(self.converter, self.time, self.time.sleep)}
+    def examine_board(self):
+        return {row.name: row for row in examine_board(self.board, self.time, self.time.sleep)}
 
-    def robot(self, **settings):
+    def examine_arm(self, **settings):
         rig = RIG.model_copy(update=settings)
-        return {each.name: each for each in examine_arm(self.arm, rig, self.time, self.time.sleep)}
+        return {row.name: row for row in examine_arm(self.arm, rig, self.time, self.time.sleep)}
 
 
-def test_a_healthy_rig_is_not_moved():
+def test_examine_moves_nothing():
     rig = Rig()
-    looked = rig.board() | rig.robot()
-    assert {diagnosis.status for diagnosis in looked.values()} <= {"ok", "warn"}
-    assert looked["rate"].found == "1000.0 Hz of 1000"
-    assert looked["samples"].found.startswith("0 of")
-    assert {f"channel {number}" for number in range(1, FIBRES + 1)} < set(looked)
-    assert "channel 0" not in looked
+    rows = rig.examine_board() | rig.examine_arm()
+    assert {diagnosis.status for diagnosis in rows.values()} <= {"ok", "warn"}
+    assert rows["rate"].message == "1000.0 Hz of 1000"
+    assert rows["samples"].message.startswith("0 of")
+    assert {f"channel {number}" for number in range(1, FIBRES + 1)} < set(rows)
+    assert "channel 0" not in rows
     assert rig.arm.moves == []
 
 
@@ -54,32 +54,32 @@ def test_a_healthy_rig_is_not_moved():
         (lambda volts: volts + 0.05 * np.random.default_rng(0).standard_normal(len(volts)), "warn", "noisy"),
     ],
 )
-def test_a_channel_without_a_sound_fibre_is_named(volts, status, word):
+def test_examine_board_names_a_channel_without_a_fibre(volts, status, word):
     rig = Rig()
-    rig.spoil(3, volts)
-    looked = rig.board()
-    assert looked["channel 3"].status == status
-    assert word in looked["channel 3"].found
-    assert looked["channel 2"].status == "ok"
+    rig.replace_readings(3, volts)
+    rows = rig.examine_board()
+    assert rows["channel 3"].status == status
+    assert word in rows["channel 3"].message
+    assert rows["channel 2"].status == "ok"
 
 
-def test_lost_samples_another_rate_devices_that_are_not_there_and_a_stopped_arm_fail():
+def test_examine_fails_devices_that_are_lost_late_or_stopped():
     rig = Rig()
-    rig.converter.lose = 7
-    found = rig.board()["samples"]
-    assert (found.status, found.found.split()[0]) == ("fail", "7")
-    said = rig.converter.connect()
-    rig.converter.connect = lambda: said | {"rate_hz": 1020.0, "warning": "its lines have no check"}
-    looked = rig.board()
-    assert (looked["rate"].status, looked["board"].status) == ("fail", "warn")
+    rig.board.lose = 7
+    samples = rig.examine_board()["samples"]
+    assert (samples.status, samples.message.split()[0]) == ("fail", "7")
+    identity = rig.board.connect()
+    rig.board.connect = lambda: identity | {"rate_hz": 1020.0, "warning": "its lines have no check"}
+    rows = rig.examine_board()
+    assert (rows["rate"].status, rows["board"].status) == ("fail", "warn")
     rig = Rig()
-    rig.converter.lost = rig.arm.lost = True
-    assert [each.status for each in (*rig.board().values(), *rig.robot().values())] == ["fail", "fail"]
+    rig.board.lost = rig.arm.lost = True
+    assert [row.status for row in (*rig.examine_board().values(), *rig.examine_arm().values())] == ["fail", "fail"]
     for kind in ("protective", "emergency"):
         rig = Rig()
         setattr(rig.arm, f"{kind}_stop", True)
-        safety = rig.robot()["safety"]
-        assert (safety.status, safety.found) == ("fail", f"{kind} stop")
+        safety = rig.examine_arm()["safety"]
+        assert (safety.status, safety.message) == ("fail", f"{kind} stop")
 
 
 @pytest.mark.parametrize(
@@ -93,18 +93,16 @@ def test_lost_samples_another_rate_devices_that_are_not_there_and_a_stopped_arm_
         (0.0, {"tcp_mm": (0.0, 0.0, 149.0)}, "tcp", "fail", "149.0]; allowed what the controller says, [0.0, 0.0, 150"),
     ],
 )
-def test_a_force_that_nobody_watches_and_a_tip_that_is_elsewhere_are_told(
-    monkeypatch, force_n, settings, name, status, words
-):
+def test_examine_arm_checks_force_and_tcp(monkeypatch, force_n, settings, name, status, words):
     rig = Rig()
     rig.arm.force_n = force_n
     monkeypatch.setattr(rig.arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
-    looked = rig.robot(**settings)[name]
-    assert looked.status == status
-    assert words in looked.found
+    row = rig.examine_arm(**settings)[name]
+    assert row.status == status
+    assert words in row.message
 
 
-def test_a_fault_is_told_with_its_advice():
+def test_rig_fault_has_its_advice():
     fault = RigFault("refused", "the port is in use", "close the other program")
     assert str(fault) == "the port is in use; close the other program"
     assert (fault.exit_code, RigFault("lost", "gone").exit_code) == (2, 1)

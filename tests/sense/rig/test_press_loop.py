@@ -1,20 +1,31 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
+import contextlib
+import importlib.util
 import json
+import os
+import signal
 import threading
 import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
+from padforge.sense.rig import operation
+from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import BoardSamples, RigFault
-from padforge.sense.rig.press_loop import Averager, Session, require_safe_plan
-from tests.sense.rig.fakes import RIG, FakeArm, FakeConverter, Time
+from padforge.sense.rig.press_loop import Averager, DiskThread, PressLoop, check_plan
+from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
 FOUR = PressPlan(PLAN.positions_mm[:4], PLAN.depths_mm[:4])
@@ -22,30 +33,34 @@ FOUR = PressPlan(PLAN.positions_mm[:4], PLAN.depths_mm[:4])
 
 def rig(**settings):
     arm = FakeArm(Time())
-    return arm, FakeConverter(arm), RIG.model_copy(update=settings)
+    return arm, FakeBoard(arm), RIG.model_copy(update=settings)
 
 
-def recorder(path):
+def open_run(path):
     return Recorder.resume(path) if path.exists() else Recorder(path, 4, {"kind": "fake"}, {})
 
 
-def run(path, arm, converter, options, plan=PLAN, **more):
-    with recorder(path) as keep:
-        Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep, **more).run(plan)
+def loop(arm, board, recorder, options, **more):
+    return PressLoop(arm, board, recorder, options, clock=arm.time, sleep=arm.time.sleep, **more)
 
 
-def fault_of(path, arm, converter, options, match, plan=PLAN):
+def run(path, arm, board, options, plan=PLAN, **more):
+    with open_run(path) as recorder:
+        loop(arm, board, recorder, options, **more).run(plan)
+
+
+def fault_of(path, arm, board, options, match, plan=PLAN):
     with pytest.raises(RigFault, match=match) as fault:
-        run(path, arm, converter, options, plan)
+        run(path, arm, board, options, plan)
     assert "\n" not in str(fault.value)
     return fault.value.cause
 
 
-def finished(path):
+def n_done(path):
     return len(read_journal(path / "journal.ndjson"))
 
 
-def test_every_press_of_the_plan_is_recorded_and_lost_samples_leave_a_gap_and_shift_nothing(tmp_path):
+def test_run_records_every_press(tmp_path):
     run(tmp_path / "run", *rig())
     recording = Recording.open(tmp_path / "run")
     assert np.array_equal(recording.presses_mm, PLAN.positions_mm)
@@ -53,49 +68,52 @@ def test_every_press_of_the_plan_is_recorded_and_lost_samples_leave_a_gap_and_sh
     assert np.diff(recording.times_s).max() < 0.011
     held = recording.up_command - recording.down_command
     assert ((held >= 18) & (held <= 24)).all()
-    rest = np.stack([recording.readings[b - 10 : b - 1].mean(axis=0) for b in recording.down_command])
-    down = np.stack([recording.readings[u - 6 : u - 1].mean(axis=0) for u in recording.up_command])
-    assert (np.abs(down - rest).max(axis=1) > 0.02).all()
+    baseline = np.stack([recording.readings[b - 10 : b - 1].mean(axis=0) for b in recording.down_command])
+    pressed = np.stack([recording.readings[u - 6 : u - 1].mean(axis=0) for u in recording.up_command])
+    assert (np.abs(pressed - baseline).max(axis=1) > 0.02).all()
     journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in journal if event["event"] == "done"])
     assert reached == pytest.approx(np.column_stack([PLAN.positions_mm, PLAN.depths_mm]), abs=0.1)
-    arm, converter, options = rig()
-    arm.hook = lambda arm: setattr(converter, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
-    run(tmp_path / "lost", arm, converter, options)
-    recording = Recording.open(tmp_path / "lost")
+
+
+def test_run_leaves_a_gap_for_lost_samples(tmp_path):
+    arm, board, options = rig()
+    arm.hook = lambda arm: setattr(board, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
+    run(tmp_path / "run", arm, board, options)
+    recording = Recording.open(tmp_path / "run")
     assert len(recording.presses_mm) == len(PLAN)
     assert 0.02 < np.diff(recording.times_s).max() < 0.06
-    assert "lost" in (tmp_path / "lost" / "journal.ndjson").read_text()
+    assert "lost" in (tmp_path / "run" / "journal.ndjson").read_text()
 
 
-def test_a_press_begins_with_the_first_reading_after_the_command(tmp_path):
+def test_press_begins_with_the_first_reading_after_the_command(tmp_path):
     """On a clock and at a rate that are powers of two, a reading is taken at the very moment of each command."""
     arm, downs = FakeArm(Time(least_s=1 / 128)), []
     move = arm.move
 
-    def noted(pose, speed_mm_s, acceleration_mm_s2):
+    def noting_move(pose, speed_mm_s, acceleration_mm_s2):
         if pose[2] < 50:
             downs.append(arm.time() - 100)
         move(pose, speed_mm_s, acceleration_mm_s2)
 
-    arm.move = noted
+    arm.move = noting_move
     options = RIG.model_copy(update={"rate_hz": 128, "board_rate_hz": 128})
-    run(tmp_path / "run", arm, FakeConverter(arm, options), options, FOUR)
+    run(tmp_path / "run", arm, FakeBoard(arm, options), options, FOUR)
     recording = Recording.open(tmp_path / "run")
     assert recording.times_s[recording.down_command] - downs == pytest.approx(1 / 128)
 
 
-def test_a_dry_run_never_touches_the_pad_and_lifts_a_tool_that_was_left_on_it(tmp_path):
-    arm, converter, options = rig()
+def test_dry_run_lifts_the_tool_and_never_touches_the_pad(tmp_path):
+    arm, board, options = rig()
     arm.pose = (5.0, -395.0, 46.0, *arm.pose[3:])
-    run(tmp_path / "run", arm, converter, options, dry=True)
+    run(tmp_path / "run", arm, board, options, dry=True)
     assert arm.moves[0][:3] == (5.0, -395.0, 60.0)
     assert min(pose[2] for pose in arm.moves) >= 50 + options.clearance_mm / 2
     assert len(Recording.open(tmp_path / "run").presses_mm) == len(PLAN)
 
 
 @pytest.mark.parametrize(
-    ("settings", "plan", "arm_is", "said"),
+    ("settings", "plan", "arm_state", "message"),
     [
         ({}, PressPlan(np.array([[0.0, 0.0], [150.0, 0.0]]), np.full(2, 4.0)), {}, "x 150 mm"),
         ({}, PressPlan(np.zeros((1, 2)), np.array([6.5])), {}, "depth 6.5 mm"),
@@ -103,71 +121,60 @@ def test_a_dry_run_never_touches_the_pad_and_lifts_a_tool_that_was_left_on_it(tm
         ({"contact_mm": None}, PLAN, {}, "contact_mm"),
         ({"box_mm": None}, PLAN, {}, "box_mm"),
         ({"pad_mm": None}, PLAN, {}, "pad_mm"),
-        ({}, PLAN, {"force_n": None}, 'max_force_n is 60, but this arm tells no force; allowed "unwatched"'),
+        ({}, PLAN, {"force_n": None}, 'max_force_n is 60, but this arm measures no force; allowed "unwatched"'),
         ({}, PLAN, {"pose": (0.0, -400.0, 100.0, np.pi * np.cos(0.5), np.pi * np.sin(0.5), 0.0)}, "held 123 degrees"),
         ({}, PLAN, {"pose": (150.0, -400.0, 100.0, 0.0, np.pi, 0.0)}, r"stands at 150\.0, -400\.0, 100\.0 mm, outside"),
     ],
 )
-def test_nothing_moves_before_all_is_safe(tmp_path, settings, plan, arm_is, said):
-    arm, converter, options = rig(**settings)
-    for name, value in arm_is.items():
-        setattr(arm, name, value)
-    assert fault_of(tmp_path / "run", arm, converter, options, said, plan) == "refused"
+def test_run_moves_nothing_before_all_is_safe(tmp_path, settings, plan, arm_state, message):
+    arm, board, options = rig(**settings)
+    vars(arm).update(arm_state)
+    assert fault_of(tmp_path / "run", arm, board, options, message, plan) == "refused"
     assert arm.moves == []
-    require_safe_plan(PLAN, RIG.model_copy(update={"clearance_mm": 70.0}))
+    check_plan(PLAN, RIG.model_copy(update={"clearance_mm": 70.0}))
 
 
-def test_a_steered_plan_is_checked_before_its_next_press(tmp_path):
-    arm, converter, options = rig()
-    astray = PressPlan(PLAN.positions_mm + 150.0, PLAN.depths_mm)
-    with recorder(tmp_path / "run") as keep:
-        session = Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep)
-        with pytest.raises(RigFault, match="x 150 mm"):
-            session.run(PLAN, steer=lambda plan, press: astray if press == 1 else plan)
+def test_run_checks_a_changed_plan_before_its_next_press(tmp_path):
+    arm, board, options = rig()
+    outside = PressPlan(PLAN.positions_mm + 150.0, PLAN.depths_mm)
+    with open_run(tmp_path / "run") as recorder, pytest.raises(RigFault, match="x 150 mm"):
+        loop(arm, board, recorder, options).run(PLAN, planner=lambda plan, press: outside if press == 1 else plan)
     assert len(arm.moves) == 3  # of the press before
 
 
-def broken_at(moment_s, what):
-    def hook(arm):
-        if arm.time() > 100 + moment_s:
-            setattr(arm, what, True)
-
-    return hook
-
-
-@pytest.mark.parametrize("moment_s", [0.05, 0.5, 0.71, 1.0, 1.3, 2.2])
-@pytest.mark.parametrize("what", ["protective_stop", "emergency_stop", "lost"])
-def test_a_fault_of_the_arm_loses_no_finished_press(tmp_path, moment_s, what):
-    arm, converter, options = rig()
-    arm.hook = broken_at(moment_s, what)
-    assert fault_of(tmp_path / "run", arm, converter, options, ".", FOUR) == what
+@pytest.mark.parametrize("time_s", [0.05, 0.5, 0.71, 1.0, 1.3, 2.2])
+@pytest.mark.parametrize("fault", ["protective_stop", "emergency_stop", "lost"])
+def test_run_loses_no_finished_press_by_a_fault_of_the_arm(tmp_path, time_s, fault):
+    arm, board, options = rig()
+    arm.hook = lambda arm: setattr(arm, fault, arm.time() > 100 + time_s)
+    assert fault_of(tmp_path / "run", arm, board, options, ".", FOUR) == fault
     assert arm.stops >= 1
-    assert arm.time() - 100 < moment_s + 1
-    done = finished(tmp_path / "run")
-    arm, converter, options = rig()
-    run(tmp_path / "run", arm, converter, options, FOUR)
+    assert arm.time() - 100 < time_s + 1
+    done = n_done(tmp_path / "run")
+    arm, board, options = rig()
+    run(tmp_path / "run", arm, board, options, FOUR)
     assert np.array_equal(Recording.open(tmp_path / "run").presses_mm, FOUR.positions_mm)
     assert len(arm.moves) == 3 * (len(FOUR) - done)
 
 
 @pytest.mark.parametrize(
-    ("change", "cause", "said"),
+    ("change", "cause", "message"),
     [
         ({"lost": True}, "lost", "."),
         ({"stalled": True}, "stale", "."),
-        ({"rate_hz": 1e-3}, "deadline", r"no reading came within 3\.0 s"),  # it sends nothing and says nothing
+        ({"rate_hz": 1e-3}, "deadline", r"no reading came within 3\.0 s"),  # it is silent, but raises nothing
     ],
 )
-def test_a_fault_of_the_board_stops_and_lifts_the_arm(tmp_path, change, cause, said):
-    arm, converter, options = rig()
-    arm.hook = lambda arm: vars(converter).update(change) if arm.time() > 101.1 else None
-    assert fault_of(tmp_path / "run", arm, converter, options, said) == cause
+def test_run_stops_and_lifts_the_arm_at_a_fault_of_the_board(tmp_path, change, cause, message):
+    arm, board, options = rig()
+    arm.hook = lambda arm: vars(board).update(change) if arm.time() > 101.1 else None
+    assert fault_of(tmp_path / "run", arm, board, options, message) == cause
     assert arm.stops >= 1
     assert arm.moves[-1][2] == 50 + options.clearance_mm
 
 
 @pytest.mark.parametrize(
-    ("force_n", "said", "ends_mm"),
+    ("force_n", "message", "end_mm"),
     [
         (lambda arm: 80.0 if arm.pose[2] < 48 else 0.0, r"80\.0 N; allowed 60 N; the tool was lifted off", 60),
         (
@@ -178,151 +185,286 @@ def test_a_fault_of_the_board_stops_and_lifts_the_arm(tmp_path, change, cause, s
     ],
     ids=["falls", "stays"],
 )
-def test_too_much_force_stops_the_arm_and_is_taken_off(tmp_path, force_n, said, ends_mm):
-    arm, converter, options = rig()
+def test_run_stops_and_retreats_at_too_much_force(tmp_path, force_n, message, end_mm):
+    arm, board, options = rig()
     arm.hook = lambda arm: setattr(arm, "force_n", force_n(arm))
-    assert fault_of(tmp_path / "run", arm, converter, options, said) == "force"
+    assert fault_of(tmp_path / "run", arm, board, options, message) == "force"
     assert arm.stops >= 1
-    assert arm.pose[2] == pytest.approx(ends_mm, abs=2)
+    assert arm.pose[2] == pytest.approx(end_mm, abs=2)
 
 
-def both_go(arm, converter):
-    converter.lost = arm.time() > 101.1
+def both_vanish(arm, board):
+    board.lost = arm.time() > 101.1
     arm.lost = arm.stops > 0
 
 
-def no_stop_is_confirmed(arm, converter):
+def no_stop_is_confirmed(arm, board):
     def stop():
         raise RigFault("lost", "the arm did not confirm the stop", "look at it")
 
     arm.stop, arm.lost = stop, arm.time() > 101.1
 
 
-def ctrl_c_at_a_protective_stop(arm, converter):
+def ctrl_c_at_a_protective_stop(arm, board):
     arm.protective_stop = arm.stops > 0
     if arm.pose[2] < 48 and not arm.stops:
         raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
-    ("trouble", "error", "said"),
+    ("trouble", "error", "message"),
     [
-        (both_go, RigFault, "the board is gone; the tool was not lifted off: the arm is gone"),
+        (both_vanish, RigFault, "the board is gone; the tool was not lifted off: the arm is gone"),
         (no_stop_is_confirmed, RigFault, "the arm is gone; the tool was not lifted off: the arm did not confirm the"),
         (ctrl_c_at_a_protective_stop, KeyboardInterrupt, "was not lifted off: the arm is in a protective stop"),
     ],
 )
-def test_a_tool_that_stays_on_the_pad_is_told_whatever_the_fault(tmp_path, trouble, error, said):
-    arm, converter, options = rig()
-    arm.hook = lambda arm: trouble(arm, converter)
-    with pytest.raises(error, match=said):
-        run(tmp_path / "run", arm, converter, options)
+def test_run_says_that_the_tool_stays_on_the_pad(tmp_path, trouble, error, message):
+    arm, board, options = rig()
+    arm.hook = lambda arm: trouble(arm, board)
+    with pytest.raises(error, match=message):
+        run(tmp_path / "run", arm, board, options)
 
 
-def test_a_full_disk_is_told_and_loses_nothing(tmp_path):
-    arm, converter, options = rig()
-    with recorder(tmp_path / "run") as keep:
-        real = keep.sync
+def test_run_loses_nothing_on_a_full_disk(tmp_path):
+    arm, board, options = rig()
+    with open_run(tmp_path / "run") as recorder:
+        sync = recorder.sync
 
         def full():
-            if len(keep.done) >= 3:
+            if len(recorder.done) >= 3:
                 raise OSError(28, "No space left on device")
-            real()
+            sync()
 
-        keep.sync = full
+        recorder.sync = full
         with pytest.raises(RigFault, match="No space left") as fault:
-            Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep).run(PLAN)
-        keep.sync = real
+            loop(arm, board, recorder, options).run(PLAN)
+        recorder.sync = sync
     assert fault.value.cause == "disk"
     assert arm.stops >= 1
-    assert finished(tmp_path / "run") >= 2
+    assert n_done(tmp_path / "run") >= 2
 
 
-def test_a_press_is_told_to_be_done_once_it_is_on_the_disk_and_none_begins_before(tmp_path):
-    arm, converter, options = rig()
-    told = []
-    with recorder(tmp_path / "run") as keep:
-        sync = keep.sync
+def test_run_begins_no_press_before_the_last_one_is_on_the_disk(tmp_path):
+    arm, board, options = rig()
+    progress = []
+    with open_run(tmp_path / "run") as recorder:
+        sync = recorder.sync
 
         def slow():
             time.sleep(0.02)
             sync()
 
-        keep.sync = slow
-        Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep).run(
-            FOUR, lambda done, of: told.append((done, finished(tmp_path / "run"), len(arm.moves)))
+        recorder.sync = slow
+        loop(arm, board, recorder, options).run(
+            FOUR, lambda done, total: progress.append((done, n_done(tmp_path / "run"), len(arm.moves)))
         )
-    assert told == [(done, done, 3 * done) for done in range(1, 5)]
+    assert progress == [(done, done, 3 * done) for done in range(1, 5)]
 
 
-def test_a_disk_that_hangs_is_a_fault(tmp_path):
-    arm, converter, options = rig()
-    go_on = threading.Event()
-    with recorder(tmp_path / "run") as keep:
-        sync = keep.sync
+def test_run_raises_a_disk_that_hangs(tmp_path):
+    arm, board, options = rig()
+    resume = threading.Event()
+    with open_run(tmp_path / "run") as recorder:
+        sync = recorder.sync
 
         def hangs():
-            go_on.wait(20)
+            resume.wait(20)
             sync()
 
         def hook(arm):
             if len(arm.moves) >= 3 and arm.pose[2] == 60:
                 arm.time.sleep(1.0)
-                converter.read()
+                board.read()
             if arm.stops:
-                go_on.set()
+                resume.set()
 
-        keep.sync, arm.hook = hangs, hook
+        recorder.sync, arm.hook = hangs, hook
         with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
-            Session(arm, converter, keep, options, clock=arm.time, sleep=arm.time.sleep).run(PLAN)
+            loop(arm, board, recorder, options).run(PLAN)
     assert fault.value.cause == "disk"
     assert len(arm.moves) == 3
 
 
-def test_what_came_before_a_recording_goes_on_is_none_of_it(tmp_path):
+def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
     """To connect an arm may take longer than the second between the last reading and the next."""
     for presses in (1, 2):
-        arm, converter, options = rig()
+        arm, board, options = rig()
         arm.time.sleep(3.0)
-        run(tmp_path / "run", arm, converter, options, PressPlan(PLAN.positions_mm[:presses], PLAN.depths_mm[:presses]))
+        run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:presses], PLAN.depths_mm[:presses]))
     recording = Recording.open(tmp_path / "run")
     assert recording.times_s[0] < 0.05
     assert np.sort(np.diff(recording.times_s))[-2:] == pytest.approx([0.01, 1.01], abs=0.02)
 
 
-def test_depth_and_force_of_a_held_press_are_kept(tmp_path):
-    """Of an arm without a sensor, which moves once it is said that nobody watches, there is no force."""
-    arm, converter, options = rig()
+def test_run_records_depth_and_force(tmp_path):
+    arm, board, options = rig()
     arm.hook = lambda arm: setattr(arm, "force_n", -7.5 if arm.pose[2] <= 46.001 else 0.0)
     plan = PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0]))
-    run(tmp_path / "run", arm, converter, options, plan)
+    run(tmp_path / "run", arm, board, options, plan)
     recording = Recording.open(tmp_path / "run")
     assert recording.depths_mm.tolist() == [4.0, 5.0]
     assert recording.reached_mm == pytest.approx([4.0, 5.0], abs=0.1)
     assert recording.forces_n == pytest.approx(7.5)
-    blind, converter, options = rig(max_force_n=None)
-    blind.force_n = None
-    run(tmp_path / "without", blind, converter, options, plan)
-    assert len(blind.moves) == 3 * len(plan)
+    arm, board, options = rig(max_force_n=None)
+    arm.force_n = None  # no sensor
+    run(tmp_path / "without", arm, board, options, plan)
+    assert len(arm.moves) == 3 * len(plan)
     assert np.isnan(Recording.open(tmp_path / "without").forces_n).all()
 
 
 @settings(max_examples=40)
 @given(st.integers(1, 12), st.integers(1, 200), st.sets(st.integers(0, 199), max_size=60), st.data())
-def test_readings_are_means_of_whole_stretches_whatever_the_pieces(ratio, count, lost, data):
-    kept = np.array([i for i in range(count) if i not in lost], dtype=np.int64)
-    whole = kept / 1000, np.column_stack([kept, -kept]).astype(float), np.diff(kept, prepend=-1) - 1
-    cuts = sorted(data.draw(st.lists(st.integers(0, len(kept)), max_size=6)))
+def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
+    index = np.array([i for i in range(count) if i not in lost], dtype=np.int64)
+    samples = index / 1000, np.column_stack([index, -index]).astype(float), np.diff(index, prepend=-1) - 1
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(index)), max_size=6)))
     averager = Averager(ratio, 2)
     pieces = [
-        averager.feed(BoardSamples(whole[0][a:b], whole[1][a:b], whole[2][a:b]))
-        for a, b in zip([0, *cuts], [*cuts, len(kept)], strict=True)
+        averager.feed(BoardSamples(*(column[a:b] for column in samples)))
+        for a, b in zip([0, *cuts], [*cuts, len(index)], strict=True)
     ]
     times, volts = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    last = int(kept[-1]) if len(kept) else -1
-    stretches = [kept[kept // ratio == number] for number in range((last + 1) // ratio)]
-    expected = [stretch.mean() for stretch in stretches if len(stretch)]
+    last = int(index[-1]) if len(index) else -1
+    blocks = [index[index // ratio == number] for number in range((last + 1) // ratio)]
+    expected = [block.mean() for block in blocks if len(block)]
     assert np.allclose(volts[:, 0], expected)
     assert np.allclose(volts[:, 1], -np.array(expected))
     assert np.allclose(1000 * times, expected)
     assert averager.lost == sum(i <= last for i in lost)
+
+
+def test_disk_thread_makes_calls_in_order_without_blocking() -> None:
+    start, done = threading.Event(), []
+    with DiskThread() as disk:
+        disk.submit(start.wait, 5)
+        for number in range(9):
+            disk.submit(done.append, number)
+        assert not disk.is_idle(0.01)
+        assert done == []
+        start.set()
+    assert done == list(range(9))
+
+
+def test_disk_thread_stops_after_a_failure() -> None:
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    done: list[int] = []
+    with DiskThread() as disk:
+        disk.submit(done.append, 1)
+        disk.submit(full)
+        disk.submit(done.append, 2)
+        for _ in range(2):
+            with pytest.raises(OSError, match="No space"):
+                disk.is_idle(5)
+    assert done == [1]
+
+
+def run_until(arm: FakeArm, path: Path, error: type[BaseException]) -> None:
+    """Record until that is raised; the tool is lifted off the pad then, and signal handlers are as before."""
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises((RigFault, KeyboardInterrupt)) as caught:
+        run(path, arm, FakeBoard(arm), RIG, FOUR)
+    assert caught.type is error
+    assert arm.pose[2] == 50 + 10
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_interrupts_notice_a_signal_whose_exception_was_lost(tmp_path: Path, name: str) -> None:
+    def lose_once(arm: FakeArm) -> None:
+        if arm.pose[2] < 48 and not raised_s:
+            raised_s.append(arm.time())
+            with contextlib.suppress(KeyboardInterrupt):  # as a callback of C code does
+                signal.raise_signal(signal.Signals[name])
+
+    arm, raised_s = FakeArm(Time()), []
+    arm.hook = lose_once
+    handlers = {name: signal.signal(signal.Signals[name], signal.default_int_handler) for name in ("SIGTERM", "SIGHUP")}
+    try:
+        run_until(arm, tmp_path / "run", KeyboardInterrupt)
+    finally:
+        for other, handler in handlers.items():
+            signal.signal(signal.Signals[other], handler)
+    assert arm.time() - raised_s[0] < 2
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RigFault])
+def test_interrupts_do_not_keep_the_tool_on_the_pad(tmp_path: Path, error: type[BaseException]) -> None:
+    def interrupt_often(arm: FakeArm) -> None:
+        if arm.pose[2] < 48 and not arm.stops and error is RigFault:
+            arm.force_n = 80.0
+        elif arm.pose[2] < 48 or arm.stops:
+            arm.force_n = 0.0
+            signal.raise_signal(signal.SIGINT)
+
+    arm = FakeArm(Time())
+    arm.hook = interrupt_often
+    run_until(arm, tmp_path / "run", error)
+
+
+def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the disk hangs, nothing else could end the program."""
+    received = []
+
+    class InterruptedLoop:
+        def __init__(self, *devices: object, **more: object) -> None:
+            pass
+
+        def run(self, *plan: object) -> None:
+            for _ in range(2):
+                try:
+                    signal.raise_signal(signal.SIGINT)
+                except KeyboardInterrupt:
+                    received.append(signal.SIGINT)
+            raise KeyboardInterrupt
+
+    arm = FakeArm(Time())
+    monkeypatch.setattr(operation, "PressLoop", InterruptedLoop)
+    config = RigConfig(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test")
+    with pytest.raises(KeyboardInterrupt):
+        operation.record(config, contextlib.nullcontext((arm, FakeBoard(arm), RIG)))
+    assert received == [signal.SIGINT] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
+@pytest.mark.parametrize("slow_s", [0.0, 1.0])
+def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
+    robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float
+) -> None:
+    """20 N/mm at 10 mm/s: a tenth of a second without a check costs 20 N, and the disk would take half a press."""
+    robot = robots.get("e", pose=(0.0, -400.0, 60.0, 0.0, np.pi, 0.0), surface_mm=50, stiffness_n_mm=20.0)
+    slow = {"press_mm_s": 10.0, "clearance_mm": 2.0}
+    options = RIG.model_copy(update={"max_force_n": 20.0, "readings_per_press": 20, **slow})
+    board = FakeBoard(FakeArm(time.monotonic))  # pyright: ignore[reportArgumentType]
+    board.model.volts(np.zeros((2, 2)), np.array([0.0, 5.0]))  # compiles what the loop needs
+    arm, stopped, fsync = UR5(host), threading.Event(), os.fsync
+    arm_stop = arm.stop
+
+    def stop() -> None:
+        arm_stop()
+        stopped.set()
+
+    def slow_fsync(file: int) -> None:
+        stopped.wait(slow_s)
+        fsync(file)
+
+    with closing(arm):
+        arm.connect()
+        monkeypatch.setattr(arm, "stop", stop)
+        with Recorder(tmp_path / "run", 4, {}, {}) as recorder:
+            monkeypatch.setattr(os, "fsync", slow_fsync)
+            with pytest.raises(RigFault, match=r"allowed 20 N; the tool was lifted off"):
+                PressLoop(arm, board, recorder, options).run(  # pyright: ignore[reportArgumentType]
+                    PressPlan(np.zeros((1, 2)), np.array([5.0]))
+                )
+            monkeypatch.setattr(os, "fsync", fsync)
+    rows = robot.truth.rows()
+    over = rows[rows[:, 7] > 20]
+    assert over[:, 7].max() < 60
+    assert over[-1, 0] - over[0, 0] < 2
+    assert rows[-1, 7] == 0
+    assert (rows[-3:, 1:4] == (0, -400, 60)).all()
+    robots.free()

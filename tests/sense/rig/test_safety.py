@@ -1,33 +1,48 @@
-"""No target beyond the limits gets through, and no wait goes on after a fault."""
+"""No target beyond the limits passes, no wait goes on after a fault, and the retreat never pushes."""
 
 import contextlib
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain, repeat
 from unittest import mock
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from padforge.sense.rig import safety
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
-from padforge.sense.rig.safety import Limits, Vector, require_safe, tilt_deg, wait_until_still, watch
+from padforge.sense.rig.safety import (
+    FALL_END_S,
+    RETREAT_MM,
+    RETREAT_MM_S,
+    Limits,
+    Vector,
+    check_start_state,
+    check_state,
+    check_target,
+    check_tcp,
+    retreat,
+    tilt_deg,
+    turn_deg,
+    wait_until_still,
+)
 from padforge.sense.settings import RigSettings
-from tests.sense.rig.fakes import Time
+from tests.sense.rig.fakes import RIG, FakeArm, Time
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
 SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)
 X, Y, Z, *TOOL = SAFE
-REST = ArmState(10.0, SAFE, 0.0, None, False, False, moving=False)
+STILL = ArmState(10.0, SAFE, 0.0, None, False, False, moving=False)
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 inside = st.tuples(st.floats(-100, 100), st.floats(-500, -300), st.floats(44, 120))
 
 
-def refused(pose: object, speed: float = 50.0, acceleration: float = 500.0, limits: Limits = LIMITS) -> str:
+def refusal(pose: object, speed: float = 50.0, acceleration: float = 500.0, limits: Limits = LIMITS) -> str:
     """Why a target is refused, one line."""
     with pytest.raises(RigFault) as caught:
-        require_safe(pose, speed, acceleration, limits)  # pyright: ignore[reportArgumentType]
+        check_target(pose, speed, acceleration, limits)  # pyright: ignore[reportArgumentType]
     assert caught.value.cause == "refused"
     assert "\n" not in str(caught.value)
     return str(caught.value)
@@ -38,23 +53,23 @@ def tilted(degrees: float) -> tuple[float, float, float]:
 
 
 @given(inside, st.floats(0.1, 250), st.floats(1, 1200))
-def test_targets_inside_are_safe(place: tuple[float, float, float], speed: float, acceleration: float) -> None:
-    require_safe((*place, *TOOL), speed, acceleration, LIMITS)
+def test_check_target_passes_inside(position: tuple[float, float, float], speed: float, acceleration: float) -> None:
+    check_target((*position, *TOOL), speed, acceleration, LIMITS)
 
 
 @given(st.lists(numbers, max_size=8), numbers.filter(lambda value: not 0 < value <= 250))
-def test_what_gets_through_is_within_every_limit(pose: list[float], speed: float) -> None:
+def test_check_target_passes_only_within_every_limit(pose: list[float], speed: float) -> None:
     with contextlib.suppress(RigFault):
-        require_safe(pose, 50, 500, LIMITS)
+        check_target(pose, 50, 500, LIMITS)
         assert len(pose) == 6
         assert all(low <= value <= high for value, (low, high) in zip(pose[:3], LIMITS.box_mm, strict=True))
         assert 50 - pose[2] <= 6
         assert tilt_deg(pose[3:], LIMITS.tool) <= LIMITS.max_tilt_deg
-    assert "speed" in refused(SAFE, speed)
+    assert "speed" in refusal(SAFE, speed)
 
 
 @pytest.mark.parametrize(
-    ("pose", "speeds", "said"),
+    ("pose", "speeds", "message"),
     [
         ((-100.1, Y, Z, *TOOL), (), "x -100.1 mm; allowed -100 to 100 mm"),
         ((100.1, Y, Z, *TOOL), (), "x 100.1 mm"),
@@ -73,15 +88,15 @@ def test_what_gets_through_is_within_every_limit(pose: list[float], speed: float
         *(((*SAFE[:k], value, *SAFE[k + 1 :]), (), "finite") for k in range(6) for value in (math.nan, -math.inf)),
     ],
 )
-def test_a_hair_beyond_a_limit_is_refused_by_its_name(pose: tuple, speeds: tuple, said: str) -> None:
-    assert said in refused(pose, *speeds)
+def test_check_target_names_the_limit(pose: tuple, speeds: tuple, message: str) -> None:
+    assert message in refusal(pose, *speeds)
 
 
-def test_targets_on_the_limits_are_safe_and_without_a_surface_none_is() -> None:
-    for place in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
-        require_safe((*place, *TOOL), 250, 1200, LIMITS)
-    require_safe((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
-    assert "surface unknown" in refused(SAFE, limits=replace(LIMITS, contact_mm=None))
+def test_check_target_on_the_limits_and_without_a_surface() -> None:
+    for position in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
+        check_target((*position, *TOOL), 250, 1200, LIMITS)
+    check_target((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
+    assert "surface unknown" in refusal(SAFE, limits=replace(LIMITS, contact_mm=None))
 
 
 @pytest.mark.parametrize(
@@ -103,25 +118,24 @@ def test_targets_on_the_limits_are_safe_and_without_a_surface_none_is() -> None:
 def test_limits_that_limit_nothing_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(change)).split("_")[0]):
         replace(LIMITS, **change)  # pyright: ignore[reportArgumentType]
-    for just in ({"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}):
-        replace(LIMITS, **just)
+    for allowed in ({"max_tilt_deg": 0.0}, {"max_tilt_deg": 90.0}, {"tool": (0.0, math.pi * 0.95, 0.0)}):
+        replace(LIMITS, **allowed)
 
 
-def test_limits_are_those_of_the_settings() -> None:
+def test_limits_from_settings() -> None:
     rig = RigSettings(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20)
-    limits = Limits.of(rig.model_copy(update={"max_depth_mm": 4.5, "acceleration_mm_s2": 700, "max_force_n": 33}))
+    update = {"max_depth_mm": 4.5, "acceleration_mm_s2": 700, "max_force_n": 33}
+    limits = Limits.from_settings(rig.model_copy(update=update))
     assert (limits.box_mm, limits.contact_mm, limits.max_speed_mm_s) == (((-1, 1), (-2, 2), (0, 90)), 30, 80)
     assert (limits.max_depth_mm, limits.max_acceleration_mm_s2, limits.max_force_n) == (4.5, 700, 33)
     for change in ({"box_mm": None}, {"box_mm": (1, -1, -2, 2, 0, 90)}, {"tool_rad": (0, 0, 0)}):
         with pytest.raises(RigFault, match=r"\[rig\]") as caught:
-            Limits.of(rig.model_copy(update=change))
+            Limits.from_settings(rig.model_copy(update=change))
         assert caught.value.cause == "refused"
 
 
 @given(st.floats(-math.pi, math.pi), st.tuples(*[st.floats(-7, 7)] * 3), st.tuples(*[st.floats(-7, 7)] * 3))
-def test_tilt_is_the_angle_between_axes_that_neither_a_turn_about_them_nor_the_order_changes(
-    turn: float, a: tuple[float, ...], b: tuple[float, ...]
-) -> None:
+def test_tilt_deg_is_the_angle_between_axes(turn: float, a: tuple[float, ...], b: tuple[float, ...]) -> None:
     """A rotation about x by a takes the z axis to (0, -sin a, cos a); one about y to (sin b, 0, cos b)."""
     down = (math.pi * math.cos(turn), math.pi * math.sin(turn), 0.0)
     assert tilt_deg(down, LIMITS.tool) == pytest.approx(0, abs=1e-6)
@@ -141,21 +155,21 @@ def down(turn: float) -> tuple[float, float, float]:
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-3.1, 3.1))
-def test_a_turn_is_the_angle_about_the_axis(a: float, b: float) -> None:
-    apart = abs(math.remainder(a - b, 2 * math.pi))
-    assert safety.turn_deg(down(a), down(b)) == pytest.approx(math.degrees(apart), abs=1e-4)
-    assert safety.turn_deg((0.0, math.pi - 0.03, 0.0), LIMITS.tool) == pytest.approx(0, abs=1e-9)
+def test_turn_deg_is_the_angle_about_the_axis(a: float, b: float) -> None:
+    turn = abs(math.remainder(a - b, 2 * math.pi))
+    assert turn_deg(down(a), down(b)) == pytest.approx(math.degrees(turn), abs=1e-4)
+    assert turn_deg((0.0, math.pi - 0.03, 0.0), LIMITS.tool) == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("degrees", "refuses"), [(44.9, False), (45.1, True), (-44.9, False), (-170.0, True)])
-def test_the_first_move_turns_the_wrist_by_so_much_at_most(degrees: float, refuses: bool) -> None:
-    state = replace(REST, force_n=0.0, pose=(*SAFE[:3], *down(math.radians(degrees))))
-    with pytest.raises(RigFault, match="at most 45") if refuses else contextlib.nullcontext():
-        safety.require_ready(state, LIMITS)
+@pytest.mark.parametrize(("degrees", "is_refused"), [(44.9, False), (45.1, True), (-44.9, False), (-170.0, True)])
+def test_check_start_state_limits_the_turn(degrees: float, is_refused: bool) -> None:
+    state = replace(STILL, force_n=0.0, pose=(*SAFE[:3], *down(math.radians(degrees))))
+    with pytest.raises(RigFault, match="at most 45") if is_refused else contextlib.nullcontext():
+        check_start_state(state, LIMITS)
 
 
 @pytest.mark.parametrize(
-    ("tcp_mm", "told", "refusal"),
+    ("tcp_mm", "measured", "message"),
     [
         ((0.0, 0.0, 150.0), [0.0, 0.05, 150.09], None),
         ((0.0, 0.0, 0.0), [0.0, 0.0, 0.0], None),
@@ -165,10 +179,12 @@ def test_the_first_move_turns_the_wrist_by_so_much_at_most(degrees: float, refus
         ((0.0, 0.0, 150.0), [math.nan] * 3, "tcp_mm"),
     ],
 )
-def test_the_tip_is_where_the_controller_thinks(tcp_mm: Vector | None, told: list[float], refusal: str | None) -> None:
-    safety.require_tool(tcp_mm, {"model": "a printer, which has no such thing"})
-    with pytest.raises(RigFault, match=refusal) if refusal else contextlib.nullcontext():
-        safety.require_tool(tcp_mm, {"tcp": [*told, 0.0, 0.0, 0.0]})
+def test_check_tcp_compares_with_the_controller(
+    tcp_mm: Vector | None, measured: list[float], message: str | None
+) -> None:
+    check_tcp(tcp_mm, {"model": "a printer, which has none"})
+    with pytest.raises(RigFault, match=message) if message else contextlib.nullcontext():
+        check_tcp(tcp_mm, {"tcp": [*measured, 0.0, 0.0, 0.0]})
 
 
 @pytest.mark.parametrize(
@@ -194,59 +210,130 @@ def test_the_tip_is_where_the_controller_thinks(tcp_mm: Vector | None, told: lis
         ({"pose": (0.0, -400.0, math.nan, *TOOL)}, "refused"),
     ],
 )
-def test_a_move_goes_on_in_sound_states_and_ends_in_others(change: dict[str, object], cause: str | None) -> None:
-    state = replace(REST, **change)  # pyright: ignore[reportArgumentType]
+def test_check_state_raises_the_cause(change: dict[str, object], cause: str | None) -> None:
+    state = replace(STILL, **change)  # pyright: ignore[reportArgumentType]
     with pytest.raises(RigFault) if cause else contextlib.nullcontext() as caught:
-        watch(state, LIMITS, 10.0, until_s=10.0)
+        check_state(state, LIMITS, 10.0, until_s=10.0)
     if caught is not None:
         assert caught.value.cause == cause
         assert "\n" not in str(caught.value)
 
 
-def test_a_force_that_nobody_watches_stops_nothing_and_a_move_takes_as_long_as_it_may() -> None:
-    watch(replace(REST, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
-    safety.require_ready(REST, replace(LIMITS, max_force_n=None))
+def test_checks_of_an_unwatched_force_and_of_the_deadline() -> None:
+    check_state(replace(STILL, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
+    check_start_state(STILL, replace(LIMITS, max_force_n=None))
     with pytest.raises(RigFault, match='allowed "unwatched"'):
-        safety.require_ready(REST, LIMITS)
+        check_start_state(STILL, LIMITS)
     with pytest.raises(RigFault, match="30 s") as caught:
-        watch(REST, LIMITS, 10.4, until_s=10.3)
+        check_state(STILL, LIMITS, 10.4, until_s=10.3)
     assert caught.value.cause == "deadline"
 
 
-def actor(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:
-    """An arm that plays states or raises what is among them, at its own pace, then stays as it is; and its clock."""
-    clock, left = Time(10.0, 0.0), chain(script, repeat(script[-1]))
+def scripted_arm(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:
+    """An arm that plays states or raises what is among them, then stays as it is; and its clock."""
+    clock, states = Time(10.0, 0.0), chain(script, repeat(script[-1]))
 
     def state() -> ArmState:
-        what = next(left)
-        if isinstance(what, BaseException):
-            raise what
-        return replace(what, time_s=clock())
+        step = next(states)
+        if isinstance(step, BaseException):
+            raise step
+        return replace(step, time_s=clock())
 
-    return mock.Mock(state=state, stop=mock.Mock(side_effect=RigFault("lost", "no answer"))), clock
+    return mock.Mock(state=state, stop=mock.Mock(side_effect=RigFault("lost", "no response"))), clock
 
 
-def test_a_wait_ends_when_the_move_has_ended_and_the_tip_rests() -> None:
-    arm, clock = actor(replace(REST, moving=True), replace(REST, speed_mm_s=1.1), replace(REST, speed_mm_s=1.0))
+def test_wait_until_still_waits_for_the_tip_to_rest() -> None:
+    arm, clock = scripted_arm(
+        replace(STILL, moving=True), replace(STILL, speed_mm_s=1.1), replace(STILL, speed_mm_s=1.0)
+    )
     assert wait_until_still(arm, LIMITS, clock, clock.sleep).speed_mm_s == 1
     assert not arm.stop.called
     assert clock() > 10
 
 
 @pytest.mark.parametrize(
-    ("what", "expected"),
+    ("step", "cause"),
     [
-        (replace(REST, moving=True), "deadline"),
-        (replace(REST, speed_mm_s=1.1), "deadline"),
-        (replace(REST, protective_stop=True, moving=True), "protective_stop"),
+        (replace(STILL, moving=True), "deadline"),
+        (replace(STILL, speed_mm_s=1.1), "deadline"),
+        (replace(STILL, protective_stop=True, moving=True), "protective_stop"),
         (RigFault("lost", "gone"), "lost"),
         (KeyboardInterrupt(), None),
     ],
 )
-def test_a_wait_stops_the_arm_before_it_tells(what: ArmState | BaseException, expected: str | None) -> None:
-    arm, clock = actor(replace(REST, moving=True), what)
-    with pytest.raises(RigFault if expected else KeyboardInterrupt) as caught:
+def test_wait_until_still_stops_the_arm_before_it_raises(step: ArmState | BaseException, cause: str | None) -> None:
+    arm, clock = scripted_arm(replace(STILL, moving=True), step)
+    with pytest.raises(RigFault if cause else KeyboardInterrupt) as caught:
         wait_until_still(arm, LIMITS, clock, clock.sleep)
-    assert getattr(caught.value, "cause", None) == expected
+    assert getattr(caught.value, "cause", None) == cause
     arm.stop.assert_called_once()
     assert clock() < 10 + LIMITS.deadline_s + 1
+
+
+RETREAT_LIMITS = Limits.from_settings(RIG)
+DEEP_MM = 46.0
+"""Height of the tool 4 mm below the pad's surface."""
+
+
+def arm_at(height_mm: float, force: Callable[[FakeArm], float]) -> FakeArm:
+    """An arm that stands at a height and feels a force."""
+    arm = FakeArm(Time(), pose=(0.0, -400.0, height_mm, 0.0, np.pi, 0.0))
+    arm.hook = lambda arm: setattr(arm, "force_n", force(arm))
+    return arm
+
+
+def retreated(arm: FakeArm) -> FakeArm:
+    retreat(arm, RETREAT_LIMITS, 500, arm.time, arm.time.sleep)
+    return arm
+
+
+def test_retreat_lifts_the_tool_slowly_off_what_it_presses() -> None:
+    arm = retreated(arm_at(DEEP_MM, lambda arm: 25 * max(0.0, 50 - arm.pose[2])))
+    assert arm.pose[2] == pytest.approx(50 + RETREAT_MM)
+    assert arm.stops == 0
+    assert arm.time() - 100 == pytest.approx((4 + RETREAT_MM) / RETREAT_MM_S, abs=0.1)
+    assert retreated(arm_at(75.0, lambda arm: 0.0)).moves == []
+    arm = retreated(arm_at(75.0, lambda arm: 80.0 if arm.pose[2] < 76 else 0.0))
+    assert arm.pose[2] == pytest.approx(75 + RETREAT_MM)
+    arm = retreated(arm_at(115.0, lambda arm: 80.0 if arm.pose[2] < 116 else 0.0))
+    assert arm.pose[2] == RETREAT_LIMITS.box_mm[2][1]
+
+
+@pytest.mark.parametrize(
+    ("force", "max_rise_mm"),
+    [
+        (lambda arm: 80.0, FALL_END_S * RETREAT_MM_S / 2),
+        (lambda arm: 80.0 + 20 * (arm.pose[2] - DEEP_MM), 1.0),
+        (lambda arm: 80.0 if arm.pose[2] < 47 else 0.0 if arm.pose[2] < 48 else -70.0, 3.0),
+        (lambda arm: 80.0 if arm.pose[2] < 47 else float("nan"), 2.0),
+    ],
+    ids=["stays", "rises", "comes back", "is lost"],
+)
+def test_retreat_stops_if_the_force_does_not_fall(force: Callable[[FakeArm], float], max_rise_mm: float) -> None:
+    arm = arm_at(DEEP_MM, force)
+    with pytest.raises(RigFault) as caught:
+        retreated(arm)
+    assert caught.value.cause == "force"
+    assert arm.stops == 1
+    assert arm.pose[2] < DEEP_MM + max_rise_mm
+
+
+@pytest.mark.parametrize("fault", ["protective_stop", "emergency_stop", "lost", "pose"])
+def test_retreat_does_not_move_a_stopped_lost_or_misplaced_arm(fault: str) -> None:
+    arm = arm_at(DEEP_MM, lambda arm: 80.0)
+    setattr(arm, fault, (102.0, *arm.pose[1:]) if fault == "pose" else True)
+    with pytest.raises(RigFault, match="x 102 mm" if fault == "pose" else ".") as caught:
+        retreated(arm)
+    assert fault in (caught.value.cause, "pose")
+    assert arm.moves == []
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "z"),
+    [(0.0, -400.0, 42.0), *((x, y, DEEP_MM) for x, y in ((100.4, -400), (-100.4, -400), (0, -299.6), (0, -500.4)))],
+)
+def test_retreat_lifts_a_tool_too_deep_or_at_the_edge_of_the_box(x: float, y: float, z: float) -> None:
+    """Arms stop near their target: half of those at the edge stand beyond it."""
+    arm = arm_at(z, lambda arm: 0.0)
+    arm.pose = (x, y, *arm.pose[2:])
+    assert retreated(arm).pose[:3] == (x, y, pytest.approx(50 + RETREAT_MM))

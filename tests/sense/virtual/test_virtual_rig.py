@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,9 @@ from padforge.sense.rig.arms.rtde import RTDE_PORT
 from padforge.sense.rig.boards import board_reader as block_reader
 from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.rig.operation import look_over
-from padforge.sense.rig.press_loop import HEIGHT_MM, Report, Session
+from padforge.sense.rig.operation import diagnose
+from padforge.sense.rig.press_loop import OnProgress, PressLoop
+from padforge.sense.rig.safety import RETREAT_MM
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import LivePad
 from padforge.sense.virtual import virtual_rig as whole_rig
@@ -66,14 +67,14 @@ class Rig:
     def plan(self, presses: int) -> PressPlan:
         return planned(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
 
-    def record(self, run: Path, plan: PressPlan, report: Report = lambda done, of: None) -> float:
+    def record(self, run: Path, plan: PressPlan, report: OnProgress = lambda done, of: None) -> float:
         """Record into `run` or go on with it; when that began."""
         with Recorder.resume(run) if run.exists() else Recorder(run, len(PAD.knots), {}, {}) as recorder:
             self.converter.connect()
             self.arm.connect()
             began = time.monotonic()
             report(0, len(plan))
-            Session(self.arm, self.converter, recorder, self.settings).run(plan, report)
+            PressLoop(self.arm, self.converter, recorder, self.settings).run(plan, report)
         return began
 
     def disturbed(self, run: Path, plan: PressPlan, disturb: Callable[["Rig"], object]) -> tuple[RigFault, float]:
@@ -155,7 +156,7 @@ def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_
     recording, truth = Recording.open(tmp_path / "run"), rig.robot.truth.rows()
     assert np.diff(recording.times_s).max() < 1.5 / recording.rate_hz
     truth = truth[truth[:, 0] > began]
-    _, depths = RobotFrame.of(ARM).tip(truth[:, 1:4])
+    _, depths = RobotFrame.from_settings(ARM).tip(truth[:, 1:4])
     touched = np.flatnonzero((depths[1:] > 0) & (depths[:-1] <= 0))
     change = np.abs(recording.readings - np.median(recording.readings, axis=0)).max(axis=1) > 2e-3
     onsets = np.flatnonzero(change[1:] & ~change[:-1]) + 1
@@ -173,7 +174,7 @@ def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(rig: Rig,
     assert_whole(tmp_path / "run", plan, 0.06)
     made = rig.robot.firmware.made
     turned = np.array([move.move.at(move.lasted_s) for move in made]) + PRINTER.tcp_mm
-    places, depths = RobotFrame.of(PRINTER).tip(turned)
+    places, depths = RobotFrame.from_settings(PRINTER).tip(turned)
     presses = np.column_stack([plan.positions_mm, plan.depths_mm])
     assert np.column_stack([places, depths])[depths > 0] == pytest.approx(presses, abs=0.06)
 
@@ -219,7 +220,7 @@ def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(rig: Rig, presses: int,
         assert rig.rests(), name
         if name == "board_of_printer":  # the probe is lifted
             tip = rig.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
-            assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + HEIGHT_MM, abs=0.05)
+            assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
     rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
@@ -245,13 +246,15 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
 
 
 def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("padforge.sense.rig.doctor.LOOK_S", 0.3)
-    setup = RigConfig(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
-    found = {each.name: each for each in look_over("simulated", setup, (14, 3))}
-    assert found["channel 1"].found.startswith("input 14 rests at")
-    assert found["channel 2"].found.startswith("input 3 rests at")
-    assert "channel 3" not in found
-    assert found["board"].found.startswith("name emulated, serial 0, channels 2, inputs [14, 3]")
+    monkeypatch.setattr("padforge.sense.rig.doctor.OBSERVE_S", 0.3)
+    config = RigConfig(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
+    with whole_rig.opened_virtual_rig("simulated", config, (14, 3)) as (arm, board, settings):
+        rows = {row.name: row.message for row in diagnose(nullcontext(board), nullcontext((arm, settings)))}
+    assert rows["channel 1"].startswith("input 14 rests at")
+    assert rows["channel 2"].startswith("input 3 rests at")
+    assert "channel 3" not in rows
+    assert rows["board"].startswith("name emulated, serial 0, channels 2, inputs [14, 3]")
+    assert "arm" in rows
 
 
 PROGRAM = """

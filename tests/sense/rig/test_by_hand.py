@@ -1,0 +1,415 @@
+"""Recordings by hand: their targets, their view, and sessions in virtual time with a finger that errs as people do."""
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+import padforge.sense.rig.streams
+from padforge.design import Contact, Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.settings import PadSettings
+from padforge.sense import Recording
+from padforge.sense.localizer.calibration import calibrate
+from padforge.sense.recording.run_directory import read_journal
+from padforge.sense.rig import by_hand
+from padforge.sense.rig.by_hand import (
+    MAP_COLUMNS,
+    MAP_ROWS,
+    ROUND,
+    open_recorder_by_hand,
+    order_in_rounds,
+    pad_view,
+    plan_targets,
+    record_by_hand,
+    remaining_targets,
+    view_lines,
+)
+from padforge.sense.rig.config import RigConfig
+from padforge.sense.rig.devices import BoardSamples, RigFault
+from padforge.sense.settings import RigSettings
+from padforge.sense.signals.press_detection import PressDetector, PressEvent
+from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
+from tests.sense.conftest import QUICK
+from tests.sense.rig.fakes import Time
+
+IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
+VIEW: dict[str, Any] = {"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7}
+VIEW |= {"message": "counted: x 0, y 0 mm"}
+VIEW |= {"target": (16.875, 16.875), "rejected": None}
+VIEW |= {"presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}]}
+
+
+def config_of(**settings: object) -> RigConfig:
+    return RigConfig(Morphology.straight(4), Contact(), RigSettings(**settings), Path("out"), "test")  # type: ignore[arg-type]
+
+
+def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
+    positions = plan_targets(config_of(presses=4 * ROUND, seed=3))
+    assert np.array_equal(positions, np.rint(positions))
+    ways = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    shuffled = np.random.default_rng(1).permutation(positions)
+    assert ways.mean() < 0.5 * np.linalg.norm(np.diff(shuffled, axis=0), axis=1).mean()
+    for first in range(0, len(positions), ROUND):
+        assert (np.ptp(positions[first : first + ROUND], axis=0) > 0.6 * 45).all()
+
+
+def test_order_in_rounds_and_remaining_targets_keep_every_target() -> None:
+    positions = np.random.default_rng(2).integers(-5, 5, (2 * ROUND + 7, 2)).astype(float)
+    ordered = order_in_rounds(positions)
+    for first in range(0, len(positions), ROUND):
+        part = slice(first, first + ROUND)
+        assert sorted(map(tuple, ordered[part])) == sorted(map(tuple, positions[part]))
+    targets = np.array([[1.0, 1], [2, 2], [1, 1], [3, 3]])
+    assert remaining_targets(targets, np.array([[1.0, 1], [np.nan, np.nan], [3, 3]])).tolist() == [[2, 2], [1, 1]]
+    assert remaining_targets(targets, targets).shape == (0, 2)
+
+
+def test_plan_targets_keeps_the_order_of_a_grid_or_file(tmp_path: Path) -> None:
+    grid = plan_targets(config_of(presses=9, plan="serpentine"))
+    assert (np.diff(grid[:3, 0]) > 0).all()
+    assert (np.diff(grid[3:6, 0]) < 0).all()
+    (tmp_path / "places.csv").write_text("x_mm,y_mm\n3.25,-1\n0,2\n3.25,-1\n")
+    assert plan_targets(config_of(plan=str(tmp_path / "places.csv"))).tolist() == [[3.25, -1], [0, 2], [3.25, -1]]
+    with pytest.raises(InputError, match=r"\[rig\] plan is adaptive, by hand allowed are"):
+        plan_targets(config_of(plan="adaptive"))
+
+
+def test_plan_targets_rounds_none_into_a_keep_out() -> None:
+    hole = ((-4.6, -20.0), (4.6, -20.0), (4.6, 20.0), (-4.6, 20.0))
+    positions = plan_targets(replace(config_of(presses=400), pad_settings=PadSettings(keep_out_mm=(hole,))))
+    assert len(positions) == 400
+    assert not ((np.abs(positions) < [4.6, 20.0]).all(axis=1)).any()
+    assert (positions == np.rint(positions)).mean() > 0.9
+
+
+def test_pad_view_has_the_paths() -> None:
+    pad = Morphology.random(2, knots=3, seed=1)
+    view = json.loads(json.dumps(pad_view(pad, "hand")))
+    assert pad_view(pad, "hand", mirrored=True)["paths"] == pad_view(pad, "hand")["paths"]
+    assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
+    assert len(view["paths"]) == 4
+    ends = np.array([[path[0], path[-1]] for path in view["paths"]])
+    np.testing.assert_allclose(ends, pad.to_mm(pad.knots[:, [0, -1]]), atol=0.051)
+
+
+def test_view_lines_map_positions() -> None:
+    pad = Morphology.straight(2)
+    lines = view_lines(pad_view(pad, "hand") | VIEW)
+    assert lines[0] == "PRESS X 5, Y 5 MM"
+    assert lines[1].count("#") == lines[1].count(".") == 15
+    rows = lines[3 : 3 + MAP_ROWS]
+    assert {len(row) for row in rows} == {MAP_COLUMNS + 2}
+    assert (rows[0][MAP_COLUMNS], rows[0][1]) == ("O", ".")  # up is up, right is right
+    assert "".join(rows).count("O") == 1
+    assert rows[MAP_ROWS // 2][1 + MAP_COLUMNS // 2] == "."
+    assert "2 of 7 presses" in lines[-2]
+    assert "q: end" in lines[-1]
+    # With its tracks up, what is to the right on the plan is to the left of whoever looks; positions stay as planned.
+    lying = view_lines(pad_view(pad, "hand", mirrored=True) | VIEW)
+    assert [row[::-1] for row in lying[3 : 3 + MAP_ROWS]] == rows
+    assert lying[0] == lines[0]
+
+
+def test_view_lines_keep_the_aspect_of_a_rectangle() -> None:
+    pad = Morphology.straight((1, 5), 8.0)  # 48 mm wide and 16 mm high
+    lines = view_lines(pad_view(pad, "hand") | VIEW | {"target": (24.0, 8.0), "rejected": (-24.0, -8.0)})
+    edges = [row for row, line in enumerate(lines) if line.startswith("+")]
+    assert (len(lines[edges[0]]), edges[1] - edges[0] - 1) == (MAP_COLUMNS + 2, MAP_ROWS // 3)
+    assert (lines[edges[0] + 1][MAP_COLUMNS], lines[edges[1] - 1][1]) == ("O", "x")
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> RigConfig:
+    """A recording whose first two presses are made, and one at an unknown place."""
+    config = RigConfig(Morphology.straight(2), Contact(), RigSettings(presses=5), tmp_path / "run", "test", [])
+    recorder, targets, remaining = open_recorder_by_hand(config, IDENTITY, resume=False)
+    assert remaining is targets
+    with recorder:
+        recorder.append(np.arange(20.0), np.ones((20, 4)))
+        for press, place in enumerate((targets[0], (np.nan, np.nan), targets[1])):
+            recorder.begin(place, 2 + 5 * press)
+            recorder.finish(5 + 5 * press)
+    return config
+
+
+def test_open_recorder_by_hand_resumes_the_stored_plan(config: RigConfig) -> None:
+    source = json.loads((config.out / "start.json").read_text())["source"]
+    assert (source["kind"], source["devices"]["board"]) == ("hand", IDENTITY)
+    assert source["plan"]["columns"] == ["x_mm", "y_mm"]
+    assert len(source["plan"]["presses"]) == 5
+    recorder, targets, remaining = open_recorder_by_hand(config, IDENTITY, resume=True)
+    with recorder:
+        assert targets.tolist() == source["plan"]["presses"]
+        np.testing.assert_array_equal(remaining, targets[2:])
+        assert recorder.readings == 20
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "rig"}, "holds a recording of kind 'rig', not 'hand'"),
+        ({"plan": {"presses": [[1, 2, 3]]}}, "its plan has shape"),
+        ({"plan": {"presses": [["a", 1]]}}, "places of the plan"),
+    ],
+)
+def test_open_recorder_by_hand_refuses_another_recording(config: RigConfig, change: dict, message: str) -> None:
+    path = config.out / "start.json"
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(document | {"source": document["source"] | change}))
+    with pytest.raises(InputError, match=message):
+        open_recorder_by_hand(config, IDENTITY, resume=True)
+
+
+def test_record_by_hand_accepts_an_unborn_recording_only(tmp_path: Path) -> None:
+    board = Mock(connect=Mock(side_effect=RigFault("lost", "the board is gone")))
+    config = replace(config_of(), out=tmp_path / "run")
+    config.out.mkdir()
+    (config.out / "journal.ndjson").touch()
+    with pytest.raises(RigFault, match="the board is gone"):
+        record_by_hand(config, board, lambda view: None)
+    (config.out / "notes.txt").touch()
+    with pytest.raises(InputError, match="never written over"):
+        record_by_hand(config, board, lambda view: None)
+
+
+HAND_PAD = Morphology.random(3, knots=3, seed=5)
+HAND_RIG = RigSettings(presses=6, readings_per_press=16, board_rate_hz=40.0)
+
+
+class FingerBoard:
+    """Reads what the finger does to the pad."""
+
+    def __init__(self, finger: Finger, clock: Time) -> None:
+        self._finger, self._clock = finger, clock
+
+    def connect(self) -> dict[str, Any]:
+        self._began_s, self._count = self._clock(), 0
+        return {"name": "virtual", "channels": 2 * HAND_PAD.grid, "rate_hz": HAND_RIG.board_rate_hz}
+
+    def read(self) -> BoardSamples:
+        count = int((self._clock() - self._began_s) * HAND_RIG.board_rate_hz)
+        times_s = self._began_s + np.arange(self._count + 1, count + 1) / HAND_RIG.board_rate_hz
+        self._count = count
+        return BoardSamples(times_s, self._finger.volts(times_s), np.zeros(len(times_s), np.int64))
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Hands:
+    """Records by hand, again and again, with one finger on one pad.
+
+    Attributes:
+        messages: outcomes of presses, in order.
+        views: all that was shown.
+    """
+
+    def __init__(self, folder: Path, finger: type[Finger] = Finger, mishaps: float = 0.0, **settings: Any) -> None:
+        rig = HAND_RIG.model_copy(update=settings)
+        self.out, self.clock = folder / "hand", Time(least_s=0.025)
+        self.finger = finger(HAND_PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
+        self.config = RigConfig(HAND_PAD, Contact(), rig, self.out, "test")
+        self.targets = plan_targets(self.config)
+        self.messages: list[str] = []
+        self.views: list[dict[str, Any]] = []
+
+    def record(
+        self,
+        resume: bool = False,
+        commands: Callable[[], list[str]] = list,
+        watch: Callable[[dict[str, Any]], None] = lambda view: None,
+    ) -> Recording:
+        def show(view: dict[str, Any]) -> None:
+            if view["message"] and (not self.views or self.views[-1]["message"] != view["message"]):
+                self.messages.append(view["message"])
+            self.views.append(view)
+            assert self.clock() < 1000, "the recording comes to no end"
+            self.finger.look(view)
+            watch(view)
+
+        with pytest.MonkeyPatch.context() as patch:  # nobody else sleeps meanwhile
+            patch.setattr(padforge.sense.rig.streams.time, "sleep", self.clock.sleep)
+            board = FingerBoard(self.finger, self.clock)
+            return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.said()], resume)
+
+    def strokes_of(self, recording: Recording) -> list[Any]:
+        """The stroke of each press of a recording that was made at once."""
+        zero_s = 100.0 + 1 / HAND_RIG.rate_hz
+        downs = np.array([stroke.down_s - zero_s for stroke in self.finger.strokes])
+        times_s = recording.times_s[recording.down_command]
+        return [self.finger.strokes[int(np.argmin(np.abs(downs - time_s)))] for time_s in times_s]
+
+    def interrupt(self, done: int, phase: str) -> None:
+        """Record until Ctrl-C after so many presses in that phase; half a minute later nothing touches the pad."""
+
+        def watch(view: dict) -> None:
+            if (view["done"], view["phase"]) == (done, phase):
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            self.record(watch=watch)
+        self.finger.look({"phase": "settle"})
+        self.clock.sleep(30)
+
+
+@pytest.fixture
+def hands(tmp_path: Path) -> Callable[..., Hands]:
+    return partial(Hands, tmp_path)
+
+
+def accepted_mm(recording: Recording) -> np.ndarray:
+    return recording.presses_mm[recording.known]
+
+
+def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
+    """Distances of accepted presses from their targets."""
+    made = zip(strokes[recording.known], accepted_mm(recording), strict=True)
+    return [float(np.linalg.norm(stroke.place_mm - place)) for stroke, place in made]
+
+
+@pytest.fixture(scope="module")
+def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
+    """A recording in which one press of five goes wrong."""
+    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.2, presses=60)
+    return hand, hand.record()
+
+
+def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Hands, Recording]) -> None:
+    hand, recording = clumsy
+    np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
+    strokes = np.array(hand.strokes_of(recording))
+    rejected, accepted = (
+        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.known, recording.known)
+    )
+    assert rejected["short"] >= 2
+    assert rejected["echo"] >= 2
+    assert rejected["press"] <= 1
+    assert accepted["short"] + accepted["echo"] + accepted["light"] == 0
+    error_mm = distances_mm(recording, strokes)
+    assert max(error_mm) < 4 * SCATTER_MM
+    assert np.sqrt(np.mean(np.square(error_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
+    held_s = (recording.up_command - recording.down_command)[recording.known] / HAND_RIG.rate_hz
+    assert held_s.min() > 0.45
+    assert all(line.startswith(("counted: x ", "not counted: it ", "not counted: nothing")) for line in hand.messages)
+    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 60
+
+
+@pytest.mark.slow
+def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
+    hand, recording = clumsy
+    _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
+    scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
+    assert document["errors"][0]["mean_mm"] < 0.55 * scale_mm
+
+
+class Inverted(PressDetector):
+    """Takes a slide in the eighth press for a release, the release for a touch, and so on. Once."""
+
+    once = True
+
+    def __init__(self, fibres: int) -> None:
+        super().__init__(fibres)
+        self._reading, self._inverted, self._touched = 0, False, list[int]()
+
+    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
+        events = super().feed(times_s, readings)
+        self._reading += 1
+        self._touched += [event.reading for event in events if event.down]
+        if Inverted.once and len(self._touched) == 8 and self._reading == self._touched[-1] + 5:
+            self._inverted, Inverted.once = True, False
+            return [PressEvent(False, self._reading - 1)]
+        return [PressEvent(event.down != self._inverted, event.reading) for event in events]
+
+
+def test_session_restarts_a_confused_detector(hands, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(by_hand, "PressDetector", Inverted)
+    hand = hands(presses=14)
+    monkeypatch.setattr(hand.finger, "said", list)  # nobody helps
+    recording = hand.record()
+    np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
+    assert not Inverted.once
+    assert 1 <= (~recording.known).sum() <= 3
+    assert max(distances_mm(recording, np.array(hand.strokes_of(recording)))) < 4 * SCATTER_MM
+
+
+def test_session_executes_commands(hands) -> None:
+    hand = hands(presses=5)
+    schedule = {2: ["back"], 4: ["skip"]}
+
+    def commands() -> list[str]:
+        return schedule.pop(len(hand.messages), []) if hand.views and hand.views[-1]["phase"] == "wait" else []
+
+    recording = hand.record(commands=commands)
+    first, second, third, *rest = hand.targets.tolist()
+    assert accepted_mm(recording).tolist() == [first, second, *rest]  # the second again, and the third left out
+    assert len(recording.presses_mm) == 5
+    journal = [json.loads(line) for line in (hand.out / "journal.ndjson").read_text().splitlines()]
+    assert [event["rejected"] for event in journal if "rejected" in event] == ["it was taken back"]
+    assert third not in accepted_mm(recording).tolist()
+    hand.record(resume=True)  # what was skipped is asked for again
+    np.testing.assert_array_equal(np.sort(accepted_mm(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
+
+
+def test_session_quits_and_never_overwrites(hands) -> None:
+    hand = hands()
+    recording = hand.record(commands=lambda: ["quit"] if len(hand.messages) == 3 else [])
+    assert len(accepted_mm(recording)) == 3
+    with pytest.raises(InputError, match="never written over"):
+        hand.record()
+
+
+@pytest.mark.parametrize(("phase", "killed"), [("hold", False), ("wait", False), ("hold", True)])
+def test_session_resumes(hands, monkeypatch, phase: str, killed: bool) -> None:
+    """A press that was under way is none; after a kill nothing tells the journal of it."""
+    hand = hands(presses=6)
+    with monkeypatch.context() as patched:
+        if killed:
+            patched.setattr(by_hand.Recorder, "abort", lambda self, reason: None)
+        hand.interrupt(3, phase)
+    assert len(read_journal(hand.out / "journal.ndjson")) == 3
+    before = Recording.open(hand.out)
+    np.testing.assert_array_equal(before.presses_mm, hand.targets[:3])
+    recording = hand.record(resume=True)
+    np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
+    np.testing.assert_array_equal(recording.readings[: len(before.readings)], before.readings)
+    assert hand.views[-1]["done"] == 6
+
+
+def test_session_raises_a_full_disk(hands, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    def watch(view: dict) -> None:
+        if view["done"] == 1:
+            monkeypatch.setattr(by_hand.Recorder, "sync", full)
+
+    with pytest.raises(RigFault, match="cannot be written") as fault:
+        hands().record(watch=watch)
+    assert fault.value.cause == "disk"
+
+
+class Resting(Finger):
+    """Leaves the hand on the pad at its third press, for long."""
+
+    def _touch(self, at_s: float) -> tuple[np.ndarray, float]:
+        place, depth = super()._touch(at_s)
+        if len(self.strokes) == 3 and self.strokes[2].up_s < np.inf:
+            self.strokes[2].up_s = self.strokes[2].down_s + 10.0
+        return place, depth
+
+
+def test_session_asks_a_resting_hand_to_lift(hands) -> None:
+    hand = hands(finger=Resting, presses=4)
+    recording = hand.record()
+    np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
+    assert [why for why in hand.messages if "held for" in why and "lift after 0.6 s" in why]
+    assert any(view["prompt"].startswith("lift; if nothing") for view in hand.views)

@@ -1,0 +1,253 @@
+"""How the pad lies before the arm, and which recordings may be resumed."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from padforge.design.common.validation import InputError
+from padforge.design.morphology import Morphology
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
+from padforge.design.twin import PlanTransform
+from padforge.fabricate import build
+from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.run_directory import START
+from padforge.sense.rig.config import RigConfig, RobotFrame, locate_on_bed, make_plan, open_recorder, plan_notice
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.press_loop import check_plan
+from padforge.sense.settings import RigSettings
+from tests.fabricate.planted import with_settings
+from tests.sense.rig import fakes
+
+PAD = Morphology.straight(2)
+
+
+@pytest.mark.parametrize(("mirrored", "y_mm"), [(False, -397), (True, -403)])
+def test_robot_frame_of_a_turned_pad(mirrored, y_mm):
+    """Turned to the left, its x axis is the arm's y axis; with its tracks up, x runs the other way."""
+    pad = {"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2), "mirrored": mirrored}
+    frame = RobotFrame.from_settings(fakes.RIG.model_copy(update=pad))
+    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, y_mm, 46, 0.1, 3.1, 0.2))
+    assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
+
+
+MM = st.floats(-500, 500)
+PRESSES = st.lists(st.tuples(MM, MM, st.floats(-20, 20)), min_size=1, max_size=5)
+
+
+@given(st.booleans(), st.floats(-360, 360), st.tuples(MM, MM), PRESSES)
+def test_robot_frame_inverts_and_agrees_with_the_plan_transform(mirrored, angle_deg, centre_mm, presses):
+    """The plan transform of a twin takes the positions of an arm that was given no frame."""
+    pad = {"mirrored": mirrored, "pad_angle_deg": angle_deg, "pad_mm": centre_mm}
+    frame = RobotFrame.from_settings(fakes.RIG.model_copy(update=pad))
+    positions, depths = np.array(presses)[:, :2], np.array(presses)[:, 2]
+    poses = np.array([frame.pose(position, depth) for position, depth in zip(positions, depths, strict=True)])
+    np.testing.assert_allclose(np.hypot(*(poses[:, :2] - centre_mm).T), np.hypot(*positions.T), atol=1e-9)
+    tips, tip_depths = frame.tip(poses)
+    np.testing.assert_allclose(tips, positions, atol=1e-9)
+    np.testing.assert_allclose(tip_depths, depths, atol=1e-9)
+    turned = PlanTransform(mirrored, angle_deg if mirrored else -angle_deg)
+    transform = replace(turned, shift_mm=tuple(-turned.rotate(np.array(centre_mm))))
+    np.testing.assert_allclose(transform.to_plan(poses[:, :2]), positions, atol=1e-9)
+
+
+HALF_MM = PAD.layout.size_mm[0] / 2
+PRINTER = RigSettings(tcp_mm=(30.0, -5.0, -20.0), max_force_n=None)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The folder of a pad with a holder."""
+    folder = tmp_path_factory.mktemp("pad")
+    build(PAD, folder, [], with_settings({"holder": True}, printer={"bed_mm": [200.0, 180.0, 150.0]}))
+    return folder
+
+
+@pytest.fixture
+def with_frame(folder, tmp_path) -> Callable[..., Path]:
+    """A folder whose file has another frame, by keys; those of None are removed."""
+
+    def write(**frame: Any) -> Path:
+        document = json.loads((folder / "fabrication.json").read_text())
+        document["frame"] = {k: v for k, v in (document["frame"] | frame).items() if v is not None}
+        (tmp_path / "fabrication.json").write_text(json.dumps(document))
+        return tmp_path
+
+    return write
+
+
+def box_of(rig: RigSettings) -> tuple[float, ...]:
+    assert rig.box_mm is not None
+    return rig.box_mm
+
+
+def test_locate_on_bed_reads_the_holder(folder, with_frame):
+    rig = locate_on_bed(PRINTER, folder)
+    assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm, rig.mirrored) == ((100.0, 90.0), 0.0, 8.0, True)
+    half = HALF_MM
+    assert rig.box_mm == pytest.approx((100 - half, 100 + half, 90 - half, 90 + half, 3.0, 130.0), abs=1e-5)
+    check_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
+    box = box_of(locate_on_bed(PRINTER.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder))
+    assert (box[0], box[3]) == (95, 90)  # it ends where the nozzle does
+    for angle_deg, (x, y) in ((0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))):
+        box = box_of(locate_on_bed(PRINTER, with_frame(pad_mm=[60.0, 20.0], angle_deg=angle_deg)))
+        assert box[:4] == (100 - x, 100 + x, 90 - y, 90 + y)
+
+
+def test_locate_on_bed_prefers_what_rig_sets(folder, with_frame):
+    update = {"pad_mm": (50.0, 60.0), "contact_mm": 9.0, "pad_angle_deg": 90.0, "mirrored": False}
+    rig = locate_on_bed(PRINTER.model_copy(update=update), folder)
+    assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg, rig.mirrored) == ((50.0, 60.0), 9.0, 90.0, False)
+    assert box_of(rig)[0] == 50 - HALF_MM
+    complete = rig.model_copy(update={"tcp_mm": None})
+    assert locate_on_bed(complete, folder / "nowhere") is complete
+    assert locate_on_bed(PRINTER, with_frame(mirrored=False)).mirrored is False
+
+
+@pytest.mark.parametrize(("position", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
+def test_locate_on_bed_keeps_the_tip_off_the_holder_and_the_bed(folder, position, depth):
+    with pytest.raises(RigFault, match="no move"):
+        check_plan(PressPlan(np.array([position]), np.array([depth])), locate_on_bed(PRINTER, folder))
+
+
+def test_locate_on_bed_refuses_a_pad_without_a_holder(folder, tmp_path):
+    with pytest.raises(RigFault, match=r"there is no .*fabrication.json; .*holder = true") as fault:
+        locate_on_bed(PRINTER, tmp_path)
+    assert fault.value.cause == "refused"
+    document = json.loads((folder / "fabrication.json").read_text())
+    (tmp_path / "fabrication.json").write_text(json.dumps(document | {"frame": None}))
+    with pytest.raises(RigFault, match="a pad without a holder"):
+        locate_on_bed(PRINTER, tmp_path)
+    with pytest.raises(RigFault, match="tcp_mm is unknown"):
+        locate_on_bed(PRINTER.model_copy(update={"tcp_mm": None}), folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("centre_mm", [1.0], "frame has no centre_mm, expected 2 finite numbers"),
+        ("surface_mm", "8", "frame has no surface_mm"),
+        ("bed_mm", [1, 2, None], "frame has no bed_mm, expected 3"),
+        ("walls_mm", 1e9, "frame has no walls_mm"),
+        ("pad_mm", [60.0, 20.0, 5.0], "frame has no pad_mm, expected 2 finite numbers"),
+        ("mirrored", "up", "mirrored of frame is 'up', expected true or false"),
+    ],
+)
+def test_locate_on_bed_names_a_damaged_entry(with_frame, key, value, message):
+    with pytest.raises(InputError, match=message):
+        locate_on_bed(PRINTER, with_frame(**{key: value}))
+
+
+RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))
+ARM = {"model": "UR5", "serial": "2018", "controller": "5.12.2", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
+BOARD = {"name": "padforge-due", "serial": "ab12", "firmware": "1.0.0", "port": "/dev/ttyACM0"}
+IDENTITIES: dict[str, dict[str, Any]] = {"arm": ARM, "board": BOARD}
+
+
+def config_of(out: Path, pad: Morphology = PAD) -> RigConfig:
+    return RigConfig(pad, PUBLISHED_CONTACT, RIG, out, "test")
+
+
+def resumed_plan(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
+    return make_plan(config_of(out, pad), RIG.model_copy(update=settings), resume=True).document()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A recording of no press so far, which nobody may change."""
+    out = tmp_path_factory.mktemp("run")
+    with open_recorder(config_of(out), RIG, planned(PAD, RIG, np.random.default_rng(0)), out, False, IDENTITIES):
+        pass
+    return out
+
+
+def test_make_plan_reads_a_file(tmp_path):
+    (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
+    rig = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
+    assert rig.plan_file == tmp_path / "places.csv"
+    assert make_plan(config_of(tmp_path / "run"), rig, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
+    assert RigSettings(plan="grid").plan_file is None
+
+
+def test_make_plan_keeps_the_plan_of_a_resumed_recording(run, tmp_path):
+    assert resumed_plan(run, seed=9, presses=3) == resumed_plan(run)
+    changed = replace(config_of(run), rig=RIG.model_copy(update={"seed": 9, "presses": 30}))
+    assert plan_notice(changed).endswith("the plan it was begun with, [rig] presses = 5, seed = 0")
+    assert plan_notice(config_of(run)) == plan_notice(replace(changed, out=tmp_path / "new")) == ""
+
+
+def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
+    pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
+    plan = planned(pad, RIG, np.random.default_rng(0))
+    with open_recorder(config_of(tmp_path, pad), RIG, plan, tmp_path, False, IDENTITIES):
+        pass
+    assert resumed_plan(tmp_path, pad) == plan.document()
+    x, y = plan.positions_mm[1].tolist()
+    hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
+    config = replace(config_of(tmp_path, pad), pad_settings=PadSettings(keep_out_mm=(hole,)))
+    with pytest.raises(InputError, match=r"press 2, at .* lies in a keep-out"):
+        make_plan(config, RIG, resume=True)
+
+
+CHANGES: dict[str, Any] = {
+    **{"channels": [0, 1, 3, 2], "rate_hz": 5.0, "readings_per_press": 50, "board_rate_hz": 500.0},
+    **{"contact_mm": 12.0, "clearance_mm": 12.0, "travel_mm_s": 90.0, "press_mm_s": 30.0, "acceleration_mm_s2": 400.0},
+    **{"depth_mm": 4.0, "depths_mm": [1.0, 2.0], "pad_mm": [1.0, 2.0], "pad_angle_deg": 5.0},
+    **{"tool_rad": [0.1, 3.1, 0.0], "tcp_mm": [0.0, 0.0, 150.0], "mirrored": True},
+}
+"""Settings that change what a press is."""
+
+
+def test_resume_refuses_settings_that_change_a_press(run):
+    for key, value in CHANGES.items():
+        with pytest.raises(InputError, match=re.escape(f"[rig] {key}: got {value}, the recording")):
+            make_plan(config_of(run), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
+
+
+def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
+    limits = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1)}
+    resumed_plan(run, **limits, host="arm", port="COM3", mirrored=False)
+    with pytest.raises(InputError, match="another pad"):
+        resumed_plan(run, Morphology.random(2, 3, 1))
+    with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
+        resumed_plan(run, Morphology.straight(3), channels=())
+
+
+@pytest.mark.parametrize(
+    ("device", "key", "value", "is_same"),
+    [
+        ("arm", "controller", "5.13.0", True),
+        ("board", "port", "/dev/ttyACM1", True),
+        ("arm", "serial", "2019", False),
+        ("arm", "model", "UR3", False),
+        ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0], False),
+        ("board", "name", "another", False),
+        ("board", "serial", "cd34", False),
+        ("board", "firmware", "1.1.0", False),
+    ],
+)
+def test_resume_refuses_another_arm_tool_or_board(run, tmp_path, device, key, value, is_same):
+    assert json.loads((run / START).read_text())["source"]["devices"] == IDENTITIES
+    out = Path(shutil.copytree(run, tmp_path / "run"))
+    identities = IDENTITIES | {device: IDENTITIES[device] | {key: value}}
+    plan = make_plan(config_of(out), RIG, resume=True)
+    refusal = pytest.raises(InputError, match=re.escape(f"{device}: {key} is {value}, the recording in"))
+    with nullcontext() if is_same else refusal, open_recorder(config_of(out), RIG, plan, out, True, identities):
+        pass
+
+
+@pytest.mark.parametrize("source", ["[]", "5", '{"plan": 5}', "{}"])
+def test_resume_refuses_a_recording_without_a_plan(tmp_path, source):
+    text = f'{{"format": "padforge-recording/2", "fibres": 4, "source": {source}}}'
+    (tmp_path / "start.json").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="has no plan"):
+        resumed_plan(tmp_path)
