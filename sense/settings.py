@@ -1,4 +1,4 @@
-"""The sections of `pad.toml` that sense owns: the rig and the localizer."""
+"""Settings of sense, sections of `pad.toml`: `[rig]` and `[localizer]`."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,9 +17,9 @@ Split = Literal["random", "chronological"]
 PLANS = ("uniform", "grid", "serpentine", "adaptive")
 
 
-def _plan(value: str) -> str:
+def _check_plan(value: str) -> str:
     if value not in PLANS and not value.lower().endswith(".csv"):
-        raise PydanticCustomError("plan", "expected uniform, grid, serpentine, adaptive or a .csv file of places")
+        raise PydanticCustomError("plan", "expected uniform, grid, serpentine, adaptive or a .csv file of positions")
     return value
 
 
@@ -32,26 +32,17 @@ Input = Annotated[int, Field(ge=0, le=511)]
 
 
 class RigSettings(Settings):
-    """`[rig]`: how presses are recorded, where a real arm may go, and how the simulated pad answers.
+    """`[rig]`: how presses are recorded, where a real arm may go, and how the simulated pad responds.
 
-    Attributes:
-        channels: inputs as they are printed on the board, from A0 or C0 on, in the order of the fibres of the pad.
-        depths_mm: depths that presses take in turn; `depth_mm` for all where empty.
-        box_mm: x, y and z from and to, in the arm's base frame, which the tool never leaves; no arm moves without.
-        contact_mm: height of the pad's surface in the base frame; no arm moves while it is unknown.
-        pad_mm, pad_angle_deg: where the pad's centre lies in the base frame, and how far its y axis is turned from the
-            base's; no arm moves while the place is unknown.
-        mirrored: whether the pad lies with its tracks up, so that its x axis runs the other way than on its plan; while
-            it is unknown a holder says so, and without one the pad counts as it lies, x to the right of y.
-        tcp_mm: the tip as seen from the flange; an arm whose controller keeps it does not move unless they agree.
-        tool_rad: rotation vector of the tool while it points down.
+    No arm moves while `box_mm`, `contact_mm` or `pad_mm` is unknown, nor if its controller has another `tcp_mm`. While
+    `mirrored` is unknown a pad's holder decides, and without one x runs to the right of y.
     """
 
     presses: int = Field(default=1500, ge=1, le=1_000_000, description="presses in a recording")
-    plan: Annotated[str, AfterValidator(_plan)] = Field(
+    plan: Annotated[str, AfterValidator(_check_plan)] = Field(
         default="uniform",
         max_length=4096,
-        description="where they go: uniform, grid, serpentine, adaptive (by --model), or a .csv file of places",
+        description="positions: uniform, grid, serpentine, adaptive (by --model), or a .csv file of them",
     )
     rate_hz: float = Field(default=13.3, ge=0.1, le=10_000, description="readings per second")
     readings_per_press: int = Field(
@@ -61,20 +52,20 @@ class RigSettings(Settings):
     depths_mm: Annotated[tuple[Depth, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="depths that presses take in turn, in place of depth_mm"
     )
-    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the places and of the simulated pad")
+    seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the positions and of the simulated pad")
     noise_mv: float = Field(default=1.6, ge=0, le=1000, description="simulated pad: white noise of a reading, mV")
-    drift_mv: float = Field(default=40.0, ge=0, le=1000, description="simulated pad: spread of the drifting rest, mV")
-    creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's answer that creeps")
+    drift_mv: float = Field(default=40.0, ge=0, le=1000, description="simulated pad: std of the drifting baseline, mV")
+    creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's response that creeps")
     hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
-    hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: time in which that goes, s")
+    hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: time constant of its decay, s")
     scatter: float = Field(
-        default=0.18, ge=0, le=1, description="simulated pad: scatter of an answer from press to press, share of it"
+        default=0.18, ge=0, le=1, description="simulated pad: scatter of a response from press to press, share of it"
     )
     scatter_common: float = Field(
-        default=0.36, ge=0, le=1, description="simulated pad: share of that variance that all fibres have in common"
+        default=0.36, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
     )
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
-    board: str = Field(default="due", min_length=1, max_length=100, description="what reads the fibres, by its name")
+    board: str = Field(default="due", min_length=1, max_length=100, description="name of the board that reads the fibres")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
     baud: int = Field(default=921_600, ge=9600, le=20_000_000, description="of a line board; USB boards take any")
     printer_port: Annotated[Annotated[str, Field(min_length=1, max_length=4096)] | None, *Unknown] = Field(
@@ -117,34 +108,34 @@ class RigSettings(Settings):
     press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
     acceleration_mm_s2: float = Field(default=500.0, gt=0, le=3000, description="acceleration, mm/s^2")
     max_force_n: Annotated[Force | None, *Unwatched] = Field(
-        default=60.0, description='force at which the arm is stopped, N; "unwatched" for an arm that tells none (CB3)'
+        default=60.0, description='force at which the arm is stopped, N; "unwatched" for an arm that measures none (CB3)'
     )
 
     @property
     def plan_file(self) -> Path | None:
-        """The file of places that `plan` names, None where it is a kind of plan."""
+        """The file that `plan` names; None if it is a kind of plan."""
         return None if self.plan in PLANS else Path(self.plan)
 
     @property
     def response_scatter(self) -> Scatter:
-        """How answers of the simulated pad scatter beside the noise of readings."""
+        """Scatter of the responses of the simulated pad, besides the noise of readings."""
         return Scatter(0.0, self.scatter, self.scatter_common)
 
-    def inputs(self, fibres: int) -> tuple[int, ...]:
-        """(fibres,) input of the board that each fibre of a pad is on.
+    def inputs(self, n_fibres: int) -> tuple[int, ...]:
+        """Return the input of the board that each fibre of a pad is on.
 
         Raises:
             InputError: `channels` names more or fewer inputs than the pad has fibres, or one twice.
         """
-        named = self.channels or tuple(range(fibres))
-        if len(named) != fibres:
+        inputs = self.channels or tuple(range(n_fibres))
+        if len(inputs) != n_fibres:
             raise InputError(
-                f"[rig] channels: got {len(named)} inputs, the pad has {fibres} fibres: name one for each, "
-                "or none where they are in order"
+                f"[rig] channels: got {len(inputs)} inputs, the pad has {n_fibres} fibres: name one for each, "
+                "or none if they are in order"
             )
-        if twice := [number for number in named if named.count(number) > 1]:
-            raise InputError(f"[rig] channels: got input {twice[0]} for more than one fibre, expected one for each")
-        return named
+        if repeated := [number for number in inputs if inputs.count(number) > 1]:
+            raise InputError(f"[rig] channels: got input {repeated[0]} for more than one fibre, expected one for each")
+        return inputs
 
 
 class LocalizerSettings(Settings):

@@ -1,7 +1,7 @@
 """The commands `padforge sense record` and `doctor`."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ from padforge.sense.cli.options import FILE, FOLDER, drawn_anew, recording_line,
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
-    from padforge.design.twin import Twin
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.doctor import Diagnosis
@@ -85,6 +84,7 @@ def record(
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from padforge.design.settings import Contact, PadSettings
+    from padforge.design.twin import Twin
     from padforge.sense.rig import operation
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import check_platform
@@ -95,7 +95,7 @@ def record(
     at_once = rig == "simulated" and not virtual_hardware
     if twin and not at_once:
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --virtual-hardware")
-    like = _load_twin(twin)
+    like = Twin.load(twin) if twin else None
     if not (rig == "simulated" or virtual_hardware or morphology):
         morphology = _morphology_beside(target)
         folder = common.pad_folder(morphology)
@@ -118,12 +118,6 @@ def record(
         config = RigConfig(pad, settings.section(Contact), options, target, command, inputs, pad_settings, folder)
         recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
-
-
-def _load_twin(path: Path | None) -> "Twin | None":
-    from padforge.design.twin import Twin
-
-    return Twin.load(path) if path else None
 
 
 def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morphology":
@@ -174,7 +168,7 @@ def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -
     """Show a person where to press, on a page and in the terminal, and take commands of both."""
     from padforge.sense.live.outputs import LivePage
     from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
-    from padforge.sense.rig.operation import opened_board
+    from padforge.sense.rig.operation import make_board
     from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
     commands = {row["key"]: row["command"] for row in COMMANDS}
@@ -183,7 +177,8 @@ def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -
         if virtual_hardware:
             board, finger = stack.enter_context(pressed_by_finger(config.pad, config.contact, config.rig))
         else:
-            board = stack.enter_context(opened_board(config, config.rig.inputs(len(config.pad.knots))))
+            inputs = config.rig.inputs(len(config.pad.knots))
+            board = stack.enter_context(closing(make_board(config.rig, inputs)))
         page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(drawn_anew()), stack.enter_context(typed_keys())
@@ -256,16 +251,16 @@ def doctor(
 
 
 def _diagnose(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "list[Diagnosis]":
-    from padforge.sense.rig.operation import diagnose, opened_arm, opened_board
+    from padforge.sense.rig.operation import diagnose, make_arm, make_board
 
     if rig == "hand" and virtual_hardware:
         from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
         with pressed_by_finger(config.pad, config.contact, config.rig) as (board, _):
-            return diagnose(nullcontext(board))
+            return diagnose(lambda: board)
     if rig == "hand":
-        return diagnose(opened_board(config, inputs))
+        return diagnose(lambda: make_board(config.rig, inputs))
     if rig == "simulated" or virtual_hardware:
         with _opened_rig(rig, config, inputs, virtual_hardware) as (arm, board, settings):
-            return diagnose(nullcontext(board), nullcontext((arm, settings)))
-    return diagnose(opened_board(config, inputs), opened_arm(rig, config, inputs))
+            return diagnose(lambda: board, lambda: (arm, settings))
+    return diagnose(lambda: make_board(config.rig, inputs), lambda: make_arm(rig, config, inputs))

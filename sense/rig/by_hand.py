@@ -73,7 +73,7 @@ def plan_targets(config: RigConfig) -> Array:
     """
     rig = config.rig
     if rig.plan == "adaptive":
-        raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, serpentine or a .csv of places")
+        raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, serpentine or a .csv of positions")
     positions_mm = planned(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings).positions_mm
     if rig.plan != "uniform":
         return positions_mm
@@ -108,12 +108,7 @@ def remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
 
 
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
-    """Open the run directory of a recording by hand, a new one or one to resume.
-
-    Args:
-        config: What is recorded.
-        board: Identity of the board.
-        resume: Whether to resume what is in `config.out`, if anything is.
+    """Open the run directory of a recording by hand, a new one or one to resume, of a board with that identity.
 
     Returns:
         The recorder, the targets (Q, 2) of its plan, and those (P, 2) still to press, mm.
@@ -354,10 +349,7 @@ def record_by_hand(
         board: Not yet connected.
         on_view: See `HandSession.run`.
         poll_commands: See `HandSession.run`.
-        resume: Whether to resume what is in `config.out`.
-
-    Returns:
-        The recording.
+        resume: Whether to resume what is in `config.out`, if anything is.
 
     Raises:
         InputError: Settings, targets or a run directory that cannot be, or no press was made.

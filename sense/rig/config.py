@@ -9,26 +9,26 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
 from padforge.design.common.files import provenance, read_json
-from padforge.design.common.validation import InputError, short_repr
+from padforge.design.common.settings import Settings, as_tuple, validate
+from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import COLUMNS, PressPlan, all_free, free_of, planned, size_of, told_pad
 from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
-from padforge.sense.settings import RigSettings
+from padforge.sense.settings import Millimetres, RigSettings
 
 Identities = Mapping[str, Mapping[str, Any]]
 """What "arm" and "board" returned on connecting."""
 
 FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/2"
-_FRAME_LENGTHS = {"bed_mm": 3, "centre_mm": 2, "angle_deg": 1, "surface_mm": 1, "walls_mm": 1}
-"""Numbers of each entry of the frame of a pad in its holder."""
 _ROUNDING_MM = 1e-6
 
 KIND = "rig"
@@ -65,7 +65,7 @@ class RobotFrame:
 
     @classmethod
     def from_settings(cls, rig: RigSettings) -> "RobotFrame":
-        """Return the frame that `[rig]` sets; raises RigFault if the contact height or the pad's position is unknown."""
+        """Return the frame that `[rig]` sets; raises RigFault if the contact height or the pad's centre is unknown."""
         if rig.contact_mm is None:
             raise RigFault(
                 "refused",
@@ -97,6 +97,18 @@ class RobotFrame:
         return np.array([[-c, -s] if self.mirrored else [c, s], [-s, c]])
 
 
+class HolderFrame(Settings):
+    """Pose of a pad in its holder on a printer's bed, as `fabricate.mould.bed_frame` describes it; mm and degrees."""
+
+    bed_mm: Annotated[tuple[Millimetres, Millimetres, Millimetres], BeforeValidator(as_tuple)]
+    centre_mm: Annotated[tuple[Millimetres, Millimetres], BeforeValidator(as_tuple)]
+    angle_deg: float = Field(ge=-360, le=360)
+    mirrored: bool
+    pad_mm: Annotated[Millimetres | tuple[Millimetres, Millimetres], BeforeValidator(as_tuple)]
+    surface_mm: Millimetres
+    walls_mm: Millimetres
+
+
 def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     """Fill in where the pad lies on a printer's bed, and the workspace above it, from its holder.
 
@@ -117,32 +129,31 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
         message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
         raise RigFault("refused", message, "measure them with the probe in place")
     frame = _read_holder_frame(folder)
-    (x, y), surface = rig.pad_mm or frame["centre_mm"], frame["surface_mm"]
-    contact = surface if rig.contact_mm is None else rig.contact_mm
-    side = frame["pad_mm"]
+    x, y = rig.pad_mm or frame.centre_mm
+    contact = frame.surface_mm if rig.contact_mm is None else rig.contact_mm
+    side = frame.pad_mm
     half_x, half_y = (length / 2 for length in (side if isinstance(side, tuple) else (side, side)))
-    if round(frame["angle_deg"] / 90) % 2:  # the pad lies turned by quarters on the bed
+    if round(frame.angle_deg / 90) % 2:  # the pad lies turned by quarters on the bed
         half_x, half_y = half_y, half_x
-    width, depth, height = frame["bed_mm"]
+    width, depth, height = frame.bed_mm
     dx, dy, dz = rig.tcp_mm
     box = (
         *(max(x - half_x, dx), min(x + half_x, width + dx)),
         *(max(y - half_y, dy), min(y + half_y, depth + dy)),
-        *(max(contact - rig.max_depth_mm, frame["walls_mm"]) - _ROUNDING_MM, height + dz),
+        *(max(contact - rig.max_depth_mm, frame.walls_mm) - _ROUNDING_MM, height + dz),
     )
     return rig.model_copy(
         update={
             "pad_mm": (x, y),
-            "mirrored": frame["mirrored"] if rig.mirrored is None else rig.mirrored,
+            "mirrored": frame.mirrored if rig.mirrored is None else rig.mirrored,
             "contact_mm": contact,
             "box_mm": rig.box_mm or box,
-            "pad_angle_deg": rig.pad_angle_deg + frame["angle_deg"],
+            "pad_angle_deg": rig.pad_angle_deg + frame.angle_deg,
         }
     )
 
 
-def _read_holder_frame(folder: Path) -> dict[str, Any]:
-    """Read and check "frame" of the folder's fabrication.json: numbers, rows of them as tuples, and "mirrored"."""
+def _read_holder_frame(folder: Path) -> HolderFrame:
     path, advice = folder / FABRICATION_FILE, "measure them, or make the pad's holder: [mould] holder = true"
     if not path.is_file():
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and there is no {path}"
@@ -151,15 +162,7 @@ def _read_holder_frame(folder: Path) -> dict[str, Any]:
     if not isinstance(frame, Mapping):
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {path} is of a pad without a holder"
         raise RigFault("refused", message, advice)
-    values: dict[str, Any] = {}
-    for name, count in (_FRAME_LENGTHS | {"pad_mm": 2 if isinstance(frame.get("pad_mm"), list) else 1}).items():
-        row = value if isinstance(value := frame.get(name), list) else [value]
-        if len(row) != count or not all(type(number) in (int, float) and abs(number) <= 1e4 for number in row):
-            raise InputError(f"{path}: frame has no {name}, expected {count} finite numbers")
-        values[name] = tuple(map(float, row)) if count > 1 else float(row[0])
-    if type(mirrored := frame.get("mirrored")) is not bool:
-        raise InputError(f"{path}: mirrored of frame is {short_repr(mirrored)}, expected true or false")
-    return values | {"mirrored": mirrored}
+    return validate(HolderFrame, frame, f"{path}: frame")
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,7 @@ class RigConfig:
         out: The run directory.
         command: Command line, for the provenance.
         inputs: Files it was made from, for the provenance.
-        pad_settings: Which part of the pad is pressed, unless a file says where, and which is not; None for the default.
+        pad_settings: Which part of the pad is pressed, unless a file says where; None for the default.
         folder: Of the pad, with what fabricate has written.
     """
 
@@ -218,7 +221,7 @@ def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any
 
 
 def plan_notice(config: RigConfig) -> str:
-    """Say that a recording to be resumed keeps its plan though `[rig]` asks for another; "" if there is nothing to say."""
+    """Say that a resumed recording keeps its plan if `[rig]` asks for another; otherwise return ""."""
     if not (config.out / START).exists():
         return ""
     before, now = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")

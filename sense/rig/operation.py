@@ -111,9 +111,6 @@ def record_simulated(
         like: See `simulate`.
         replacing: Whether a simulated recording in `out` is replaced.
 
-    Returns:
-        The recording.
-
     Raises:
         InputError: Settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
@@ -131,35 +128,15 @@ def record_simulated(
 
 @contextmanager
 def opened_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, Board, RigSettings]]:
-    """Open a rig with real devices, see `OpenedRig`.
-
-    Args:
-        kind: Name of the arm.
-        config: What is recorded.
-        inputs: Of the board, in the order of the fibres; all of them if empty.
-    """
-    arm, rig = _make_arm(kind, config, inputs)
+    """Open a rig with real devices, see `OpenedRig`, `make_arm` and `make_board`."""
+    arm, rig = make_arm(kind, config, inputs)
     # The arm is closed, and so stopped, before the board.
-    with closing(_make_board(rig, inputs)) as board, closing(arm):
+    with closing(make_board(rig, inputs)) as board, closing(arm):
         yield arm, board, rig
 
 
-@contextmanager
-def opened_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, RigSettings]]:
-    """Open the arm alone, not yet connected, with the settings for it; see `opened_rig`."""
-    arm, rig = _make_arm(kind, config, inputs)
-    with closing(arm):
-        yield arm, rig
-
-
-@contextmanager
-def opened_board(config: RigConfig, inputs: Sequence[int]) -> Iterator[Board]:
-    """Open the board alone, not yet connected; see `opened_rig`."""
-    with closing(_make_board(config.rig, inputs)) as board:
-        yield board
-
-
-def _make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm, RigSettings]:
+def make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm, RigSettings]:
+    """Return an arm by its name, not yet connected, and the settings for it, which name the inputs of the board."""
     make = load_device("padforge.arms", kind)
     rig = config.rig.model_copy(update={"channels": tuple(inputs)})
     if kind == "printer":
@@ -167,7 +144,8 @@ def _make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm,
     return make(rig), rig
 
 
-def _make_board(rig: RigSettings, inputs: Sequence[int]) -> Board:
+def make_board(rig: RigSettings, inputs: Sequence[int]) -> Board:
+    """Return the board that `[rig]` names, not yet connected, which reads these inputs, or all if empty."""
     return load_device("padforge.boards", rig.board)(rig, inputs)
 
 
@@ -233,30 +211,28 @@ def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Ca
 
 
 def diagnose(
-    board: AbstractContextManager[Board], arm: AbstractContextManager[tuple[Arm, RigSettings]] | None = None
+    make_board: Callable[[], Board], make_arm: Callable[[], tuple[Arm, RigSettings]] | None = None
 ) -> list[Diagnosis]:
     """Diagnose a rig, or the board alone, before a long run; nothing moves.
 
     Args:
-        board: Of `opened_board`.
-        arm: Of `opened_arm`. One device is examined even if the other cannot be opened.
+        make_board: Returns the board.
+        make_arm: Returns the arm and its settings. One device is examined even if the other cannot be made.
 
     Raises:
-        RigFault: The board is alone, and cannot be opened.
+        RigFault: The board is alone, and cannot be made.
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
     try:
-        with board as device:
-            diagnoses += examine_board(device, time.monotonic, time.sleep)
+        diagnoses += examine_board(make_board(), time.monotonic, time.sleep)
     except RigFault as fault:
-        if arm is None:
+        if make_arm is None:
             raise
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
-    if arm is not None:
+    if make_arm is not None:
         try:
-            with arm as (device, rig):
-                diagnoses += examine_arm(device, rig, time.monotonic, time.sleep)
+            diagnoses += examine_arm(*make_arm(), time.monotonic, time.sleep)
         except RigFault as fault:
             diagnoses.append(Diagnosis("arm", "fail", str(fault)))
     return diagnoses

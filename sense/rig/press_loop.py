@@ -43,7 +43,6 @@ _SETTLE_S = 0.1
 """Before the state is read again of an arm that refused a move: it tells why."""
 _RECENT = 4096
 """Readings whose times are remembered, to find the first one after a command."""
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class DiskThread:
@@ -91,7 +90,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self._received = self._blocked = False
-        self._previous: dict[int, Any] = {}
+        self._previous: dict[int, Callable[[int, FrameType | None], Any]] = {}
 
     @contextlib.contextmanager
     def blocked(self) -> Iterator[None]:
@@ -107,24 +106,20 @@ class Interrupts:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            for name in set(_SIGNALS) & set(dir(signal)):
-                number = getattr(signal, name)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 if callable(previous := signal.getsignal(number)):  # else it is ignored, as under nohup, or not ours
                     self._previous[number] = previous
-                    signal.signal(number, self._handler(previous))
+                    signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *error: object) -> None:
         for number, previous in self._previous.items():
             signal.signal(number, previous)
 
-    def _handler(self, previous: Callable[[int, FrameType | None], Any]) -> Callable[[int, FrameType | None], None]:
-        def handle(number: int, frame: FrameType | None) -> None:
-            if not (self._blocked or self._received):
-                self._received = True
-                previous(number, frame)
-
-        return handle
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if not (self._blocked or self._received):
+            self._received = True
+            self._previous[number](number, frame)
 
 
 class PressLoop:
@@ -173,7 +168,7 @@ class PressLoop:
 
         Args:
             plan: Presses.
-            on_progress: Called after every press.
+            on_progress: See `OnProgress`.
             planner: Called with the plan and the next press, from which on it may move the presses.
 
         Raises:

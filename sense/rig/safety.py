@@ -137,12 +137,6 @@ def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_
 def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float, limits: Limits) -> None:
     """Check a target before any motion.
 
-    Args:
-        pose: x, y, z in mm and a rotation vector in rad.
-        speed_mm_s: Of the move.
-        acceleration_mm_s2: Of the move.
-        limits: What is allowed.
-
     Raises:
         RigFault: "refused", naming what is out of limits, its value and what is allowed.
     """
@@ -193,13 +187,7 @@ def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
 
 
 def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
-    """Check a state during a move.
-
-    Args:
-        state: The latest.
-        limits: What is allowed.
-        now_s: The time.
-        until_s: When the move has to be over.
+    """Check the latest state during a move, which has to be over at `until_s`.
 
     Raises:
         RigFault: "emergency_stop", "protective_stop", "stale", "force", "refused" (too deep), or "deadline".

@@ -134,12 +134,13 @@ def test_locate_on_bed_refuses_a_pad_without_a_holder(folder, tmp_path):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("centre_mm", [1.0], "frame has no centre_mm, expected 2 finite numbers"),
-        ("surface_mm", "8", "frame has no surface_mm"),
-        ("bed_mm", [1, 2, None], "frame has no bed_mm, expected 3"),
-        ("walls_mm", 1e9, "frame has no walls_mm"),
-        ("pad_mm", [60.0, 20.0, 5.0], "frame has no pad_mm, expected 2 finite numbers"),
-        ("mirrored", "up", "mirrored of frame is 'up', expected true or false"),
+        ("centre_mm", [1.0], "centre_mm.* field required"),
+        ("surface_mm", "8", "surface_mm: got '8'"),
+        ("bed_mm", [1, 2, None], "bed_mm.2: got None"),
+        ("walls_mm", 1e9, "walls_mm: got 1000000000.0"),
+        ("pad_mm", [60.0, 20.0, 5.0], "pad_mm"),
+        ("mirrored", "up", "mirrored: got 'up'"),
+        ("mirrored", None, "mirrored: got .* field required"),
     ],
 )
 def test_locate_on_bed_names_a_damaged_entry(with_frame, key, value, message):

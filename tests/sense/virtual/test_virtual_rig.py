@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -249,7 +249,7 @@ def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkey
     monkeypatch.setattr("padforge.sense.rig.doctor.OBSERVE_S", 0.3)
     config = RigConfig(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
     with whole_rig.opened_virtual_rig("simulated", config, (14, 3)) as (arm, board, settings):
-        rows = {row.name: row.message for row in diagnose(nullcontext(board), nullcontext((arm, settings)))}
+        rows = {row.name: row.message for row in diagnose(lambda: board, lambda: (arm, settings))}
     assert rows["channel 1"].startswith("input 14 rests at")
     assert rows["channel 2"].startswith("input 3 rests at")
     assert "channel 3" not in rows
