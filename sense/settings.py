@@ -57,7 +57,7 @@ class RigSettings(Settings):
     drift_mv: float = Field(default=40.0, ge=0, le=1000, description="simulated pad: std of the drifting baseline, mV")
     creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's response that creeps")
     hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
-    hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: time constant of its decay, s")
+    hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: its time constant, s")
     scatter: float = Field(
         default=0.18, ge=0, le=1, description="simulated pad: scatter of a response from press to press, share of it"
     )
@@ -65,7 +65,7 @@ class RigSettings(Settings):
         default=0.36, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
     )
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
-    board: str = Field(default="due", min_length=1, max_length=100, description="name of the board that reads the fibres")
+    board: str = Field(default="due", min_length=1, max_length=100, description="name of the board")
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
     baud: int = Field(default=921_600, ge=9600, le=20_000_000, description="of a line board; USB boards take any")
     printer_port: Annotated[Annotated[str, Field(min_length=1, max_length=4096)] | None, *Unknown] = Field(
@@ -108,7 +108,7 @@ class RigSettings(Settings):
     press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
     acceleration_mm_s2: float = Field(default=500.0, gt=0, le=3000, description="acceleration, mm/s^2")
     max_force_n: Annotated[Force | None, *Unwatched] = Field(
-        default=60.0, description='force at which the arm is stopped, N; "unwatched" for an arm that measures none (CB3)'
+        default=60.0, description='force at which the arm is stopped, N; "unwatched" if the arm measures none (CB3)'
     )
 
     @property

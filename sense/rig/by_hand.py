@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import provenance
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
@@ -29,18 +28,16 @@ from padforge.sense.rig.by_hand_presses import (
     PressValidator,
     press_responses,
 )
-from padforge.sense.rig.config import RigConfig, check_same_devices, make_source, read_source
+from padforge.sense.rig.config import RigConfig, open_recorder, read_source
 from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, Ring, connected
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
-KIND = "hand"
-"""Of the source of such a recording, whose depths are unknown."""
+KIND = "hand"  # of the source of such a recording, whose depths are unknown
+# Targets of a uniform plan that are ordered by a short way before the next ones: a session that ends early has covered
+# the whole pad, and drift with time is not confused with position.
 ROUND = 25
-"""Targets of a uniform plan that are ordered by a short way before the next ones: a session that ends early has covered
-the whole pad, and drift with time is not confused with position."""
-TRAIL = 12
-"""Presses that the view shows."""
+TRAIL = 12  # presses that the view shows
 UNKNOWN = (np.nan, np.nan)
 COMMANDS = (
     {"key": "b", "command": "back", "text": "Take the last press back"},
@@ -49,12 +46,9 @@ COMMANDS = (
     {"key": "q", "command": "quit", "text": "End"},
 )
 """Commands of a person, by a key or a button."""
-PATH_TOLERANCE = 0.02
-"""Of the paths drawn, grid units."""
-MAP_COLUMNS, MAP_ROWS = 49, 21
-"""Of the map on a terminal, whose characters are about twice as high as wide; of a pad that is not square, at most."""
-BAR = 30
-"""Characters of the progress bar."""
+PATH_TOLERANCE = 0.02  # of the paths drawn, grid units
+MAP_COLUMNS, MAP_ROWS = 49, 21  # at most, of the map on a terminal, whose characters are twice as high as wide
+BAR = 30  # characters of the progress bar
 
 OnView = Callable[[dict[str, Any]], None]
 PollCommands = Callable[[], Sequence[str]]
@@ -116,22 +110,18 @@ def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: b
     Raises:
         InputError: Targets that cannot be, another recording in the way, or one that was begun otherwise.
     """
-    identities = {"board": board}
-    if resume and (config.out / START).exists():
-        source = read_source(config, config.rig, KIND)
-        targets_mm = check_numbers(source["plan"]["presses"], np.float64, "places of the plan")
+    is_resumed = resume and (config.out / START).exists()
+    if is_resumed:
+        presses = read_source(config, config.rig, KIND)["plan"]["presses"]
+        targets_mm = check_numbers(presses, np.float64, "positions of the plan")
         if targets_mm.ndim != 2 or targets_mm.shape[1] != 2:
             raise InputError(f"{config.out}: its plan has shape {targets_mm.shape}, expected (Q, 2)")
-        check_magnitude("places of the plan", targets_mm, MAX_MM, "mm")
-        check_same_devices(config.out, source, identities)
-        recorder = Recorder.resume(config.out)
-        pressed_mm = np.array([press[:2] for press in read_journal(config.out / JOURNAL).values()]).reshape(-1, 2)
-        return recorder, targets_mm, remaining_targets(targets_mm, pressed_mm)
-    targets_mm = plan_targets(config)
-    plan = {"columns": ["x_mm", "y_mm"], "presses": targets_mm.tolist()}
-    source = make_source(config, config.rig, KIND, plan, identities)
-    made_by = provenance(config.command, config.rig.seed, config.inputs)
-    return Recorder(config.out, board["channels"], source, made_by), targets_mm, targets_mm
+        check_magnitude("positions of the plan", targets_mm, MAX_MM, "mm")
+    else:
+        targets_mm = plan_targets(config)
+    recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
+    pressed = [press[:2] for press in read_journal(config.out / JOURNAL).values()] if is_resumed else []
+    return recorder, targets_mm, remaining_targets(targets_mm, np.reshape(pressed, (-1, 2)))
 
 
 class HandSession:

@@ -20,23 +20,15 @@ from padforge.sense.localizer.features import REST
 
 # In the published recording, with presses detected as here, one press in 370 is weaker than MIN_RESPONSE of the usual
 # one, and one in 80 changes by more than MIN_COSINE while it is held.
-MIN_RESPONSE = 0.15
-"""Share of the usual response, all fibres together, below which a press tells too little."""
-MIN_COSINE = 0.95
-"""Between the responses early in a press and at its end, below which it was not at one position."""
-MIN_PRESSES = 5
-"""Accepted presses from which on the usual response is known."""
-TOUCHED, UNTOUCHED = 0.5, 0.25
-"""Distances from the baseline, shares of the usual response, beyond and below which a pad is and is not touched."""
-SINK_S, RELEASE_S = 0.4, 1.0
-"""Times after which a touch has sunk in, and a release has ended but for slow creep."""
+MIN_RESPONSE = 0.15  # share of the usual response, all fibres together, below which a press tells too little
+MIN_COSINE = 0.95  # of the responses early in a press and at its end, below which it was not at one position
+MIN_PRESSES = 5  # accepted presses from which on the usual response is known
+TOUCHED, UNTOUCHED = 0.5, 0.25  # distance from the baseline, share of the usual response: more, less than that
+SINK_S, RELEASE_S = 0.4, 1.0  # a touch has sunk in; a release has ended but for slow creep
 
-SETTLE_S = 2.0
-"""Before the first press: the baseline and its noise are learnt from that."""
-MIN_SHOWN_S = 0.6
-"""A press sooner after its target was shown was meant for the one before, or is its echo."""
-MIN_HOLD, MAX_HOLD = 0.8, 4.0
-"""Shares of the hold that a press has to last, and may: people lift a little before they are asked to."""
+SETTLE_S = 2.0  # before the first press: the baseline and its noise are learnt from that
+MIN_SHOWN_S = 0.6  # a press sooner after its target was shown was meant for the one before, or is its echo
+MIN_HOLD, MAX_HOLD = 0.8, 4.0  # shares of the hold that a press has to last, and may: people lift early
 
 Position = tuple[float, float]
 

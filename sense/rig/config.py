@@ -25,14 +25,10 @@ from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
 from padforge.sense.settings import Millimetres, RigSettings
 
-Identities = Mapping[str, Mapping[str, Any]]
-"""What "arm" and "board" returned on connecting."""
-
 FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/2"
 _ROUNDING_MM = 1e-6
 
-KIND = "rig"
-"""Of the source of a recording that an arm pressed."""
+KIND = "rig"  # of the source of a recording that an arm pressed
 _PLAN_KEYS = ("presses", "plan", "seed")
 _CHANGEABLE = {
     *_PLAN_KEYS,  # the plan is stored
@@ -229,36 +225,40 @@ def plan_notice(config: RigConfig) -> str:
     return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
 
 
-def check_same_devices(out: Path, source: Mapping[str, Any], identities: Identities) -> None:
-    """Raise InputError if a recording would be resumed with another arm, tool or board; see `make_source`."""
-    for device, identity in identities.items():
-        stored = _get(source.get("devices"), device)
-        for key in _IDENTITY_KEYS[device]:
-            if (before := _get(stored, key)) != (now := _as_json(identity).get(key)):
-                raise InputError(f"{device}: {key} is {now}, the recording in {out} was begun with {before}")
-
-
-def make_source(
-    config: RigConfig, rig: RigSettings, kind: str, plan: Mapping[str, Any], identities: Identities
-) -> dict[str, Any]:
-    """Return the source of a new recording: kind, devices, settings, pad, and the plan with its columns."""
-    devices = {name: _as_json(identity) for name, identity in identities.items()}
-    return {"kind": kind, "devices": devices, **_settings_and_pad(config, rig), "plan": dict(plan)}
-
-
 def open_recorder(
-    config: RigConfig, rig: RigSettings, plan: PressPlan, folder: Path, resume: bool, identities: Identities
+    config: RigConfig,
+    rig: RigSettings,
+    presses: Sequence[Sequence[float]],
+    folder: Path,
+    resume: bool,
+    identities: Mapping[str, Mapping[str, Any]],
+    kind: str = KIND,
 ) -> Recorder:
     """Return the recorder of a new recording in `folder`, or of the one there that is resumed.
 
+    Args:
+        config: What is recorded.
+        rig: `[rig]`, as it is on this rig.
+        presses: The plan, x and y or x, y and depth of each, mm.
+        folder: The run directory.
+        resume: Whether to resume what is in `folder`, if anything is.
+        identities: What "arm" and "board" returned on connecting.
+        kind: Of the source.
+
     Raises:
-        InputError: The recording cannot be resumed, or was begun with other devices.
+        InputError: The recording cannot be resumed, or was begun with another arm, tool or board.
     """
-    if resume and (folder / START).exists():
-        check_same_devices(folder, read_json(folder / START, FORMAT).get("source", {}), identities)
-        return Recorder.resume(folder)
-    source = make_source(config, rig, KIND, {"columns": list(COLUMNS), "presses": plan.document()}, identities)
-    return Recorder(folder, len(config.pad.knots), source, provenance(config.command, rig.seed, config.inputs))
+    devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
+    if not (resume and (folder / START).exists()):
+        plan = {"columns": list(COLUMNS[: len(presses[0])]), "presses": presses}
+        source = {"kind": kind, "devices": devices, **_settings_and_pad(config, rig), "plan": plan}
+        return Recorder(folder, len(config.pad.knots), source, provenance(config.command, rig.seed, config.inputs))
+    stored = read_json(folder / START, FORMAT)["source"].get("devices")
+    for device, identity in devices.items():
+        for key in _IDENTITY_KEYS[device]:
+            if (before := _get(_get(stored, device), key)) != (now := identity.get(key)):
+                raise InputError(f"{device}: {key} is {now}, the recording in {folder} was begun with {before}")
+    return Recorder.resume(folder)
 
 
 def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
@@ -269,7 +269,3 @@ def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
 
 def _get(mapping: object, key: str) -> Any:
     return mapping.get(key) if isinstance(mapping, dict) else None
-
-
-def _as_json(identity: Mapping[str, Any]) -> dict[str, Any]:
-    return json.loads(json.dumps(dict(identity)))

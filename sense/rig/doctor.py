@@ -14,11 +14,8 @@ from padforge.sense.settings import RigSettings
 Status = Literal["ok", "warn", "fail"]
 
 OBSERVE_S = 2.0
-"""For how long channels and states are observed."""
-_DEAD_V = 0.02
-"""A channel nearer than this to either end of the range is open, shorted or saturated."""
-_STUCK_V, _NOISY_V = 1e-6, 0.02
-"""Standard deviations below and above which a channel is stuck or noisy: an ADC that reads a fibre shows noise."""
+_DEAD_V = 0.02  # a channel nearer than this to either end of the range is open, shorted or saturated
+_STUCK_V, _NOISY_V = 1e-6, 0.02  # std below and above: an ADC that reads a fibre shows noise, but little
 _LATE_S = 0.1
 _RATE_TOLERANCE = 0.01
 

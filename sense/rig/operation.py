@@ -33,12 +33,10 @@ from padforge.sense.rig.safety import Limits, check_start_state, check_tcp
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 
-ADAPT_EVERY = 20
-"""Presses between two evaluations of the localizer by an adaptive plan."""
+ADAPT_EVERY = 20  # presses between two evaluations of the localizer by an adaptive plan
 _N_CANDIDATES = 500
 _N_NEIGHBOURS = 5
-_DRY_PREFIX = "padforge-dry-"
-"""Of the temporary folders that dry runs record into."""
+_DRY_PREFIX = "padforge-dry-"  # of the temporary folders that dry runs record into
 
 OpenedRig = AbstractContextManager[tuple[Arm, Board, RigSettings]]
 """An arm and a board, not yet connected, and the settings for them, which name the inputs of the board."""
@@ -195,7 +193,7 @@ def record(
             on_message('[rig] max_force_n is "unwatched": no force stops the arm')
         folder = temporary_folder(Path(tempfile.gettempdir()), _DRY_PREFIX) if dry else nullcontext(config.out)
         with folder as out:
-            with open_recorder(config, rig, plan, out, resume, identities) as recorder:
+            with open_recorder(config, rig, plan.document(), out, resume, identities) as recorder:
                 on_progress(len(recorder.done), len(plan))
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)

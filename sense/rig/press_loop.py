@@ -39,10 +39,8 @@ OnProgress = Callable[[int, int], None]
 
 _READING_DEADLINE_S = 3.0
 _DISK_DEADLINE_S = 30.0
-_SETTLE_S = 0.1
-"""Before the state is read again of an arm that refused a move: it tells why."""
-_RECENT = 4096
-"""Readings whose times are remembered, to find the first one after a command."""
+_SETTLE_S = 0.1  # until the state of an arm that refused a move tells why
+_RECENT = 4096  # readings whose times are remembered, to find the first one after a command
 
 
 class DiskThread:
@@ -126,11 +124,11 @@ class PressLoop:
     """Records presses with one arm and one board, both connected.
 
     Args:
-        arm: It presses.
-        board: It reads the fibres.
+        arm: Presses.
+        board: Reads the fibres.
         recorder: New or resumed; presses it has are not made again.
-        rig: `[rig]`.
-        dry: Press nothing: the arm stays above the pad all the time.
+        rig: Settings of this rig.
+        dry: Whether the arm stays above the pad all the time.
         clock: Returns the time, s.
         sleep: Pauses for a time, s.
     """

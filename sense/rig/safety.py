@@ -15,24 +15,18 @@ from padforge.sense.rig.devices import Arm, ArmState, Pose, RigFault
 from padforge.sense.settings import RigSettings
 
 Vector = tuple[float, float, float]
-DOWN: Vector = (0.0, math.pi, 0.0)
-"""Rotation vector of a tool that points straight down."""
-MAX_LEAN_DEG = 10.0
-"""Between the expected tool axis and straight down: depths are measured along the base's z axis."""
+DOWN: Vector = (0.0, math.pi, 0.0)  # rotation vector of a tool that points straight down
+MAX_LEAN_DEG = 10.0  # of the expected tool axis from straight down: depths are measured along the base's z axis
 TCP_TOLERANCE_MM = 0.1
 STILL_MM_S = 1.0
-DEPTH_TOLERANCE_MM = 0.3
-"""How much deeper than allowed a moving tip may read: noise and overshoot, not a wrong target."""
+DEPTH_TOLERANCE_MM = 0.3  # how much deeper than allowed a moving tip may read: noise and overshoot, no wrong target
 POLL_S = 0.004
 
-RETREAT_MM_S, RETREAT_MM = 10.0, 10.0
-"""Speed of a retreat, and its height above the pad, or above the place where the force was too great."""
-FALL_START_S, FALL_END_S = 0.2, 1.0
-"""When, in a retreat, a force that was too great has to begin to fall, and when it has to be below its limit."""
-MAX_RISE_N = 5.0
-"""How far that force may rise above its minimum: the error of force sensors."""
-EDGE_MM = 1.0
-"""How far outside the box a tool may stand that was sent to its edge: arms stop near their target, not on it."""
+RETREAT_MM_S = 10.0
+RETREAT_MM = 10.0  # height above the pad, or above the place where the force was too great
+FALL_START_S, FALL_END_S = 0.2, 1.0  # by when such a force has to begin to fall, and to be below its limit
+MAX_RISE_N = 5.0  # of such a force above its minimum: the error of force sensors
+EDGE_MM = 1.0  # how far outside the box a tool may stand that was sent to its edge: arms stop near their target
 
 
 @dataclass(frozen=True)

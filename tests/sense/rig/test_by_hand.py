@@ -132,7 +132,7 @@ def config(tmp_path: Path) -> RigConfig:
     """A recording whose first two presses are made, and one at an unknown place."""
     config = RigConfig(Morphology.straight(2), Contact(), RigSettings(presses=5), tmp_path / "run", "test", [])
     recorder, targets, remaining = open_recorder_by_hand(config, IDENTITY, resume=False)
-    assert remaining is targets
+    np.testing.assert_array_equal(remaining, targets)
     with recorder:
         recorder.append(np.arange(20.0), np.ones((20, 4)))
         for press, place in enumerate((targets[0], (np.nan, np.nan), targets[1])):
@@ -158,7 +158,7 @@ def test_open_recorder_by_hand_resumes_the_stored_plan(config: RigConfig) -> Non
     [
         ({"kind": "rig"}, "holds a recording of kind 'rig', not 'hand'"),
         ({"plan": {"presses": [[1, 2, 3]]}}, "its plan has shape"),
-        ({"plan": {"presses": [["a", 1]]}}, "places of the plan"),
+        ({"plan": {"presses": [["a", 1]]}}, "positions of the plan"),
     ],
 )
 def test_open_recorder_by_hand_refuses_another_recording(config: RigConfig, change: dict, message: str) -> None:

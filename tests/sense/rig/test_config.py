@@ -165,8 +165,8 @@ def resumed_plan(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A recording of no press so far, which nobody may change."""
-    out = tmp_path_factory.mktemp("run")
-    with open_recorder(config_of(out), RIG, planned(PAD, RIG, np.random.default_rng(0)), out, False, IDENTITIES):
+    out, plan = tmp_path_factory.mktemp("run"), planned(PAD, RIG, np.random.default_rng(0))
+    with open_recorder(config_of(out), RIG, plan.document(), out, False, IDENTITIES):
         pass
     return out
 
@@ -189,7 +189,7 @@ def test_make_plan_keeps_the_plan_of_a_resumed_recording(run, tmp_path):
 def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
     pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
     plan = planned(pad, RIG, np.random.default_rng(0))
-    with open_recorder(config_of(tmp_path, pad), RIG, plan, tmp_path, False, IDENTITIES):
+    with open_recorder(config_of(tmp_path, pad), RIG, plan.document(), tmp_path, False, IDENTITIES):
         pass
     assert resumed_plan(tmp_path, pad) == plan.document()
     x, y = plan.positions_mm[1].tolist()
@@ -240,7 +240,7 @@ def test_resume_refuses_another_arm_tool_or_board(run, tmp_path, device, key, va
     assert json.loads((run / START).read_text())["source"]["devices"] == IDENTITIES
     out = Path(shutil.copytree(run, tmp_path / "run"))
     identities = IDENTITIES | {device: IDENTITIES[device] | {key: value}}
-    plan = make_plan(config_of(out), RIG, resume=True)
+    plan = resumed_plan(out)
     refusal = pytest.raises(InputError, match=re.escape(f"{device}: {key} is {value}, the recording in"))
     with nullcontext() if is_same else refusal, open_recorder(config_of(out), RIG, plan, out, True, identities):
         pass
