@@ -20,7 +20,7 @@ from padforge.sense.settings import RigSettings
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
 
-def test_a_recording_lies_in_the_folder_of_its_pad(padforge_sense) -> None:
+def test_record_writes_beside_its_pad(padforge_sense) -> None:
     assert padforge_sense("record", "--presses", "4")[0] == 0
     assert Recording.open("out/pad/recording").source["rig"]["presses"] == 4
     Morphology.random(2, 3, 1).save(Path("mine/morphology.json"))
@@ -30,21 +30,21 @@ def test_a_recording_lies_in_the_folder_of_its_pad(padforge_sense) -> None:
     assert Recording.open("mine/recording").source["rig"]["seed"] == 7
 
 
-def test_a_twin_is_recorded_as_it_was_wired_and_another_pad_as_planned(padforge_sense) -> None:
+def test_record_simulates_a_twin(padforge_sense) -> None:
     twin = printed_pad(Morphology.random(2, 3, 5), np.random.default_rng(3))
     twin.save("twin.json")
-    assert padforge_sense("record", "--twin", "twin.json", "--presses", "4", "--out", "own")[0] == 0
-    own = Recording.open("own")
-    assert own.fibres == len(twin.channels)
-    assert own.source["kind"] == "simulated"
-    assert own.source["contact"] == twin.contact().model_dump(mode="json")
-    made_by = json.loads(Path("own/start.json").read_text())["provenance"]
+    assert padforge_sense("record", "--twin", "twin.json", "--presses", "4", "--out", "measured")[0] == 0
+    measured = Recording.open("measured")
+    assert measured.fibres == len(twin.channels)
+    assert measured.source["kind"] == "simulated"
+    assert measured.source["contact"] == twin.contact().model_dump(mode="json")
+    made_by = json.loads(Path("measured/start.json").read_text())["provenance"]
     assert made_by["inputs"]["twin.json"] == sha256(Path("twin.json"))
     for name, pad in (("planned", twin.morphology), ("other", Morphology.straight(3))):
         pad.save(f"{name}.json")
         words = ("record", "--twin", "twin.json", "--morphology", f"{name}.json", "--presses", "4", "--out", name)
         assert padforge_sense(*words)[0] == 0
-    assert not np.array_equal(Recording.open("planned").readings, own.readings)
+    assert not np.array_equal(Recording.open("planned").readings, measured.readings)
     assert Recording.open("other").fibres == 6
 
 
@@ -54,7 +54,7 @@ PRINTER = (
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
-def test_a_printer_is_practised_on_through_its_drivers(padforge_sense) -> None:
+def test_record_with_a_virtual_printer(padforge_sense) -> None:
     pytest.importorskip("serial")
     Path("pad.toml").write_text(PRINTER)
     Morphology.straight(2).save("morphology.json")
@@ -73,10 +73,10 @@ def test_a_printer_is_practised_on_through_its_drivers(padforge_sense) -> None:
         ((0.0, 0.05, 150.0), None, 0, "no force stops the arm"),
     ],
 )
-def test_nothing_moves_before_the_tool_is_known(
+def test_record_checks_the_tcp_before_anything_moves(
     padforge_sense, monkeypatch: pytest.MonkeyPatch, tcp_mm: object, max_force_n: object, code: int, said: str
 ) -> None:
-    """The controller has the tip 150 mm from the flange; an arm whose force nobody watches is told."""
+    """The controller has the tip 150 mm from the flange; an unwatched force is announced."""
     arm, session = FakeArm(Time()), Mock()
     monkeypatch.setattr(arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
     monkeypatch.setattr(
@@ -98,7 +98,7 @@ HAND = '[pad]\ngrid = 2\n[rig]\npresses = 2\nreadings_per_press = 10\nport = "/d
 
 
 @pytest.mark.slow
-def test_a_finger_records_through_the_drivers(padforge_sense) -> None:
+def test_record_with_a_virtual_hand(padforge_sense) -> None:
     """In real time, which the board needs."""
     Path("pad.toml").write_text(HAND)
     by_hand = ("record", "--rig", "hand", "--virtual-hardware", "--out", "rec")
@@ -108,15 +108,15 @@ def test_a_finger_records_through_the_drivers(padforge_sense) -> None:
     recording = Recording.open("rec")
     assert recording.known.sum() == 2
     assert recording.source["kind"] == "hand"
-    *told, last = out.splitlines()
-    assert sum(line.startswith("counted: x ") for line in told) == 2
+    *messages, last = out.splitlines()
+    assert sum(line.startswith("counted: x ") for line in messages) == 2
     assert last.startswith(f"{len(recording.presses_mm)} presses")
     code, out, err = padforge_sense(*by_hand)
     assert (code, out) == (2, "")
     assert "never written over" in err
 
 
-def test_each_device_is_looked_over_where_the_other_is_not_there(padforge_sense) -> None:
+def test_doctor_examines_each_device_without_the_other(padforge_sense) -> None:
     Path("rig.toml").write_text(
         '[rig]\nport = "no-such-port"\nprinter_port = "neither"\npad_mm = [0, 0]\ncontact_mm = 9\n'
         "box_mm = [-9, 9, -9, 9, 0, 99]\n"
@@ -128,7 +128,7 @@ def test_each_device_is_looked_over_where_the_other_is_not_there(padforge_sense)
 
 
 @pytest.mark.slow
-def test_the_board_alone_is_looked_over_for_a_hand(padforge_sense) -> None:
+def test_doctor_examines_the_board_alone_for_a_hand(padforge_sense) -> None:
     Path("pad.toml").write_text(HAND)
     code, out, _ = padforge_sense("doctor", "--rig", "hand", "--virtual-hardware")
     assert code == 0

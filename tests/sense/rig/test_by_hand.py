@@ -113,7 +113,7 @@ def test_view_lines_map_positions() -> None:
     assert rows[MAP_ROWS // 2][1 + MAP_COLUMNS // 2] == "."
     assert "2 of 7 presses" in lines[-2]
     assert "q: end" in lines[-1]
-    # With its tracks up, what is to the right on the plan is to the left of whoever looks; positions stay as planned.
+    # With the tracks up, what is right on the plan is left on the map; positions stay as planned.
     lying = view_lines(pad_view(pad, "hand", mirrored=True) | VIEW)
     assert [row[::-1] for row in lying[3 : 3 + MAP_ROWS]] == rows
     assert lying[0] == lines[0]
@@ -349,8 +349,8 @@ def test_session_executes_commands(hands) -> None:
         return schedule.pop(len(hand.messages), []) if hand.views and hand.views[-1]["phase"] == "wait" else []
 
     recording = hand.record(commands=commands)
-    first, second, third, *rest = hand.targets.tolist()
-    assert accepted_mm(recording).tolist() == [first, second, *rest]  # the second again, and the third left out
+    first, second, third, *others = hand.targets.tolist()
+    assert accepted_mm(recording).tolist() == [first, second, *others]  # the second again, and the third left out
     assert len(recording.presses_mm) == 5
     journal = [json.loads(line) for line in (hand.out / "journal.ndjson").read_text().splitlines()]
     assert [event["rejected"] for event in journal if "rejected" in event] == ["it was taken back"]
