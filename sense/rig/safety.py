@@ -103,7 +103,7 @@ def turn_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
     return math.degrees(2 * math.atan2(abs(about), abs(along)))
 
 
-def require_numbers(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
+def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
     """RigFault("refused") unless these are six finite numbers and two positive ones."""
     if len(pose) != 6:
         _refuse(f"a pose of {len(pose)} numbers", "6")
@@ -124,7 +124,7 @@ def require_safe(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
     Raises:
         RigFault: "refused", naming what is out of limits, its value and what is allowed.
     """
-    require_numbers(pose, speed_mm_s, acceleration_mm_s2)
+    check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
     if limits.contact_mm is None:
         _refuse("the height of the pad's surface unknown", "a measured height")
     for axis, value, (low, high) in zip("xyz", pose[:3], limits.box_mm, strict=True):

@@ -118,7 +118,7 @@ def known(recording: Recording) -> np.ndarray:
 def off_from(recording: Recording, strokes: np.ndarray) -> list[float]:
     """How far off their places, mm, the strokes of those presses went that count."""
     made = zip(strokes[recording.known], known(recording), strict=True)
-    return [float(np.linalg.norm(stroke.place_mm - place)) for stroke, place in made]
+    return [float(np.linalg.norm(stroke.position_mm - place)) for stroke, place in made]
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from padforge.sense.rig import devices as plugins
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards import due as due_link
 from padforge.sense.rig.boards import line_board as line_driver
-from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.devices import RigFault, device, device_names, refusal, start
 from padforge.sense.settings import RigSettings
 
@@ -80,21 +80,21 @@ def test_the_ports_of_a_due_are_found_native_first_and_that_of_a_line_board_wher
 
     ports(PROGRAMMING, NATIVE, UNO)
     native = due_link.BoardPort("/dev/ttyACM3", "native", "")
-    assert due_link.find_ports() == [native, due_link.BoardPort("/dev/ttyACM1", "programming", "7")]
-    assert due_link.port_of(RigSettings()) == "/dev/ttyACM3"
+    assert due_link.list_due_ports() == [native, due_link.BoardPort("/dev/ttyACM1", "programming", "7")]
+    assert due_link.find_due_port(RigSettings()) == "/dev/ttyACM3"
     with pytest.raises(RigFault, match="3 serial ports on USB; name one of /dev/ttyACM1, /dev/ttyACM2, /dev/ttyACM3"):
-        line_driver.port_of(RigSettings())
+        line_driver.find_line_port(RigSettings())
     ports(UNO)
-    assert line_driver.port_of(RigSettings()) == "/dev/ttyACM2"
+    assert line_driver.find_line_port(RigSettings()) == "/dev/ttyACM2"
     with pytest.raises(RigFault, match="no board is found; plug it in"):
-        due_link.port_of(RigSettings())
+        due_link.find_due_port(RigSettings())
     ports()
     with pytest.raises(RigFault, match="0 serial ports on USB; plug the board in"):
-        line_driver.port_of(RigSettings())
-    for port_of in (due_link.port_of, line_driver.port_of):
-        assert port_of(RigSettings(port="COM3")) == "COM3"
+        line_driver.find_line_port(RigSettings())
+    for find_port in (due_link.find_due_port, line_driver.find_line_port):
+        assert find_port(RigSettings(port="COM3")) == "COM3"
     monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (Arduino("/dev/ttyACM0", 1000).connect, due_link.find_ports):
+    for action in (DueBoard("/dev/ttyACM0", 1000).connect, due_link.list_due_ports):
         with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
             action()
         assert caught.value.cause == "refused"

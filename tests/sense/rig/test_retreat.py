@@ -119,7 +119,7 @@ def test_too_much_force_is_seen_at_once_and_taken_off_however_slow_the_disk(
             with pytest.raises(RigFault, match=r"allowed 20 N; the tool was lifted off"):
                 session.run(PressPlan(np.zeros((1, 2)), np.array([5.0])))
             monkeypatch.setattr(os, "fsync", sync)
-    rows = robot.truth.rows()
+    rows = robot.pose_log.rows()
     over = rows[rows[:, 7] > 20]
     assert over[:, 7].max() < 60
     assert over[-1, 0] - over[0, 0] < 2
