@@ -1,13 +1,7 @@
-"""What emulated devices at serial ports share: a thread at the far end of a pseudo-terminal, and noise.
-POSIX only.
+"""Emulated boards at pseudo-terminals: an Arduino Due, and a board that speaks the line protocol. POSIX only.
 
-What emulated boards share: they sample in time, and fail on demand.
-
-A stand-in for the Arduino Due, which speaks as its firmware does.
-What it samples comes from a function of time, so that one simulated pad can be behind it and behind a simulated arm.
-It samples by the host's clock at a rate that may be off by some ppm, and fails on demand. POSIX only.
-
-A stand-in for a board that speaks the line protocol; see `due_board` for what is behind it. POSIX only.
+What they sample is a function of time, so that one simulated pad can be behind a board and an emulated arm. They sample
+by the host's clock, at a rate that may be off by some ppm, and fail on demand.
 """
 
 import os
@@ -33,14 +27,31 @@ from padforge.sense.rig.boards.due_framing import (
     Kind,
     Status,
 )
-from padforge.sense.rig.boards.line_framing import ASK, LineHeader, header_line, sample_line
+from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineHeader, format_header, format_sample
+
+SampleSource = Callable[[Array], Array]
+"""(n,) host times in s to (n, C) volts, C the number of inputs of the board or more."""
+
+MAX_OUT_BYTES = 65_536
+"""Bytes that wait for a slow host; what comes then is dropped, whole samples at a time."""
+MIN_NS_PER_CONVERSION = 6000
+MAX_PERIOD_NS = 1_000_000_000
+BLOCK_NS = 20_000_000
+"""A block of the Due holds this much time, or a single sample."""
+
+_POLL_S = 0.01
 
 
 class SerialDevice(ABC):
-    """A device, running from `with` to its end, at the port `port`."""
+    """A device at the port `port`, a pseudo-terminal, from `with` to its end."""
 
     def __init__(self, name: str, seed: int) -> None:
-        """Open the pseudo-terminal; `seed` is of the damage by `garble`."""
+        """Open the pseudo-terminal.
+
+        Args:
+            name: of the thread.
+            seed: of the noise of `garble`.
+        """
         import tty
 
         self._rng, self._garble = np.random.default_rng(seed), 0.0
@@ -60,23 +71,27 @@ class SerialDevice(ABC):
         self.unplug()
 
     def unplug(self) -> None:
-        """Take the device from its port, for good."""
+        """Remove the device from its port, for good."""
         self._ending = True
         self._thread.join()
 
-    @abstractmethod
-    def _turn(self, data: bytes) -> None:
-        """Take what the host has sent, which may be nothing, and add to `_out` what is to be sent."""
+    def garble(self, probability: float) -> None:
+        """Flip a bit of, drop or double each byte with `probability`."""
+        self._garble = probability
 
     @abstractmethod
-    def _pause_s(self) -> float:
-        """Longest wait for the host before the next turn."""
+    def _step(self, data: bytes) -> None:
+        """Process what the host has sent, possibly nothing, and add to `_out` what is to be sent."""
+
+    def _wait_s(self) -> float:
+        """Return the longest wait for the host before the next step."""
+        return _POLL_S
 
     def _run(self) -> None:
         try:
             while not self._ending:
-                ready, _, _ = select.select([self._master], [], [], self._pause_s())
-                self._turn(os.read(self._master, 4096) if ready else b"")
+                ready, _, _ = select.select([self._master], [], [], self._wait_s())
+                self._step(os.read(self._master, 4096) if ready else b"")
                 if self._out:
                     with suppress(BlockingIOError):
                         del self._out[: os.write(self._master, self._out)]
@@ -84,101 +99,83 @@ class SerialDevice(ABC):
             os.close(self._slave)
             os.close(self._master)
 
-    def _damaged(self, data: bytes) -> bytes:
+    def _add_noise(self, data: bytes) -> bytes:
         if not self._garble:
             return data
-        damaged = bytearray(data)
+        noisy = bytearray(data)
         for at in np.flatnonzero(self._rng.random(len(data)) < self._garble)[::-1].tolist():
-            byte, fate = data[at], int(self._rng.integers(3))
-            damaged[at : at + 1] = (bytes([byte ^ 1 << int(self._rng.integers(8))]), b"", bytes([byte, byte]))[fate]
-        return bytes(damaged)
-
-
-Source = Callable[[Array], Array]
-"""(n,) host times in s to (n, C) volts, C the inputs of the board or more than are asked for."""
-
-OUT_BYTES = 65_536
-"""So much waits for a host that is slow; what comes then is dropped, whole samples at a time."""
-
-_PAUSE_S = 0.01
+            byte, kind = data[at], int(self._rng.integers(3))
+            noisy[at : at + 1] = (bytes([byte ^ 1 << int(self._rng.integers(8))]), b"", bytes([byte, byte]))[kind]
+        return bytes(noisy)
 
 
 class SerialBoard(SerialDevice):
-    """A board at a serial port."""
+    """A board at a serial port; the noise of `garble` is on what it sends."""
 
     def __init__(self, skew_ppm: float, seed: int) -> None:
         """Open the pseudo-terminal.
 
         Args:
-            skew_ppm: how much longer a period is than it should be. seed: of the damage by `garble`.
+            skew_ppm: how much longer a period is than nominal.
+            seed: of the noise of `garble`.
         """
         super().__init__("board", seed)
         self._skew_ppm = skew_ppm
-        self._started_s: float | None = None
-        self._first = 0
+        self._start_s: float | None = None
+        self._first = 0  # index of the next sample
         self._stalled = False
 
     def stall(self, stalled: bool = True) -> None:
-        """Neither sample nor answer any more, as firmware that hangs; False is the restart of the board."""
+        """Neither sample nor answer any more, as firmware that hangs; False restarts the board."""
         self._stalled = stalled
 
-    def garble(self, probability: float) -> None:
-        """Flip a bit of, drop or double each byte sent with `probability`."""
-        self._garble = probability
-
-    def truth_s(self, index: int | Indices) -> Array:
-        """Host times at which the samples of these indices since the last start were complete."""
-        if self._started_s is None:
+    def true_times(self, index: int | Indices) -> Array:
+        """Return the host times at which samples since the last start were complete."""
+        if self._start_s is None:
             raise ValueError("the board is not sampling")
-        return self._started_s + (np.asarray(index) + 1) * self._period_s() * (1 + self._skew_ppm * 1e-6)
+        return self._start_s + (np.asarray(index) + 1) * self._period_s() * (1 + self._skew_ppm * 1e-6)
 
     @abstractmethod
     def _period_s(self) -> float:
-        """From sample to sample, by the board's clock."""
+        """Return the sampling period by the board's clock."""
 
     @abstractmethod
-    def _listen(self, data: bytes) -> None:
-        """Take what the host sends."""
+    def _process(self, data: bytes) -> None:
+        """Process what the host sends."""
 
     @abstractmethod
     def _sample(self) -> None:
-        """Queue the samples that are due, and count them in `_first`."""
+        """Send the samples that are due, and advance `_first`."""
 
-    def _at_once(self) -> int:
-        """Samples that are sent together."""
+    def _block_size(self) -> int:
+        """Return the number of samples that are sent together."""
         return 1
 
-    def _queue(self, data: bytes) -> None:
-        self._out += self._damaged(data)
+    def _send(self, data: bytes) -> None:
+        self._out += self._add_noise(data)
 
-    def _turn(self, data: bytes) -> None:
+    def _step(self, data: bytes) -> None:
         if self._stalled:
-            self._started_s = None
+            self._start_s = None
             self._out.clear()
         else:
             if data:
-                self._listen(data)
+                self._process(data)
             self._sample()
 
-    def _pause_s(self) -> float:
-        if self._started_s is None:
-            return _PAUSE_S
-        due_s = float(self.truth_s(self._first + self._at_once() - 1))
-        return min(max(due_s - time.monotonic(), 0.0), _PAUSE_S)
+    def _wait_s(self) -> float:
+        if self._start_s is None:
+            return _POLL_S
+        due_s = float(self.true_times(self._first + self._block_size() - 1))
+        return min(max(due_s - time.monotonic(), 0.0), _POLL_S)
 
 
-MIN_NS_PER_CONVERSION = 6000
-MAX_PERIOD_NS = 1_000_000_000
-BLOCK_NS = 20_000_000
-"""A block is sent after so much time at the latest, or when it holds a single sample."""
-
-
-class EmulatedBoard(SerialBoard):
-    """The board, running from `with` to its end, at the port `port`."""
+class EmulatedDue(SerialBoard):
+    """An Arduino Due with padforge's firmware."""
 
     def __init__(
         self,
-        source: Source,
+        source: SampleSource,
         *,
         supply_v: float = 3.3,
         skew_ppm: float = 0.0,
@@ -189,8 +186,12 @@ class EmulatedBoard(SerialBoard):
         """Open the pseudo-terminal.
 
         Args:
-            source: what the inputs read. supply_v: reading at full scale. skew_ppm: how much longer a period is.
-            firmware: version it says it has. silent: answer nothing. seed: of the damage by `garble`.
+            source: voltages of the inputs.
+            supply_v: reading at full scale.
+            skew_ppm: how much longer a period is than nominal.
+            firmware: version that it reports.
+            silent: whether it answers nothing.
+            seed: of the noise of `garble`.
         """
         super().__init__(skew_ppm, seed)
         self._source, self._supply_v = source, supply_v
@@ -199,61 +200,60 @@ class EmulatedBoard(SerialBoard):
         self._silent = silent
         self._decoder = framing.DueDecoder()
         self._settings = BoardSettings(1_000_000, 0xFF, 1)
-        self._sequence = self._overruns = self._overrun_asked = 0
+        self._sequence = self._overruns = self._n_to_drop = 0
         self._halting = False
 
     def halt(self) -> None:
-        """Stop and say that conversions were lost."""
+        """Stop and report that conversions were lost."""
         self._halting = True
 
     def overrun(self, samples: int) -> None:
-        """Drop the next `samples` samples, up to whole blocks."""
-        self._overrun_asked += samples
+        """Drop the next samples, rounded up to blocks."""
+        self._n_to_drop += samples
 
     def _period_s(self) -> float:
         return self._settings.period_ns * 1e-9
 
-    def _listen(self, data: bytes) -> None:
-        for frame in self._decoder.feed(data):
-            if not self._silent and (answer := self._answer(frame)) is not None:
-                self._queue(framing.encode(answer))
+    def _process(self, data: bytes) -> None:
+        for message in self._decoder.decode(data):
+            if not self._silent and (answer := self._answer(message)) is not None:
+                self._send(framing.encode(answer))
 
-    def _answer(self, frame: framing.Frame) -> Identity | Ack | None:
-        status = Status.OK
-        if isinstance(frame, BoardSettings):
-            status = Status.RUNNING if self._started_s is not None else judge_settings(frame)
+    def _answer(self, message: framing.DueMessage) -> Identity | Ack | None:
+        if isinstance(message, BoardSettings):
+            status = Status.RUNNING if self._start_s is not None else check_settings(message)
             if status == Status.OK:
-                self._settings = frame
+                self._settings = message
             return Ack(Kind.SETTINGS, status, self._settings)
-        if not isinstance(frame, framing.Request):
+        if not isinstance(message, framing.Request):
             return None
-        if frame.kind == Kind.IDENTIFY:
+        if message.kind == Kind.IDENTIFY:
             return self._identity
-        if frame.kind == Kind.STOP:
-            self._started_s = None
-        elif self._started_s is None:
+        if message.kind == Kind.STOP:
+            self._start_s = None
+        elif self._start_s is None:
             self._first = self._sequence = self._overruns = 0
-            self._started_s = time.monotonic()
-        return Ack(frame.kind, status, self._settings)
+            self._start_s = time.monotonic()
+        return Ack(message.kind, Status.OK, self._settings)
 
     def _sample(self) -> None:
         if self._halting:
-            self._halting, self._started_s = False, None
-            self._queue(framing.encode(Ack(Kind.STOP, Status.HALTED, self._settings)))
-        samples = self._at_once()
-        while self._started_s is not None:
+            self._halting, self._start_s = False, None
+            self._send(framing.encode(Ack(Kind.STOP, Status.HALTED, self._settings)))
+        samples = self._block_size()
+        while self._start_s is not None:
             index = self._first + np.arange(samples)
-            times_s = self.truth_s(index)
+            times_s = self.true_times(index)
             if times_s[-1] > time.monotonic():
                 return
             self._first += samples
-            if self._overrun_asked > 0 or len(self._out) > OUT_BYTES:
-                self._overrun_asked = max(self._overrun_asked - samples, 0)
+            if self._n_to_drop > 0 or len(self._out) > MAX_OUT_BYTES:
+                self._n_to_drop = max(self._n_to_drop - samples, 0)
                 self._overruns += samples
             else:
-                self._queue(framing.encode(self._block(int(index[0]), times_s)))
+                self._send(framing.encode(self._block(int(index[0]), times_s)))
 
-    def _at_once(self) -> int:
+    def _block_size(self) -> int:
         return min(max(BLOCK_NS // self._settings.period_ns, 1), framing.MAX_SAMPLES)
 
     def _block(self, first: int, times_s: Array) -> DueBlock:
@@ -266,25 +266,25 @@ class EmulatedBoard(SerialBoard):
         return DueBlock((steps * averaging).astype(np.uint16), averaging, mask, *numbers)
 
 
-def judge_settings(settings: BoardSettings) -> Status:
-    """What the board says to settings."""
+def check_settings(settings: BoardSettings) -> Status:
+    """Return the status with which the firmware answers settings."""
     mask, averaging, period_ns = settings.mask, settings.averaging, settings.period_ns
-    possible = 0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
-    if not (possible and 0 < period_ns <= MAX_PERIOD_NS):
+    valid = 0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
+    if not (valid and 0 < period_ns <= MAX_PERIOD_NS):
         return Status.BAD_SETTINGS
     return Status.TOO_FAST if period_ns < averaging * mask.bit_count() * MIN_NS_PER_CONVERSION else Status.OK
 
 
 class EmulatedLineBoard(SerialBoard):
-    """The board, running from `with` to its end, at the port `port`.
+    """A board that speaks the line protocol.
 
     Attributes:
-        dropped: lines that were left out because the host was too slow.
+        dropped: number of lines left out because the host was too slow.
     """
 
     def __init__(
         self,
-        source: Source,
+        source: SampleSource,
         header: LineHeader,
         *,
         boot_us: int = 0,
@@ -295,8 +295,12 @@ class EmulatedLineBoard(SerialBoard):
         """Open the pseudo-terminal.
 
         Args:
-            source: what the inputs read. header: what it says of itself. boot_us: its time as it starts.
-            skew_ppm: how much longer a period is. silent: answer nothing. seed: of the damage by `garble`.
+            source: voltages of the inputs.
+            header: what it sends as its header.
+            boot_us: its clock at the start.
+            skew_ppm: how much longer a period is than nominal.
+            silent: whether it sends nothing.
+            seed: of the noise of `garble`.
         """
         super().__init__(skew_ppm, seed)
         self._source, self._header, self._boot_us, self._silent = source, header, boot_us, silent
@@ -304,36 +308,36 @@ class EmulatedLineBoard(SerialBoard):
 
     def reset(self) -> None:
         """Start anew, as by its button."""
-        self._started_s = None
+        self._start_s = None
 
     def send_columns(self, columns: int) -> None:
-        """Send so many counts a line from now on."""
+        """Send this number of counts a line from now on."""
         self._columns = columns
 
     def _period_s(self) -> float:
         return 1 / self._header.rate_hz
 
-    def _listen(self, data: bytes) -> None:
-        if ASK in data and not self._silent:
-            self._queue(header_line(self._header))
+    def _process(self, data: bytes) -> None:
+        if HEADER_REQUEST in data and not self._silent:
+            self._send(format_header(self._header))
 
     def _sample(self) -> None:
         if self._silent:
             return
-        if self._started_s is None:
-            self._started_s, self._first = time.monotonic(), 0
-            self._queue(header_line(self._header))
-        last = int((time.monotonic() - self._started_s) / float(self.truth_s(0) - self._started_s))
-        index = np.arange(self._first, last)
+        if self._start_s is None:
+            self._start_s, self._first = time.monotonic(), 0
+            self._send(format_header(self._header))
+        end = int((time.monotonic() - self._start_s) / float(self.true_times(0) - self._start_s))
+        index = np.arange(self._first, end)
         if len(index) == 0:
             return
-        self._first = last
+        self._first = end
         scale = self._header.full_scale
-        volts = self._source(self.truth_s(index))[:, : self._columns]
+        volts = self._source(self.true_times(index))[:, : self._columns]
         counts = np.clip(np.rint(volts / self._header.reference_v * scale), 0, scale).astype(np.int64)
         for k, row in zip(index.tolist(), counts.tolist(), strict=True):
-            if len(self._out) > OUT_BYTES:
+            if len(self._out) > MAX_OUT_BYTES:
                 self.dropped += 1
                 continue
             time_us = self._boot_us + round((k + 1) * 1e6 * self._period_s())
-            self._queue(sample_line(time_us % 2**32, row, self._header.checked))
+            self._send(format_sample(time_us % 2**32, row, self._header.checked))

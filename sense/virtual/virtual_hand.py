@@ -1,4 +1,4 @@
-"""A person without a body: presses a simulated pad where a page or a terminal asks for it, as well as people do."""
+"""An emulated finger that presses a simulated pad where a page or a terminal asks for it, and errs as people do."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -10,48 +10,58 @@ import numpy as np
 
 from padforge.design import Contact, Morphology, signals
 from padforge.sense.arrays import Array
-from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.devices import Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import TRAVEL_S, LivePad
-from padforge.sense.virtual.boards import EmulatedBoard
+from padforge.sense.virtual.boards import EmulatedDue
 
 SCATTER_MM = 1.5
-"""Standard deviation, each way, of where a press goes."""
+"""Standard deviation of the position of a press, in x and in y."""
 DEPTHS = (0.7, 1.1)
-"""Range of depths, shares of `depth_mm`."""
-LATE_S = (0.3, 0.7)
-"""Range of the time from being asked to the touch; a lift follows in half of it."""
+"""Range of depths, relative to `depth_mm`."""
+REACTION_S = (0.3, 0.7)
+"""Range of the time from the request to the touch; a lift follows in half of it."""
 MISHAPS = ("short", "double", "light", "slide")
 """A press is let go at once, or followed by a second tap, or hardly felt, or slides away."""
 SHORT_S, AGAIN_S, LIGHT, SLIDE_MM = 0.3, 0.25, 0.04, 12.0
 PATIENCE_S = 3.0
-"""After so long a press that nobody noticed is given up."""
+"""Time after which a press that was not detected is given up."""
 
 
 @dataclass
 class FingerStroke:
-    """A press: where, how deep, mm, and from when to when the finger is down, s; `up_s` is inf while nobody knows."""
+    """A press of the finger.
+
+    Attributes:
+        kind: "press", one of `MISHAPS`, or "echo", the second tap.
+        position_mm: of the touch; shape (2,).
+        depth_mm: when it is down.
+        down_s: time of the touch.
+        up_s: time of the lift; inf while it is unknown.
+        slide_mm: how far it slides along x within a second.
+    """
 
     kind: str
-    place_mm: Array
+    position_mm: Array
     depth_mm: float
     down_s: float
     up_s: float = math.inf
     slide_mm: float = 0.0
 
-    def at(self, time_s: float) -> tuple[Array, float]:
-        """Place and depth at a time."""
+    def contact(self, time_s: float) -> tuple[Array, float]:
+        """Return position and depth at a time, mm."""
         since_s, until_s = time_s - self.down_s, self.up_s + TRAVEL_S - time_s
-        slid = np.array([min(max(since_s, 0.0), 1.0) * self.slide_mm, 0.0])
-        return self.place_mm + slid, self.depth_mm * min(max(min(since_s, until_s) / TRAVEL_S, 0.0), 1.0)
+        slide_mm = np.array([min(max(since_s, 0.0), 1.0) * self.slide_mm, 0.0])
+        share = min(max(min(since_s, until_s) / TRAVEL_S, 0.0), 1.0)
+        return self.position_mm + slide_mm, self.depth_mm * share
 
 
 class Finger:
-    """A finger that looks at what is shown (`look`) and moves as the samples go by (`volts`).
+    """A finger that looks at what is displayed (`look`) and moves as the samples go by (`volts`).
 
     Attributes:
-        strokes: all that it has done.
+        strokes: all that it has made.
     """
 
     def __init__(
@@ -64,10 +74,15 @@ class Finger:
         scatter_mm: float = SCATTER_MM,
         mishaps: float = 0.05,
     ) -> None:
-        """Get ready over a pad that is sampled at `rate_hz`.
+        """Hold the finger over a pad.
 
         Args:
-            scatter_mm: see `SCATTER_MM`. mishaps: share of presses that come to one of `MISHAPS`.
+            pad: what it presses.
+            contact: what a press deforms.
+            rig: depth of the presses, noise of the pad, seed.
+            rate_hz: samples a second.
+            scatter_mm: see `SCATTER_MM`.
+            mishaps: share of presses that become one of `MISHAPS`.
         """
         rng = np.random.default_rng(rig.seed)
         self._model = LivePad(pad, contact, rig, rate_hz, rng)
@@ -78,60 +93,66 @@ class Finger:
         self.strokes: list[FingerStroke] = []
 
     def look(self, view: Mapping[str, Any]) -> None:
-        """See what is shown: its "phase" and "target", [x, y] mm."""
+        """See what is displayed: its "phase" and "target", [x, y] mm."""
         self._view = view
 
     def said(self) -> list[str]:
-        """What it says to what is shown: that it touches nothing, where it has long been told to lift."""
+        """Return its commands: that the pad is free, if it has long been asked to lift."""
         waits = self._view["phase"] == "lift" and bool(self.strokes)
         return ["free"] if waits and self._now_s > self.strokes[-1].up_s + PATIENCE_S else []
 
     def volts(self, times_s: Array) -> Array:
-        """(n, C) volts at (n,) ascending times, s, later than those before."""
-        places, depths = zip(*map(self._touch, times_s.tolist()), strict=True) if len(times_s) else ((), ())
-        return self._model.volts(np.reshape(places, (-1, 2)), np.array(depths, dtype=np.float64))
+        """Return the (n, C) readings at (n,) ascending times, later than those before."""
+        positions, depths = zip(*map(self._touch, times_s.tolist()), strict=True) if len(times_s) else ((), ())
+        return self._model.volts(np.reshape(positions, (-1, 2)), np.array(depths, dtype=np.float64))
 
-    def _touch(self, at_s: float) -> tuple[Array, float]:
-        stroke, self._now_s = self.strokes[-1] if self.strokes else None, at_s
-        if stroke is None or at_s > stroke.up_s + TRAVEL_S:
-            stroke = self._next(stroke, at_s)
+    def _touch(self, time_s: float) -> tuple[Array, float]:
+        stroke, self._now_s = self.strokes[-1] if self.strokes else None, time_s
+        if stroke is None or time_s > stroke.up_s + TRAVEL_S:
+            stroke = self._start_stroke(stroke, time_s)
         if stroke is None:
             return np.zeros(2), 0.0
         if stroke.up_s == math.inf:
             if self._view["phase"] == "lift":
-                stroke.up_s = at_s + self._rng.uniform(*LATE_S) / 2
-            elif at_s > stroke.down_s + PATIENCE_S and self._view["phase"] == "press":
-                stroke.up_s = at_s
-        return stroke.at(at_s)
+                stroke.up_s = time_s + self._rng.uniform(*REACTION_S) / 2
+            elif time_s > stroke.down_s + PATIENCE_S and self._view["phase"] == "press":
+                stroke.up_s = time_s
+        return stroke.contact(time_s)
 
-    def _next(self, last: FingerStroke | None, at_s: float) -> FingerStroke | None:
-        """The stroke that is begun now, if any is."""
-        if last is not None and last.kind == "double":
-            again_s = at_s + AGAIN_S
-            self.strokes.append(FingerStroke("echo", last.place_mm, last.depth_mm, again_s, again_s + SHORT_S))
-            return self.strokes[-1]
+    def _start_stroke(self, previous: FingerStroke | None, time_s: float) -> FingerStroke | None:
+        if previous is not None and previous.kind == "double":
+            down_s = time_s + AGAIN_S
+            echo = FingerStroke("echo", previous.position_mm, previous.depth_mm, down_s, down_s + SHORT_S)
+            self.strokes.append(echo)
+            return echo
         if self._view["phase"] != "press":
             return None
         kind = str(self._rng.choice(MISHAPS)) if self._rng.random() < self._mishaps else "press"
-        place_mm = np.array(self._view["target"]) + self._scatter_mm * self._rng.standard_normal(2)
+        position_mm = np.array(self._view["target"]) + self._scatter_mm * self._rng.standard_normal(2)
         depth_mm = self._depth_mm * self._rng.uniform(*DEPTHS)
-        stroke = FingerStroke(kind, place_mm, depth_mm, at_s + self._rng.uniform(*LATE_S))
+        stroke = FingerStroke(kind, position_mm, depth_mm, time_s + self._rng.uniform(*REACTION_S))
         if kind in ("short", "light"):
             stroke.up_s = stroke.down_s + SHORT_S
         if kind == "light":
             stroke.depth_mm *= LIGHT
         if kind == "slide":
-            stroke.slide_mm = -math.copysign(SLIDE_MM, place_mm[0])
+            stroke.slide_mm = -math.copysign(SLIDE_MM, position_mm[0])
         self.strokes.append(stroke)
         return stroke
 
 
 @contextmanager
 def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Board, Finger]]:
-    """The driver of an emulated board, not yet connected, over a simulated pad, and the finger that presses it."""
+    """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it.
+
+    Args:
+        pad: what is pressed.
+        contact: what a press deforms.
+        rig: depth of the presses, rate of the board, noise of the pad, seed.
+    """
     finger = Finger(pad, contact, rig, rig.board_rate_hz)
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
-    with EmulatedBoard(finger.volts) as board:
-        emulated = rig.model_copy(update={"port": board.port})
-        with closing(Arduino.of(emulated, range(len(pad.knots)))) as converter:
-            yield converter, finger
+    with EmulatedDue(finger.volts) as emulated:
+        settings = rig.model_copy(update={"port": emulated.port})
+        with closing(DueBoard.from_settings(settings, range(len(pad.knots)))) as board:
+            yield board, finger

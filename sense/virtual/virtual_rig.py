@@ -11,114 +11,109 @@ from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.ur5 import UR5
-from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.boards.line_framing import LineHeader
 from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import Arm, Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, LivePad
-from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard, Source
+from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, SampleSource
 from padforge.sense.virtual.printer import EmulatedPrinter
-from padforge.sense.virtual.ur5 import HOST, UrEmulator
+from padforge.sense.virtual.ur5 import HOST, EmulatedUR5
 
 STIFFNESS_N_MM = 2.0
-"""Of the pad under the emulated arm, which has a force sensor: 10 N at the 5 mm of a usual press."""
-MUX_INPUTS = 16
-"""Of the emulated line board, which has more where more are named."""
-
+"""Of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press."""
+MIN_LINE_INPUTS = 16
+"""Inputs of the emulated line board, which has more if higher ones are named."""
 BED_MM = 1000.0
 """Width, depth and height of the emulated printer: room for any pad."""
 
 _START_S = 2.0
-_DRIVERS = {"due": Arduino, "line": LineBoard}
 
-Driver = Arduino | LineBoard
-EmulatedBoards = EmulatedBoard | EmulatedLineBoard
+BoardDriver = DueBoard | LineBoard
+EmulatedBoard = EmulatedDue | EmulatedLineBoard
 
 
 @contextmanager
-def emulated(
+def emulate_ur5(
     pad: Morphology, contact: Contact, rig: RigSettings
-) -> Iterator[tuple[UR5, Driver, UrEmulator, EmulatedBoards]]:
-    """Drivers of an arm and a board, not yet connected, and the emulators behind them.
+) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, EmulatedBoard]]:
+    """Open drivers of an arm and a board, not yet connected, and the emulators behind them.
 
     Args:
-        pad: under the arm, where `rig` says. contact: what a press deforms.
-        rig: as `emulated_rig` makes it, of strengths of the pad and of the rate; names the board and how it is wired.
+        pad: under the arm, where `rig` says.
+        contact: what a press deforms.
+        rig: of `ur5_settings`; names the board and its inputs.
 
     Raises:
-        InputError, RigFault: a board that is not emulated, or has too few inputs.
+        InputError: for a board that is not emulated.
+        RigFault: for a board with too few inputs.
     """
-    start = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
+    tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
-    with UrEmulator("e", start, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
-        _await_pose(robot)
-        with _read_below(pad, contact, rig, robot.pose_at) as (converter, board), closing(UR5(HOST)) as arm:
-            yield arm, converter, robot, board
+    with EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
+        deadline = time.monotonic() + _START_S  # a board that samples from its start on asks for the arm's pose
+        while not len(robot.pose_log.rows()) and time.monotonic() < deadline:
+            time.sleep(1e-3)
+        with _emulate_board(pad, contact, rig, robot.true_poses) as (driver, board), closing(UR5(HOST)) as arm:
+            yield arm, driver, robot, board
 
 
 @contextmanager
-def emulated_printer(
+def emulate_printer(
     pad: Morphology, contact: Contact, rig: RigSettings
-) -> Iterator[tuple[Printer, Driver, EmulatedPrinter, EmulatedBoards]]:
-    """As `emulated`, with a printer for the arm and `rig` as `emulated_printer_rig` makes it."""
+) -> Iterator[tuple[Printer, BoardDriver, EmulatedPrinter, EmulatedBoard]]:
+    """Open drivers and emulators as `emulate_ur5` does, with a printer as the arm and `rig` of `printer_settings`."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp = np.array(rig.tcp_mm)
     x, y, z = (tip[:3] - tcp).tolist()
     with EmulatedPrinter((x, y, z), bed_mm=(BED_MM, BED_MM, BED_MM)) as robot:
         printer = Printer(rig.model_copy(update={"printer_port": robot.port}))
 
-        def tips(times_s: Array) -> Array:
-            return robot.nozzle_at(times_s) + tcp
+        def tip_positions(times_s: Array) -> Array:
+            return robot.true_positions(times_s) + tcp
 
-        with _read_below(pad, contact, rig, tips) as (converter, board), closing(printer):
-            yield printer, converter, robot, board
+        with _emulate_board(pad, contact, rig, tip_positions) as (driver, board), closing(printer):
+            yield printer, driver, robot, board
 
 
 @contextmanager
-def _read_below(
-    pad: Morphology, contact: Contact, rig: RigSettings, tips: Source
-) -> Iterator[tuple[Driver, EmulatedBoards]]:
-    """The driver of a board and the board, which reads the pad below a tip whose x, y, z `tips` gives for times."""
+def _emulate_board(
+    pad: Morphology, contact: Contact, rig: RigSettings, tip_positions: SampleSource
+) -> Iterator[tuple[BoardDriver, EmulatedBoard]]:
+    """Open the driver of a board, and the board, which samples the pad below the tip."""
     frame, inputs = RobotFrame.from_settings(rig), rig.inputs(len(pad.knots))
-    there = max(MUX_INPUTS, 1 + max(inputs))
+    n_inputs = max(MIN_LINE_INPUTS, 1 + max(inputs))
     model = LivePad(pad, contact, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
 
-    def volts(times_s: Array) -> Array:
-        wired = np.zeros((len(times_s), there))
-        wired[:, inputs] = model.volts(*frame.tip(tips(times_s)))
-        return wired
+    def source(times_s: Array) -> Array:
+        volts = np.zeros((len(times_s), n_inputs))
+        volts[:, inputs] = model.volts(*frame.tip(tip_positions(times_s)))
+        return volts
 
-    with _board(rig, volts, there) as board:
-        driver = _DRIVERS[rig.board].of(rig.model_copy(update={"port": board.port}), inputs)
-        with closing(driver) as converter:
-            yield converter, board
-
-
-def _await_pose(robot: UrEmulator) -> None:
-    """Return once the arm knows where it is: a board that samples from its start on asks for that."""
-    deadline = time.monotonic() + _START_S
-    while not len(robot.truth.rows()) and time.monotonic() < deadline:
-        time.sleep(1e-3)
-
-
-def _board(rig: RigSettings, volts: Source, inputs: int) -> EmulatedBoards:
-    """The emulated board that `[rig]` names, with so many inputs if it is a line board."""
     if rig.board == "due":
-        return EmulatedBoard(volts)
-    if rig.board == "line":
-        said = (("name", "emulated"), ("serial", "0"))
-        return EmulatedLineBoard(volts, LineHeader(rig.board_rate_hz, 12, SUPPLY_V, inputs, said=said))
-    raise InputError(f"[rig] board: got {rig.board!r}, emulated are {' and '.join(_DRIVERS)}")
+        emulated, driver_type = EmulatedDue(source), DueBoard
+    elif rig.board == "line":
+        extra = (("name", "emulated"), ("serial", "0"))
+        header = LineHeader(rig.board_rate_hz, 12, SUPPLY_V, n_inputs, extra=extra)
+        emulated, driver_type = EmulatedLineBoard(source, header), LineBoard
+    else:
+        raise InputError(f"[rig] board: got {rig.board!r}, emulated are due and line")
+    with emulated as board:
+        driver = driver_type.from_settings(rig.model_copy(update={"port": board.port}), inputs)
+        with closing(driver):
+            yield driver, board
 
 
-def emulated_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
-    """`rig` with a workspace around the emulated pad.
+def _reach_mm(rig: RigSettings, pad: Morphology) -> float:
+    """Return how far from the middle of a pad a tip may go, however the pad is rotated."""
+    return max(pad.layout.size_mm) + rig.clearance_mm
 
-    Where the pad lies and where the tip is are as said, or as good as any.
-    """
+
+def ur5_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
+    """Return `rig` with a workspace around the emulated pad; pad and tip are where `rig` says, if it does."""
     x, y = rig.pad_mm or (0.0, -400.0)
     reach = _reach_mm(rig, pad)
     return rig.model_copy(
@@ -131,13 +126,8 @@ def emulated_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
     )
 
 
-def _reach_mm(rig: RigSettings, pad: Morphology) -> float:
-    """How far from the middle of a pad a tip may go, however the pad is turned."""
-    return max(pad.layout.size_mm) + rig.clearance_mm
-
-
-def emulated_printer_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
-    """`rig` with the pad in the middle of the emulated printer's bed, and the probe beside its nozzle."""
+def printer_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
+    """Return `rig` with the pad in the middle of the emulated printer's bed, and the probe beside its nozzle."""
     middle, height = BED_MM / 2, 8.0
     reach = _reach_mm(rig, pad)
     sides = (middle - reach, middle + reach)
@@ -153,9 +143,9 @@ def emulated_printer_rig(rig: RigSettings, pad: Morphology) -> RigSettings:
 
 
 RIGS = {
-    "simulated": (emulated_rig, emulated),
-    "ur5": (emulated_rig, emulated),
-    "printer": (emulated_printer_rig, emulated_printer),
+    "simulated": (ur5_settings, emulate_ur5),
+    "ur5": (ur5_settings, emulate_ur5),
+    "printer": (printer_settings, emulate_printer),
 }
 """What is emulated, by the name of the rig: its settings, and its devices."""
 

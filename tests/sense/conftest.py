@@ -19,8 +19,8 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.virtual import virtual_rig as whole_rig
-from padforge.sense.virtual.ur5 import UrEmulator
+from padforge.sense.virtual import virtual_rig
+from padforge.sense.virtual.ur5 import EmulatedUR5
 from padforge.sense.virtual.ur5_controller import Series
 from tests.helpers.once import Once
 
@@ -107,10 +107,10 @@ class Robots:
         self.host, self.series, self.robot = host, "", None
         self.arm: UR5 | None = None
 
-    def get(self, series: Series, **settings: Any) -> UrEmulator:
+    def get(self, series: Series, **settings: Any) -> EmulatedUR5:
         if self.robot is None or settings or self.series != series:
             self.free()
-            self.series, self.robot = series, UrEmulator(series, host=self.host, **settings).__enter__()
+            self.series, self.robot = series, EmulatedUR5(series, host=self.host, **settings).__enter__()
         return self.robot
 
     def connected(self, host: str) -> UR5:
@@ -128,7 +128,7 @@ class Robots:
             self.arm.close()
             self.arm = None
         if self.robot is not None:
-            asked, self.series = self.robot.asked(), ""
+            asked, self.series = self.robot.dashboard_log(), ""
             self.robot.__exit__()
             self.robot = None
             assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
@@ -164,7 +164,7 @@ def address() -> Iterator[str]:
 def own_address(address: str) -> Iterator[None]:
     """Whole rigs are emulated at the address."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(whole_rig, "HOST", address)
+        patch.setattr(virtual_rig, "HOST", address)
         yield
 
 
@@ -187,10 +187,10 @@ def series() -> Series:
 
 
 @pytest.fixture
-def robot(robots: Robots, series: Series) -> UrEmulator:
+def robot(robots: Robots, series: Series) -> EmulatedUR5:
     return robots.get(series)
 
 
 @pytest.fixture
-def arm(robots: Robots, robot: UrEmulator, host: str) -> UR5:
+def arm(robots: Robots, robot: EmulatedUR5, host: str) -> UR5:
     return robots.connected(host)

@@ -1,11 +1,12 @@
-"""The thread that has a printer's port: it moves the nozzle, and asks where it is again and again.
-A firmware with a clock of its own for moves (`M114 R`) tells where the nozzle is; others tell where the move leads,
-and between its ends the place is that of the straight move commanded. A move is over when the firmware says that
-nothing is left of it (`M400`) and the nozzle stands where it was sent.
+"""A 3D printer with Marlin as an arm: a probe clamped beside its nozzle presses, G-code over a serial port moves it.
 
-A 3D printer with Marlin as an arm: a probe clamped beside its nozzle presses, G-code over a serial port moves it.
-Poses are of the probe's tip, in the printer's own frame: the nozzle's place and `[rig] tcp_mm`. The tip cannot turn.
-A printer feels no force.
+Poses are of the probe's tip, in the printer's own frame: the nozzle's position plus `[rig] tcp_mm`. The tip cannot
+turn, and a printer measures no force.
+
+A thread has the port. It moves the nozzle and asks for its position again and again. A firmware with a real-time
+position (`M114 R`) reports where the nozzle is; others report the end of the move, and during it the position is that
+of the commanded move. A move is over when the firmware says that nothing is left of it (`M400`) and the nozzle stands
+where it was sent.
 """
 
 import math
@@ -22,97 +23,112 @@ from typing import Any, NoReturn
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
-from padforge.sense.rig.arms import printer_link as marlin
-from padforge.sense.rig.arms.printer_link import HOME, MarlinLink, Place, StraightMove
+from padforge.sense.rig.arms.motion import Position, StraightMove
+from padforge.sense.rig.arms.printer_link import (
+    FIRMWARE,
+    HOMING_ADVICE,
+    MarlinLink,
+    PrinterInfo,
+    format_move,
+    parse_axis_limits,
+    parse_position,
+)
 from padforge.sense.rig.devices import ArmState, Array, Pose, RigFault
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-LOOK_S = 0.03
-"""Pause between two looks at the place."""
-SLACK_MM = 0.05
-"""How far from where it was sent a nozzle at rest may be said to stand: half a hundredth, and a step of its motors."""
+CONNECT_S = 3.0
+"""Longest wait for a printer that restarts as its port is opened."""
+STALE_S = 0.5
+SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
+"""Millimetres, absolute positions, speeds at 100 %, software endstops on, motors always energized."""
 
-_KEPT = 100_000
-_TOLD_S = 0.8
+_POLL_S = 0.03  # pause between two questions for the position
+_TOLERANCE_MM = 0.05  # of a position at rest: its last decimal, and a step of the motors
+_MAX_STATES = 100_000
+_MOVE_S = 0.8
 _STOP_S = 0.3
-_START_S = 0.1
-"""How long a firmware waits for further moves before it begins the first."""
-_LATE_S = 1.2
-"""How much longer than its limits say a move may take."""
-_OFF_MM = 1.0
-"""How far from its straight way a nozzle may be said to be."""
-_ODD = 3
-"""So many places that cannot be, one after the other, are no noise."""
+_START_S = 0.1  # a firmware waits this long for further moves before it starts the first
+_MAX_LATE_S = 1.2  # beyond the duration that the axes' limits give
+_MAX_OFFSET_MM = 1.0  # from the straight path during a move
+_MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 
 @dataclass(frozen=True)
-class ObservedState:
-    """Where the nozzle was: when that was said, its place, its speed in mm/s, and whether a move was under way."""
+class NozzleState:
+    """State of the nozzle at one moment.
+
+    Attributes:
+        time_s: when the printer reported it.
+        position: of the nozzle, mm.
+        speed_mm_s: >= 0.
+        moving: whether a move is under way.
+    """
 
     time_s: float
-    at: Place
+    position: Position
     speed_mm_s: float
     moving: bool
 
 
-class Mover(threading.Thread):
-    """Moves a nozzle that stands at `at`.
+class NozzleThread(threading.Thread):
+    """The thread that moves the nozzle and polls its position.
 
     Attributes:
-        latest: where it was last. fault: why nothing is known any more; None while all is well.
+        latest: the last state.
+        fault: why the position is unknown; None while all is well.
     """
 
-    def __init__(self, link: MarlinLink, at: Place, max_mm_s: Place, max_mm_s2: Place) -> None:
+    def __init__(self, link: MarlinLink, position: Position, max_mm_s: Position, max_mm_s2: Position) -> None:
         super().__init__(name="printer", daemon=True)
-        self._link, self._speeds, self._accelerations = link, max_mm_s, max_mm_s2
-        self._stand = at
+        self._link, self._max_mm_s, self._max_mm_s2 = link, max_mm_s, max_mm_s2
+        self._position = position  # at rest
         self._move: StraightMove | None = None
-        self._begun_s, self._acceleration, self._odd = 0.0, 0.0, 0
-        self._orders: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
-        self._seen: deque[ObservedState] = deque(maxlen=_KEPT)
+        self._start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
+        self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
+        self._states: deque[NozzleState] = deque(maxlen=_MAX_STATES)
         self._ending = threading.Event()
         self.fault: RigFault | None = None
-        self.latest = ObservedState(time.monotonic(), at, 0.0, False)
+        self.latest = NozzleState(time.monotonic(), position, 0.0, False)
 
     def run(self) -> None:
-        """Look, and do what is ordered, until the end or a fault."""
+        """Poll, and execute commands, until the end or a fault."""
         try:
             while not self._ending.is_set():
                 try:
-                    work, answer = self._orders.get(timeout=LOOK_S)
+                    command, result = self._commands.get(timeout=_POLL_S)
                 except queue.Empty:
-                    self._look()
+                    self._poll()
                 else:
-                    self._obey(work, answer)
+                    self._execute(command, result)
         except RigFault as fault:
             self.fault = fault
         except Exception as error:  # a thread that dies silently would look like a printer at rest
             self.fault = RigFault("lost", f"what moves the printer has failed ({error!r})")
 
-    def take(self) -> list[ObservedState]:
-        """What was seen since the last call."""
-        return [self._seen.popleft() for _ in range(len(self._seen))]
+    def drain(self) -> list[NozzleState]:
+        """Return the states since the last call."""
+        return [self._states.popleft() for _ in range(len(self._states))]
 
-    def move(self, end: Place, speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Begin a straight move and return as soon as the firmware has understood it; RigFault where it has not."""
-        self._order(lambda: self._go(end, speed_mm_s, acceleration_mm_s2), _TOLD_S)
+    def move(self, end: Position, speed_mm_s: float, acceleration_mm_s2: float) -> None:
+        """Start a straight move; return, or raise RigFault, as soon as the firmware has confirmed its end position."""
+        self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), _MOVE_S)
 
     def stop(self) -> None:
-        """End the move that is under way, by an emergency stop where the printer does not confirm another one.
+        """End the move under way, by an emergency stop if the printer does not confirm a quick stop.
 
         Raises:
-            RigFault: "lost" where it was not confirmed.
+            RigFault: "lost" if it was not confirmed.
         """
-        if self._move is None or self._link.ended:
+        if self._move is None or self._link.halted:
             return
         try:
-            self._order(self._halt, _STOP_S)
+            self._submit(self._quick_stop, _STOP_S)
         except RigFault:
-            self._link.shout("M112")
+            self._link.send_unnumbered("M112")
             self._move = None
             reason = "the printer did not confirm the stop, and was told to halt"
-            self.fault = RigFault("lost", reason, f"see that it stands, or switch it off; {HOME}")
+            self.fault = RigFault("lost", reason, f"see that it stands, or switch it off; {HOMING_ADVICE}")
             raise self.fault from None
 
     def end(self) -> None:
@@ -120,144 +136,139 @@ class Mover(threading.Thread):
         self._ending.set()
         self.join()
 
-    def _order(self, work: Callable[[], None], wait_s: float) -> None:
+    def _submit(self, command: Callable[[], None], timeout_s: float) -> None:
         if self.fault is not None:
             raise self.fault
-        answer: Future[None] = Future()
-        self._orders.put((work, answer))
+        result: Future[None] = Future()
+        self._commands.put((command, result))
         try:
-            answer.result(wait_s)
+            result.result(timeout_s)
         except TimeoutError:
-            raise self.fault or RigFault("deadline", f"the printer did not answer within {wait_s} s") from None
+            raise self.fault or RigFault("deadline", f"the printer did not answer within {timeout_s} s") from None
 
-    def _obey(self, work: Callable[[], None], answer: "Future[None]") -> None:
+    def _execute(self, command: Callable[[], None], result: "Future[None]") -> None:
         try:
-            work()
+            command()
         except RigFault as fault:
-            answer.set_exception(fault)
+            result.set_exception(fault)
             if fault.cause != "refused":
                 raise
         else:
-            answer.set_result(None)
+            result.set_result(None)
 
-    def _go(self, end: Place, speed_mm_s: float, acceleration_mm_s2: float) -> None:
+    def _start_move(self, end: Position, speed_mm_s: float, acceleration_mm_s2: float) -> None:
         if self._move is not None:
             raise RigFault("refused", "a move of the printer is under way", "wait for its end or stop it")
-        move = StraightMove(self._stand, end, speed_mm_s, acceleration_mm_s2).within(self._speeds, self._accelerations)
+        move = StraightMove(self._position, end, speed_mm_s, acceleration_mm_s2)
+        move = move.limit_axes(self._max_mm_s, self._max_mm_s2)
         if not move.length_mm:
             return
         if move.acceleration != self._acceleration:
-            self._link.ask(f"M204 P{move.acceleration:.1f} T{move.acceleration:.1f}")
+            self._link.execute(f"M204 P{move.acceleration:.1f} T{move.acceleration:.1f}")
             self._acceleration = move.acceleration
         self._move = move
-        self._link.ask(marlin.move(end, move.speed))
-        self._begun_s = time.monotonic()
-        if math.dist(at := self._place("M114", end), end) > SLACK_MM:
-            self._halt()
-            self._elsewhere(f"is about to go to {_said(at)}", end)
-        self._note(time.monotonic(), move.start)
+        self._link.execute(format_move(end, move.speed))
+        self._start_s = time.monotonic()
+        # Without R the firmware reports the end of its moves: software endstops may have clipped this one.
+        if math.dist(planned := self._ask_position("M114", end), end) > _TOLERANCE_MM:
+            self._quick_stop()
+            self._raise_displaced(f"is about to go to {_format(planned)}", end)
+        self._add_state(time.monotonic(), move.start)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         move = self._move
         if move is None:
-            if math.dist(at := self._place("M114 R", self._stand), self._stand) > SLACK_MM:
-                self._elsewhere(f"stands at {_said(at)}", self._stand)
-            self._note(time.monotonic(), self._stand)
+            self._check_at_rest(self._position)
+            self._add_state(time.monotonic(), self._position)
             return
-        at = self._place("M114 R", None)
-        now = time.monotonic()
-        gone_s = now - self._begun_s
-        if math.dist(at, move.end) <= SLACK_MM:
-            if gone_s >= move.duration_s:
-                self._note(now, at)
-                self._arrive(move)
+        position = self._ask_position("M114 R", None)
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._start_s
+        if math.dist(position, move.end) <= _TOLERANCE_MM:
+            if elapsed_s >= move.duration_s:
+                self._add_state(now_s, position)
+                self._link.execute("M400")
+                self._check_at_rest(move.end)
+                self._rest(move.end)
                 return
-            at = move.at(gone_s - _START_S)
-        late = gone_s > move.duration_s + _LATE_S
-        self._odd = self._odd + 1 if late or move.distance_mm(at) > _OFF_MM else 0
-        if self._odd >= _ODD:
-            self._elsewhere(f"is at {_said(at)}", move.end)
-        if not self._odd:
-            self._note(now, at)
+            position = move.position(elapsed_s - _START_S)  # without a real-time position only the end is reported
+        late = elapsed_s > move.duration_s + _MAX_LATE_S
+        implausible = late or move.distance_mm(position) > _MAX_OFFSET_MM
+        self._n_implausible = self._n_implausible + 1 if implausible else 0
+        if self._n_implausible >= _MAX_IMPLAUSIBLE:
+            self._raise_displaced(f"is at {_format(position)}", move.end)
+        if not implausible:
+            self._add_state(now_s, position)
 
-    def _arrive(self, move: StraightMove) -> None:
-        self._link.ask("M400")
-        if math.dist(at := self._place("M114 R", move.end), move.end) > SLACK_MM:
-            self._elsewhere(f"stands at {_said(at)}", move.end)
-        self._rest(move.end)
+    def _quick_stop(self) -> None:
+        self._link.execute("M410")
+        self._link.execute("M400")
+        self._rest(self._ask_position("M114", None))
 
-    def _halt(self) -> None:
-        self._link.ask("M410")
-        self._link.ask("M400")
-        self._rest(self._place("M114", None))
+    def _rest(self, position: Position) -> None:
+        self._move, self._position, self._n_implausible = None, position, 0
+        self._add_state(time.monotonic(), position)
 
-    def _rest(self, at: Place) -> None:
-        self._move, self._stand, self._odd = None, at, 0
-        self._note(time.monotonic(), at)
+    def _check_at_rest(self, expected: Position) -> None:
+        if math.dist(position := self._ask_position("M114 R", expected), expected) > _TOLERANCE_MM:
+            self._raise_displaced(f"stands at {_format(position)}", expected)
 
-    def _place(self, command: str, expected: Place | None) -> Place:
-        """What the firmware says of the nozzle's place: damaged answers, and odd ones, are asked for again."""
-        at = None
-        for _ in range(_ODD):
-            places = [place for line in self._link.ask(command) if (place := marlin.place(line)) is not None]
-            at = places[-1] if places else at
-            if places and (expected is None or math.dist(places[-1], expected) <= SLACK_MM):
+    def _ask_position(self, command: str, expected: Position | None) -> Position:
+        """Ask for the nozzle's position; ask again where the answer is damaged or not as expected."""
+        position = None
+        for _ in range(_MAX_IMPLAUSIBLE):
+            positions = [found for line in self._link.execute(command) if (found := parse_position(line)) is not None]
+            position = positions[-1] if positions else position
+            if positions and (expected is None or math.dist(positions[-1], expected) <= _TOLERANCE_MM):
                 break
-        if at is None:
-            raise RigFault("stale", "the printer does not say where it is", "its link may be noisy: check its cable")
-        return at
+        if position is None:
+            advice = "its link may be noisy: check its cable"
+            raise RigFault("stale", "the printer does not report its position", advice)
+        return position
 
-    def _elsewhere(self, where: str, sent: Place) -> NoReturn:
-        advice = f"something else moves it, or it cannot go there: {HOME}"
-        raise RigFault("lost", f"the printer {where} mm, but was sent to {_said(sent)} mm", advice)
+    def _raise_displaced(self, problem: str, target: Position) -> NoReturn:
+        advice = f"something else moves it, or it cannot go there: {HOMING_ADVICE}"
+        raise RigFault("lost", f"the printer {problem} mm, but was sent to {_format(target)} mm", advice)
 
-    def _note(self, now_s: float, at: Place) -> None:
-        before, moving = self.latest, self._move is not None
-        passed_s = now_s - before.time_s
-        speed = math.dist(at, before.at) / passed_s if moving and passed_s > 0 else 0.0
-        self.latest = ObservedState(now_s, at, speed, moving)
-        self._seen.append(self.latest)
-
-
-def _said(at: Place) -> str:
-    return ", ".join(f"{value:.2f}" for value in at)
+    def _add_state(self, now_s: float, position: Position) -> None:
+        moving, elapsed_s = self._move is not None, now_s - self.latest.time_s
+        speed = math.dist(position, self.latest.position) / elapsed_s if moving and elapsed_s > 0 else 0.0
+        self.latest = NozzleState(now_s, position, speed, moving)
+        self._states.append(self.latest)
 
 
-CONNECT_S = 3.0
-"""Longest wait for a printer that restarts as its port is opened."""
-STALE_S = 0.5
-SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
-"""Millimetres, places from the origin, speeds as said, ends of the axes heeded, and motors that never let go."""
+def _format(position: Position) -> str:
+    return ", ".join(f"{value:.2f}" for value in position)
 
 
 class Printer:
-    """The printer at `[rig] printer_port`.
+    """The printer at `[rig] printer_port`; implements `Arm`.
 
-    It is never homed from here, for the probe would meet the bed: a person does that. If this process ends, the printer
+    It is never homed from here, for the probe would hit the bed: a person does that. If this process ends, the printer
     ends the one move that is under way and stands.
     """
 
     def __init__(self, rig: RigSettings) -> None:
         self._rig = rig
         self._link: MarlinLink | None = None
-        self._mover: Mover | None = None
-        self._tcp: Place = (0.0, 0.0, 0.0)
+        self._thread: NozzleThread | None = None
+        self._tcp: Position = (0.0, 0.0, 0.0)
 
     @classmethod
-    def of(cls, rig: RigSettings) -> "Printer":
-        """The printer that `[rig]` names."""
+    def from_settings(cls, rig: RigSettings) -> "Printer":
+        """Return the printer that `[rig]` names."""
         return cls(rig)
 
     def connect(self) -> Mapping[str, Any]:
         """Open the port and set the printer up; nothing moves.
 
         Returns:
-            port, baud, firmware and machine by name, the greatest speeds (mm/s) and accelerations (mm/s²) of its axes,
+            port, baud, firmware and machine by name, the maximum speeds (mm/s) and accelerations (mm/s²) of its axes,
             and whether it can halt at once.
 
         Raises:
             RigFault: "refused" where there is no printer with Marlin, it has not been homed, it restarts as its port is
-                opened, its axes are too slow for the presses wanted, or a setting is missing; "lost", "stale".
+                opened, its axes are too slow for the presses, or a setting is missing; "lost", "stale".
         """
         self.close()
         rig = self._rig
@@ -269,118 +280,126 @@ class Printer:
         self._tcp = rig.tcp_mm
         self._link = link = MarlinLink(rig.printer_port, rig.printer_baud)
         try:
-            link.begin(CONNECT_S)
-            firmware = marlin.PrinterDialect.of(link.ask("M115"))
-            if marlin.FIRMWARE not in firmware.name:
-                raise RigFault("refused", f"the firmware is {firmware.name or 'of no name'!r}, allowed is Marlin")
-            if marlin.waits_for_moves(firmware.name):
-                message = f"the firmware is {firmware.name!r}, which says where it is only once it stands"
-                raise RigFault("refused", message, "allowed is Marlin 2")
-            speeds, accelerations = self._limits(link)
-            self._require_quick(speeds, accelerations)
+            link.handshake(CONNECT_S)
+            info = _identify(link)
+            max_mm_s, max_mm_s2 = _read_axis_limits(link)
+            self._check_press_time(max_mm_s, max_mm_s2)
             for command in SETTINGS:
-                link.ask(command)
-            at = _standing(link)
+                link.execute(command)
+            position = _ask_home_position(link)
         except BaseException:
             self.close()
             raise
-        self._mover = Mover(link, at, speeds, accelerations)
-        self._mover.start()
+        self._thread = NozzleThread(link, position, max_mm_s, max_mm_s2)
+        self._thread.start()
         return {
             "port": rig.printer_port,
             "baud": rig.printer_baud,
-            "firmware": firmware.name,
-            "machine": firmware.machine,
-            "max_mm_s": list(speeds),
-            "max_mm_s2": list(accelerations),
-            "halts_at_once": "EMERGENCY_PARSER" in firmware.capabilities,
+            "firmware": info.firmware,
+            "machine": info.machine,
+            "max_mm_s": list(max_mm_s),
+            "max_mm_s2": list(max_mm_s2),
+            "halts_at_once": "EMERGENCY_PARSER" in info.capabilities,
         }
 
     def state(self) -> ArmState:
-        """The latest state; see `Arm.state`."""
-        seen = self._running().latest
-        if (age := time.monotonic() - seen.time_s) > STALE_S:
-            message = f"the printer's last answer is {age:.2f} s old; allowed {STALE_S} s"
+        """Return the latest state; see `Arm.state`."""
+        state = self._connected().latest
+        if (age_s := time.monotonic() - state.time_s) > STALE_S:
+            message = f"the printer's last answer is {age_s:.2f} s old; allowed {STALE_S} s"
             raise RigFault("stale", message, "it may be busy: look at its display")
-        return ArmState(seen.time_s, self._pose(seen.at), seen.speed_mm_s, None, False, False, seen.moving)
+        return ArmState(state.time_s, self._pose(state.position), state.speed_mm_s, None, False, False, state.moving)
 
     def drain(self) -> Array:
-        """(n, 10) states since the last call; those before a fault come before it."""
-        mover = self._mover
-        seen = mover.take() if mover else []
-        if not seen:
-            self._running()
+        """Return the (n, 10) states since the last call; those before a fault come before it."""
+        states = self._thread.drain() if self._thread else []
+        if not states:
+            self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
-        return np.array([[one.time_s, *self._pose(one.at), one.speed_mm_s, np.nan, 1.0] for one in seen])
+        return np.array([[one.time_s, *self._pose(one.position), one.speed_mm_s, np.nan, 1.0] for one in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Begin a straight move from rest, as fast as wanted or as the printer's axes can.
+        """Start a straight move from rest, at the speed wanted or as fast as the printer's axes can.
 
         Args:
-            pose: x, y, z in mm of the tip, and `[rig] tool_rad`. speed_mm_s, acceleration_mm_s2: of the tip.
+            pose: x, y, z of the tip in mm, and `[rig] tool_rad`.
+            speed_mm_s: of the tip.
+            acceleration_mm_s2: of the tip.
 
         Raises:
-            RigFault: "refused" for what is no pose or speed, or another turn of the tool; "lost", "stale".
+            RigFault: "refused" for numbers that are no move, or another rotation of the tool; "lost", "stale".
         """
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
             raise RigFault("refused", f"a turn of the tool to {list(pose[3:])} rad; a printer cannot turn it")
         x, y, z = (float(value) - offset for value, offset in zip(pose, self._tcp, strict=False))
-        self._running().move((x, y, z), speed_mm_s, acceleration_mm_s2)
+        self._connected().move((x, y, z), speed_mm_s, acceleration_mm_s2)
 
     def stop(self) -> None:
-        """Stop the printer, for good where it does not confirm it; see `Arm.stop`."""
-        if self._mover is not None:
-            self._mover.stop()
+        """Stop the printer, for good if it does not confirm it; see `Arm.stop`."""
+        if self._thread is not None:
+            self._thread.stop()
 
     def close(self) -> None:
         """Stop the printer and close the port; never raises."""
-        if self._mover is not None:
+        if self._thread is not None:
             with suppress(RigFault):
-                self._mover.stop()
-            self._mover.end()
+                self._thread.stop()
+            self._thread.end()
         if self._link is not None:
             self._link.close()
-        self._mover = self._link = None
+        self._thread = self._link = None
 
-    def _running(self) -> Mover:
-        if self._mover is None:
+    def _connected(self) -> NozzleThread:
+        if self._thread is None:
             raise RigFault("lost", "there is no link to the printer", "connect first")
-        if fault := self._mover.fault:
-            raise fault
-        return self._mover
+        if self._thread.fault:
+            raise self._thread.fault
+        return self._thread
 
-    def _pose(self, nozzle: Place) -> Pose:
+    def _pose(self, nozzle: Position) -> Pose:
         x, y, z = (a + b for a, b in zip(nozzle, self._tcp, strict=True))
         return (x, y, z, *self._rig.tool_rad)
 
-    def _limits(self, link: MarlinLink) -> tuple[Place, Place]:
-        lines = link.ask("M503", CONNECT_S)
-        speeds, accelerations = marlin.limits(lines, "M203"), marlin.limits(lines, "M201")
-        if speeds is None or accelerations is None:
-            raise RigFault("refused", "the printer does not tell the limits of its axes (M503: M203 and M201)")
-        return speeds, accelerations
-
-    def _require_quick(self, speeds: Place, accelerations: Place) -> None:
+    def _check_press_time(self, max_mm_s: Position, max_mm_s2: Position) -> None:
         """Refuse presses that would be over before the tip is down."""
         rig = self._rig
-        way = rig.clearance_mm + max(rig.depths_mm or (rig.depth_mm,))
-        down = StraightMove((0, 0, way), (0, 0, 0), rig.press_mm_s, rig.acceleration_mm_s2)
-        down_s = down.within(speeds, accelerations).duration_s
+        depth_mm = rig.clearance_mm + max(rig.depths_mm or (rig.depth_mm,))
+        down = StraightMove((0, 0, depth_mm), (0, 0, 0), rig.press_mm_s, rig.acceleration_mm_s2)
+        down_s = down.limit_axes(max_mm_s, max_mm_s2).duration_s
         if down_s >= (half_s := rig.readings_per_press / 2 / rig.rate_hz):
             raise RigFault(
                 "refused",
-                f"the printer's way down of {way:g} mm takes {down_s:.1f} s, allowed is less than {half_s:.2g} s,"
+                f"the printer's way down of {depth_mm:g} mm takes {down_s:.1f} s, allowed is less than {half_s:.2g} s,"
                 " half of a press's cycle",
                 "lower [rig] clearance_mm, or raise readings_per_press or press_mm_s",
             )
 
 
-def _standing(link: MarlinLink) -> Place:
-    """Where the nozzle stands; RigFault("refused") where it has not been homed."""
-    places = [place for _ in range(3) for line in link.ask("M114") if (place := marlin.place(line)) is not None]
-    if not places:
-        raise RigFault("refused", "the printer does not say where it is (M114)")
-    if math.hypot(*places[-1]) == 0:
-        raise RigFault("refused", "the printer says that it is at 0, 0, 0: it has not been homed, or not raised", HOME)
-    return places[-1]
+def _identify(link: MarlinLink) -> PrinterInfo:
+    info = PrinterInfo.parse(link.execute("M115"))
+    if FIRMWARE not in info.firmware:
+        raise RigFault("refused", f"the firmware is {info.firmware or 'of no name'!r}, allowed is Marlin")
+    if info.delays_position:
+        message = f"the firmware is {info.firmware!r}, which reports its position only once it stands"
+        raise RigFault("refused", message, "allowed is Marlin 2")
+    return info
+
+
+def _read_axis_limits(link: MarlinLink) -> tuple[Position, Position]:
+    lines = link.execute("M503", CONNECT_S)
+    speeds, accelerations = parse_axis_limits(lines, "M203"), parse_axis_limits(lines, "M201")
+    if speeds is None or accelerations is None:
+        raise RigFault("refused", "the printer does not report the limits of its axes (M503: M203 and M201)")
+    return speeds, accelerations
+
+
+def _ask_home_position(link: MarlinLink) -> Position:
+    """Return the position of the nozzle; RigFault("refused") where it has not been homed."""
+    answers = [position for _ in range(3) for line in link.execute("M114") if (position := parse_position(line))]
+    if not answers:
+        raise RigFault("refused", "the printer does not report its position (M114)")
+    if math.hypot(*answers[-1]) == 0:
+        message = "the printer says that it is at 0, 0, 0: it has not been homed, or not raised"
+        raise RigFault("refused", message, HOMING_ADVICE)
+    return answers[-1]

@@ -1,8 +1,6 @@
-"""What the child that holds ur-rtde writes to its parent: states as numbers, answers as JSON.
+"""RTDE, the data link of Universal Robots controllers: frames, recipes, the dashboard, and a reader of the states.
 
-Frames of RTDE, the data link of Universal Robots controllers, and their dashboard; big-endian, both ways.
-
-Reads every state of a UR controller's RTDE stream and tells when each was taken on the host's clock.
+Frames are big-endian, both ways. At the end, the messages from the process that holds ur-rtde to its parent.
 """
 
 import json
@@ -16,57 +14,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-_STATE = struct.Struct("<c14d")
-_ANSWER = struct.Struct("<cI")
-
-
-class StateRow(NamedTuple):
-    """One state on the wire: mm, rad, s and N; the flags are 0 or 1, force is NaN without a sensor."""
-
-    time_s: float
-    x_mm: float
-    y_mm: float
-    z_mm: float
-    rx: float
-    ry: float
-    rz: float
-    speed_mm_s: float
-    force_n: float
-    protective_stop: float
-    emergency_stop: float
-    moving: float
-    skipped: float
-    sideways_n: float
-
-
-def pack_row(row: StateRow) -> bytes:
-    """Bytes of a state."""
-    return _STATE.pack(b"S", *row)
-
-
-def pack_answer(answer: Any) -> bytes:
-    """Bytes of an answer."""
-    text = json.dumps(answer).encode()
-    return _ANSWER.pack(b"A", len(text)) + text
-
-
-def read(source: Callable[[int], bytes]) -> Iterator[StateRow | dict[str, Any]]:
-    """States and answers from a blocking `source` of bytes until it ends, be it in the middle of one."""
-    while kind := source(1):
-        head = kind + source((_STATE if kind == b"S" else _ANSWER).size - 1)
-        try:
-            if kind == b"S":
-                yield StateRow._make(_STATE.unpack(head)[1:])
-            else:
-                yield json.loads(source(_ANSWER.unpack(head)[1]))
-        except (struct.error, ValueError, RecursionError):
-            return
-
-
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 VERSION, CONTROLLER, OUTPUTS, INPUTS, START, PAUSE, DATA = b"VvOISPU"
 PROTOCOL = 2
-"""The only version of the protocol that is spoken here."""
+"""The only version of the protocol that is used here."""
 RUNNING = 7
 """Robot mode of an arm that is powered on and has its brakes released."""
 STOPPED, PLAYING, PAUSED = 1, 2, 4
@@ -74,6 +25,15 @@ STOPPED, PLAYING, PAUSED = 1, 2, 4
 PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 """Protective and safeguard stop, recovery, violation, fault: the controller does not move the arm."""
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
+VARIABLES = (
+    *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
+    *("robot_mode", "runtime_state", "safety_status_bits", "output_int_register_2"),
+)
+"""What the reader asks for."""
+FORCE_SERIES = 5
+"""First major version of PolyScope whose arms have a force sensor at the tool."""
+MAX_CLOCK_SKEW = 2e-4
+"""Relative difference of the controller's clock and the host's."""
 
 _HEADER = struct.Struct(">HB")
 _CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}
@@ -91,34 +51,34 @@ _TYPES = (
 )
 
 
-def type_of(name: str) -> str:
-    """Type of a variable by its name, as ur-rtde decodes it."""
+def variable_type(name: str) -> str:
+    """Return the type of a variable by its name, as ur-rtde decodes it."""
     return next(kind for pattern, kind in _TYPES if re.fullmatch(pattern, name))
 
 
-def layout(types: Sequence[str]) -> struct.Struct:
-    """Layout of the values of a recipe; KeyError for a type that a controller gives to a variable it does not have."""
+def recipe_layout(types: Sequence[str]) -> struct.Struct:
+    """Return the layout of the values of a recipe; KeyError for an unknown type."""
     return struct.Struct(">" + "".join(_CODES[kind] for kind in types))
 
 
-def width(kind: str) -> int:
-    """How many values a variable of a type has."""
+def n_values(kind: str) -> int:
+    """Return how many values a variable of a type has."""
     return int(_CODES[kind][:-1] or 1)
 
 
-def frame(kind: int, payload: bytes = b"") -> bytes:
-    """A frame with its header."""
+def pack_frame(kind: int, payload: bytes = b"") -> bytes:
+    """Return a frame with its header."""
     return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
-class Splitter:
-    """Cuts a stream of bytes into frames."""
+class FrameSplitter:
+    """Splits a stream of bytes into frames."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
 
-    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Kind and payload of every frame that `data` completes; ValueError for a size no frame can have."""
+    def split(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield kind and payload of every frame that `data` completes; ValueError for an impossible size."""
         self._bytes += data
         while len(self._bytes) >= _HEADER.size:
             size, kind = _HEADER.unpack_from(self._bytes)
@@ -132,7 +92,7 @@ class Splitter:
 
 
 def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list[str]:
-    """One line of answer to each question; OSError where the dashboard does not answer within `timeout_s` each."""
+    """Return one line of answer to each question; OSError if the dashboard does not answer each in time."""
     with socket.create_connection((host, DASHBOARD_PORT), timeout_s) as link, link.makefile("rb") as lines:
         lines.readline()
         answers = []
@@ -145,9 +105,9 @@ def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list
 
 
 def stop_program(host: str, timeout_s: float) -> bool:
-    """Stop the program of the arm, and with it the arm, by the dashboard; whether none runs any more.
+    """Stop the arm's program, and with it the arm, by the dashboard; return whether no program runs any more.
 
-    A stopped program cannot go on when a person unlocks the arm, a paused one can.
+    A stopped program cannot go on when a person unlocks the arm; a paused one can.
     """
     try:
         return ask_dashboard(host, ["stop", "running"], timeout_s)[1].lower().endswith("false")
@@ -155,25 +115,21 @@ def stop_program(host: str, timeout_s: float) -> bool:
         return False
 
 
-VARIABLES = (
-    *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
-    *("robot_mode", "runtime_state", "safety_status_bits", "output_int_register_2"),
-)
-FORCE_SERIES = 5
-"""First major version of PolyScope whose arms have a force sensor at the tool."""
-DRIFT = 2e-4
-"""How fast the controller's clock may run against the host's, as a share."""
-
-
 @dataclass(frozen=True)
-class Reading:
-    """One state as the controller sends it.
+class RtdeState:
+    """A state as the controller sends it.
 
     Attributes:
-        time_s: when it was taken, on the host's monotonic clock. skipped: how many states are missing before it.
-        pose: m and rad. speed: of the tool, m/s. force_n: on the tool along z, None without a sensor.
-        sideways_n: across z, 0 without one.
-        mode: of the robot. runtime: state of the program. safety: bits. progress: ur-rtde's register of moves.
+        time_s: when it was measured, on the host's monotonic clock.
+        skipped: number of states missing before it.
+        pose: m and rad.
+        speed: of the tool, m/s.
+        force_n: on the tool along z; None without a sensor.
+        sideways_n: force across z; 0 without a sensor.
+        mode: robot mode.
+        runtime: state of the program.
+        safety: status bits.
+        progress: ur-rtde's register of moves.
     """
 
     time_s: float
@@ -189,102 +145,155 @@ class Reading:
 
 
 class HostClock:
-    """Controller time to host time by the shortest delay seen, so that a late arrival is not taken for a late state."""
+    """Converts controller time to host time by the shortest delay so far, so that late arrivals are no late states."""
 
     def __init__(self) -> None:
         self._offset = float("inf")
-        self._before = self._last = float("-inf")
+        self._last_stamp = self._last_s = float("-inf")
 
-    def host_time(self, stamp: float, arrived: float) -> float:
-        """Host time of the state stamped `stamp` that arrived at `arrived`: no later than that, always ascending."""
-        grown = self._offset + DRIFT * max(stamp - self._before, 0.0)
-        self._offset = min(grown, arrived - stamp)
-        self._before = stamp
-        self._last = max(stamp + self._offset, self._last + 1e-6)
-        return self._last
+    def host_time(self, stamp: float, arrival_s: float) -> float:
+        """Return the host time of a state.
+
+        Args:
+            stamp: its controller time, s.
+            arrival_s: host time at which it arrived.
+
+        Returns:
+            A time not after `arrival_s`, later than all returned before.
+        """
+        drifted = self._offset + MAX_CLOCK_SKEW * max(stamp - self._last_stamp, 0.0)
+        self._offset = min(drifted, arrival_s - stamp)
+        self._last_stamp = stamp
+        self._last_s = max(stamp + self._offset, self._last_s + 1e-6)
+        return self._last_s
 
 
 class RtdeReader:
-    """A link to the RTDE port; OSError where there is none or it ends, TimeoutError where nothing comes.
+    """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes.
 
     Attributes:
-        version: of the controller, four numbers. rate_hz: of the stream.
+        version: of the controller, four numbers.
+        rate_hz: states a second.
     """
 
     def __init__(self, host: str, timeout_s: float) -> None:
-        """Connect and agree on what is sent; ValueError where the controller lacks the protocol or a variable."""
+        """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
         self._link = socket.create_connection((host, RTDE_PORT), timeout_s)
         self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._splitter = Splitter()
-        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._splitter = FrameSplitter()
+        self._queue: deque[tuple[float, bytes]] = deque()
         self._clock = HostClock()
-        self._stamp: float | None = None
-        if self._ask(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
+        self._last_stamp: float | None = None
+        if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
-        self.version: tuple[int, ...] = _unpacked(struct.Struct(">4I"), self._ask(CONTROLLER))
+        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))
         self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125
         names = ",".join(VARIABLES).encode()
-        types = self._ask(OUTPUTS, struct.pack(">d", self.rate_hz) + names)[1:].decode().split(",")
+        types = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + names)[1:].decode().split(",")
         if "NOT_FOUND" in types:
             raise ValueError(f"the controller has no {VARIABLES[types.index('NOT_FOUND') % len(VARIABLES)]}")
-        if types != [type_of(name) for name in VARIABLES]:
+        if types != [variable_type(name) for name in VARIABLES]:
             raise ValueError(f"the controller would send {','.join(types)[:200]!r} for {','.join(VARIABLES)}")
-        self._layout = layout(types)
-        self._ask(START)
+        self._layout = recipe_layout(types)
+        self._request(START)
 
-    def read(self, timeout_s: float) -> Reading:
-        """The next state; TimeoutError after `timeout_s` without a byte, ValueError for one that is none."""
+    def read(self, timeout_s: float) -> RtdeState:
+        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
         self._link.settimeout(timeout_s)
-        while not self._waiting:
+        while not self._queue:
             self._receive()
-        arrived, payload = self._waiting.popleft()
-        return self._reading(arrived, _unpacked(self._layout, payload[1:]))
+        arrival_s, payload = self._queue.popleft()
+        return self._parse(arrival_s, _unpack(self._layout, payload[1:]))
 
-    def close(self) -> None:
-        """Close the link."""
-        self._link.close()
-
-    def _ask(self, kind: int, payload: bytes = b"") -> bytes:
-        self._link.sendall(frame(kind, payload))
+    def _request(self, kind: int, payload: bytes = b"") -> bytes:
+        self._link.sendall(pack_frame(kind, payload))
         while True:
-            for got, answer in self._receive():
-                if got == kind:
+            for answer_kind, answer in self._receive():
+                if answer_kind == kind:
                     return answer
 
     def _receive(self) -> list[tuple[int, bytes]]:
-        """Wait for bytes; queues the states among the frames they complete and returns the others."""
+        """Wait for bytes; queue the states among the frames that they complete and return the other frames."""
         data = self._link.recv(65536)
         if not data:
             raise ConnectionError("the controller closed the link")
         now = time.monotonic()
-        others = []
-        for kind, payload in self._splitter.feed(data):
+        answers = []
+        for kind, payload in self._splitter.split(data):
             if kind == DATA:
-                self._waiting.append((now, payload))
+                self._queue.append((now, payload))
             else:
-                others.append((kind, payload))
-        return others
+                answers.append((kind, payload))
+        return answers
 
-    def _reading(self, arrived: float, values: tuple[float, ...]) -> Reading:
+    def _parse(self, arrival_s: float, values: tuple[float, ...]) -> RtdeState:
         stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
-        felt = self.version[0] >= FORCE_SERIES
+        has_sensor = self.version[0] >= FORCE_SERIES
         if not all(map(math.isfinite, values)):
             raise ValueError("the controller sent a state that holds NaN or infinity")
-        skipped = 0 if self._stamp is None else max(0, round((stamp - self._stamp) * self.rate_hz) - 1)
-        self._stamp = stamp
-        return Reading(
-            time_s=self._clock.host_time(stamp, arrived),
+        skipped = 0
+        if self._last_stamp is not None:
+            skipped = max(0, round((stamp - self._last_stamp) * self.rate_hz) - 1)
+        self._last_stamp = stamp
+        return RtdeState(
+            time_s=self._clock.host_time(stamp, arrival_s),
             skipped=skipped,
             pose=pose,
-            speed=sum(value * value for value in speed) ** 0.5,
-            force_n=force[2] if felt else None,
-            sideways_n=math.hypot(*force[:2]) if felt else 0.0,
+            speed=math.hypot(*speed),
+            force_n=force[2] if has_sensor else None,
+            sideways_n=math.hypot(*force[:2]) if has_sensor else 0.0,
             **dict(zip(("mode", "runtime", "safety", "progress"), map(int, values[19:]), strict=True)),
         )
 
 
-def _unpacked(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
-    """The values of a payload; ValueError where it is of another size."""
+def _unpack(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
     if len(payload) != layout.size:
         raise ValueError(f"the controller sent {len(payload)} bytes, expected {layout.size}")
     return layout.unpack(payload)
+
+
+class StateRow(NamedTuple):
+    """A state as the worker process sends it: mm, rad, s and N; flags are 0 or 1, force is NaN without a sensor."""
+
+    time_s: float
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    rx: float
+    ry: float
+    rz: float
+    speed_mm_s: float
+    force_n: float
+    protective_stop: float
+    emergency_stop: float
+    moving: float
+    skipped: float
+    sideways_n: float
+
+
+_STATE = struct.Struct("<c14d")
+_REPLY = struct.Struct("<cI")
+
+
+def pack_state(row: StateRow) -> bytes:
+    """Return the bytes of a state."""
+    return _STATE.pack(b"S", *row)
+
+
+def pack_reply(reply: Any) -> bytes:
+    """Return the bytes of a reply, which is any JSON."""
+    text = json.dumps(reply).encode()
+    return _REPLY.pack(b"A", len(text)) + text
+
+
+def read_messages(source: Callable[[int], bytes]) -> Iterator[StateRow | dict[str, Any]]:
+    """Yield states and replies from a blocking `source` of bytes, until it ends or is damaged."""
+    while kind := source(1):
+        head = kind + source((_STATE if kind == b"S" else _REPLY).size - 1)
+        try:
+            if kind == b"S":
+                yield StateRow._make(_STATE.unpack(head)[1:])
+            else:
+                yield json.loads(source(_REPLY.unpack(head)[1]))
+        except (struct.error, ValueError, RecursionError):
+            return

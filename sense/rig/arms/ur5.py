@@ -1,7 +1,4 @@
-"""The parent's end of the link to the child that holds ur-rtde: waits have a deadline, and the child can be killed.
-
-A Universal Robots arm over ur-rtde, which runs in a child process that can be killed: it can hang and crash.
-"""
+"""A Universal Robots arm over ur-rtde, which can hang and crash and therefore runs in a process that can be killed."""
 
 import importlib.util
 import itertools
@@ -18,85 +15,90 @@ from typing import Any
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
-from padforge.sense.rig.arms import rtde as wire
-from padforge.sense.rig.arms.rtde import stop_program
+from padforge.sense.rig.arms.rtde import StateRow, read_messages, stop_program
 from padforge.sense.rig.devices import ArmState, Array, Cause, RigFault, start
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-KEPT = 300_000
-"""States that are kept for `take`: 10 minutes at 500 Hz."""
-BEAT_S = 0.05
-LOOK_S = 2.0
-"""How long the heart beats on after the program last looked at the arm."""
-STOP_S = 0.2
+MAX_STATES = 300_000
+"""States kept for `drain`: 10 minutes at 500 Hz."""
+HEARTBEAT_S = 0.05
+SUPERVISION_S = 2.0
+"""How long heartbeats go on after the program last asked for a state."""
+CONNECT_S = 4.5
+MOVE_S = 1.0
+STALE_S = 0.5
+CONFIRM_S = 0.25
+"""Longest wait for the worker to confirm a stop; the dashboard is asked after that."""
+DASHBOARD_S = 0.2
 """Longest wait for the dashboard to confirm a stop."""
 
 
-class ArmLink:
-    """A running child.
+class RtdeWorker:
+    """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed.
 
     Attributes:
-        latest: its last state. skipped: states the arm left out.
-        stopped: whether the arm's dashboard confirmed a stop after the child's end.
+        latest: last state of the arm.
+        skipped: number of states that the controller left out.
+        stopped: whether the arm's dashboard confirmed a stop after the worker's end.
     """
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self._ended: tuple[Cause, str, str] | None = None
-        self.latest: wire.StateRow | None = None
+        self._exit: tuple[Cause, str, str] | None = None
+        self.latest: StateRow | None = None
         self.skipped = 0
         self.stopped = False
-        self._answers: dict[int, dict[str, Any]] = {}
-        self._numbers = itertools.count(1)
-        self._rows: deque[wire.StateRow] = deque(maxlen=KEPT)
-        self._news = threading.Condition()
-        self._looked = time.monotonic()
-        self._ending = threading.Event()
+        self._replies: dict[int, dict[str, Any]] = {}
+        self._ids = itertools.count(1)
+        self._rows: deque[StateRow] = deque(maxlen=MAX_STATES)
+        self._received = threading.Condition()
+        self._supervised_s = time.monotonic()
+        self._killed = threading.Event()
         self._process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
         assert self._process.stdin is not None
         os.set_blocking(self._process.stdin.fileno(), False)
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._beat)]
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._receive, self._send_heartbeats)]
         for thread in self._threads:
             thread.start()
 
     @property
     def fault(self) -> RigFault | None:
-        """Why the child has ended; None while it runs."""
-        return RigFault(*self._ended) if self._ended else None
+        """Why the worker has ended; None while it runs."""
+        return RigFault(*self._exit) if self._exit else None
 
     @property
     def pid(self) -> int:
-        """Process id of the child."""
+        """Process id."""
         return self._process.pid
 
-    def ask(self, what: str, *arguments: Any, timeout_s: float) -> Any:
-        """Give the child an order and wait for its answer; RigFault where it fails, ends, or is late."""
-        number = next(self._numbers)
-        self._write(json.dumps({"id": number, "do": what, "with": arguments}).encode())
-        with self._news:
-            self._news.wait_for(lambda: number in self._answers or self._ended, timeout_s)
-            answer = self._answers.pop(number, None)
-        if answer is None:
-            raise self.fault or RigFault("deadline", f"the arm did not {what} within {timeout_s} s", "connect again")
-        if "fault" in answer:
-            raise RigFault(*answer["fault"])
-        return answer["is"]
+    def request(self, command: str, *arguments: Any, timeout_s: float) -> Any:
+        """Send a command and return its result; RigFault if it fails, the worker ends, or it is late."""
+        number = next(self._ids)
+        self._write(json.dumps({"id": number, "command": command, "arguments": arguments}).encode())
+        with self._received:
+            self._received.wait_for(lambda: number in self._replies or self._exit, timeout_s)
+            reply = self._replies.pop(number, None)
+        if reply is None:
+            raise self.fault or RigFault("deadline", f"the arm did not {command} within {timeout_s} s", "connect again")
+        if "fault" in reply:
+            raise RigFault(*reply["fault"])
+        return reply["result"]
 
-    def look(self) -> None:
+    def supervise(self) -> None:
         """Note that the program looks at the arm, so that a move may go on."""
-        self._looked = time.monotonic()
+        self._supervised_s = time.monotonic()
 
-    def take(self) -> list[wire.StateRow]:
-        """States since the last call."""
-        with self._news:
+    def drain(self) -> list[StateRow]:
+        """Return the states since the last call."""
+        with self._received:
             rows = list(self._rows)
             self._rows.clear()
         return rows
 
-    def end(self) -> None:
-        """Kill the child and wait for its end; never raises."""
-        self._ending.set()
+    def kill(self) -> None:
+        """Kill the worker and wait for its end; never raises."""
+        self._killed.set()
         self._process.kill()
         self._process.wait()
         for thread in self._threads:
@@ -112,57 +114,49 @@ class ArmLink:
         except (OSError, ValueError):
             raise self.fault or RigFault("lost", f"the link to the arm {self._host} is down", "connect again") from None
 
-    def _beat(self) -> None:
-        while not self._ending.wait(BEAT_S) and not self._ended:
-            if time.monotonic() < self._looked + LOOK_S:
+    def _send_heartbeats(self) -> None:
+        while not self._killed.wait(HEARTBEAT_S) and not self._exit:
+            if time.monotonic() < self._supervised_s + SUPERVISION_S:
                 with suppress(RigFault):
                     self._write(b"")
 
-    def _read(self) -> None:
+    def _receive(self) -> None:
         assert self._process.stdout is not None
-        ended: tuple[Cause, str, str] = ("lost", "the process that holds ur-rtde has ended", "connect again")
-        for news in wire.read(self._process.stdout.read):
-            with self._news:
-                if isinstance(news, wire.StateRow):
-                    self.latest = news
-                    self.skipped += int(news.skipped)
-                    self._rows.append(news)
-                elif "ended" in news:
-                    ended = news["ended"]
+        reason: tuple[Cause, str, str] = ("lost", "the process that holds ur-rtde has ended", "connect again")
+        for message in read_messages(self._process.stdout.read):
+            with self._received:
+                if isinstance(message, StateRow):
+                    self.latest = message
+                    self.skipped += int(message.skipped)
+                    self._rows.append(message)
+                elif "exit" in message:
+                    reason = message["exit"]
                 else:
-                    self._answers[news["id"]] = news
-                    self._news.notify_all()
-        with self._news:
-            self._ended = ended
-            self._news.notify_all()
-        if self.latest is not None and not self._ending.is_set():
-            self.stopped = stop_program(self._host, STOP_S)
-
-
-CONNECT_S = 4.5
-MOVE_S = 1.0
-STALE_S = 0.5
-CONFIRM_S = 0.25
-"""Longest wait for the child to confirm a stop; the dashboard is asked after that."""
-DASHBOARD_S = 0.2
+                    self._replies[message["id"]] = message
+                    self._received.notify_all()
+        with self._received:
+            self._exit = reason
+            self._received.notify_all()
+        if self.latest is not None and not self._killed.is_set():
+            self.stopped = stop_program(self._host, DASHBOARD_S)
 
 
 class UR5:
-    """The arm at a network address. Linux and macOS.
+    """The arm at a network address; implements `Arm`. Linux and macOS.
 
     During a move `state` or `drain` must be called at least every 2 s, or the arm is stopped; it also stops within
-    0.5 s where this process ends or is suspended. A protective or emergency stop ends the move for good: a person has
-    to unlock the arm, and `connect` starts anew. Nothing here unlocks, powers or starts an arm.
+    0.5 s if this process ends or is suspended. A protective or emergency stop ends the move for good: a person has to
+    unlock the arm, and `connect` starts anew. Nothing here unlocks, powers or starts an arm.
     """
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self._link: ArmLink | None = None
-        self._moved_s = 0.0
+        self._worker: RtdeWorker | None = None
+        self._move_s = 0.0
 
     @classmethod
-    def of(cls, rig: RigSettings) -> "UR5":
-        """The arm that `[rig]` names."""
+    def from_settings(cls, rig: RigSettings) -> "UR5":
+        """Return the arm that `[rig]` names."""
         return cls(rig.host)
 
     def connect(self) -> Mapping[str, Any]:
@@ -172,39 +166,39 @@ class UR5:
             host, model, polyscope, serial, controller and ur_rtde versions, rate_hz, and the tool's tcp in mm and rad.
 
         Raises:
-            RigFault: "refused" where there is no arm, it is not in remote control or not powered, another program uses
-                it, on this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop";
-                "deadline" after 4.5 s.
+            RigFault: "refused" if there is no arm, it is not in remote control or not powered, another program uses it,
+                on this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop"; "deadline"
+                after 4.5 s.
         """
         if importlib.util.find_spec("rtde_control") is None:
             raise RigFault("refused", "the arm needs ur-rtde", "pip install 'padforge[rig]'")
-        self._end()
-        self._link = ArmLink(self._host)
+        self._end_worker()
+        self._worker = RtdeWorker(self._host)
         try:
-            return self._link.ask("connect", timeout_s=CONNECT_S)
+            return self._worker.request("connect", timeout_s=CONNECT_S)
         except BaseException:
-            self._end()
+            self._end_worker()
             raise
 
     @property
-    def child(self) -> int | None:
-        """Process id of the child, None before `connect`."""
-        return self._link.pid if self._link else None
+    def worker_pid(self) -> int | None:
+        """Process id of the worker, None before `connect`."""
+        return self._worker.pid if self._worker else None
 
     @property
     def skipped(self) -> int:
-        """How many states the controller left out since `connect`."""
-        return self._link.skipped if self._link else 0
+        """Number of states that the controller left out since `connect`."""
+        return self._worker.skipped if self._worker else 0
 
     def state(self) -> ArmState:
-        """The latest state; see `Arm.state`.
+        """Return the latest state; see `Arm.state`.
 
         Raises:
-            RigFault: "stale", "lost"; "deadline" where nobody looked for 2 s during a move.
+            RigFault: "stale", "lost"; "deadline" if nobody asked for a state for 2 s during a move.
         """
-        link = self._running()
-        link.look()
-        row = link.latest
+        worker = self._connected()
+        worker.supervise()
+        row = worker.latest
         age_s = np.inf if row is None else time.monotonic() - row.time_s
         if row is None or age_s > STALE_S:
             raise RigFault("stale", f"the last state of the arm is {age_s:.2f} s old; allowed {STALE_S} s")
@@ -215,54 +209,56 @@ class UR5:
             force_n=None if np.isnan(row.force_n) else row.force_n,
             protective_stop=bool(row.protective_stop),
             emergency_stop=bool(row.emergency_stop),
-            moving=bool(row.moving) or row.time_s < self._moved_s,
+            moving=bool(row.moving) or row.time_s < self._move_s,
             sideways_n=row.sideways_n,
         )
 
     def drain(self) -> Array:
-        """(n, 10) states since the last call; those that came before the link was lost come before the fault.
+        """Return the (n, 10) states since the last call; those before the link was lost come before the fault.
 
         The last 300 000 states are kept: 10 minutes at 500 Hz.
         """
-        rows = self._link.take() if self._link else []
+        rows = self._worker.drain() if self._worker else []
         if not rows:
-            self._running()
+            self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
-        if self._link:
-            self._link.look()
+        if self._worker:
+            self._worker.supervise()
         values = np.array(rows, dtype=np.float64)
         return np.column_stack([values[:, :9], (~values[:, 9:11].any(axis=1)).astype(np.float64)])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Begin a straight move from rest.
+        """Start a straight move from rest.
 
         Args:
-            pose: x, y, z in mm and a rotation vector in rad. speed_mm_s, acceleration_mm_s2: of the tool.
+            pose: x, y, z in mm and a rotation vector in rad.
+            speed_mm_s: of the tool.
+            acceleration_mm_s2: of the tool.
 
         Raises:
-            RigFault: "refused" for what is no pose or speed, or where the arm does not take it; "lost", "deadline".
+            RigFault: "refused" for numbers that are no move, or if the arm does not accept it; "lost", "deadline".
         """
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
-        link = self._running()
-        link.look()
+        worker = self._connected()
+        worker.supervise()
         try:
-            link.ask("move", [float(value) for value in pose], speed_mm_s, acceleration_mm_s2, timeout_s=MOVE_S)
+            worker.request("move", [float(value) for value in pose], speed_mm_s, acceleration_mm_s2, timeout_s=MOVE_S)
         except RigFault as fault:
             if fault.cause != "refused":
                 self._abandon()
             raise
-        self._moved_s = time.monotonic()
+        self._move_s = time.monotonic()
 
     def stop(self) -> None:
-        """Stop the arm, by ur-rtde or, where that does not answer, by its dashboard and its watchdog.
+        """Stop the arm, by ur-rtde or, if that does not answer, by its dashboard and its watchdog.
 
         Raises:
-            RigFault: "lost" where the arm did not confirm it; the watchdog stops it 0.25 s after the last sign of life.
+            RigFault: "lost" if the arm did not confirm it; the watchdog stops it 0.25 s after the last sign of life.
         """
-        if self._link is None or self._link.stopped:
+        if self._worker is None or self._worker.stopped:
             return
         try:
-            self._link.ask("stop", timeout_s=CONFIRM_S)
+            self._worker.request("stop", timeout_s=CONFIRM_S)
         except RigFault:
             if not self._abandon():
                 reason = f"the arm {self._host} did not confirm the stop"
@@ -270,27 +266,27 @@ class UR5:
 
     def close(self) -> None:
         """Stop the arm and close the link; never raises."""
-        if self._link is not None:
+        if self._worker is not None:
             with suppress(RigFault):
-                self._link.ask("close", timeout_s=MOVE_S)
-            self._end()
+                self._worker.request("close", timeout_s=MOVE_S)
+            self._end_worker()
 
-    def _running(self) -> ArmLink:
-        if self._link is None:
+    def _connected(self) -> RtdeWorker:
+        if self._worker is None:
             raise RigFault("lost", f"there is no link to the arm {self._host}", "connect first")
-        if fault := self._link.fault:
+        if fault := self._worker.fault:
             raise fault
-        return self._link
+        return self._worker
 
     def _abandon(self) -> bool:
-        """Kill the child, so that the watchdog is kicked no more; whether the dashboard confirms that the arm stops."""
-        if self._link is not None:
-            self._link.end()
-            if self._link.stopped:
+        """Kill the worker, so that the watchdog is kicked no more; return whether the dashboard confirms the stop."""
+        if self._worker is not None:
+            self._worker.kill()
+            if self._worker.stopped:
                 return True
         return stop_program(self._host, DASHBOARD_S)
 
-    def _end(self) -> None:
-        if self._link is not None:
-            self._link.end()
-            self._link = None
+    def _end_worker(self) -> None:
+        if self._worker is not None:
+            self._worker.kill()
+            self._worker = None

@@ -1,7 +1,4 @@
-"""The port of an Arduino Due: where it is found, and frames to and from it.
-
-The converter of the real rig: an Arduino Due on its native USB port, with the firmware beside this module.
-"""
+"""The board of the published rig: an Arduino Due on its native USB port, with the firmware beside this module."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -12,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from padforge.design.common.validation import InputError
-from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, chosen_inputs
+from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, select_inputs
 from padforge.sense.rig.boards.due_framing import (
     FULL_SCALE,
     MAX_AVERAGING,
@@ -21,7 +18,7 @@ from padforge.sense.rig.boards.due_framing import (
     BoardSettings,
     DueBlock,
     DueDecoder,
-    Frame,
+    DueMessage,
     Identity,
     Kind,
     Request,
@@ -33,99 +30,96 @@ from padforge.sense.settings import RigSettings
 
 BAUD = 115_200
 """Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
+FIRMWARE_MAJOR = 1
+"""Boards with another first number of the firmware version speak another wire format."""
+MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 
-F = TypeVar("F", bound=Frame)
-
+_FIRMWARE = "sense/rig/boards/firmware/padforge_due"
 _RESEND_S = 0.25
+_ANSWER_S = 1.0
+_MAX_JUMP_US = 5000  # of board time against sample index from block to block: interrupts come late
 _DUE_PORTS = {0x003E: "native", 0x003D: "programming"}
 _VENDORS = (0x2341, 0x2A03)
+
+M = TypeVar("M", bound=DueMessage)
 
 
 @dataclass(frozen=True)
 class BoardPort:
-    """A port at which an Arduino Due seems to be: "native" is the one to use, "programming" cannot carry the data."""
+    """A port of an Arduino Due: "native" is the one to use, "programming" cannot carry the data."""
 
     device: str
     kind: str
     serial_number: str
 
 
-def find_ports() -> list[BoardPort]:
-    """The ports of this host that look like a Due, native ones first. Raises RigFault("refused") without pyserial."""
-    found = [
+def list_due_ports() -> list[BoardPort]:
+    """Return the ports of this host that look like a Due, native ones first; RigFault("refused") without pyserial."""
+    ports = [
         BoardPort(port.device, _DUE_PORTS[port.pid], port.serial_number or "")
         for port in host_ports()
         if port.vid in _VENDORS and port.pid in _DUE_PORTS
     ]
-    return sorted(found, key=lambda port: (port.kind, port.device))
+    return sorted(ports, key=lambda port: (port.kind, port.device))
 
 
-def port_of(rig: RigSettings) -> str:
-    """The board's port, looked for where `[rig]` does not set it; raises RigFault("refused") where none is found."""
+def find_due_port(rig: RigSettings) -> str:
+    """Return the board's port: that of `[rig]`, or the first Due if it is "auto"; RigFault("refused") if none is."""
     if rig.port != "auto":
         return rig.port
-    if not (ports := find_ports()):
+    if not (ports := list_due_ports()):
         raise RigFault("refused", '[rig] port is "auto" and no board is found', "plug it in, or name its port")
     return ports[0].device
 
 
-class SerialLink:
-    """An open port that speaks frames. Any method but `close` raises RigFault("lost") once the board is gone."""
+class DueLink:
+    """An open port that carries messages. Any method but `close` raises RigFault("lost") once the board is gone."""
 
     def __init__(self, port: str) -> None:
-        """Open `port` for this process alone; raises RigFault("refused") where that cannot be."""
-        self.port = port
+        """Open `port` exclusively; raises RigFault("refused") if that fails."""
         self.decoder = DueDecoder()
         self._stream = ByteStream(port, BAUD)
 
-    def receive(self) -> tuple[float, list[Frame]]:
-        """When bytes have come, after a short wait, and the frames they completed."""
+    def receive(self) -> tuple[float, list[DueMessage]]:
+        """Wait shortly for bytes; return the host time and the messages that they complete."""
         now_s, data = self._stream.receive()
-        return now_s, self.decoder.feed(data)
+        return now_s, self.decoder.decode(data)
 
     def send(self, command: Request | BoardSettings) -> None:
         """Send one command."""
         self._stream.send(encode(command))
 
-    def ask(self, command: Request | BoardSettings, kind: type[F], fits: Callable[[F], bool], wait_s: float) -> F:
-        """Send `command` until a frame of `kind` that `fits` comes; all other frames are thrown away.
+    def request(self, command: Request | BoardSettings, kind: type[M], matches: Callable[[M], bool] | None = None) -> M:
+        """Send a command until its answer comes; all other messages are dropped.
+
+        Args:
+            command: what to send.
+            kind: of the answer.
+            matches: whether a message of this kind is the answer; any is if None.
 
         Raises:
-            RigFault: "stale" where none has come after `wait_s`.
+            RigFault: "stale" if none has come after a second.
         """
-        deadline = time.monotonic() + wait_s
-        resend = 0.0
+        deadline = time.monotonic() + _ANSWER_S
+        resend_s = 0.0
         while (now := time.monotonic()) < deadline:
-            if now >= resend:
+            if now >= resend_s:
                 self.send(command)
-                resend = now + _RESEND_S
-            for frame in self.receive()[1]:
-                if isinstance(frame, kind) and fits(frame):
-                    return frame
-        raise RigFault("stale", f"{self.port}: no answer within {wait_s:g} s")
+                resend_s = now + _RESEND_S
+            for message in self.receive()[1]:
+                if isinstance(message, kind) and (matches is None or matches(message)):
+                    return message
+        raise RigFault("stale", f"{self._stream.port}: no answer within {_ANSWER_S:g} s")
 
     def close(self) -> None:
         """Close the port; never raises."""
         self._stream.close()
 
 
-FIRMWARE_MAJOR = 1
-"""Boards with another first number of the firmware version speak another wire format."""
-MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
+class DueBoard:
+    """An Arduino Due that samples the fibres at a fixed rate; implements `Board`.
 
-_FIRMWARE = "sense/rig/boards/firmware/padforge_due"
-_ANSWER_S = 1.0
-_JUMP_US = 5000
-"""Board time and sample index may differ by so much from block to block: interrupts come late."""
-
-Arrival = tuple[float, DueBlock]
-"""A block and the host time at which it came."""
-
-
-class Arduino:
-    """An Arduino Due that reads fibres every 1 / `rate_hz`; implements `Board`.
-
-    The host time of a sample is when its last conversion was complete, apart from the least delay of the USB link.
+    The host time of a sample is when its last conversion was complete, but for the least delay of the USB link.
     """
 
     def __init__(
@@ -134,36 +128,38 @@ class Arduino:
         """Take the settings; nothing is opened before `connect`.
 
         Args:
-            port: name of the native USB port. rate_hz: samples per second, 10 to 10 000.
-            inputs: which to read, fibre by fibre, 0 for A0 to 11; all in order where empty.
-            supply_v: reading at full scale, V. averaging: conversions summed to a sample, 1 to 16.
+            port: name of the native USB port.
+            rate_hz: samples a second, 10 to 10 000.
+            inputs: which to read, fibre by fibre, 0 for A0 to 11; all in order if empty.
+            supply_v: reading at full scale, V.
+            averaging: conversions summed to a sample, 1 to 16.
 
         Raises:
             InputError: a value is out of range.
-            RigFault: "refused" for an input that the board has not.
+            RigFault: "refused" for an input that the board does not have.
         """
-        _within("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        _within("averaging", averaging, 1, MAX_AVERAGING)
-        self._inputs = chosen_inputs(inputs, MAX_CHANNELS, "an Arduino Due")
+        _check_range("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
+        _check_range("averaging", averaging, 1, MAX_AVERAGING)
+        self._inputs = select_inputs(inputs, MAX_CHANNELS, "an Arduino Due")
         self._port = port
-        self._wanted = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
+        self._settings = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
         self._supply_v = supply_v
-        self._link: SerialLink | None = None
+        self._link: DueLink | None = None
         self._reader: BlockReader[DueBlock] | None = None
         self._assembler: DueAssembler | None = None
 
     @classmethod
-    def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "Arduino":
-        """The board that `[rig]` names, looked for where its port is "auto"; see `__init__` and `port_of`."""
-        return cls(port_of(rig), rig.board_rate_hz, inputs)
+    def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "DueBoard":
+        """Return the board that `[rig]` names; see `__init__` and `find_due_port`."""
+        return cls(find_due_port(rig), rig.board_rate_hz, inputs)
 
     def connect(self) -> dict[str, Any]:
-        """Open the port, check the firmware, set the board and start it; see `Board`."""
+        """Open the port, check the firmware, configure the board and start it; see `Board`."""
         self.close()
-        self._link = link = SerialLink(self._port)
+        self._link = link = DueLink(self._port)
         try:
             identity = self._identify(link)
-            settings = self._set(link)
+            settings = self._configure(link)
             self._assembler = DueAssembler(settings, self._inputs, self._supply_v)
             self._start(link, settings)
         except BaseException:
@@ -183,28 +179,30 @@ class Arduino:
         }
 
     def read(self) -> BoardSamples:
-        """All samples since the last call, C columns of volts; see `Board`.
+        """Return all samples since the last call, C columns of volts; see `Board`.
 
         Raises:
-            RigFault: "stale" or "lost" once all samples that came before have been read, "data" where nobody has read
-                for 60 s or the board has lost its place, "refused" before `connect`.
+            RigFault: "stale" or "lost" once all samples that came before have been read, "data" if nobody has read for
+                60 s or the board has lost its place, "refused" before `connect`.
         """
         if self._reader is None or self._assembler is None:
             raise RigFault("refused", f"{self._port}: not connected")
-        return self._assembler.samples(self._reader.take())
+        return self._assembler.assemble(self._reader.drain())
 
     def statistics(self) -> dict[str, float]:
-        """Since `connect`: blocks, damaged frames, missing samples, those of them dropped by the board, clock skew.
+        """Return counts since `connect`, of what has been read.
 
-        All but the damaged frames count what has been read.
+        Returns:
+            blocks, damaged frames (also of what has not been read), missing samples, overruns (missing samples that the
+            board dropped), skew_ppm of the clocks.
         """
-        taken = self._assembler
+        assembler = self._assembler
         return {
-            "blocks": taken.blocks if taken else 0,
+            "blocks": assembler.blocks if assembler else 0,
             "damaged": self._link.decoder.damaged if self._link else 0,
-            "missing": taken.missing if taken else 0,
-            "overruns": taken.overruns if taken else 0,
-            "skew_ppm": taken.clock.skew_ppm if taken else 0.0,
+            "missing": assembler.missing if assembler else 0,
+            "overruns": assembler.overruns if assembler else 0,
+            "skew_ppm": assembler.clock.skew_ppm if assembler else 0.0,
         }
 
     def close(self) -> None:
@@ -217,9 +215,9 @@ class Arduino:
             self._link.close()
         self._reader = None
 
-    def _identify(self, link: SerialLink) -> Identity:
+    def _identify(self, link: DueLink) -> Identity:
         try:
-            identity = link.ask(Request(Kind.IDENTIFY), Identity, lambda _: True, _ANSWER_S)
+            identity = link.request(Request(Kind.IDENTIFY), Identity)
         except RigFault as fault:
             if fault.cause != "stale":
                 raise
@@ -231,39 +229,41 @@ class Arduino:
             raise RigFault("refused", message, f"flash it anew, see {_FIRMWARE}/README.md")
         return identity
 
-    def _set(self, link: SerialLink) -> BoardSettings:
-        link.ask(Request(Kind.STOP), Ack, lambda ack: ack.command == Kind.STOP, _ANSWER_S)
-        ack = link.ask(self._wanted, Ack, lambda ack: ack.command == Kind.SETTINGS, _ANSWER_S)
+    def _configure(self, link: DueLink) -> BoardSettings:
+        link.request(Request(Kind.STOP), Ack, lambda ack: ack.command == Kind.STOP)
+        ack = link.request(self._settings, Ack, lambda ack: ack.command == Kind.SETTINGS)
         if ack.status != Status.OK:
-            wanted = self._wanted
+            settings = self._settings
             message = (
-                f"{self._port}: the board refuses {wanted.mask.bit_count()} channels at {1e9 / wanted.period_ns:g} Hz "
-                f"with {wanted.averaging} conversions a sample (status {ack.status})"
+                f"{self._port}: the board refuses {settings.mask.bit_count()} channels at {1e9 / settings.period_ns:g} "
+                f"Hz with {settings.averaging} conversions a sample (status {ack.status})"
             )
             raise RigFault("refused", message, "lower the rate, the channels or the averaging")
         return ack.settings
 
-    def _start(self, link: SerialLink, settings: BoardSettings) -> None:
+    def _start(self, link: DueLink, settings: BoardSettings) -> None:
         halted = False
 
         def receive() -> tuple[float, list[DueBlock]]:
             nonlocal halted
             if halted:
                 raise RigFault("data", f"{self._port}: the board has lost conversions and stopped")
-            now_s, frames = link.receive()
-            halted = any(isinstance(frame, Ack) and frame.status == Status.HALTED for frame in frames)
-            return now_s, [frame for frame in frames if isinstance(frame, DueBlock)]
+            now_s, messages = link.receive()
+            halted = any(isinstance(message, Ack) and message.status == Status.HALTED for message in messages)
+            return now_s, [message for message in messages if isinstance(message, DueBlock)]
 
         link.decoder.damaged = 0
         self._reader = BlockReader(self._port, receive, 1e9 / settings.period_ns)
-        self._reader.begin(lambda: link.send(Request(Kind.START)))
+        self._reader.start_settled(lambda: link.send(Request(Kind.START)))
 
 
 class DueAssembler:
-    """Makes `Samples` of blocks: times by a `SampleClock`, volts fibre by fibre, what is missing by the index.
+    """Makes `BoardSamples` of blocks: host times by a `SampleClock`, volts by fibre, missing samples by the index.
 
     Attributes:
-        blocks, missing, overruns: blocks so far, samples that are missing, those of them dropped by the board.
+        blocks: number of blocks so far.
+        missing: number of samples that are missing.
+        overruns: those of them that the board dropped.
     """
 
     def __init__(self, settings: BoardSettings, inputs: Sequence[int], supply_v: float) -> None:
@@ -275,47 +275,47 @@ class DueAssembler:
         self._next = 0
         self._time_us: int | None = None
 
-    def samples(self, arrivals: Iterable[Arrival]) -> BoardSamples:
-        """The samples of the blocks that have arrived since the last call.
+    def assemble(self, arrivals: Iterable[tuple[float, DueBlock]]) -> BoardSamples:
+        """Return the samples of blocks, each with the host time of its arrival.
 
         Raises:
-            RigFault: "data" where a block cannot follow the ones before it.
+            RigFault: "data" if a block cannot follow the ones before it.
         """
         placed = []
         for arrival_s, block in arrivals:
-            first, lost = self._place(block)
+            first, missing = self._place(block)
             self.clock.observe(first + len(block.counts) - 1, arrival_s)
-            placed.append((first, lost, block.counts))
+            placed.append((first, missing, block.counts))
         times = [self.clock.times(np.arange(first, first + len(counts))) for first, _, counts in placed]
-        missing = [np.r_[lost, np.zeros(len(counts) - 1, np.int64)] for _, lost, counts in placed]
+        gaps = [np.r_[missing, np.zeros(len(counts) - 1, np.int64)] for _, missing, counts in placed]
+        volts = [counts[:, self._columns] * self._volts for *_, counts in placed]
         return BoardSamples(
             np.concatenate([np.empty(0), *times]),
-            np.concatenate([np.empty((0, len(self._columns))), *(counts[:, self._columns] for *_, counts in placed)])
-            * self._volts,
-            np.concatenate([np.empty(0, np.int64), *missing]),
+            np.concatenate([np.empty((0, len(self._columns))), *volts]),
+            np.concatenate([np.empty(0, np.int64), *gaps]),
         )
 
     def _place(self, block: DueBlock) -> tuple[int, int]:
-        """Index of the first sample, counted on without wrapping, and how many are lost before it."""
+        """Return the unwrapped index of the first sample, and how many are missing before it."""
         if (block.mask, block.averaging) != (self._settings.mask, self._settings.averaging):
             raise RigFault("data", "the board sends other channels than it was set to", "connect again")
-        lost = (block.first - self._next) % 2**32
-        samples = lost + len(block.counts)
+        missing = (block.first - self._next) % 2**32
+        samples = missing + len(block.counts)
         if self._time_us is not None:
             elapsed_us = round(samples * self._settings.period_ns / 1000)
             jump_us = (block.time_us - self._time_us - elapsed_us + 2**31) % 2**32 - 2**31
-            if elapsed_us >= 2**32 or abs(jump_us) > _JUMP_US:
+            if elapsed_us >= 2**32 or abs(jump_us) > _MAX_JUMP_US:
                 message = f"sample {block.first} came {jump_us} us off its time"
                 raise RigFault("data", message, "the board may have been reset; connect again")
         self._time_us = block.time_us
-        first = self._next + lost
+        first = self._next + missing
         self._next = first + len(block.counts)
         self.blocks += 1
-        self.missing += lost
+        self.missing += missing
         self.overruns = block.overruns
-        return first, lost
+        return first, missing
 
 
-def _within(name: str, value: float, least: float, most: float) -> None:
-    if not least <= value <= most:
-        raise InputError(f"{name} is {value:g}, expected {least:g} to {most:g}")
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise InputError(f"{name} is {value:g}, expected {low:g} to {high:g}")

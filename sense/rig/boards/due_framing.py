@@ -1,11 +1,11 @@
-"""What travels between the host and the board that reads the fibres: frames of bytes, the same both ways.
+"""The wire format of the Arduino Due board: messages between host and board as frames, the same both ways.
 
-On the wire a frame is `00 coded check 00`. `coded` is the payload with its zeros taken out by COBS (consistent
-overhead byte stuffing), so a zero is always the edge of a frame and a reader falls in step again at the next one. The
-zeros on both sides let a damaged edge cost one frame only. `check` is the CRC-16/CCITT-FALSE of `coded`, in three bytes
-of 2, 7 and 7 bits with the top bit set, so that it holds no zero either. It covers the coded bytes and not the payload
-because one flipped bit among the COBS counts would alter several bytes of the payload: as it is, up to three flipped
-bits and every burst of up to 16 bits are found for certain.
+On the wire a frame is `00 coded check 00`. `coded` is the payload with its zeros taken out by COBS (consistent overhead
+byte stuffing), so a zero is always the edge of a frame and a decoder falls in step again at the next one. With zeros on
+both sides a damaged edge costs one frame only. `check` is the CRC-16/CCITT-FALSE of `coded`, in three bytes of 2, 7 and
+7 bits with the top bit set, so that it holds no zero either. It covers the coded bytes and not the payload because one
+flipped bit among the COBS counts would alter several bytes of the payload: as it is, up to three flipped bits and every
+burst of up to 16 bits are detected for certain.
 
 A payload is a kind (one byte) and a body, little-endian:
 
@@ -17,7 +17,8 @@ A payload is a kind (one byte) and a body, little-endian:
                    board time at the last sample u32 us, samples dropped by the board u32, n x C sums u16
 
 Indices, times and sequence numbers wrap around. A sum of conversions is at most 16 x 4095, so averaging loses no
-resolution."""
+resolution.
+"""
 
 import struct
 from binascii import crc_hqx
@@ -56,7 +57,7 @@ class Status(IntEnum):
     TOO_FAST = 2
     RUNNING = 3
     HALTED = 4
-    """Not an answer: the board has stopped of itself because conversions were lost."""
+    """Not an answer: the board has stopped by itself because conversions were lost."""
 
 
 @dataclass(frozen=True)
@@ -66,30 +67,36 @@ class Request:
     kind: Kind
 
     def pack(self) -> bytes:
-        """The payload."""
+        """Return the payload."""
         return bytes([self.kind])
 
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """How to sample: `period_ns` from sample to sample, inputs by bit of `mask`, `averaging` conversions a sample."""
+    """How to sample.
+
+    Attributes:
+        period_ns: from sample to sample.
+        mask: of inputs, bit 0 is A0.
+        averaging: conversions summed to a sample.
+    """
 
     period_ns: int
     mask: int
     averaging: int
 
     def pack(self) -> bytes:
-        """The payload."""
+        """Return the payload."""
         return bytes([Kind.SETTINGS]) + self.body()
 
     def body(self) -> bytes:
-        """The payload without its kind, as it also stands in an `Ack`."""
+        """Return the payload without its kind, which is also a part of an `Ack`."""
         return _SETTINGS.pack(self.period_ns, self.mask, self.averaging)
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What the board says of itself; `name` has up to 16 ASCII characters, `serial` 16 bytes."""
+    """Identity of a board; `name` has up to 16 ASCII characters, `serial` 16 bytes."""
 
     firmware: tuple[int, int, int]
     bits: int
@@ -98,7 +105,7 @@ class Identity:
     serial: bytes
 
     def pack(self) -> bytes:
-        """The payload."""
+        """Return the payload."""
         fields = (*self.firmware, self.bits, self.channels, self.name.encode("ascii"), self.serial)
         return bytes([Kind.IDENTITY]) + _IDENTITY.pack(*fields)
 
@@ -112,7 +119,7 @@ class Ack:
     settings: BoardSettings
 
     def pack(self) -> bytes:
-        """The payload."""
+        """Return the payload."""
         return bytes([Kind.ACK, self.command, self.status]) + self.settings.body()
 
 
@@ -122,8 +129,12 @@ class DueBlock:
 
     Attributes:
         counts: (n, C) sums of `averaging` conversions, n up to 16, one column for every bit of `mask`.
-        first: index of the first sample since the start. time_us: board time as the last sample was complete.
-        overruns: samples the board has dropped since the start. sequence: number of the block since the start.
+        averaging: conversions summed to a sample.
+        mask: of inputs.
+        sequence: number of the block since the start.
+        first: index of the first sample since the start.
+        time_us: board time when the last sample was complete.
+        overruns: samples that the board has dropped since the start.
     """
 
     counts: NDArray[np.uint16]
@@ -135,12 +146,12 @@ class DueBlock:
     overruns: int
 
     def pack(self) -> bytes:
-        """The payload."""
+        """Return the payload."""
         fields = (self.averaging, self.mask, self.sequence, self.first, self.time_us, self.overruns)
         return _BLOCK.pack(Kind.BLOCK, len(self.counts), *fields) + self.counts.astype("<u2").tobytes()
 
 
-Frame = Request | BoardSettings | Identity | Ack | DueBlock
+DueMessage = Request | BoardSettings | Identity | Ack | DueBlock
 
 _SETTINGS = struct.Struct("<IHB")
 _IDENTITY = struct.Struct("<3BBB16s16s")
@@ -151,16 +162,16 @@ _MAX_PAYLOAD = _BLOCK.size + 2 * MAX_SAMPLES * MAX_CHANNELS
 _MAX_FRAME = _MAX_PAYLOAD + 2 + _CHECK_BYTES
 
 
-def encode(frame: Frame) -> bytes:
-    """The bytes of a frame on the wire, with the zeros at both ends."""
-    coded = cobs_encode(frame.pack())
+def encode(message: DueMessage) -> bytes:
+    """Return the frame of a message, with the zeros at both ends."""
+    coded = cobs_encode(message.pack())
     return b"\0" + coded + _check(coded) + b"\0"
 
 
 def cobs_encode(payload: bytes) -> bytes:
-    """`payload` without zeros: every run between them with a count, 255 where a run of 254 goes on.
+    """Return `payload` without zeros: every run between them after a count, 255 where a run of 254 goes on.
 
-    As the firmware does, and other than the package `cobs`, a run of 254 at the very end is followed by an empty one.
+    Like the firmware, and unlike the package `cobs`, a run of 254 at the very end is followed by an empty one.
     """
     coded = bytearray()
     for run in payload.split(b"\0"):
@@ -173,7 +184,7 @@ def cobs_encode(payload: bytes) -> bytes:
 
 
 def cobs_decode(coded: bytes) -> bytes:
-    """The payload that `cobs_encode` made `coded` from; raises ValueError where there is none."""
+    """Return the payload of `coded`, the inverse of `cobs_encode`; ValueError if there is none."""
     payload = bytearray()
     at = 0
     while at < len(coded):
@@ -187,8 +198,8 @@ def cobs_decode(coded: bytes) -> bytes:
     return bytes(payload)
 
 
-def unpack(payload: bytes) -> Frame:
-    """The frame of a payload; raises ValueError where it is none."""
+def unpack(payload: bytes) -> DueMessage:
+    """Return the message of a payload; ValueError if it is none."""
     kind = payload[0] if payload else None
     try:
         if kind in (Kind.IDENTIFY, Kind.START, Kind.STOP) and len(payload) == 1:
@@ -205,7 +216,7 @@ def unpack(payload: bytes) -> Frame:
         raise ValueError(f"kind {kind} of {len(payload)} bytes ({error})") from error
     if kind == Kind.BLOCK:
         return _unpack_block(payload)
-    raise ValueError(f"kind {kind} of {len(payload)} bytes, expected one of {[int(known) for known in Kind]}")
+    raise ValueError(f"kind {kind} of {len(payload)} bytes, expected one of {[int(member) for member in Kind]}")
 
 
 def _unpack_block(payload: bytes) -> DueBlock:
@@ -213,8 +224,8 @@ def _unpack_block(payload: bytes) -> DueBlock:
         raise ValueError(f"a block of {len(payload)} bytes, expected at least {_BLOCK.size}")
     _, samples, averaging, mask, *numbers = _BLOCK.unpack_from(payload)
     channels = mask.bit_count()
-    limits = 1 <= samples <= MAX_SAMPLES and 1 <= averaging <= MAX_AVERAGING and 0 < mask < 1 << MAX_CHANNELS
-    if not limits or len(payload) != _BLOCK.size + 2 * samples * channels:
+    valid = 1 <= samples <= MAX_SAMPLES and 1 <= averaging <= MAX_AVERAGING and 0 < mask < 1 << MAX_CHANNELS
+    if not valid or len(payload) != _BLOCK.size + 2 * samples * channels:
         raise ValueError(f"a block of {len(payload)} bytes with {samples} samples of {channels} channels")
     counts = np.frombuffer(payload, "<u2", offset=_BLOCK.size).reshape(samples, channels)
     if counts.max() > averaging * FULL_SCALE:
@@ -223,23 +234,23 @@ def _unpack_block(payload: bytes) -> DueBlock:
 
 
 class DueDecoder:
-    """Finds the frames in a stream of bytes that comes in any portions.
+    """Decodes the messages in a stream of bytes that comes in any portions.
 
     Attributes:
-        damaged: pieces between two zeros, so far, that were no frame.
+        damaged: pieces between two zeros, so far, that were no message.
     """
 
     def __init__(self) -> None:
         self.damaged = 0
-        self._rest = b""
+        self._tail = b""
 
-    def feed(self, data: bytes) -> list[Frame]:
-        """The frames that `data` completes, in order."""
-        *pieces, rest = (self._rest + data).split(b"\0")
-        self._rest = rest[: _MAX_FRAME + 1]  # one byte too long is damaged whatever follows
-        return [frame for piece in pieces if piece and (frame := self._frame(piece)) is not None]
+    def decode(self, data: bytes) -> list[DueMessage]:
+        """Return the messages that `data` completes, in order."""
+        *pieces, tail = (self._tail + data).split(b"\0")
+        self._tail = tail[: _MAX_FRAME + 1]  # one byte too long is damaged whatever follows
+        return [message for piece in pieces if piece and (message := self._decode_piece(piece)) is not None]
 
-    def _frame(self, piece: bytes) -> Frame | None:
+    def _decode_piece(self, piece: bytes) -> DueMessage | None:
         coded, check = piece[:-_CHECK_BYTES], piece[-_CHECK_BYTES:]
         try:
             if len(piece) > _MAX_FRAME or check != _check(coded):

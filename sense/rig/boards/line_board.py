@@ -1,4 +1,4 @@
-"""A converter that sends lines of text: any board that speaks the protocol of `framing`."""
+"""A board that sends lines of text: any board that speaks the protocol of `line_framing`."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -7,31 +7,37 @@ from typing import Any
 
 import numpy as np
 
-from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, chosen_inputs
-from padforge.sense.rig.boards.line_framing import ASK, LineDecoder, LineHeader, Sample
+from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, select_inputs
+from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineDecoder, LineHeader, LineSample
 from padforge.sense.rig.devices import BoardSamples, RigFault, host_ports
 from padforge.sense.settings import RigSettings
 
 RESONATOR_SKEW = 5e-3
-"""Small boards have a ceramic resonator in place of a quartz."""
+"""Relative error of a ceramic resonator, which small boards have instead of a quartz."""
 
-_ANSWER_S = 3.0
-"""Opening their port resets many boards, and some wait for a new program before they start."""
-_ASK_AGAIN_S = 0.5
-_SAME_RATE = 1e-3
-_BAD_S, _BAD_LINES = 0.5, 5
-"""Half a second of nothing but damaged lines is no noise, and told before it counts as silence."""
-_MAX_GAP_US = 2_000_000
-"""A board that is silent for a second is stale, so no sound time jumps so far."""
-_FOLLOW = 0.1
-"""Share by which the times to come follow a line that is a little early or late."""
-_MISPLACED, _FORGIVEN = 8, 0.1
-"""So many lines whose time cannot be are a fault; one that can be makes up for a tenth of one."""
+_ANSWER_S = 3.0  # opening their port resets many boards, and some wait for a new program before they start
+_RESEND_S = 0.5
+_RATE_TOLERANCE = 1e-3
+_BAD_S, _MIN_BAD_LINES = 0.5, 5  # so much of nothing but damaged lines is no noise; reported before it is silence
+_MAX_GAP_US = 2_000_000  # a board that is silent for a second is stale, so no valid time jumps so far
+_SLOT_GAIN = 0.1  # share by which the slots to come follow a line that is a little early or late
+_MAX_MISPLACED, _FORGIVEN = 8, 0.1  # misplaced lines that are a fault; a line in its slot makes up for a tenth of one
+
+
+def find_line_port(rig: RigSettings) -> str:
+    """Return the board's port: that of `[rig]`, or the only one on USB; RigFault("refused") if that is not one."""
+    if rig.port != "auto":
+        return rig.port
+    ports = [port.device for port in host_ports() if port.vid is not None]
+    if len(ports) != 1:
+        message = f'[rig] port is "auto", and there are {len(ports)} serial ports on USB'
+        raise RigFault("refused", message, f"name one of {', '.join(sorted(ports))}" if ports else "plug the board in")
+    return ports[0]
 
 
 @dataclass(frozen=True)
-class LineReader:
-    """Samples that came together: their times by the board, and (n, C) counts."""
+class LineBlock:
+    """Samples that came together: n board times, and (n, C) counts."""
 
     times_us: list[int]
     counts: list[tuple[int, ...]]
@@ -40,41 +46,43 @@ class LineReader:
 class LineBoard:
     """A board at a serial port that sends samples as lines; implements `Board`.
 
-    The host time of a sample is when it was taken by the board's clock, apart from the least delay of the port.
+    The host time of a sample is when it was measured by the board's clock, but for the least delay of the port.
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
         """Take the settings; nothing is opened before `connect`.
 
         Args:
-            port, baud: of the board. rate_hz: samples a second, which the board must say it takes.
-            inputs: which to read, fibre by fibre, from 0; all in order where empty.
+            port: name of the serial port.
+            baud: of the board.
+            rate_hz: samples a second, which the board's header must state.
+            inputs: which to read, fibre by fibre, from 0; all in order if empty.
         """
         self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
         self._stream: ByteStream | None = None
         self._decoder = LineDecoder()
-        self._reader: BlockReader[LineReader] | None = None
+        self._reader: BlockReader[LineBlock] | None = None
         self._assembler: LineAssembler | None = None
 
     @classmethod
-    def of(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
-        """The board that `[rig]` names; where its port is "auto", at the only serial port there is."""
-        return cls(port_of(rig), rig.baud, rig.board_rate_hz, inputs)
+    def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
+        """Return the board that `[rig]` names; see `__init__` and `find_line_port`."""
+        return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
 
     def connect(self) -> dict[str, Any]:
-        """Open the port, ask the board what it is and begin to read; see `Board`."""
+        """Open the port, ask the board for its header and start to read; see `Board`."""
         self.close()
         self._stream, self._decoder = ByteStream(self._port, self._baud), LineDecoder()
         try:
             header = self._identify(self._stream)
-            inputs = chosen_inputs(self._inputs, header.channels, "the board")
+            inputs = select_inputs(self._inputs, header.channels, "the board")
             self._assembler = LineAssembler(header, inputs)
             self._start(self._stream, header)
         except BaseException:
             self.close()
             raise
         return {
-            **dict(header.said),
+            **dict(header.extra),
             "channels": len(inputs),
             "inputs": list(inputs),
             "bits": header.bits,
@@ -85,24 +93,24 @@ class LineBoard:
         }
 
     def read(self) -> BoardSamples:
-        """All samples since the last call, C columns of volts; see `Board`.
+        """Return all samples since the last call, C columns of volts; see `Board`.
 
         Raises:
-            RigFault: "stale" or "lost" once all samples that came before have been read, "data" where nobody has read
-                for 60 s, the board was reset or its lines are no samples, "refused" before `connect`.
+            RigFault: "stale" or "lost" once all samples that came before have been read, "data" if nobody has read for
+                60 s, the board was reset or its lines are no samples, "refused" before `connect`.
         """
         if self._reader is None or self._assembler is None:
             raise RigFault("refused", f"{self._port}: not connected")
-        return self._assembler.samples(self._reader.take())
+        return self._assembler.assemble(self._reader.drain())
 
     def statistics(self) -> dict[str, float]:
-        """Since `connect`: samples, damaged lines, samples that are missing, clock skew; what has been read counts."""
-        taken = self._assembler
+        """Return counts since `connect`, of what has been read: samples, damaged lines, missing samples, skew_ppm."""
+        assembler = self._assembler
         return {
-            "samples": taken.taken if taken else 0,
+            "samples": assembler.samples if assembler else 0,
             "damaged": self._decoder.damaged,
-            "missing": taken.missing if taken else 0,
-            "skew_ppm": taken.clock.skew_ppm if taken else 0.0,
+            "missing": assembler.missing if assembler else 0,
+            "skew_ppm": assembler.clock.skew_ppm if assembler else 0.0,
         }
 
     def close(self) -> None:
@@ -114,92 +122,90 @@ class LineBoard:
         self._reader = None
 
     def _identify(self, stream: ByteStream) -> LineHeader:
-        deadline, again = time.monotonic() + _ANSWER_S, 0.0
+        deadline, resend_s = time.monotonic() + _ANSWER_S, 0.0
         while self._decoder.header is None:
             if (now := time.monotonic()) > deadline:
-                found = self._decoder.complaint or "no board that speaks the line protocol answers"
-                raise RigFault("refused", f"{self._port}: {found}", "is [rig] baud that of the board?")
-            if now >= again:
-                stream.send(ASK)
-                again = now + _ASK_AGAIN_S
-            self._decoder.feed(stream.receive()[1])
+                reason = self._decoder.error or "no board that speaks the line protocol answers"
+                raise RigFault("refused", f"{self._port}: {reason}", "is [rig] baud that of the board?")
+            if now >= resend_s:
+                stream.send(HEADER_REQUEST)
+                resend_s = now + _RESEND_S
+            self._decoder.decode(stream.receive()[1])
         header = self._decoder.header
-        if abs(header.rate_hz / self._rate_hz - 1) > _SAME_RATE:
+        if abs(header.rate_hz / self._rate_hz - 1) > _RATE_TOLERANCE:
             message = f"{self._port}: the board takes {header.rate_hz:g} samples a second, [rig] says {self._rate_hz:g}"
             raise RigFault("refused", message, f"set board_rate_hz = {header.rate_hz:g}")
         return header
 
     def _start(self, stream: ByteStream, header: LineHeader) -> None:
-        settled, good_s = False, time.monotonic()
+        settled, last_sample_s = False, time.monotonic()
 
-        def receive() -> tuple[float, list[LineReader]]:
-            nonlocal good_s
+        def receive() -> tuple[float, list[LineBlock]]:
+            nonlocal last_sample_s
             now_s, data = stream.receive()
-            found = self._decoder.feed(data)
-            headers = [each for each in found if isinstance(each, LineHeader)]
-            if headers and (settled or headers[-1] != header):  # before, it answers a question that was asked again
+            items = self._decoder.decode(data)
+            headers = [item for item in items if isinstance(item, LineHeader)]
+            if headers and (settled or headers[-1] != header):  # before, it answers a request that was repeated
                 raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
-            if self._decoder.in_a_row >= _BAD_LINES and now_s - good_s > _BAD_S:
-                raise RigFault("data", f"{self._port}: {self._decoder.complaint}", "line after line; look at the board")
-            samples = [each for each in found if isinstance(each, Sample)]
+            if self._decoder.n_errors >= _MIN_BAD_LINES and now_s - last_sample_s > _BAD_S:
+                raise RigFault("data", f"{self._port}: {self._decoder.error}", "line after line; look at the board")
+            samples = [item for item in items if isinstance(item, LineSample)]
             if not samples:
                 return now_s, []
-            good_s = now_s
-            return now_s, [LineReader([each.time_us for each in samples], [each.counts for each in samples])]
+            last_sample_s = now_s
+            return now_s, [LineBlock([sample.time_us for sample in samples], [sample.counts for sample in samples])]
 
         self._reader = BlockReader(self._port, receive, header.rate_hz)
-        self._reader.begin()
+        self._reader.start_settled()
         settled = True
 
 
 class LineAssembler:
-    """Makes `BoardSamples` of lines: times by a `SampleClock`, volts fibre by fibre, what is missing by the times.
+    """Makes `BoardSamples` of lines: host times by a `SampleClock`, volts by fibre, missing samples by the times.
 
     Every sample has its slot, a period after the one before; the slots follow the board, whose rate need not be quite
-    what it says. A line that fits into no slot, by its time, is no sample.
+    that of its header. A line whose time fits into no slot is no sample.
 
     Attributes:
-        taken, missing: samples so far, and those that are missing.
+        samples: number of samples so far.
+        missing: number of samples that are missing.
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
         self.clock = SampleClock(1e-6, RESONATOR_SKEW)
-        self.taken = self.missing = 0
+        self.samples = self.missing = 0
         self._columns = list(inputs)
         self._volts = header.reference_v / header.full_scale
         self._period_us = 1e6 / header.rate_hz
         self._last_us: int | None = None
         self._slot_us = 0.0
-        self._misplaced = 0.0
+        self._n_misplaced = 0.0
 
-    def samples(self, arrivals: Iterable[tuple[float, LineReader]]) -> BoardSamples:
-        """The samples of the lines that have arrived since the last call.
+    def assemble(self, arrivals: Iterable[tuple[float, LineBlock]]) -> BoardSamples:
+        """Return the samples of lines, each block with the host time of its arrival.
 
         Raises:
-            RigFault: "data" where the times of the lines cannot be.
+            RigFault: "data" if the times of the lines are impossible.
         """
-        times_us, counts, missing = [], [], []
-        for arrival_s, lines in arrivals:
-            for time_us, row in zip(lines.times_us, lines.counts, strict=True):
-                if (lost := self._place(time_us)) is not None:
+        times_us, rows, gaps = [], [], []
+        for arrival_s, block in arrivals:
+            for time_us, counts in zip(block.times_us, block.counts, strict=True):
+                if (missing := self._place(time_us)) is not None:
                     times_us.append(self._last_us)
-                    counts.append(row)
-                    missing.append(lost)
+                    rows.append([counts[column] for column in self._columns])
+                    gaps.append(missing)
             if times_us:
                 self.clock.observe(times_us[-1], arrival_s)
-        self.taken += len(counts)
-        self.missing += sum(missing)
-        volts = (
-            np.array(counts, np.float64).reshape(len(counts), -1) if counts else np.empty((0, 1 + max(self._columns)))
-        )
+        self.samples += len(rows)
+        self.missing += sum(gaps)
         return BoardSamples(
             self.clock.times(np.array(times_us)) if times_us else np.empty(0),
-            volts[:, self._columns] * self._volts,
-            np.array(missing, np.int64),
+            np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._volts,
+            np.array(gaps, np.int64),
         )
 
     def _place(self, time_us: int) -> int | None:
-        """How many samples are lost before one of this time; None where it cannot be that time."""
+        """Return how many samples are missing before one of this time; None if the time is impossible."""
         if self._last_us is None:
             self._last_us, self._slot_us = time_us, float(time_us)
             return 0
@@ -207,24 +213,13 @@ class LineAssembler:
         now_us = self._last_us + elapsed_us
         steps = round((now_us - self._slot_us) / self._period_us)
         if not 0 < elapsed_us <= _MAX_GAP_US or steps < 1:
-            self._misplaced += 1
-            if self._misplaced >= _MISPLACED:
+            self._n_misplaced += 1
+            if self._n_misplaced >= _MAX_MISPLACED:
                 message = f"a line came {elapsed_us} us after another by the board's clock, not {self._period_us:g}"
                 raise RigFault("data", message, "it was reset, or its rate is not that of its header; connect again")
             return None
-        self._misplaced = max(self._misplaced - _FORGIVEN, 0.0)
+        self._n_misplaced = max(self._n_misplaced - _FORGIVEN, 0.0)
         self._slot_us += steps * self._period_us
-        self._slot_us += _FOLLOW * (now_us - self._slot_us)
+        self._slot_us += _SLOT_GAIN * (now_us - self._slot_us)
         self._last_us = now_us
         return steps - 1
-
-
-def port_of(rig: RigSettings) -> str:
-    """The board's port: that of `[rig]`, or the only one on USB; raises RigFault("refused") where that is not one."""
-    if rig.port != "auto":
-        return rig.port
-    ports = [port.device for port in host_ports() if port.vid is not None]
-    if len(ports) != 1:
-        message = f'[rig] port is "auto", and there are {len(ports)} serial ports on USB'
-        raise RigFault("refused", message, f"name one of {', '.join(sorted(ports))}" if ports else "plug the board in")
-    return ports[0]

@@ -273,7 +273,7 @@ def accepted_mm(recording: Recording) -> np.ndarray:
 def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
     """Distances of accepted presses from their targets."""
     made = zip(strokes[recording.known], accepted_mm(recording), strict=True)
-    return [float(np.linalg.norm(stroke.place_mm - place)) for stroke, place in made]
+    return [float(np.linalg.norm(stroke.position_mm - place)) for stroke, place in made]
 
 
 @pytest.fixture(scope="module")

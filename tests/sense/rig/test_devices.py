@@ -13,7 +13,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense.rig import devices
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards import due, line_board
-from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.devices import RigFault, device_names, load_device, port_fault, start
 from padforge.sense.settings import RigSettings
 
@@ -79,21 +79,21 @@ def test_ports_of_boards_are_found(
 
     connect(PROGRAMMING, NATIVE, UNO)
     native = due.BoardPort("/dev/ttyACM3", "native", "")
-    assert due.find_ports() == [native, due.BoardPort("/dev/ttyACM1", "programming", "7")]
-    assert due.port_of(RigSettings()) == "/dev/ttyACM3"
+    assert due.list_due_ports() == [native, due.BoardPort("/dev/ttyACM1", "programming", "7")]
+    assert due.find_due_port(RigSettings()) == "/dev/ttyACM3"
     with pytest.raises(RigFault, match="3 serial ports on USB; name one of /dev/ttyACM1, /dev/ttyACM2, /dev/ttyACM3"):
-        line_board.port_of(RigSettings())
+        line_board.find_line_port(RigSettings())
     connect(UNO)
-    assert line_board.port_of(RigSettings()) == "/dev/ttyACM2"
+    assert line_board.find_line_port(RigSettings()) == "/dev/ttyACM2"
     with pytest.raises(RigFault, match="no board is found; plug it in"):
-        due.port_of(RigSettings())
+        due.find_due_port(RigSettings())
     connect()
     with pytest.raises(RigFault, match="0 serial ports on USB; plug the board in"):
-        line_board.port_of(RigSettings())
-    for port_of in (due.port_of, line_board.port_of):
-        assert port_of(RigSettings(port="COM3")) == "COM3"
+        line_board.find_line_port(RigSettings())
+    for find_port in (due.find_due_port, line_board.find_line_port):
+        assert find_port(RigSettings(port="COM3")) == "COM3"
     monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (Arduino("/dev/ttyACM0", 1000).connect, due.find_ports):
+    for action in (DueBoard("/dev/ttyACM0", 1000).connect, due.list_due_ports):
         with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
             action()
         assert caught.value.cause == "refused"

@@ -461,7 +461,7 @@ def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
                     PressPlan(np.zeros((1, 2)), np.array([5.0]))
                 )
             monkeypatch.setattr(os, "fsync", fsync)
-    rows = robot.truth.rows()
+    rows = robot.pose_log.rows()
     over = rows[rows[:, 7] > 20]
     assert over[:, 7].max() < 60
     assert over[-1, 0] - over[0, 0] < 2

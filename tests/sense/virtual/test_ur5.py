@@ -11,47 +11,46 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.arms import rtde as ur_frames
+from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.virtual import ur5_controller as ur_controller
-from padforge.sense.virtual import ur5_controller as ur_truth
-from padforge.sense.virtual.ur5 import UrEmulator
+from padforge.sense.virtual import ur5_controller
+from padforge.sense.virtual.ur5 import EmulatedUR5
 from padforge.sense.virtual.ur5_controller import Controller
 
 
-def test_the_truth_keeps_the_newest_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ur_truth, "ROWS", 64)
-    ur_truth.create(tmp_path / "truth")
-    writer, truth = ur_truth.TruthWriter(tmp_path / "truth"), ur_truth.Truth(tmp_path / "truth")
+def test_pose_log_keeps_newest_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ur5_controller, "ROWS", 64)
+    ur5_controller.create_pose_log(tmp_path / "truth")
+    writer, log = ur5_controller.PoseLogWriter(tmp_path / "truth"), ur5_controller.PoseLog(tmp_path / "truth")
     with pytest.raises(ValueError, match="before the oldest"):
-        truth.pose_at(0.0)
+        log.poses(0.0)
     for i in range(100):
         writer.append(i, np.full(6, 10.0 * i), 0.0)
-    np.testing.assert_allclose(truth.pose_at([70.5, 99, 200])[:, 0], [705, 990, 990])
+    np.testing.assert_allclose(log.poses([70.5, 99, 200])[:, 0], [705, 990, 990])
     with pytest.raises(ValueError, match="before the oldest"):
-        truth.pose_at(36.0)
+        log.poses(36.0)
 
 
-def test_one_at_a_time_and_the_ports_are_free_again(address: str) -> None:
-    taken = re.escape(f"{address}: Address already in use")
-    with UrEmulator(host=address), pytest.raises(RigFault, match=taken) as caught:
-        UrEmulator(host=address).__enter__()
+def test_emulator_has_its_ports_alone_and_frees_them(address: str) -> None:
+    in_use = re.escape(f"{address}: Address already in use")
+    with EmulatedUR5(host=address), pytest.raises(RigFault, match=in_use) as caught:
+        EmulatedUR5(host=address).__enter__()
     assert "\n" not in str(caught.value)
-    with UrEmulator("e", host=address) as robot:
+    with EmulatedUR5("e", host=address) as robot:
         robot.remote_control(False)
         asked = ["PolyscopeVersion", "is in remote control", "get serial number", "running", "nonsense"]
-        answers = ur_frames.ask_dashboard(address, asked, 1.0)
+        answers = rtde.ask_dashboard(address, asked, 1.0)
         assert answers[0].startswith("URSoftware 5.12.2.")
         assert answers[1:4] == ["false", "20185500000", "Program running: false"]
         assert answers[4].startswith("could not understand")
-        assert robot.asked() == asked
+        assert robot.dashboard_log() == asked
 
 
 START, CYCLE_S = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0]), 0.008
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["paused", "stopped"])
-def test_a_program_that_a_protective_stop_has_paused_goes_on_when_a_person_plays_and_a_stopped_one_does_not(
+def test_play_resumes_paused_program_but_not_stopped_one(
     stopped: bool,
 ) -> None:
     """Without sockets, and ur-rtde's orders written as it writes them."""
@@ -64,7 +63,7 @@ def test_a_program_that_a_protective_stop_has_paused_goes_on_when_a_person_plays
     controller.upload()
     cycle(1.0)
     pose = (*START[:2], 0.0, *START[3:], 0.1, 1.0)
-    orders = {"input_int_register_1": 1, "input_int_register_0": ur_controller.MOVE}
+    orders = {"input_int_register_1": 1, "input_int_register_0": ur5_controller.MOVE_L}
     controller.write({f"input_double_register_{i}": float(value) for i, value in enumerate(pose)} | orders, 1.0)
     cycle(0.5)
     assert controller.motion.pose[2] < START[2]
@@ -73,25 +72,25 @@ def test_a_program_that_a_protective_stop_has_paused_goes_on_when_a_person_plays
     cycle(0.5)
     assert controller.motion.pose[2] > 0.14
     if stopped:
-        assert controller.dashboard("stop") == "Stopped"
+        assert controller.answer_dashboard("stop") == "Stopped"
     controller.clear()
     controller.play()
     cycle(3.0)
     height = controller.motion.pose[2]
     assert height > 0.14 if stopped else height == pytest.approx(0.0)
-    assert (controller.state()["runtime_state"] == ur_frames.PLAYING) is not stopped
+    assert (controller.state()["runtime_state"] == rtde.PLAYING) is not stopped
 
 
 LEFT = """
 import os, sys
-from padforge.sense.virtual.ur5 import UrEmulator
-with UrEmulator(host=sys.argv[1]):
+from padforge.sense.virtual.ur5 import EmulatedUR5
+with EmulatedUR5(host=sys.argv[1]):
     os._exit(9)
 """
 
 
 @pytest.mark.slow
-def test_what_a_killed_program_has_left_among_temporary_files_goes_with_the_next(
+def test_emulator_removes_temporary_files_of_killed_one(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And nothing else goes, nor the file of one that is at work."""
@@ -104,10 +103,10 @@ def test_what_a_killed_program_has_left_among_temporary_files_goes_with_the_next
     assert subprocess.run([sys.executable, "-c", LEFT, address], check=False).returncode == 9
     assert len(list(tmp_path.iterdir())) == len(near) + 1
     time.sleep(0.5)  # its arm finds that its program has ended
-    with UrEmulator(host=address):
+    with EmulatedUR5(host=address):
         at_work = {path.name for path in tmp_path.iterdir()} - near
         assert len(at_work) == 1
-        with pytest.raises(RigFault, match="is there another one"), UrEmulator(host=address):
+        with pytest.raises(RigFault, match="is there another one"), EmulatedUR5(host=address):
             pass
         assert {path.name for path in tmp_path.iterdir()} == near | at_work
     assert {path.name for path in tmp_path.iterdir()} == near

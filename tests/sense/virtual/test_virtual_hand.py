@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design import Contact, Morphology
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual.virtual_hand import LATE_S, LIGHT, MISHAPS, SHORT_S, Finger, FingerStroke
+from padforge.sense.virtual.virtual_hand import LIGHT, MISHAPS, REACTION_S, SHORT_S, Finger, FingerStroke
 
 RATE_HZ = 50.0
 
@@ -24,15 +24,15 @@ def pressed(mishaps: float, presses: int) -> Finger:
     return finger
 
 
-def test_it_presses_where_it_is_asked_to_lifts_when_it_is_told_and_makes_every_mistake() -> None:
+def test_finger_presses_where_asked_lifts_and_errs() -> None:
     finger = pressed(0.0, 30)
     assert [stroke.kind for stroke in finger.strokes] == ["press"] * 30
-    places = np.array([stroke.place_mm for stroke in finger.strokes])
+    places = np.array([stroke.position_mm for stroke in finger.strokes])
     assert places.mean(axis=0) == pytest.approx([5, -5], abs=1.0)
     assert places.std(axis=0) == pytest.approx([1.5, 1.5], rel=0.4)
     late = np.array([(stroke.down_s % 5, stroke.up_s % 5 - 2) for stroke in finger.strokes])
-    assert (late > [LATE_S[0], 0]).all()
-    assert (late < np.array([LATE_S[1], LATE_S[1] / 2]) + 0.04).all()
+    assert (late > [REACTION_S[0], 0]).all()
+    assert (late < np.array([REACTION_S[1], REACTION_S[1] / 2]) + 0.04).all()
     assert min(stroke.depth_mm for stroke in finger.strokes) >= 3.5
     assert finger.said() == []
     finger.look({"phase": "lift", "target": (5.0, -5.0)})  # it touches nothing where it is told to lift
@@ -45,9 +45,9 @@ def test_it_presses_where_it_is_asked_to_lifts_when_it_is_told_and_makes_every_m
     of_kind = {stroke.kind: stroke for stroke in strokes}
     assert of_kind["short"].up_s - of_kind["short"].down_s == pytest.approx(SHORT_S)
     assert of_kind["light"].depth_mm < 1.2 * LIGHT * RigSettings().depth_mm
-    slid, still = (of_kind[kind].at(of_kind[kind].down_s + 1)[0] for kind in ("slide", "double"))
-    assert np.linalg.norm(slid - of_kind["slide"].place_mm) > 10
-    np.testing.assert_array_equal(still, of_kind["double"].place_mm)
+    slid, still = (of_kind[kind].contact(of_kind[kind].down_s + 1)[0] for kind in ("slide", "double"))
+    assert np.linalg.norm(slid - of_kind["slide"].position_mm) > 10
+    np.testing.assert_array_equal(still, of_kind["double"].position_mm)
     stroke = FingerStroke("press", np.zeros(2), 4.0, down_s=1.0, up_s=2.0)  # it sinks in and leaves
-    assert [stroke.at(at_s)[1] for at_s in (0.5, 1.0, 1.5, 1.9, 2.2)] == [0, 0, 4, 4, 0]
-    assert 0 < stroke.at(1.05)[1] < 4
+    assert [stroke.contact(at_s)[1] for at_s in (0.5, 1.0, 1.5, 1.9, 2.2)] == [0, 0, 4, 4, 0]
+    assert 0 < stroke.contact(1.05)[1] < 4

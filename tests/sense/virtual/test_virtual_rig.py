@@ -22,7 +22,7 @@ from padforge.sense.recording.press_plan import PressPlan, planned
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig.arms.rtde import RTDE_PORT
-from padforge.sense.rig.boards import board_reader as block_reader
+from padforge.sense.rig.boards import board_reader
 from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.operation import diagnose
@@ -30,7 +30,7 @@ from padforge.sense.rig.press_loop import OnProgress, PressLoop
 from padforge.sense.rig.safety import RETREAT_MM
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import LivePad
-from padforge.sense.virtual import virtual_rig as whole_rig
+from padforge.sense.virtual import virtual_rig
 from padforge.sense.virtual.printer import EmulatedPrinter
 
 pytest.importorskip("rtde_control")
@@ -47,8 +47,8 @@ NIMBLE = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.
 QUICK = {"rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5}
 QUICK |= {"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000}
 SLOWER = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 2.0, "depth_mm": 3.0, "press_mm_s": 100}
-ARM = whole_rig.emulated_rig(RigSettings.model_validate(QUICK | QUIET), PAD)
-PRINTER = whole_rig.emulated_printer_rig(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
+ARM = virtual_rig.ur5_settings(RigSettings.model_validate(QUICK | QUIET), PAD)
+PRINTER = virtual_rig.printer_settings(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
 
 
 class Rig:
@@ -62,7 +62,7 @@ class Rig:
         """Another rig in the place of this one."""
         self.kept.close()
         devices = self.kept.enter_context(self.emulated(PAD, PUBLISHED_CONTACT, self.settings))
-        self.arm, self.converter, self.robot, self.board = devices
+        self.arm, self.board_driver, self.robot, self.board = devices
 
     def plan(self, presses: int) -> PressPlan:
         return planned(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
@@ -70,11 +70,11 @@ class Rig:
     def record(self, run: Path, plan: PressPlan, report: OnProgress = lambda done, of: None) -> float:
         """Record into `run` or go on with it; when that began."""
         with Recorder.resume(run) if run.exists() else Recorder(run, len(PAD.knots), {}, {}) as recorder:
-            self.converter.connect()
+            self.board_driver.connect()
             self.arm.connect()
             began = time.monotonic()
             report(0, len(plan))
-            PressLoop(self.arm, self.converter, recorder, self.settings).run(plan, report)
+            PressLoop(self.arm, self.board_driver, recorder, self.settings).run(plan, report)
         return began
 
     def disturbed(self, run: Path, plan: PressPlan, disturb: Callable[["Rig"], object]) -> tuple[RigFault, float]:
@@ -95,10 +95,10 @@ class Rig:
         """Whether the arm is at rest, in truth, half a second from now, and the printer for as long as it may be."""
         if isinstance(self.robot, EmulatedPrinter):
             now = time.monotonic()
-            return bool(np.ptp(self.robot.nozzle_at([now, now + 9]), axis=0).max() == 0)
+            return bool(np.ptp(self.robot.true_positions([now, now + 9]), axis=0).max() == 0)
         time.sleep(0.5)
         now = time.monotonic()
-        a, b = self.robot.pose_at([now - 0.05, now - 0.01])[:, :3]
+        a, b = self.robot.true_poses([now - 0.05, now - 0.01])[:, :3]
         return bool(np.linalg.norm(b - a) / 0.04 < 1)
 
     def home(self) -> None:
@@ -111,15 +111,15 @@ class Rig:
 def quick() -> Iterator[None]:
     """Printers are nimble, and boards need not settle: their times need not be exact but in one test."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(whole_rig, "EmulatedPrinter", partial(EmulatedPrinter, **NIMBLE))
-        patch.setattr(block_reader, "SETTLE_S", 0.15)
+        patch.setattr(virtual_rig, "EmulatedPrinter", partial(EmulatedPrinter, **NIMBLE))
+        patch.setattr(board_reader, "SETTLE_S", 0.15)
         yield
 
 
 RIGS = {
-    "arm": (ARM, whole_rig.emulated),
-    "line": (ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), whole_rig.emulated),
-    "printer": (PRINTER, whole_rig.emulated_printer),
+    "arm": (ARM, virtual_rig.emulate_ur5),
+    "line": (ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), virtual_rig.emulate_ur5),
+    "printer": (PRINTER, virtual_rig.emulate_printer),
 }
 
 
@@ -149,11 +149,11 @@ def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One clock: where the tip is, by the controller's states, and what the fibres give, by the board's samples."""
-    monkeypatch.setattr(block_reader, "SETTLE_S", 0.5)
+    monkeypatch.setattr(board_reader, "SETTLE_S", 0.5)
     plan = rig.plan(4)
     began = rig.record(tmp_path / "run", plan)
     assert_whole(tmp_path / "run", plan)
-    recording, truth = Recording.open(tmp_path / "run"), rig.robot.truth.rows()
+    recording, truth = Recording.open(tmp_path / "run"), rig.robot.pose_log.rows()
     assert np.diff(recording.times_s).max() < 1.5 / recording.rate_hz
     truth = truth[truth[:, 0] > began]
     _, depths = RobotFrame.from_settings(ARM).tip(truth[:, 1:4])
@@ -172,8 +172,8 @@ def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(rig: Rig,
     rig.record(tmp_path / "run", plan, lambda done, of: rig.robot.garble(1e-3))
     rig.robot.garble(0)
     assert_whole(tmp_path / "run", plan, 0.06)
-    made = rig.robot.firmware.made
-    turned = np.array([move.move.at(move.lasted_s) for move in made]) + PRINTER.tcp_mm
+    moves = rig.robot.firmware.moves
+    turned = np.array([move.move.position(move.duration_s) for move in moves]) + PRINTER.tcp_mm
     places, depths = RobotFrame.from_settings(PRINTER).tip(turned)
     presses = np.column_stack([plan.positions_mm, plan.depths_mm])
     assert np.column_stack([places, depths])[depths > 0] == pytest.approx(presses, abs=0.06)
@@ -219,7 +219,7 @@ def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(rig: Rig, presses: int,
         assert told_s < (2 if rig.settings is PRINTER else 5), name
         assert rig.rests(), name
         if name == "board_of_printer":  # the probe is lifted
-            tip = rig.robot.nozzle_at(time.monotonic())[0] + PRINTER.tcp_mm
+            tip = rig.robot.true_positions(time.monotonic())[0] + PRINTER.tcp_mm
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
@@ -234,11 +234,11 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
     """As many as the board has inputs, and not in its order."""
     pad = Morphology.straight(grid)
     channels = np.random.default_rng(1).permutation(2 * grid).tolist()
-    rig = whole_rig.emulated_rig(RigSettings.model_validate({"board": board, "channels": channels, **QUIET}), pad)
-    with whole_rig.emulated(pad, PUBLISHED_CONTACT, rig) as (_, converter, _, _):
-        said = converter.connect()
+    rig = virtual_rig.ur5_settings(RigSettings.model_validate({"board": board, "channels": channels, **QUIET}), pad)
+    with virtual_rig.emulate_ur5(pad, PUBLISHED_CONTACT, rig) as (_, board_driver, _, _):
+        said = board_driver.connect()
         assert said["inputs"] == list(rig.channels)
-        volts = np.median(converter.read().volts, axis=0)
+        volts = np.median(board_driver.read().volts, axis=0)
     still = LivePad(pad, PUBLISHED_CONTACT, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
     rests_v = still.volts(np.zeros((1, 2)), np.full(1, -10.0))[0]
     assert volts == pytest.approx(rests_v, abs=3.3 / 4095)
@@ -248,7 +248,7 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
 def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("padforge.sense.rig.doctor.OBSERVE_S", 0.3)
     config = RigConfig(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
-    with whole_rig.opened_virtual_rig("simulated", config, (14, 3)) as (arm, board, settings):
+    with virtual_rig.opened_virtual_rig("simulated", config, (14, 3)) as (arm, board, settings):
         rows = {row.name: row.message for row in diagnose(lambda: board, lambda: (arm, settings))}
     assert rows["channel 1"].startswith("input 14 rests at")
     assert rows["channel 2"].startswith("input 3 rests at")
@@ -259,8 +259,8 @@ def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkey
 
 PROGRAM = """
 import sys
-from padforge.sense.virtual import whole_rig
-whole_rig.HOST = sys.argv.pop(1)
+from padforge.sense.virtual import virtual_rig
+virtual_rig.HOST = sys.argv.pop(1)
 from padforge.cli import main
 main()
 """

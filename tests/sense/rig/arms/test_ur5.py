@@ -17,13 +17,12 @@ import pytest
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig.arms import ur5
-from padforge.sense.rig.arms import ur5 as ur5_link
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual.ur5 import HOME, UrEmulator
+from padforge.sense.virtual.ur5 import HOME, EmulatedUR5
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
@@ -39,7 +38,7 @@ def go(arm: UR5, pose: Pose, speed_mm_s: float = 1000) -> ArmState:
     return wait_until_still(arm, LIMITS)
 
 
-def begin(arm: UR5) -> None:
+def start_slow_move(arm: UR5) -> None:
     """Be a little into a slow way down."""
     if arm.state().pose[2] < 120:
         go(arm, HOME)
@@ -50,19 +49,19 @@ def begin(arm: UR5) -> None:
         time.sleep(0.005)
 
 
-def rested_s(robot: UrEmulator) -> float:
+def last_motion_s(robot: EmulatedUR5) -> float:
     """When the arm last moved, in truth."""
-    rows = robot.truth.rows()
+    rows = robot.pose_log.rows()
     return float(rows[1 + np.flatnonzero(np.diff(rows[:, 1:7], axis=0).any(axis=1))[-1], 0])
 
 
 def within(seconds: float, call: Callable[..., T], *arguments: object) -> T:
     """The result of a call that may not take longer."""
-    down_command = time.monotonic()
+    start_s = time.monotonic()
     try:
         return call(*arguments)
     finally:
-        assert time.monotonic() - down_command < seconds
+        assert time.monotonic() - start_s < seconds
 
 
 def fault_of(call: Callable[..., object], *arguments: object, seconds: float = LONGEST_CALL_S) -> str:
@@ -75,7 +74,7 @@ def fault_of(call: Callable[..., object], *arguments: object, seconds: float = L
 
 
 @BOTH
-def test_moves_arrive_and_no_state_is_missed(robot: UrEmulator, arm: UR5) -> None:
+def test_move_arrives_without_skipped_states(robot: EmulatedUR5, arm: UR5) -> None:
     go(arm, HOME)
     arm.drain()
     places = np.random.default_rng(3).uniform((-150, -460, 150), (-90, -400, 210), (4, 3))
@@ -84,19 +83,19 @@ def test_moves_arrive_and_no_state_is_missed(robot: UrEmulator, arm: UR5) -> Non
         state = go(arm, (x, y, z, *HOME[3:]), 400)
         pieces.append(arm.drain())
         np.testing.assert_allclose(state.pose[:3], (x, y, z), atol=0.1)
-        np.testing.assert_allclose(robot.pose_at(time.monotonic())[0, :3], (x, y, z), atol=0.1)
+        np.testing.assert_allclose(robot.true_poses(time.monotonic())[0, :3], (x, y, z), atol=0.1)
     rows = np.vstack(pieces)
     assert rows.shape[1] == len(STATE_COLUMNS)
     assert arm.skipped == 0
     period = float(np.median(np.diff(rows[:, 0])))
     np.testing.assert_allclose(np.diff(rows[:, 0]), period, rtol=0.5)
-    assert np.abs(robot.pose_at(rows[:, 0])[:, :3] - rows[:, 1:4]).max() < 400 * 0.003
+    assert np.abs(robot.true_poses(rows[:, 0])[:, :3] - rows[:, 1:4]).max() < 400 * 0.003
     assert rows[:, 7].max() == pytest.approx(400, rel=0.5)
     assert (rows[:, 9] == 1).all()
 
 
 @BOTH
-def test_what_the_arm_says_of_itself(robot: UrEmulator, arm: UR5) -> None:
+def test_connect_reports_identity(robot: EmulatedUR5, arm: UR5) -> None:
     about = within(LONGEST_CALL_S, arm.connect)
     assert about["rate_hz"] in (125, 500)
     assert about["model"] == "UR5"
@@ -110,19 +109,19 @@ def test_what_the_arm_says_of_itself(robot: UrEmulator, arm: UR5) -> None:
 
 
 @BOTH
-def test_stop(robot: UrEmulator, arm: UR5) -> None:
-    begin(arm)
+def test_stop_ends_move_within_half_a_second(robot: EmulatedUR5, arm: UR5) -> None:
+    start_slow_move(arm)
     assert fault_of(arm.move, HOME, 10, 10) == "refused"  # one move at a time
     assert arm.state().moving
-    down_command = time.monotonic()
+    start_s = time.monotonic()
     within(REST_S, arm.stop)
     within(REST_S, arm.stop)
-    assert rested_s(robot) < down_command + REST_S
+    assert last_motion_s(robot) < start_s + REST_S
     assert not arm.state().moving
     assert arm.state().speed_mm_s == 0
 
 
-def test_poses_that_are_none_never_reach_the_arm(robot: UrEmulator, arm: UR5) -> None:
+def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5) -> None:
     before = arm.state().pose
     for pose in (HOME[:5], (*HOME, 0.0), (float("nan"), *HOME[1:]), (*HOME[:5], float("inf"))):
         assert fault_of(arm.move, pose, 10, 10) == "refused"
@@ -137,7 +136,7 @@ def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure:
     cure()
 
 
-def test_arms_that_cannot_be_had(robots: Any, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connect_refuses_unavailable_arm(robots: Any, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     robots.free()
     with closing(UR5(host)) as arm:
         assert fault_of(arm.connect) == "refused"
@@ -154,7 +153,7 @@ def test_arms_that_cannot_be_had(robots: Any, host: str, monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_arms_that_do_not_answer_are_not_waited_for(robot: UrEmulator, host: str, monkeypatch) -> None:
+def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, monkeypatch) -> None:
     with closing(UR5(host)) as arm:
         refused_until_cured(arm, lambda: robot.refuse(True), "refused", lambda: robot.refuse(False))
         refused_until_cured(arm, lambda: robot.unplug(True), "refused", lambda: robot.unplug(False))
@@ -163,22 +162,20 @@ def test_arms_that_do_not_answer_are_not_waited_for(robot: UrEmulator, host: str
         arm.connect()
 
 
-def test_an_arm_at_work_is_not_taken_over_by_a_program_on_this_computer(
-    robot: UrEmulator, arm: UR5, address: str
-) -> None:
+def test_connect_refuses_arm_in_use_on_this_computer(robot: EmulatedUR5, arm: UR5, address: str) -> None:
     """Nor looked over by `doctor`; the move that is under way goes on."""
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    (found,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
-    assert found.status == "fail"
-    assert "another program on this computer uses the arm" in found.found
+    (diagnosis,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
+    assert diagnosis.status == "fail"
+    assert "another program on this computer uses the arm" in diagnosis.found
     assert arm.state().moving
     arm.stop()
 
 
 @pytest.mark.slow
-def test_an_arm_at_work_is_not_taken_over_from_another_computer(
-    robot: UrEmulator, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_connect_refuses_arm_in_use_by_another_computer(
+    robot: EmulatedUR5, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go(arm, HOME)
     arm.move(LOW, 50, 500)
@@ -190,7 +187,7 @@ def test_an_arm_at_work_is_not_taken_over_from_another_computer(
     go(arm, HOME)
 
 
-def test_force_from_below_and_from_the_side_is_felt_and_limited_and_the_tip_told(robots: Any, host: str) -> None:
+def test_force_is_limited_in_all_directions(robots: Any, host: str) -> None:
     robot = robots.get("e", surface_mm=100, stiffness_n_mm=2.0, tcp_mm=(0.0, 1.5, 150.0))
     with closing(UR5(host)) as arm:
         assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
@@ -211,26 +208,26 @@ def test_force_from_below_and_from_the_side_is_felt_and_limited_and_the_tip_told
     robots.free()
 
 
-def unlock_and_play(robot: UrEmulator) -> None:
+def unlock_and_play(robot: EmulatedUR5) -> None:
     """A person unlocks the arm, and presses play as well."""
     robot.clear()
     robot.play()
 
 
-def signal_child(name: str) -> Callable[[UrEmulator, UR5], None]:
-    def send(robot: UrEmulator, arm: UR5) -> None:
-        assert arm.child is not None
-        os.kill(arm.child, signal.Signals[name])
+def signal_worker(name: str) -> Callable[[EmulatedUR5, UR5], None]:
+    def send(robot: EmulatedUR5, arm: UR5) -> None:
+        assert arm.worker_pid is not None
+        os.kill(arm.worker_pid, signal.Signals[name])
 
     return send
 
 
-FAULTS: dict[str, tuple[Callable[[UrEmulator, UR5], object], str, float, Callable[[UrEmulator], object]]] = {
+FAULTS: dict[str, tuple[Callable[[EmulatedUR5, UR5], object], str, float, Callable[[EmulatedUR5], object]]] = {
     "protective stop": (lambda robot, arm: robot.protective_stop(), "protective_stop", 0.5, unlock_and_play),
     "stream frozen": (lambda robot, arm: robot.freeze(True), "stale", 1.0, lambda robot: robot.freeze(False)),
-    "program stopped": (lambda robot, arm: robot.halt(), "lost", 1.0, lambda robot: None),
-    "child killed": (signal_child("SIGKILL"), "lost stale", 1.5, lambda robot: None),
-    "child hangs": (signal_child("SIGSTOP"), "lost stale", 1.5, lambda robot: None),
+    "program stopped": (lambda robot, arm: robot.stop_program(), "lost", 1.0, lambda robot: None),
+    "worker killed": (signal_worker("SIGKILL"), "lost stale", 1.5, lambda robot: None),
+    "worker hangs": (signal_worker("SIGSTOP"), "lost stale", 1.5, lambda robot: None),
     "emergency stop": (lambda robot, arm: robot.emergency_stop(), "emergency_stop", 0.5, unlock_and_play),
     "links closed": (lambda robot, arm: robot.drop("rtde"), "lost", 3.0, lambda robot: None),
     "cable out": (lambda robot, arm: robot.unplug(True), "stale", 1.0, lambda robot: robot.unplug(False)),
@@ -238,7 +235,7 @@ FAULTS: dict[str, tuple[Callable[[UrEmulator, UR5], object], str, float, Callabl
     "slow": (lambda robot, arm: robot.slow(1.0), "lost", 3.0, lambda robot: robot.slow(0.0)),
 }
 """What goes wrong, its cause, how soon it is told, and what helps."""
-QUICK = ("protective stop", "stream frozen", "program stopped", "child killed")
+QUICK = ("protective stop", "stream frozen", "program stopped", "worker killed")
 
 
 @pytest.mark.parametrize(
@@ -249,46 +246,46 @@ QUICK = ("protective stop", "stream frozen", "program stopped", "child killed")
         *(pytest.param("e", name, marks=pytest.mark.slow) for name in (*QUICK[:2], "links closed")),
     ],
 )
-def test_faults_during_a_move(robot: UrEmulator, arm: UR5, name: str) -> None:
+def test_arm_rests_after_fault_during_move(robot: EmulatedUR5, arm: UR5, name: str) -> None:
     inject, causes, notice_s, cure = FAULTS[name]
-    begin(arm)
-    down_command = time.monotonic()
+    start_slow_move(arm)
+    start_s = time.monotonic()
     inject(robot, arm)
     assert fault_of(wait_until_still, arm, LIMITS, seconds=notice_s) in causes.split()
     with suppress(RigFault):  # there may be nobody to confirm it
         within(REST_S, arm.stop)
-    time.sleep(max(0.0, down_command + 0.55 - time.monotonic()))
-    assert rested_s(robot) < down_command + REST_S
+    time.sleep(max(0.0, start_s + 0.55 - time.monotonic()))
+    assert last_motion_s(robot) < start_s + REST_S
     cure(robot)
     time.sleep(0.1)
-    assert rested_s(robot) < down_command + REST_S
+    assert last_motion_s(robot) < start_s + REST_S
     within(LONGEST_CALL_S, arm.connect)
     x, y, z = arm.state().pose[:3]
     go(arm, (x, y, z + 1, *HOME[3:]))
 
 
-def test_a_protective_stop_ends_a_move_for_good_though_nobody_looks(robot: UrEmulator, arm: UR5) -> None:
-    begin(arm)
+def test_protective_stop_ends_move_for_good(robot: EmulatedUR5, arm: UR5) -> None:
+    start_slow_move(arm)
     robot.protective_stop()
     time.sleep(0.4)
-    down_command = time.monotonic()
+    start_s = time.monotonic()
     unlock_and_play(robot)
     time.sleep(0.2)
-    assert rested_s(robot) < down_command
+    assert last_motion_s(robot) < start_s
     arm.connect()
 
 
 @pytest.mark.slow
-def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> None:
-    begin(arm)
+def test_play_does_not_resume_old_move(robot: EmulatedUR5, arm: UR5) -> None:
+    start_slow_move(arm)
     robot.refuse(True)
     robot.protective_stop()
     assert fault_of(wait_until_still, arm, LIMITS, seconds=0.5) == "protective_stop"
     assert fault_of(arm.stop, seconds=REST_S) == "lost"
-    down_command = time.monotonic()
+    start_s = time.monotonic()
     unlock_and_play(robot)
     time.sleep(0.7)
-    assert rested_s(robot) < down_command + REST_S
+    assert last_motion_s(robot) < start_s + REST_S
     robot.refuse(False)
     arm.connect()
 
@@ -296,7 +293,6 @@ def test_play_does_not_bring_back_an_old_move(robot: UrEmulator, arm: UR5) -> No
 PARENT = f"""
 import sys, time
 from padforge.sense.rig.arms.ur5 import UR5
-from padforge.sense.virtual.ur5_controller import Series
 arm = UR5(sys.argv[1])
 arm.connect()
 arm.move({LOW}, 50, 500)
@@ -315,34 +311,34 @@ while True:
         pytest.param("e", "SIGKILL", marks=pytest.mark.slow),
     ],
 )
-def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str, name: str) -> None:
+def test_arm_rests_after_program_dies_or_is_suspended(robot: EmulatedUR5, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)
     arm.close()
     with subprocess.Popen([sys.executable, "-c", PARENT, host], stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         assert program.stdout.readline() == "moving\n"
         time.sleep(0.15)
-        down_command = time.monotonic()
+        start_s = time.monotonic()
         program.send_signal(signal.Signals[name])
         time.sleep(0.55)
         program.kill()
-    assert down_command < rested_s(robot) < down_command + REST_S
+    assert start_s < last_motion_s(robot) < start_s + REST_S
 
 
 @pytest.mark.slow
-def test_a_program_that_does_not_look(robot: UrEmulator, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ur5_link, "OBSERVE_S", 0.4)
+def test_arm_rests_when_program_stops_asking(robot: EmulatedUR5, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ur5, "SUPERVISION_S", 0.4)
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    down_command = time.monotonic()
+    start_s = time.monotonic()
     time.sleep(1.0)
-    assert down_command + 0.4 < rested_s(robot) < down_command + 1.0
+    assert start_s + 0.4 < last_motion_s(robot) < start_s + 1.0
     assert fault_of(arm.state) == "deadline"
 
 
 @pytest.mark.slow
-def test_the_script_link_is_not_missed(robot: UrEmulator, arm: UR5) -> None:
-    begin(arm)
+def test_stop_works_without_script_connection(robot: EmulatedUR5, arm: UR5) -> None:
+    start_slow_move(arm)
     robot.drop("script")
     arm.stop()
     assert go(arm, LOW).pose == pytest.approx(LOW)

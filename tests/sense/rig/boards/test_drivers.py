@@ -12,24 +12,22 @@ import numpy as np
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense.rig.boards import board_reader as block_reader
-from padforge.sense.rig.boards import due as due_driver
-from padforge.sense.rig.boards import line_board as line_driver
-from padforge.sense.rig.boards.due import Arduino
+from padforge.sense.rig.boards import board_reader, due, line_board
+from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.boards.line_framing import LineHeader
 from padforge.sense.rig.devices import BoardSamples, RigFault
-from padforge.sense.virtual.boards import EmulatedBoard, EmulatedLineBoard
+from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
 STEP_V = 3.3 / 4095
-HEADER = LineHeader(1000, 12, 3.3, 16, said=(("name", "emulated"), ("serial", "7")))
+HEADER = LineHeader(1000, 12, 3.3, 16, extra=(("name", "emulated"), ("serial", "7")))
 BAUD = 921_600
-Board = EmulatedBoard | EmulatedLineBoard
-Driver = Arduino | LineBoard
+Board = EmulatedDue | EmulatedLineBoard
+Driver = DueBoard | LineBoard
 
 
 def waves(times_s: np.ndarray) -> np.ndarray:
@@ -38,42 +36,42 @@ def waves(times_s: np.ndarray) -> np.ndarray:
 
 
 def emulated(kind: str, header: Any = HEADER, **options: Any) -> Board:
-    return EmulatedBoard(waves, **options) if kind == "due" else EmulatedLineBoard(waves, header, **options)
+    return EmulatedDue(waves, **options) if kind == "due" else EmulatedLineBoard(waves, header, **options)
 
 
-def driver(board: Board, rate_hz: float = 1000.0, **options: Any) -> Driver:
-    if isinstance(board, EmulatedBoard):
-        return Arduino(board.port, rate_hz, **options)
+def make_driver(board: Board, rate_hz: float = 1000.0, **options: Any) -> Driver:
+    if isinstance(board, EmulatedDue):
+        return DueBoard(board.port, rate_hz, **options)
     return LineBoard(board.port, BAUD, rate_hz, **options)
 
 
 @contextmanager
 def connected(board: Board, rate_hz: float = 1000.0, **options: Any) -> Iterator[Driver]:
-    with board, closing(driver(board, rate_hz, **options)) as converter:
-        converter.connect()
-        yield converter
+    with board, closing(make_driver(board, rate_hz, **options)) as driver:
+        driver.connect()
+        yield driver
 
 
 @pytest.fixture(autouse=True)
 def soon_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where times need not be exact, connecting need not take long."""
-    monkeypatch.setattr(block_reader, "SETTLE_S", 0.15)
+    monkeypatch.setattr(board_reader, "SETTLE_S", 0.15)
 
 
-def joined(*parts: BoardSamples) -> BoardSamples:
+def concatenate(*parts: BoardSamples) -> BoardSamples:
     return BoardSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
-def read_for(converter: Driver, seconds: float) -> BoardSamples:
-    parts, end = [converter.read()], time.monotonic() + seconds
+def read_for(driver: Driver, seconds: float) -> BoardSamples:
+    parts, end = [driver.read()], time.monotonic() + seconds
     while time.monotonic() < end:
         time.sleep(0.02)
-        parts.append(converter.read())
-    return joined(*parts)
+        parts.append(driver.read())
+    return concatenate(*parts)
 
 
 def check(
-    samples: BoardSamples, board: Board, within_s: float = 0.05, inputs: Sequence[int] = (), step_v: float = STEP_V
+    samples: BoardSamples, board: Board, atol_s: float = 0.05, inputs: Sequence[int] = (), step_v: float = STEP_V
 ) -> None:
     """Every reading is what the board read at that index, at the right time.
 
@@ -82,18 +80,18 @@ def check(
     columns = list(inputs or range(samples.volts.shape[1]))
 
     def worst_v(index: np.ndarray) -> float:
-        return np.abs(samples.volts[: len(index)] - waves(board.truth_s(index))[:, columns]).max()
+        return np.abs(samples.volts[: len(index)] - waves(board.true_times(index))[:, columns]).max()
 
     index = np.cumsum(1 + samples.missing) - 1
     if isinstance(board, EmulatedLineBoard):
         index -= index[0]
-        period_s = float(board.truth_s(1) - board.truth_s(0))
-        down_command = max(round((samples.times_s[0] - float(board.truth_s(0))) / period_s), 60)
-        near = range(down_command - 60, down_command + 60)
+        period_s = float(board.true_times(1) - board.true_times(0))
+        guess = max(round((samples.times_s[0] - float(board.true_times(0))) / period_s), 60)
+        near = range(guess - 60, guess + 60)
         index += next(first for first in near if worst_v(first + index[:5]) < 0.502 * step_v)
     assert worst_v(index) < 0.502 * step_v
     assert (np.diff(samples.times_s) > 0).all()
-    assert np.abs(samples.times_s - board.truth_s(index)).max() < within_s
+    assert np.abs(samples.times_s - board.true_times(index)).max() < atol_s
 
 
 BOTH = pytest.mark.parametrize("kind", ["due", "line"])
@@ -106,24 +104,24 @@ SAYS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("kind", ["due", SLOW_LINE])
-def test_a_second_without_a_gap_right_to_a_step_and_on_time(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_returns_exact_samples_on_time(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     board = emulated(kind, **SKEWED[kind])
-    with board, closing(driver(board)) as converter:
-        said = converter.connect()
-        assert said.items() >= SAYS[kind].items()
-        assert said["rate_hz"] == pytest.approx(1000)
-        assert said["inputs"] == list(range(SAYS[kind]["channels"]))
-        assert "warning" not in said
-        down_command = time.process_time(), time.monotonic()
-        samples = read_for(converter, 0.6)
-        share = (time.process_time() - down_command[0]) / (time.monotonic() - down_command[1])
+    with board, closing(make_driver(board)) as driver:
+        identity = driver.connect()
+        assert identity.items() >= SAYS[kind].items()
+        assert identity["rate_hz"] == pytest.approx(1000)
+        assert identity["inputs"] == list(range(SAYS[kind]["channels"]))
+        assert "warning" not in identity
+        start = time.process_time(), time.monotonic()
+        samples = read_for(driver, 0.6)
+        share = (time.process_time() - start[0]) / (time.monotonic() - start[1])
         assert len(samples.times_s) > 900
         assert not samples.missing.any()
-        check(samples, board, within_s=5e-3)
+        check(samples, board, atol_s=5e-3)
         assert share < 0.5  # of a core, the emulated board included: nobody waits in a loop
         counted = {"due": ("blocks", 16), "line": ("samples", 1)}[kind]
-        assert converter.statistics()[counted[0]] == len(samples.times_s) / counted[1]
+        assert driver.statistics()[counted[0]] == len(samples.times_s) / counted[1]
 
 
 @pytest.mark.parametrize(
@@ -136,112 +134,112 @@ def test_a_second_without_a_gap_right_to_a_step_and_on_time(kind: str, monkeypat
         ("line", LineHeader(333.0, 16, 5.0, 16), {"inputs": (15, 0, 7)}),
     ],
 )
-def test_other_rates_inputs_and_averages(kind: str, header: LineHeader, options: dict[str, Any]) -> None:
+def test_read_at_other_rates_inputs_and_averages(kind: str, header: LineHeader, options: dict[str, Any]) -> None:
     board = emulated(kind, header)
-    with connected(board, header.rate_hz, **options) as converter:
-        samples = read_for(converter, 0.15)
+    with connected(board, header.rate_hz, **options) as driver:
+        samples = read_for(driver, 0.15)
         assert len(samples.times_s) > 0.15 * header.rate_hz
         step_v = header.reference_v / header.full_scale + 1e-9
         check(samples, board, inputs=options.get("inputs", ()), step_v=step_v)
 
 
-def test_a_line_board_is_asked_through_noise_and_looked_upon_with_doubt_where_its_lines_have_no_check() -> None:
+def test_line_board_connects_through_noise_and_warns_without_checks() -> None:
     board = emulated("line", seed=1)
     board.garble(5e-3)
-    with connected(board) as converter:
+    with connected(board) as driver:
         board.garble(0)
-        check(read_for(converter, 0.1), board)
+        check(read_for(driver, 0.1), board)
     board = emulated("line", replace(HEADER, checked=False))
-    with board, closing(driver(board)) as converter:
-        assert "a damaged one may pass" in converter.connect()["warning"]
-        check(read_for(converter, 0.1), board)
+    with board, closing(make_driver(board)) as driver:
+        assert "a damaged one may pass" in driver.connect()["warning"]
+        check(read_for(driver, 0.1), board)
 
 
 @BOTH
-def test_garbled_bytes_cost_samples_that_are_counted_and_never_give_a_wrong_one(kind: str) -> None:
+def test_read_counts_garbled_samples_and_returns_no_wrong_one(kind: str) -> None:
     board = emulated(kind, seed=3)
-    with connected(board) as converter:
+    with connected(board) as driver:
         board.garble(4e-3)
-        samples = read_for(converter, 0.4)
+        samples = read_for(driver, 0.4)
         board.garble(0)
-        samples = joined(samples, read_for(converter, 0.1))
+        samples = concatenate(samples, read_for(driver, 0.1))
         check(samples, board)
-        statistics = converter.statistics()
+        statistics = driver.statistics()
         assert statistics["damaged"] > 5
         assert statistics["missing"] == samples.missing.sum() > 50
         assert statistics.get("overruns", 0) == 0
 
 
-def test_samples_the_board_drops_are_missing_and_counted_and_lost_conversions_end_the_reading() -> None:
-    board = EmulatedBoard(waves)
-    with connected(board) as converter:
+def test_due_counts_overruns_and_raises_for_lost_conversions() -> None:
+    board = EmulatedDue(waves)
+    with connected(board) as driver:
         board.overrun(160)
-        samples = read_for(converter, 0.25)
+        samples = read_for(driver, 0.25)
         check(samples, board)
         assert samples.missing.max() == samples.missing.sum() == 160
-        assert converter.statistics()["overruns"] == 160
+        assert driver.statistics()["overruns"] == 160
         board.halt()
-        fault_of(converter.read, "data", "lost conversions")
+        fault_of(driver.read, "data", "lost conversions")
 
 
 @BOTH
-def test_unplugging_is_noticed_at_once_after_the_last_samples(kind: str) -> None:
+def test_read_raises_when_unplugged_after_last_samples(kind: str) -> None:
     board = emulated(kind)
-    with connected(board) as converter:
+    with connected(board) as driver:
         board.unplug()
-        assert len(converter.read().times_s) >= 96
-        assert fault_of(converter.read, "lost", "the board is gone") < 2
-        converter.close()
-        fault_of(converter.read, "refused", "not connected")
-        fault_of(converter.connect, "refused", "there is no such port")
+        assert len(driver.read().times_s) >= 96
+        assert fault_of(driver.read, "lost", "the board is gone") < 2
+        driver.close()
+        fault_of(driver.read, "refused", "not connected")
+        fault_of(driver.connect, "refused", "there is no such port")
     assert not any(thread.name == f"reader of {board.port}" for thread in threading.enumerate())
 
 
 @pytest.mark.parametrize("kind", ["due", SLOW_LINE])
-def test_a_board_that_falls_silent_is_stale_after_a_second_and_comes_back_after_connecting_anew(kind: str) -> None:
+def test_read_raises_when_board_stalls_and_connect_recovers(kind: str) -> None:
     board = emulated(kind)
-    with connected(board) as converter:
+    with connected(board) as driver:
         board.stall()
-        assert 0.5 < fault_of(converter.read, "stale") < 2.5
+        assert 0.5 < fault_of(driver.read, "stale") < 2.5
         board.stall(False)
-        converter.connect()
-        check(read_for(converter, 0.1), board)
+        driver.connect()
+        check(read_for(driver, 0.1), board)
 
 
 @pytest.mark.parametrize("kind", ["due", SLOW_LINE])
-def test_a_host_that_never_reads_is_told_so(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_reader, "UNREAD_S", 0.3)
+def test_read_raises_after_buffer_overflow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board_reader, "BUFFER_S", 0.3)
     board = emulated(kind)
-    with connected(board) as converter:
+    with connected(board) as driver:
         time.sleep(0.35)
-        check(converter.read(), board)
-        fault_of(converter.read, "data", "nobody has read")
+        check(driver.read(), board)
+        fault_of(driver.read, "data", "nobody has read")
 
 
 @pytest.mark.parametrize("garbled", [0.0, pytest.param(2e-2, marks=pytest.mark.slow)], ids=["its header", "its times"])
-def test_a_reset_is_told_and_its_samples_are_not_mixed_with_those_before(garbled: float) -> None:
+def test_read_raises_when_line_board_resets(garbled: float) -> None:
     """A header among so many damaged bytes is hardly ever read, nor is every other line: it is told by the times."""
     board = EmulatedLineBoard(waves, HEADER, seed=5)
-    with connected(board) as converter:
+    with connected(board) as driver:
         board.garble(garbled)
-        before = read_for(converter, 0.1)
+        before = read_for(driver, 0.1)
         board.reset()
-        assert fault_of(converter.read, "data", "reset") < 2
+        assert fault_of(driver.read, "data", "reset") < 2
         assert len(before.times_s) > 5
         board.garble(0)
-        converter.connect()
-        check(read_for(converter, 0.1), board)
+        driver.connect()
+        check(read_for(driver, 0.1), board)
 
 
-def test_lines_of_other_columns_are_never_taken_and_told() -> None:
+def test_read_raises_for_lines_of_other_columns() -> None:
     board = EmulatedLineBoard(waves, HEADER)
-    with connected(board) as converter:
+    with connected(board) as driver:
         board.send_columns(15)
-        assert fault_of(converter.read, "data", "a line has 16 numbers, expected 17: .* line after line") < 2
+        assert fault_of(driver.read, "data", "a line has 16 numbers, expected 17: .* line after line") < 2
 
 
 @pytest.mark.parametrize(
-    ("kind", "board_is", "rate_hz", "options", "match"),
+    ("kind", "board_options", "rate_hz", "options", "match"),
     [
         ("due", {"silent": True}, 1000, {}, "no padforge board answers.*native USB port"),
         ("due", {"firmware": (9, 1, 0)}, 1000, {}, r"firmware 9\.1\.0"),
@@ -251,13 +249,13 @@ def test_lines_of_other_columns_are_never_taken_and_told() -> None:
         ("line", {}, 1000, {"inputs": (3, 16)}, "channels: fibre 2 is on input 16, the board has 0 to 15"),
     ],
 )
-def test_a_board_that_is_not_ours_or_cannot_do_what_is_asked_is_refused(
-    kind: str, board_is: dict, rate_hz: float, options: dict, match: str, monkeypatch: pytest.MonkeyPatch
+def test_connect_refuses_unsuitable_board(
+    kind: str, board_options: dict, rate_hz: float, options: dict, match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (due_driver, line_driver):
+    for module in (due, line_board):
         monkeypatch.setattr(module, "_ANSWER_S", 0.3)
-    with emulated(kind, **board_is) as board:
-        assert fault_of(driver(board, rate_hz, **options).connect, "refused", match) < 5
+    with emulated(kind, **board_options) as board:
+        assert fault_of(make_driver(board, rate_hz, **options).connect, "refused", match) < 5
 
 
 @pytest.mark.parametrize(
@@ -270,15 +268,15 @@ def test_a_board_that_is_not_ours_or_cannot_do_what_is_asked_is_refused(
         ({"inputs": (3, 12)}, RigFault, "channels: fibre 2 is on input 12, an Arduino Due has 0 to 11"),
     ],
 )
-def test_settings_that_no_due_has_are_refused_before_it_is_opened(values: dict, error: type, match: str) -> None:
+def test_due_refuses_impossible_settings(values: dict, error: type, match: str) -> None:
     with pytest.raises(error, match=match):
-        Arduino("port", **{"rate_hz": 1000, **values})
+        DueBoard("port", **{"rate_hz": 1000, **values})
 
 
 @BOTH
-def test_a_port_in_use_is_refused_and_free_again_after_close(kind: str) -> None:
+def test_connect_refuses_port_in_use_until_closed(kind: str) -> None:
     with emulated(kind) as board:
-        first, second = driver(board), driver(board)
+        first, second = make_driver(board), make_driver(board)
         first.connect()
         fault_of(second.connect, "refused", "another program uses it")
         first.close()

@@ -1,4 +1,4 @@
-"""The sketch itself, compiled for this computer with a stand-in for the chip; the program's decoder reads it."""
+"""The sketch itself, compile_sketch for this computer with a stand-in for the chip; the program's decoder reads it."""
 
 from pathlib import Path
 
@@ -11,15 +11,15 @@ from padforge.sense.rig.boards.due_framing import (
     BoardSettings,
     DueBlock,
     DueDecoder,
-    Frame,
+    DueMessage,
     Identity,
     Kind,
     Request,
     Status,
     encode,
 )
-from padforge.sense.virtual.boards import judge_settings
-from tests.sense.rig.boards.compiling import compiled, sent
+from padforge.sense.virtual.boards import check_settings
+from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"
 ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]
@@ -28,17 +28,17 @@ ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled("due", FIRMWARE, tmp_path_factory.mktemp("firmware"))
+    return compile_sketch("due", FIRMWARE, tmp_path_factory.mktemp("firmware"))
 
 
-def run(program: Path, *steps: str | Request | BoardSettings) -> list[Frame]:
-    """What the board sends as the script is run with frames of the host in it: as the program would write it."""
+def run(program: Path, *steps: str | Request | BoardSettings) -> list[DueMessage]:
+    """What the board sends as the script is run with messages of the host in it: as the program would write it."""
     script = [step if isinstance(step, str) else f"host {encode(step).hex()}" for step in steps]
-    decoder, stream = DueDecoder(), sent(program, script)
-    frames = decoder.feed(stream)
+    decoder, stream = DueDecoder(), run_sketch(program, script)
+    messages = decoder.decode(stream)
     assert decoder.damaged == 0
-    assert stream == b"".join(map(encode, frames))
-    return frames
+    assert stream == b"".join(map(encode, messages))
+    return messages
 
 
 START, STOP, IDENTIFY = Request(Kind.START), Request(Kind.STOP), Request(Kind.IDENTIFY)
@@ -72,15 +72,15 @@ def check_blocks(blocks: list[DueBlock], wanted: BoardSettings) -> None:
         BoardSettings(100_000_000, 1, 1),
     ],
 )
-def test_blocks_hold_every_conversion_in_its_place(program: Path, wanted: BoardSettings) -> None:
+def test_firmware_sends_every_conversion_in_its_place(program: Path, wanted: BoardSettings) -> None:
     script = *[f"trigger {16 * wanted.averaging}", "loop 20"] * 8, "loop 200"
     ack, started, *blocks = run(program, wanted, START, *script)
     assert ack == Ack(Kind.SETTINGS, Status.OK, wanted)
     assert started == Ack(Kind.START, Status.OK, wanted)
-    found = [block for block in blocks if isinstance(block, DueBlock)]
-    assert len(found) == len(blocks) == 8 * 16 // len(found[0].counts)
-    check_blocks(found, wanted)
-    assert judge_settings(wanted) == Status.OK
+    due_blocks = [block for block in blocks if isinstance(block, DueBlock)]
+    assert len(due_blocks) == len(blocks) == 8 * 16 // len(due_blocks[0].counts)
+    check_blocks(due_blocks, wanted)
+    assert check_settings(wanted) == Status.OK
 
 
 @pytest.mark.parametrize(
@@ -96,55 +96,53 @@ def test_blocks_hold_every_conversion_in_its_place(program: Path, wanted: BoardS
         (BoardSettings(1_000_000, 0xFFF, 16), Status.TOO_FAST),
     ],
 )
-def test_settings_it_cannot_keep_are_refused_as_the_emulated_board_does(
-    program: Path, wanted: BoardSettings, status: Status
-) -> None:
+def test_firmware_refuses_settings_as_emulator_does(program: Path, wanted: BoardSettings, status: Status) -> None:
     (ack,) = run(program, wanted)
     assert ack == Ack(Kind.SETTINGS, status, BoardSettings(1_000_000, 0xFF, 1))
-    assert judge_settings(wanted) == status
+    assert check_settings(wanted) == status
 
 
-def test_start_twice_goes_on_and_settings_wait_for_stop(program: Path) -> None:
+def test_firmware_ignores_second_start_and_refuses_settings_while_running(program: Path) -> None:
     default, other = BoardSettings(1_000_000, 0xFF, 1), BoardSettings(2_000_000, 3, 1)
     script = START, "trigger 16", "loop 2", START, other, "trigger 16", "loop 2"
-    frames = run(program, *script, STOP, other, START, "trigger 10", "loop 2")
-    acks = [(ack.command, ack.status) for ack in frames if isinstance(ack, Ack)]
+    messages = run(program, *script, STOP, other, START, "trigger 10", "loop 2")
+    acks = [(ack.command, ack.status) for ack in messages if isinstance(ack, Ack)]
     assert acks[:3] == [(Kind.START, Status.OK), (Kind.START, Status.OK), (Kind.SETTINGS, Status.RUNNING)]
     assert acks[3:] == [(Kind.STOP, Status.OK), (Kind.SETTINGS, Status.OK), (Kind.START, Status.OK)]
-    blocks = [block for block in frames if isinstance(block, DueBlock)]
+    blocks = [block for block in messages if isinstance(block, DueBlock)]
     check_blocks(blocks[:2], default)
     assert [(block.first, block.mask) for block in blocks] == [(0, 0xFF), (16, 0xFF), (0, 3)]
 
 
-def test_a_host_too_slow_costs_whole_blocks_that_are_counted_and_one_that_closes_the_port_stops_it(
+def test_firmware_counts_dropped_blocks_and_stops_when_port_closes(
     program: Path,
 ) -> None:
-    frames = run(program, START, f"trigger {16 * 70}", "loop 100", "trigger 16", "loop 2")
-    blocks = [block for block in frames if isinstance(block, DueBlock)]
+    messages = run(program, START, f"trigger {16 * 70}", "loop 100", "trigger 16", "loop 2")
+    blocks = [block for block in messages if isinstance(block, DueBlock)]
     assert [block.first for block in blocks[:64]] == list(range(0, 1024, 16))
     assert [(block.first, block.overruns, block.sequence) for block in blocks[64:]] == [(1120, 96, 64)]
-    frames = run(program, START, "trigger 16", "loop 2", "close", "trigger 64", "loop 20")
-    assert sum(isinstance(frame, DueBlock) for frame in frames) == 1
+    messages = run(program, START, "trigger 16", "loop 2", "close", "trigger 64", "loop 20")
+    assert sum(isinstance(message, DueBlock) for message in messages) == 1
 
 
 @pytest.mark.parametrize("trouble", [["slip", "trigger 64"], ["masked 64"]])
-def test_lost_conversions_stop_the_board_rather_than_give_wrong_values(program: Path, trouble: list[str]) -> None:
-    frames = run(program, START, "trigger 16", "loop 2", *trouble, "loop 20", "trigger 64", "loop 20")
-    assert [block.first for block in frames if isinstance(block, DueBlock)] == [0]
-    assert isinstance(frames[-1], Ack)
-    assert (frames[-1].command, frames[-1].status) == (Kind.STOP, Status.HALTED)
+def test_firmware_halts_on_lost_conversions(program: Path, trouble: list[str]) -> None:
+    messages = run(program, START, "trigger 16", "loop 2", *trouble, "loop 20", "trigger 64", "loop 20")
+    assert [block.first for block in messages if isinstance(block, DueBlock)] == [0]
+    assert isinstance(messages[-1], Ack)
+    assert (messages[-1].command, messages[-1].status) == (Kind.STOP, Status.HALTED)
 
 
-def test_it_says_what_it_is_and_which_period_its_timer_keeps_and_passes_over_damaged_commands(program: Path) -> None:
+def test_firmware_identifies_itself_reports_period_and_skips_damaged_commands(program: Path) -> None:
     wanted = encode(BoardSettings(2_000_000, 3, 2))
     damaged: list[bytes] = []
     for i in range(len(wanted)):
         damaged += [wanted[:i] + bytes([wanted[i] ^ 0x10]) + wanted[i + 1 :], wanted[:i] + wanted[i + 1 :]]
-    frames = run(program, *(f"host {each.hex()}" for each in [*damaged, b"\x55" * 100]), IDENTIFY)
-    whole = Ack(Kind.SETTINGS, Status.OK, BoardSettings(2_000_000, 3, 2))
-    (identity,) = [frame for frame in frames if frame != whole]
+    messages = run(program, *(f"host {each.hex()}" for each in [*damaged, b"\x55" * 100]), IDENTIFY)
+    intact = Ack(Kind.SETTINGS, Status.OK, BoardSettings(2_000_000, 3, 2))
+    (identity,) = [message for message in messages if message != intact]
     assert identity == Identity((1, 0, 0), 12, 12, "padforge-due", b"serial-of-a-chip")
-    assert frames.count(whole) <= 2  # a zero too few between two frames harms neither
+    assert messages.count(intact) <= 2  # a zero too few between two messages harms neither
     (ack,) = run(program, BoardSettings(1_000_000_000 // 1300, 0xFF, 7))
     assert isinstance(ack, Ack)
     ticks = round(1e9 / 1300 * 0.042 / 7)

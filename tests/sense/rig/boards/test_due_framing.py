@@ -23,7 +23,7 @@ from padforge.sense.rig.boards.due_framing import (
     BoardSettings,
     DueBlock,
     DueDecoder,
-    Frame,
+    DueMessage,
     Identity,
     Kind,
     Request,
@@ -65,7 +65,7 @@ FRAMES = st.one_of(
 )
 
 
-def payloads(frames: list[Frame]) -> list[bytes]:
+def payloads(frames: list[DueMessage]) -> list[bytes]:
     return [frame.pack() for frame in frames]
 
 
@@ -99,7 +99,7 @@ LONG_RUNS = st.builds(
 
 
 @given(st.binary(max_size=800) | LONG_RUNS)
-def test_cobs_takes_out_the_zeros_as_on_the_board_and_puts_them_back(payload: bytes) -> None:
+def test_cobs_encode_matches_byte_by_byte_encoding_and_decode_inverts_it(payload: bytes) -> None:
     coded = cobs_encode(payload)
     assert coded == cobs_byte_by_byte(payload)
     assert 0 not in coded
@@ -108,12 +108,12 @@ def test_cobs_takes_out_the_zeros_as_on_the_board_and_puts_them_back(payload: by
 
 @settings(max_examples=60)
 @given(st.lists(FRAMES, max_size=8), st.data())
-def test_frames_come_back_whatever_the_portions(frames: list[Frame], data: st.DataObject) -> None:
+def test_decode_returns_messages_in_any_portions(frames: list[DueMessage], data: st.DataObject) -> None:
     sent = b"".join(map(encode, frames))
     edges = [0, *sorted(data.draw(st.lists(st.integers(0, len(sent)), max_size=20))), len(sent)]
     decoder = DueDecoder()
-    found = [frame for a, b in pairwise(edges) for frame in decoder.feed(sent[a:b])]
-    assert payloads(found) == payloads(frames)
+    decoded = [frame for a, b in pairwise(edges) for frame in decoder.decode(sent[a:b])]
+    assert payloads(decoded) == payloads(frames)
     assert decoder.damaged == 0
 
 
@@ -124,38 +124,38 @@ def damage_in_one_place(sent: bytes) -> Iterator[bytes]:
         yield from (sent[:i] + bytes([value]) + sent[i:] for value in (0x00, 0x01, 0x80, 0xFF, sent[i]))
 
 
-def test_every_flipped_bit_dropped_byte_and_inserted_byte_costs_one_block_at_most() -> None:
+def test_decode_loses_at_most_one_block_per_damaged_byte() -> None:
     frames = stream(3)
-    whole = payloads(DueDecoder().feed(b"".join(frames)))
+    expected = payloads(DueDecoder().decode(b"".join(frames)))
     for damaged in damage_in_one_place(frames[1]):
         decoder = DueDecoder()
-        found = payloads(decoder.feed(frames[0] + damaged + frames[2]))
-        assert found in (whole, [whole[0], whole[2]])
-        assert decoder.damaged > 0 or found == whole
+        decoded = payloads(decoder.decode(frames[0] + damaged + frames[2]))
+        assert decoded in (expected, [expected[0], expected[2]])
+        assert decoder.damaged > 0 or decoded == expected
 
 
 @settings(max_examples=20)
 @given(st.sampled_from([1e-3, 1e-2, 0.1]), st.integers(0, 10**6))
-def test_no_amount_of_damage_gives_a_wrong_frame(share: float, seed: int) -> None:
+def test_decode_never_returns_wrong_message(share: float, seed: int) -> None:
     frames = stream(60)
-    whole = payloads(DueDecoder().feed(b"".join(frames)))
+    expected = payloads(DueDecoder().decode(b"".join(frames)))
     rng = np.random.default_rng(seed)
     data = np.frombuffer(b"".join(frames), np.uint8).copy()
     hit = rng.random(len(data)) < share
     data[hit] = rng.integers(0, 256, hit.sum())
     data = np.delete(data, np.flatnonzero(rng.random(len(data)) < share / 2))
-    left = iter(whole)
+    remaining = iter(expected)
     # a subsequence: right, in order, none twice
-    assert all(payload in left for payload in payloads(DueDecoder().feed(data.tobytes())))
+    assert all(payload in remaining for payload in payloads(DueDecoder().decode(data.tobytes())))
 
 
-def test_noise_without_an_edge_neither_grows_nor_passes() -> None:
+def test_decode_bounds_memory_of_endless_noise() -> None:
     decoder = DueDecoder()
     for _ in range(1000):
-        assert decoder.feed(b"\x55" * 1000) == []
+        assert decoder.decode(b"\x55" * 1000) == []
     assert len(pickle.dumps(decoder)) < 1000
     (frame,) = stream(1)
-    assert len(decoder.feed(frame)) == 1
+    assert len(decoder.decode(frame)) == 1
     assert decoder.damaged == 1
 
 
@@ -180,13 +180,13 @@ def of_counts(counts: object, averaging: int = 1, mask: int = 0xFF) -> bytes:
         of_counts(np.zeros((2, 8)))[:-1],
     ],
 )
-def test_a_payload_that_is_no_frame_counts_as_damaged_although_its_check_is_right(payload: bytes) -> None:
+def test_decode_counts_impossible_payload_as_damaged(payload: bytes) -> None:
     class Forged(Request):
         def pack(self) -> bytes:
             return payload
 
     decoder = DueDecoder()
-    assert decoder.feed(encode(Forged(Kind.STOP))) == []
+    assert decoder.decode(encode(Forged(Kind.STOP))) == []
     assert decoder.damaged == 1
 
 
@@ -200,7 +200,7 @@ def check_bytes(coded: bytes) -> bytes:
     return bytes([0x80 | crc >> 14, 0x80 | crc >> 7 & 0x7F, 0x80 | crc & 0x7F])
 
 
-def test_the_bytes_of_a_frame_are_as_documented() -> None:
+def test_encode_writes_documented_bytes() -> None:
     """A board of another make relies on them. CRC-16/CCITT-FALSE of "123456789" is 29B1."""
     assert encode(Request(Kind.START)) == b"\0\x02\x03" + check_bytes(b"\x02\x03") + b"\0"
     for period in range(1, 4000, 7):
@@ -229,21 +229,21 @@ def assembler(inputs: tuple[int, ...] = (0, 1, 2, 3, 4, 5, 6, 7), averaging: int
     return DueAssembler(BoardSettings(1_000_000, sum(1 << i for i in inputs), averaging), inputs, 3.3)
 
 
-def test_samples_whose_numbers_all_wrap_take_no_more_memory_than_a_few() -> None:
+def test_assemble_unwraps_indices_in_bounded_memory() -> None:
     count = 70_000
     start = 2**32 - count // 32 * 16
-    decoder, assembles, held, before = DueDecoder(), assembler(), [], -np.inf
+    decoder, due, allocated, before = DueDecoder(), assembler(), [], -np.inf
     for first in range(start, start + count, 400):
         sent = [encode(block(index)) for index in range(first, first + 400, 16)]
-        frames = [frame for frame in decoder.feed(b"".join(sent)) if isinstance(frame, DueBlock)]
-        samples = assembles.samples(((first + 16 * i) * 1e-3, frame) for i, frame in enumerate(frames))
+        frames = [frame for frame in decoder.decode(b"".join(sent)) if isinstance(frame, DueBlock)]
+        samples = due.assemble(((first + 16 * i) * 1e-3, frame) for i, frame in enumerate(frames))
         assert samples.times_s[0] > before
         before = samples.times_s[-1]
         assert samples.volts[0, 0] == pytest.approx(first % 4096 * STEP_V)
-        held.append(sys.getallocatedblocks())
-    assert assembles.missing == start  # none but those before the first block
-    assert assembles.blocks == count // 16
-    assert max(held[-40:]) < max(held[60:110]) + 1000
+        allocated.append(sys.getallocatedblocks())
+    assert due.missing == start  # none but those before the first block
+    assert due.blocks == count // 16
+    assert max(allocated[-40:]) < max(allocated[60:110]) + 1000
 
 
 @pytest.mark.parametrize(
@@ -251,12 +251,12 @@ def test_samples_whose_numbers_all_wrap_take_no_more_memory_than_a_few() -> None
     [block(0), block(64, 17_000), block(16, 90_000), block(2**31)],
     ids=["again", "too early", "too late", "far away"],
 )
-def test_a_block_that_cannot_follow_or_is_of_other_channels_is_a_fault(second: DueBlock) -> None:
-    assembles = assembler()
-    assembles.samples([(1.0, block(0))])
+def test_assemble_raises_for_impossible_block(second: DueBlock) -> None:
+    due = assembler()
+    due.assemble([(1.0, block(0))])
     with pytest.raises(RigFault, match="off its time") as caught:
-        assembles.samples([(1.1, second)])
+        due.assemble([(1.1, second)])
     assert caught.value.cause == "data"
     for other in (assembler((0, 1, 2, 3)), assembler(averaging=2)):
         with pytest.raises(RigFault, match="other channels"):
-            other.samples([(1.0, block(0))])
+            other.assemble([(1.0, block(0))])

@@ -9,36 +9,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.sense.rig.boards import line_framing as framing
-from padforge.sense.rig.boards.line_board import LineAssembler, LineReader
-from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, Sample, header_line, sample_line
+from padforge.sense.rig.boards.line_board import LineAssembler, LineBlock
+from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, LineSample, format_header, format_sample
 from padforge.sense.rig.devices import BoardSamples, RigFault
 
-HEADER = LineHeader(500, 12, 3.3, 4, said=(("name", "my-board"),))
-SAMPLES = [Sample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
-LINES = [sample_line(sample.time_us, sample.counts, True) for sample in SAMPLES]
+HEADER = LineHeader(500, 12, 3.3, 4, extra=(("name", "my-board"),))
+SAMPLES = [LineSample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
+LINES = [format_sample(sample.time_us, sample.counts, True) for sample in SAMPLES]
 
 
 def checked(text: bytes) -> bytes:
     return text + b"*%08x\n" % crc32(text)
 
 
-def decoded(*lines: bytes, header: bytes = header_line(HEADER)) -> tuple[list[LineHeader | Sample], LineDecoder]:
+def decoded(*lines: bytes, header: bytes = format_header(HEADER)) -> tuple[list[LineHeader | LineSample], LineDecoder]:
     decoder = LineDecoder()
-    decoder.feed(header)
-    return decoder.feed(b"".join(lines)), decoder
+    decoder.decode(header)
+    return decoder.decode(b"".join(lines)), decoder
 
 
-def test_the_example_of_the_protocol_is_read() -> None:
+def test_decode_reads_documented_example() -> None:
     """The one that whoever writes a board's program has before him."""
     text = "\n".join(line.strip() for line in (framing.__doc__ or "").splitlines() if line.startswith("    "))
-    found = LineDecoder().feed(text.encode() + b"\n")
-    assert found[0] == HEADER
-    assert found[1:] == [Sample(2000, (2048, 1991, 870, 2003)), Sample(4000, (2049, 1990, 871, 2004))]
+    items = LineDecoder().decode(text.encode() + b"\n")
+    assert items[0] == HEADER
+    assert items[1:] == [LineSample(2000, (2048, 1991, 870, 2003)), LineSample(4000, (2049, 1990, 871, 2004))]
 
 
 @settings(max_examples=30)
 @given(st.data())
-def test_what_is_written_is_read_in_any_portions(data: st.DataObject) -> None:
+def test_decode_returns_lines_in_any_portions(data: st.DataObject) -> None:
     header = LineHeader(
         data.draw(st.sampled_from([10.0, 333.25, 10_000.0])),
         data.draw(st.integers(1, 24)),
@@ -47,21 +47,21 @@ def test_what_is_written_is_read_in_any_portions(data: st.DataObject) -> None:
         data.draw(st.booleans()),
     )
     counts = st.tuples(*[st.integers(0, header.full_scale)] * header.channels)
-    samples = data.draw(st.lists(st.builds(Sample, st.integers(0, 2**63 - 1), counts), max_size=9))
-    sent = [header_line(header), *(sample_line(each.time_us, each.counts, header.checked) for each in samples)]
+    samples = data.draw(st.lists(st.builds(LineSample, st.integers(0, 2**63 - 1), counts), max_size=9))
+    sent = [format_header(header), *(format_sample(each.time_us, each.counts, header.checked) for each in samples)]
     stream = b"".join(sent)
     if data.draw(st.booleans()):
         stream = stream.replace(b"\n", b"\r\n")
-    decoder, found, at = LineDecoder(), [], 0
+    decoder, items, at = LineDecoder(), [], 0
     while at < len(stream):
         size = data.draw(st.integers(1, 100))
-        found += decoder.feed(stream[at : at + size])
+        items += decoder.decode(stream[at : at + size])
         at += size
-    assert found == [header, *samples]
+    assert items == [header, *samples]
     assert decoder.damaged == 0
 
 
-def test_any_bit_byte_or_newline_that_is_wrong_costs_its_lines_and_gives_no_other() -> None:
+def test_decode_never_returns_wrong_sample_for_damaged_line() -> None:
     """Every flipped bit, every byte dropped, doubled or replaced, and every pair of neighbours swapped."""
     line = LINES[1]
     for i in range(len(line)):
@@ -69,59 +69,62 @@ def test_any_bit_byte_or_newline_that_is_wrong_costs_its_lines_and_gives_no_othe
         damaged = [line[:i] + other + line[i + 1 :] for other in others if other != line[i : i + 1]]
         damaged.append(line[:i] + line[i : i + 2][::-1] + line[i + 2 :])
         for each in damaged:
-            found, _ = decoded(LINES[0], each, LINES[2])
-            assert [sample for sample in found if sample not in (SAMPLES[0], SAMPLES[2])] in ([], [SAMPLES[1]])
-            assert found[0] == SAMPLES[0]
+            items, _ = decoded(LINES[0], each, LINES[2])
+            assert [sample for sample in items if sample not in (SAMPLES[0], SAMPLES[2])] in ([], [SAMPLES[1]])
+            assert items[0] == SAMPLES[0]
 
 
 @pytest.mark.parametrize(
-    ("line", "complaint"),
+    ("line", "error"),
     [
         (b"2000,1,2,3,4\n", "a line has no check"),
-        (sample_line(2000, (1, 2, 3), True), "has 4 numbers, expected 5: the time and the inputs"),
-        (sample_line(2000, (1, 2, 3, 4, 5), True), "has 6 numbers, expected 5"),
-        (sample_line(2000, (1, 2, 3, 4096), True), "a count is 4096, its header allows 4095"),
-        (sample_line(-2000, (1, 2, 3, 4), True), "begins '-2000,1,2,3,4*b292ef', expected whole numbers"),
+        (format_sample(2000, (1, 2, 3), True), "has 4 numbers, expected 5: the time and the inputs"),
+        (format_sample(2000, (1, 2, 3, 4, 5), True), "has 6 numbers, expected 5"),
+        (format_sample(2000, (1, 2, 3, 4096), True), "a count is 4096, its header allows 4095"),
+        (format_sample(-2000, (1, 2, 3, 4), True), "begins '-2000,1,2,3,4*b292ef', expected whole numbers"),
         *((checked(text), "expected whole numbers") for text in (b"2000,1,2,,4", b"2000,1,2,1_0,4", b"2000,1,2, 3,4")),
         (b"9" * 9000 + b"\n", "a line of more than 8192 bytes"),
-        (sample_line(2**63, (1, 2, 3, 4), True), "the time of a line is beyond all clocks"),
+        (format_sample(2**63, (1, 2, 3, 4), True), "the time of a line is beyond all clocks"),
         (LINES[0][:-2] + b"!\n", "the check does not fit"),
     ],
 )
-def test_a_line_that_is_no_sample_is_counted_and_said(line: bytes, complaint: str) -> None:
-    found, decoder = decoded(line)
-    assert found == []
-    assert (decoder.damaged, decoder.in_a_row) == (1, 1)
-    assert complaint in decoder.complaint
-    assert decoder.feed(LINES[0]) == [SAMPLES[0]]
-    assert (decoder.damaged, decoder.in_a_row) == (1, 0)
+def test_decode_counts_and_describes_bad_line(line: bytes, error: str) -> None:
+    items, decoder = decoded(line)
+    assert items == []
+    assert (decoder.damaged, decoder.n_errors) == (1, 1)
+    assert error in decoder.error
+    assert decoder.decode(LINES[0]) == [SAMPLES[0]]
+    assert (decoder.damaged, decoder.n_errors) == (1, 0)
 
 
-def test_lines_for_people_wrong_ones_and_those_without_a_header_are_passed_over_and_noise_does_not_grow() -> None:
-    short = sample_line(2000, (1, 2, 3), True)
-    found, decoder = decoded(b"# warming up\n", LINES[0], b"#\n\n")
-    assert (found, decoder.damaged) == ([SAMPLES[0]], 0)
-    decoder.feed(short + short + b"1,2\n# hot\n")
-    assert decoder.in_a_row == 3
-    assert "4 numbers" in decoder.complaint
+def test_decode_skips_comments_and_bounds_memory_of_endless_noise() -> None:
+    short = format_sample(2000, (1, 2, 3), True)
+    items, decoder = decoded(b"# warming up\n", LINES[0], b"#\n\n")
+    assert (items, decoder.damaged) == ([SAMPLES[0]], 0)
+    decoder.decode(short + short + b"1,2\n# hot\n")
+    assert decoder.n_errors == 3
+    assert "4 numbers" in decoder.error
     header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"  # whose check may be left out
-    found, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
-    assert (found, decoder.damaged) == ([Sample(10, (1, 2))], 1)
+    items, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
+    assert (items, decoder.damaged) == ([LineSample(10, (1, 2))], 1)
     decoder = LineDecoder()
-    assert decoder.feed(b"boot: 1,2,3\n" + LINES[0]) == []
+    assert decoder.decode(b"boot: 1,2,3\n" + LINES[0]) == []
     for _ in range(1000):
-        decoder.feed(b"1" * 1000)
+        decoder.decode(b"1" * 1000)
     assert len(pickle.dumps(decoder)) < 10_000
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "error"),
     [
         ("2 rate_hz=100 bits=10 reference_v=5 channels=2", "version 2 of the line protocol, expected 1"),
         ("1 rate_hz=100 bits=10 reference_v=5", "channels of its header is 'missing', allowed is 1 to 512"),
         *(
-            (f"1 rate_hz={said} bits=10 reference_v=5 channels=2", f"rate_hz of its header is '{said}', allowed is 10")
-            for said in ("fast", "9.9", "nan")
+            (
+                f"1 rate_hz={match} bits=10 reference_v=5 channels=2",
+                f"rate_hz of its header is '{match}', allowed is 10",
+            )
+            for match in ("fast", "9.9", "nan")
         ),
         ("1 rate_hz=100 bits=10.5 reference_v=5 channels=2", "bits of its header is '10.5', allowed is 1 to 24"),
         ("1 rate_hz=100 bits=10 reference_v=0 channels=2", "reference_v of its header is '0'"),
@@ -129,11 +132,11 @@ def test_lines_for_people_wrong_ones_and_those_without_a_header_are_passed_over_
         ("1 rate_hz=100 bits=10 reference_v=5 channels=2 check=xor", "check is 'xor', allowed are crc32 and none"),
     ],
 )
-def test_a_header_that_cannot_be_is_told(text: str, complaint: str) -> None:
+def test_decode_describes_impossible_header(text: str, error: str) -> None:
     decoder = LineDecoder()
-    assert decoder.feed(f"# padforge-line {text}\n".encode()) == []
+    assert decoder.decode(f"# padforge-line {text}\n".encode()) == []
     assert decoder.header is None
-    assert complaint in decoder.complaint
+    assert error in decoder.error
 
 
 THREE = LineHeader(1000, 10, 5.0, 3)
@@ -143,14 +146,14 @@ def read(times_us: list[int] | np.ndarray, assembler: LineAssembler | None = Non
     """The samples of lines of these times, all come at once; the first count is the number of the line."""
     assembler = assembler or LineAssembler(THREE, (0, 1, 2))
     counts = [(k, 10, 1023) for k in range(len(times_us))]
-    return assembler.samples([(1.0, LineReader([int(time_us) for time_us in times_us], counts))])
+    return assembler.assemble([(1.0, LineBlock([int(time_us) for time_us in times_us], counts))])
 
 
 WRAPPED = ((2**32 - 3000 + 1000 * np.array([0, 1, 4, 5, 25])) % 2**32).tolist()
 
 
 @pytest.mark.parametrize(
-    ("times_us", "taken", "missing"),
+    ("times_us", "kept_lines", "missing"),
     [
         (WRAPPED, [0, 1, 2, 3, 4], [0, 0, 2, 0, 19]),
         ([2**40 + 1000, 2**40 + 2000, 2**40 + 5000], [0, 1, 2], [0, 0, 2]),
@@ -159,27 +162,27 @@ WRAPPED = ((2**32 - 3000 + 1000 * np.array([0, 1, 4, 5, 25])) % 2**32).tolist()
     ],
     ids=["a time that wraps", "a time that does not wrap", "lines held up and sent in a bunch", "times that cannot be"],
 )
-def test_every_sample_has_its_slot_and_the_slots_left_out_are_missing(times_us, taken, missing) -> None:
+def test_assemble_counts_empty_slots_as_missing(times_us, kept_lines, missing) -> None:
     samples = read(times_us)
-    assert np.rint(samples.volts[:, 0] * 1023 / 5).astype(int).tolist() == taken
+    assert np.rint(samples.volts[:, 0] * 1023 / 5).astype(int).tolist() == kept_lines
     assert samples.missing.tolist() == missing
     assert np.diff(samples.times_s) == pytest.approx(1e-3 * (1 + samples.missing[1:]), rel=1e-3)
 
 
 @pytest.mark.parametrize("share", [0.98, 0.999, 1.001, 1.02])
-def test_a_rate_that_is_not_quite_what_it_says_and_lines_that_are_late_lose_nothing(share: float) -> None:
+def test_assemble_follows_inexact_rate_and_late_lines(share: float) -> None:
     rng, assembler = np.random.default_rng(0), LineAssembler(THREE, (0, 1, 2))
     samples = read(np.cumsum(np.full(2000, 1000 / share)) + rng.uniform(-150, 150, 2000), assembler)
     assert len(samples.times_s) == 2000
     assert not samples.missing.any()
     assert len(pickle.dumps(assembler)) < 10_000
-    kept = np.sort(rng.choice(4000, 3000, replace=False))
-    samples = read(1000 * kept + rng.uniform(0, 450, 3000))
-    assert np.array_equal(np.cumsum(1 + samples.missing) - 1, kept - kept[0])
+    slots = np.sort(rng.choice(4000, 3000, replace=False))
+    samples = read(1000 * slots + rng.uniform(0, 450, 3000))
+    assert np.array_equal(np.cumsum(1 + samples.missing) - 1, slots - slots[0])
 
 
 @pytest.mark.parametrize(
-    ("before_us", "after", "said"),
+    ("before_us", "after", "match"),
     [
         (10**6, np.arange(1, 20) * 1000, "a line came -[0-9]+ us after another by the board's clock, not 1000; it was"),
         (2**31 + 10**7, np.arange(1, 20) * 1000, "it was reset"),
@@ -189,9 +192,9 @@ def test_a_rate_that_is_not_quite_what_it_says_and_lines_that_are_late_lose_noth
     ],
     ids=["reset", "reset after half the range", "far away", "milliseconds", "too fast"],
 )
-def test_times_that_cannot_be_line_after_line_are_a_fault(before_us: int, after: np.ndarray, said: str) -> None:
+def test_assemble_raises_for_repeatedly_impossible_times(before_us: int, after: np.ndarray, match: str) -> None:
     assembler = LineAssembler(THREE, (0, 1, 2))
     read(before_us + np.arange(1001) * 1000, assembler)
-    with pytest.raises(RigFault, match=said) as caught:
+    with pytest.raises(RigFault, match=match) as caught:
         read(after, assembler)
     assert caught.value.cause == "data"

@@ -49,18 +49,18 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     """Error of the time of each block's last sample; checks that all times ascend and are given as blocks come."""
     last, taken, arrived = link.blocks()
     clock, before, errors = SampleClock(1 / link.rate_hz), -np.inf, []
-    given_to = 0
+    n_done = 0
     for i in range(len(last)):
         clock.observe(int(last[i]), arrived[i])
         if arrived[i] < arrived[0] + SETTLE_S:
             continue
-        for j in range(given_to, i + 1):
+        for j in range(n_done, i + 1):
             times = clock.times(block_of(int(last[j]), link.block))
             assert times[0] > before
             assert (np.diff(times) > 0).all()
             before = times[-1]
             errors.append(before - taken[j])
-        given_to = i + 1
+        n_done = i + 1
     return np.array(errors), clock
 
 
@@ -71,23 +71,21 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     jitter_s=st.floats(0, 8e-3),
     seed=st.integers(0, 1000),
 )
-def test_times_are_within_5_ms_from_the_first_and_half_a_ms_soon(
-    rate: tuple[float, int], skew: float, jitter_s: float, seed: int
-) -> None:
+def test_times_are_accurate_from_first_block(rate: tuple[float, int], skew: float, jitter_s: float, seed: int) -> None:
     errors, clock = run(Link(*rate, 30.0, skew, seed, jitter_s))
     assert np.abs(errors).max() < 5e-3
     assert np.abs(errors[len(errors) // 2 :]).max() < 5e-4
     assert clock.skew_ppm == pytest.approx(skew * 1e6, abs=60)
 
 
-def test_times_hold_for_long_in_bounded_memory() -> None:
+def test_times_stay_accurate_in_bounded_memory() -> None:
     errors, clock = run(Link(40.0, 8, 1500.0, 200e-6, seed=1))
     assert np.abs(errors).max() < 2e-3
     assert np.abs(errors[500:]).max() < 1e-3
     assert len(pickle.dumps(clock)) < 3000  # a minute of arrivals
 
 
-def test_gaps_in_samples_are_kept_and_a_step_of_the_delay_is_caught_up_with_without_ever_going_back() -> None:
+def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
     clock = SampleClock(1e-3)
     with pytest.raises(ValueError, match="no block"):
         clock.times(block_of(0, 1))
@@ -105,7 +103,7 @@ def test_gaps_in_samples_are_kept_and_a_step_of_the_delay_is_caught_up_with_with
     assert before == pytest.approx(3.199, abs=1e-3)
 
 
-def test_counts_that_are_no_steps_of_one_keep_their_distance() -> None:
+def test_times_of_microsecond_clock() -> None:
     """A board that counts microseconds, with a resonator that is off by 3 in a thousand."""
     rng = np.random.default_rng(2)
     clock, taken_us = SampleClock(1e-6, 5e-3), np.cumsum(rng.integers(900, 1100, 90_000))
@@ -121,7 +119,7 @@ def test_counts_that_are_no_steps_of_one_keep_their_distance() -> None:
 
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
-def test_the_line_under_the_arrivals_is_the_highest_at_their_middle(seed: int, count: int, size: float) -> None:
+def test_times_follow_highest_line_below_arrivals(seed: int, count: int, size: float) -> None:
     """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
     rng = np.random.default_rng(seed)
     x, y = np.sort(rng.choice(100, count, replace=False)), size * rng.uniform(0, 1, count)

@@ -10,16 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.arms import rtde as frames
-from padforge.sense.rig.arms import rtde as messages
+from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.arms.rtde import VARIABLES, HostClock, RtdeReader
 
-TYPES = [frames.type_of(name) for name in VARIABLES]
+TYPES = [rtde.variable_type(name) for name in VARIABLES]
 VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.0, -25.0, 0.0, 0.0, 0.0, 7, 1, 1, 5)
 """Of a state: stamp, pose, speed, force, mode, runtime, safety and progress."""
 
 
-def spoiled(data: bytes, places: list[tuple[int, int]]) -> bytes:
+def damage_bytes(data: bytes, places: list[tuple[int, int]]) -> bytes:
     """`data` with some bytes replaced."""
     changed = bytearray(data)
     for at, byte in places:
@@ -31,29 +30,29 @@ DAMAGE = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_si
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20), DAMAGE)
-def test_frames_survive_any_cut_and_damage_is_the_same_in_any_portions(sent, size, damage) -> None:
+def test_splitter_returns_frames_in_any_portions(sent, size, damage) -> None:
     def cut(data: bytes, size: int) -> list[tuple[int, bytes] | None]:
-        splitter, found = frames.Splitter(), []
+        splitter, items = rtde.FrameSplitter(), []
         try:
             for at in range(0, len(data), size):
-                for frame in splitter.feed(data[at : at + size]):
-                    found.append(frame)
+                for frame in splitter.split(data[at : at + size]):
+                    items.append(frame)
         except ValueError:
-            found.append(None)
-        return found
+            items.append(None)
+        return items
 
-    stream = b"".join(frames.frame(*frame) for frame in sent)
+    stream = b"".join(rtde.pack_frame(*frame) for frame in sent)
     assert cut(stream, size) == sent
     if stream:
-        damaged = spoiled(stream, damage)
+        damaged = damage_bytes(stream, damage)
         assert cut(damaged, size) == cut(damaged, len(damaged))
     with pytest.raises(ValueError, match="2 bytes"):
-        list(frames.Splitter().feed(b"\x00\x02U"))
+        list(rtde.FrameSplitter().split(b"\x00\x02U"))
 
 
 @settings(max_examples=40)
 @given(st.lists(st.floats(0, 0.5), min_size=50, max_size=50))
-def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
+def test_host_clock_ignores_late_arrivals(delays: list[float]) -> None:
     clock, delays = HostClock(), [0.0, *delays]
     times = [clock.host_time(0.008 * i, 100 + 0.008 * i + delay) for i, delay in enumerate(delays)]
     np.testing.assert_allclose(times, 100 + 0.008 * np.arange(len(delays)), atol=1e-3)
@@ -61,18 +60,18 @@ def test_late_arrivals_are_not_late_states(delays: list[float]) -> None:
 
 
 def state(*values: float) -> bytes:
-    return frames.frame(frames.DATA, b"\x01" + frames.layout(TYPES).pack(*values))
+    return rtde.pack_frame(rtde.DATA, b"\x01" + rtde.recipe_layout(TYPES).pack(*values))
 
 
 def stream(*states: bytes, major: int = 5, version: bytes = b"\x01", types: list[str] = TYPES) -> list[bytes]:
     """What a controller sends to a reader that connects."""
     answers = (
-        (frames.VERSION, version),
-        (frames.CONTROLLER, struct.pack(">4I", major, 11, 0, 0)),
-        (frames.OUTPUTS, b"\x01" + ",".join(types).encode()),
-        (frames.START, b"\x01"),
+        (rtde.VERSION, version),
+        (rtde.CONTROLLER, struct.pack(">4I", major, 11, 0, 0)),
+        (rtde.OUTPUTS, b"\x01" + ",".join(types).encode()),
+        (rtde.START, b"\x01"),
     )
-    return [*(frames.frame(*answer) for answer in answers), *states]
+    return [*(rtde.pack_frame(*answer) for answer in answers), *states]
 
 
 def reader(sent: list[bytes]) -> RtdeReader:
@@ -82,7 +81,7 @@ def reader(sent: list[bytes]) -> RtdeReader:
         return RtdeReader("arm", 1.0)
 
 
-def test_a_state_is_read_in_its_units_and_those_left_out_are_counted() -> None:
+def test_reader_converts_state_and_counts_skipped() -> None:
     later = (VALUES[0] + 4 / 500, *VALUES[1:])
     link = reader(stream(state(*VALUES), state(*later)))
     first, second = link.read(1.0), link.read(1.0)
@@ -96,27 +95,27 @@ def test_a_state_is_read_in_its_units_and_those_left_out_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sent", "said"),
+    ("sent", "match"),
     [
         (stream(version=b"\x00"), "does not speak RTDE 2"),
         (stream(types=["NOT_FOUND", *TYPES[1:]]), "the controller has no timestamp"),
         (stream(types=TYPES[::-1]), "the controller would send"),
-        (stream(frames.frame(frames.DATA, b"\x01" + b"x" * 10)), "sent 10 bytes, expected 168"),
+        (stream(rtde.pack_frame(rtde.DATA, b"\x01" + b"x" * 10)), "sent 10 bytes, expected 168"),
         *((stream(state(*VALUES[:k], value, *VALUES[k + 1 :])), "NaN") for k in (3, 15) for value in (np.nan, np.inf)),
     ],
     ids=range(8),
 )
-def test_a_controller_of_another_kind_and_a_state_that_is_none_are_refused(sent: list[bytes], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_reader_refuses_other_controller_and_impossible_state(sent: list[bytes], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
         reader(sent).read(1.0)
 
 
 @settings(max_examples=100)
 @given(st.integers(0, 8), DAMAGE)
-def test_a_controller_that_talks_nonsense_is_an_os_or_value_error(which: int, damage: list[tuple[int, int]]) -> None:
+def test_reader_raises_os_or_value_error_for_damage(which: int, damage: list[tuple[int, int]]) -> None:
     """The two that whoever uses the reader is prepared for."""
     sent = stream(*[state(*VALUES)] * 5)
-    sent[which] = spoiled(sent[which], damage)
+    sent[which] = damage_bytes(sent[which], damage)
     try:
         link = reader(sent)
         for _ in range(6):
@@ -129,20 +128,20 @@ def test_a_controller_that_talks_nonsense_is_an_os_or_value_error(which: int, da
 
 @settings(max_examples=60)
 @given(st.lists(st.booleans(), min_size=1, max_size=6), DAMAGE)
-def test_what_the_child_of_the_arm_writes_is_read_up_to_where_it_is_damaged(kinds: list[bool], damage) -> None:
-    row = messages.StateRow._make(np.arange(14.0).tolist())
-    answer = {"id": 1, "is": [1.5, "a"]}
-    sent = b"".join(messages.pack_row(row) if kind else messages.pack_answer(answer) for kind in kinds)
+def test_read_messages_stops_at_damage(kinds: list[bool], damage) -> None:
+    row = rtde.StateRow._make(np.arange(14.0).tolist())
+    answer = {"id": 1, "result": [1.5, "a"]}
+    sent = b"".join(rtde.pack_state(row) if kind else rtde.pack_reply(answer) for kind in kinds)
 
     def read(data: bytes) -> list:
-        rest = [data]
+        remaining = [data]
 
         def source(count: int) -> bytes:
-            taken, rest[0] = rest[0][:count], rest[0][count:]
-            return taken
+            chunk, remaining[0] = remaining[0][:count], remaining[0][count:]
+            return chunk
 
-        return list(messages.read(source))
+        return list(rtde.read_messages(source))
 
     assert read(sent) == [row if kind else answer for kind in kinds]
-    for found in read(spoiled(sent, damage)):
-        assert isinstance(found, messages.StateRow) or json.dumps(found)
+    for items in read(damage_bytes(sent, damage)):
+        assert isinstance(items, rtde.StateRow) or json.dumps(items)

@@ -1,0 +1,103 @@
+"""Straight moves from rest to rest with a trapezoidal velocity profile."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+Position = tuple[float, float, float]
+"""x, y and z, mm."""
+
+
+@dataclass(frozen=True)
+class TrapezoidalProfile:
+    """Distance and speed of a move from rest to rest over time.
+
+    Attributes:
+        length: distance of the move, >= 0; mm, m or rad.
+        max_speed: in these units a second, > 0.
+        acceleration: at the start and at the end, > 0.
+    """
+
+    length: float
+    max_speed: float
+    acceleration: float
+
+    @property
+    def duration_s(self) -> float:
+        """Time from rest to rest, s."""
+        cruise_s = self.length / (self.acceleration * self._rise_s) - self._rise_s if self._rise_s else 0.0
+        return 2 * self._rise_s + cruise_s
+
+    @property
+    def _rise_s(self) -> float:
+        return min(self.max_speed / self.acceleration, math.sqrt(self.length / self.acceleration))
+
+    def evaluate(self, t_s: float) -> tuple[float, float]:
+        """Return distance and speed `t_s` seconds after the start; before and after the move it is at rest."""
+        t_s, remaining_s, rise_s = max(t_s, 0.0), max(self.duration_s - t_s, 0.0), self._rise_s
+        if remaining_s == 0:
+            return self.length, 0.0
+        if t_s < rise_s:
+            return self.acceleration * t_s**2 / 2, self.acceleration * t_s
+        if remaining_s < rise_s:
+            return self.length - self.acceleration * remaining_s**2 / 2, self.acceleration * remaining_s
+        return self.acceleration * rise_s * (t_s - rise_s / 2), self.acceleration * rise_s
+
+
+@dataclass(frozen=True)
+class StraightMove:
+    """A straight move of a nozzle.
+
+    Attributes:
+        start: position before it.
+        end: position after it.
+        speed: at most, > 0, mm/s.
+        acceleration: > 0, mm/s².
+    """
+
+    start: Position
+    end: Position
+    speed: float
+    acceleration: float
+
+    @property
+    def length_mm(self) -> float:
+        """Distance from start to end."""
+        return math.dist(self.start, self.end)
+
+    @property
+    def profile(self) -> TrapezoidalProfile:
+        """Distance from the start over time."""
+        return TrapezoidalProfile(self.length_mm, self.speed, self.acceleration)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from rest to rest, s."""
+        return self.profile.duration_s
+
+    def limit_axes(self, max_speeds: Sequence[float], max_accelerations: Sequence[float]) -> "StraightMove":
+        """Return the same move, slowed down until no axis exceeds its own speed and acceleration."""
+        if not self.length_mm:
+            return self
+        shares = [abs(b - a) / self.length_mm for a, b in zip(self.start, self.end, strict=True)]
+        speed, acceleration = (
+            min([wanted, *(limit / share for limit, share in zip(limits, shares, strict=True) if share)])
+            for wanted, limits in ((self.speed, max_speeds), (self.acceleration, max_accelerations))
+        )
+        return replace(self, speed=speed, acceleration=acceleration)
+
+    def position(self, t_s: float) -> Position:
+        """Return the position `t_s` seconds after the start; `start` before the move, `end` after it."""
+        if t_s >= self.duration_s:
+            return self.end
+        share = self.profile.evaluate(t_s)[0] / self.length_mm
+        x, y, z = (a + share * (b - a) for a, b in zip(self.start, self.end, strict=True))
+        return x, y, z
+
+    def distance_mm(self, position: Position) -> float:
+        """Return the distance of a position from the path."""
+        path, offset = ([b - a for a, b in zip(self.start, end, strict=True)] for end in (self.end, position))
+        square = self.length_mm**2
+        share = sum(a * b for a, b in zip(path, offset, strict=True)) / square if square else 0.0
+        share = min(max(share, 0.0), 1.0)
+        return math.dist(offset, [share * value for value in path])
