@@ -331,7 +331,7 @@ def test_the_program_dies_or_is_suspended(robot: UrEmulator, arm: UR5, host: str
 
 @pytest.mark.slow
 def test_a_program_that_does_not_look(robot: UrEmulator, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ur5_link, "OBSERVE_S", 0.4)
+    monkeypatch.setattr(ur5_link, "LOOK_S", 0.4)
     go(arm, HOME)
     arm.move(LOW, 50, 500)
     down_command = time.monotonic()
