@@ -171,7 +171,7 @@ def test_an_arm_at_work_is_not_taken_over_by_a_program_on_this_computer(
     arm.move(LOW, 50, 500)
     (found,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
     assert found.status == "fail"
-    assert "another program on this computer uses the arm" in found.found
+    assert "another program on this computer uses the arm" in found.message
     assert arm.state().moving
     arm.stop()
 
