@@ -246,7 +246,7 @@ def _scaled(entry: ColumnEntry, array: NDArray[Any]) -> Array:
 def _by_readings(values: Array, n_readings: int) -> Array:
     """Return (R, c) readings from (R, c), (c, R) or (R,)."""
     if values.ndim in (1, 2) and len(values) == n_readings:
-        return values.reshape(n_readings, -1)
+        return values[:, None] if values.ndim == 1 else values
     if values.ndim == 2 and values.shape[1] == n_readings:
         return values.T
     raise InputError(

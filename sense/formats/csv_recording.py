@@ -1,7 +1,7 @@
 """Recordings from and to CSV.
 
-Padforge's own columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm` and
-`y_mm`. The last two hold the position of the press while the probe is sent down, `?` where it is unknown, and are empty
+Padforge's own columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm`
+and `y_mm`. The last two hold the position of the press while the probe is sent down, `?` where it is unknown, and are empty
 on all other lines: a press begins on the first line of a run of equal positions, and ends on the first one after it.
 Where any press has them, `depth_mm` (commanded), `reached_mm` and `force_n` follow. Where no line has a position, all
 lines have one, or the two columns are missing, presses are detected in the readings. Other columns are named by a
@@ -60,7 +60,9 @@ def import_csv(path: str | Path, columns: str = "") -> Recording:
         raise InputError(f"{path}: line {line} has one of {x} and {y}, expected both or neither")
     ends = np.cumsum([len(entry_columns) for _, entry_columns in matched])
     arrays = [(entry, part) for (entry, _), part in zip(matched, np.split(values, ends[:-1], axis=1), strict=True)]
-    return assemble_recording(path, arrays, {"kind": "csv", "file": path.name} | ({"columns": columns} if columns else {}))
+    return assemble_recording(
+        path, arrays, {"kind": "csv", "file": path.name} | ({"columns": columns} if columns else {})
+    )
 
 
 def _own_entries(names: list[str]) -> list[ColumnEntry]:

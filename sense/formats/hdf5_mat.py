@@ -29,7 +29,9 @@ from padforge.sense.recording.recording import Recording
 FORMAT = "padforge-hdf5/2"
 NOTE = "note"
 """Key in the source of a recording that says what was left out of it."""
-_DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")} | {"readings_v": "readings"}
+_DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")} | {
+    "readings_v": "readings"
+}
 """Datasets, and their attributes of a `Recording`."""
 CYCLE, DOWN_AT = 40, 20
 """Readings of a published press, and the one at which the probe is sent down; it is sent up at the end."""

@@ -37,9 +37,9 @@ _Column = NDArray[Any]
 def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotations | None = None) -> None:
     """Write a recording as a LeRobot dataset, a folder that appears complete or not at all.
 
-    Features are `observation.state`, the readings in V, NaN where one is missing; `action`, the commanded position, with
-    the depth if all presses have one, and whether the probe is down; `observation.force` if all presses have one; and
-    `observation.touch`, what a model predicts once a press is over. Presses of unknown position are no episodes.
+    Features are `observation.state`, the readings in V, NaN where one is missing; `action`, the commanded position,
+    with the depth if all presses have one, and whether the probe is down; `observation.force` if all presses have one;
+    and `observation.touch`, what a model predicts once a press is over. Presses of unknown position are no episodes.
 
     Args:
         recording: to write.

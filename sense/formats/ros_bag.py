@@ -135,22 +135,33 @@ def _read_storage(
 def _read_mcap(path: Path, is_selected: Callable[[str, str, str], bool]) -> Iterator[tuple[str, int, bytes]]:
     from rosbags.rosbag2 import storage_mcap
 
-    storage_mcap.DECOMPRESSORS.update({name: _bounded(name) for name in ("", "lz4", "zstd")})
-    storage_mcap.get_qos = lambda metadata: []  # YAML of any size, which reading does not need
     storage = storage_mcap.McapReader(path)
-    storage.open()
-    with closing(storage):
-        selected = [
-            connection
-            for connection in storage.connections
-            if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
-        ]
-        n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
-        for connection, stamp, message in storage.messages_scan(selected):
-            n_messages += 1
-            yield connection.topic, stamp, message
-        if n_messages < n_expected:  # rosbags ends without a word at a record that is longer than its chunk
-            raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
+    with _guarded(storage_mcap):
+        storage.open()
+        with closing(storage):
+            selected = [
+                connection
+                for connection in storage.connections
+                if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
+            ]
+            n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
+            for connection, stamp, message in storage.messages_scan(selected):
+                n_messages += 1
+                yield connection.topic, stamp, message
+    if n_messages < n_expected:  # rosbags ends without an error at a record that is longer than its chunk
+        raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
+
+
+@contextmanager
+def _guarded(storage_mcap: Any) -> Iterator[None]:
+    """Have rosbags unpack no more than is allowed, and leave out the YAML of QoS, which may be long."""
+    decompressors, get_qos = storage_mcap.DECOMPRESSORS, storage_mcap.get_qos
+    storage_mcap.DECOMPRESSORS = {name: _bounded(name) for name in decompressors}
+    storage_mcap.get_qos = lambda metadata: []
+    try:
+        yield
+    finally:
+        storage_mcap.DECOMPRESSORS, storage_mcap.get_qos = decompressors, get_qos
 
 
 def _bounded(compression: str) -> Callable[[bytes, int], bytes]:
@@ -193,7 +204,9 @@ def _read_sqlite(path: Path, is_selected: Callable[[str, str, str], bool]) -> It
 def _check_tables(database: sqlite3.Connection, file_bytes: int) -> None:
     """Check that a database has plain tables only: views and computed columns may take any time and memory."""
     database.execute("PRAGMA trusted_schema = OFF")
-    for kind, name, sql in database.execute("SELECT type, name, sql FROM sqlite_master WHERE type != 'index'").fetchall():
+    for kind, name, sql in database.execute(
+        "SELECT type, name, sql FROM sqlite_master WHERE type != 'index'"
+    ).fetchall():
         is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE")
         columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall() if is_plain else []
         if not is_plain or any(hidden for (hidden,) in columns):

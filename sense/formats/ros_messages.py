@@ -14,9 +14,8 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from padforge.design.common.validation import InputError, check_float, short_repr
+from padforge.design.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_S, Array, Indices, Mask
 from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.ros_bag import RawMessages
@@ -351,9 +350,7 @@ def encode_health(
     return np.array(health_stamps, np.int64), messages
 
 
-def _health_message(
-    store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int
-) -> memoryview:
+def _health_message(store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int) -> memoryview:
     message = _empty(store, TOPICS[HEALTH].msgtype)
     message.header.frame_id = FRAME
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)

@@ -235,9 +235,7 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
     return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns})
 
 
-def _decode_entry(
-    store: "Typestore", entry: ColumnEntry, name: str, raw: Mapping[str, RawMessages]
-) -> TopicSeries:
+def _decode_entry(store: "Typestore", entry: ColumnEntry, name: str, raw: Mapping[str, RawMessages]) -> TopicSeries:
     """Return the numbers of a topic, of a type that may hold the quantity."""
     what, types = f"{entry.quantity} is {short_repr(name)}", _TYPES[entry.quantity]
     if name not in raw:
@@ -295,7 +293,9 @@ def export_bag(
     messages = {RECORDING: [encode_text(store, to_text(recording, epoch_s, messages))], **messages}
     _check_readable(messages)
     types = {topic: (TOPICS[topic].msgtype, TOPICS[topic].description) for topic in messages}
-    in_order = merge(*(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in types), key=itemgetter(1))
+    in_order = merge(
+        *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in types), key=itemgetter(1)
+    )
     with reraise_write_error(path), atomic_files(path.parent) as folder:
         bag = write_mcap(folder / f"{UNFINISHED}{path.stem}", store, types, in_order, latched=RECORDING)
         bag.replace(folder / path.name)
@@ -307,5 +307,6 @@ def _check_readable(messages: Mapping[str, Sequence[memoryview]]) -> None:
     size = sum(map(len, read))
     if len(read) > MAX_MESSAGES or size > MAX_BYTES:
         raise InputError(
-            f"recording would be {len(read)} messages of {size} bytes, allowed in a bag are {MAX_MESSAGES} of {MAX_BYTES}"
+            f"recording would be {len(read)} messages of {size} bytes, "
+            f"allowed in a bag are {MAX_MESSAGES} of {MAX_BYTES}"
         )

@@ -41,7 +41,7 @@ def open_in_place(path: Path) -> BinaryIO:
 
 
 def block_dtype(fibres: int) -> np.dtype[np.void]:
-    """Return the layout of a block: little-endian, at least four rows of 1 + `fibres` numbers, a multiple of 256 bytes."""
+    """Return the layout of a block: little-endian, four or more rows of 1 + `fibres` numbers, n x 256 bytes."""
     row = 8 * (1 + fibres)
     size = -(-(_HEADER + 4 * row) // _UNIT) * _UNIT
     rows = (size - _HEADER) // row

@@ -85,9 +85,7 @@ def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -
         sensed = shapely.box(left, low, right, high)
         share = sensed.difference(shapely.union_all(keep_outs(pad_settings))).area / sensed.area
         if share < MIN_PRESSABLE:
-            raise InputError(
-                f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {MIN_PRESSABLE:.0%}"
-            )
+            raise InputError(f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {MIN_PRESSABLE:.0%}")
     return pad_settings
 
 

@@ -262,7 +262,9 @@ class Recorder:
         """
         position = check_numbers(position_mm, np.float64, "position")
         if position.shape != (2,) or not (np.isnan(position).all() or (np.abs(position) <= MAX_MM).all()):
-            raise InputError(f"position is {short_repr(position_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
+            raise InputError(
+                f"position is {short_repr(position_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice"
+            )
         number = self._press if press is None else check_int("press", press, 0, MAX_INDEX)
         reading = check_int("reading", reading, 0, MAX_INDEX)
         x, y = (None if np.isnan(value) else value for value in position.tolist())
@@ -368,7 +370,9 @@ def _check_readings(path: Path, fibres: int, n_presses: int) -> None:
     """Refuse readings that cannot be what a break left: nothing of them may be cut off then."""
     times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
     if (n_presses and not len(times_s)) or not (np.diff(times_s) > 0).all():
-        raise InputError(f"{path / READINGS}: not the readings of {n_presses} presses of {fibres} fibres in the journal")
+        raise InputError(
+            f"{path / READINGS}: not the readings of {n_presses} presses of {fibres} fibres in the journal"
+        )
 
 
 def _cut_torn_line(path: Path) -> None:

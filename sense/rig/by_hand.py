@@ -20,9 +20,9 @@ from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import flatten
 from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.features import REST, bridged
-from padforge.sense.recording.press_plan import free_of, planned, size_of
+from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, read_journal, refuse_begun
+from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, check_new_recording, read_journal
 from padforge.sense.rig.by_hand_presses import GONE_S, MOST, SOON_S, Judge, Phase, Place, Turns, answers
 from padforge.sense.rig.config import RigConfig, begun_source, require_same_devices, source_of
 from padforge.sense.rig.devices import Board, RigFault
@@ -45,11 +45,11 @@ def targets_of(setup: RigConfig) -> Array:
     rig = setup.rig
     if rig.plan == "adaptive":
         raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, boustrophedon or a .csv of places")
-    positions_mm = planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size).positions_mm
+    positions_mm = make_plan(setup.pad, rig, np.random.default_rng(rig.seed), setup.size).positions_mm
     if rig.plan != "uniform":
         return positions_mm
     whole_mm = np.rint(positions_mm)
-    free = free_of(setup.pad, size_of(setup.pad, setup.size))(whole_mm)
+    free = pressable_test(setup.pad, fit_pad_settings(setup.pad, setup.size))(whole_mm)
     return in_rounds(np.where(free[:, None], whole_mm, positions_mm))
 
 
@@ -144,7 +144,7 @@ class HandSession:
         # Times of a recording begin at 0, and go on a second after the last ones where it is resumed.
         self._start_s = recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0
         self._zero_s: float | None = None
-        self._first = recorder.readings
+        self._first = recorder.n_readings
         self._number = max(recorder.done, default=-1) + 1
         self._made = made
         self._turns = Turns(targets_mm, hold_s, self._start_s)
@@ -345,7 +345,7 @@ def record_by_hand(
         RigFault: the board failed, or the disk.
     """
     if not resume:
-        refuse_begun(setup.out)
+        check_new_recording(setup.out)
     rig = setup.rig
     source = connected(converter, rig.rate_hz)
     recorder, targets, left = opened(setup, source.converter, resume)

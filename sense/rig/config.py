@@ -175,13 +175,19 @@ def plan_of(setup: RigConfig, rig: "RigSettings", resume: bool) -> "PressPlan":
     """The plan of a resumed recording, or the one that `rig` asks for: of a kind, or from a file."""
     import numpy as np
 
-    from padforge.sense.recording.press_plan import PressPlan, all_free, free_of, planned, size_of
+    from padforge.sense.recording.press_plan import (
+        PressPlan,
+        check_pressable,
+        fit_pad_settings,
+        make_plan,
+        pressable_test,
+    )
     from padforge.sense.recording.run_directory import START
 
     if resume and (setup.out / START).exists():
-        plan = PressPlan.of(begun_source(setup, rig, KIND)["plan"]["presses"])
-        return all_free(plan, setup.out, free_of(setup.pad, size_of(setup.pad, setup.size)))
-    return planned(setup.pad, rig, np.random.default_rng(rig.seed), setup.size)
+        plan = PressPlan.from_rows(begun_source(setup, rig, KIND)["plan"]["presses"])
+        return check_pressable(plan, setup.out, pressable_test(setup.pad, fit_pad_settings(setup.pad, setup.size)))
+    return make_plan(setup.pad, rig, np.random.default_rng(rig.seed), setup.size)
 
 
 KIND = "rig"
@@ -260,10 +266,10 @@ def source_of(
 
 def _told(setup: RigConfig, rig: "RigSettings") -> dict[str, Any]:
     """Settings, with the inputs of the board as they are wired and the side of the pad as it counts, and the pad."""
-    from padforge.sense.recording.press_plan import told_pad
+    from padforge.sense.recording.press_plan import pad_source
 
     wired = rig.model_copy(update={"channels": rig.inputs(len(setup.pad.knots)), "mirrored": bool(rig.mirrored)})
-    return {"rig": wired.model_dump(mode="json"), "morphology": told_pad(setup.pad)}
+    return {"rig": wired.model_dump(mode="json"), "morphology": pad_source(setup.pad)}
 
 
 def _plain(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -293,5 +299,5 @@ def recorder_of(
     if resume and (folder / START).exists():
         require_same_devices(folder, read_json(folder / START, FORMAT).get("source", {}), devices)
         return Recorder.resume(folder)
-    source = source_of(setup, rig, KIND, {"columns": list(COLUMNS), "presses": plan.document()}, devices)
+    source = source_of(setup, rig, KIND, {"columns": list(COLUMNS), "presses": plan.to_rows()}, devices)
     return Recorder(folder, len(setup.pad.knots), source, provenance(setup.command, rig.seed, setup.inputs))

@@ -22,9 +22,15 @@ from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.recording.press_plan import Free, PressPlan, free_of, size_of, uniform
+from padforge.sense.recording.press_plan import (
+    PositionTest,
+    PressPlan,
+    fit_pad_settings,
+    pressable_test,
+    sample_uniform,
+)
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import refuse_begun, refuse_existing
+from padforge.sense.recording.run_directory import check_new_folder, check_new_recording
 from padforge.sense.rig.config import RigConfig, kept_plan, on_bed, plan_of, recorder_of
 from padforge.sense.rig.devices import Arm, Board, RigFault, device, host_ports
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_converter
@@ -47,7 +53,7 @@ class AdaptivePlanner:
             every press. rng: of the candidates. free: which of them may be pressed.
     """
 
-    def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: Free) -> None:
+    def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: PositionTest) -> None:
         self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
 
     def __call__(self, plan: PressPlan, press: int) -> PressPlan:
@@ -58,7 +64,7 @@ class AdaptivePlanner:
         errors = np.linalg.norm(self._localizer.predict(recording).positions_mm - recording.presses_mm, axis=1)
         places = plan.positions_mm.copy()
         high = np.abs(plan.positions_mm).max(axis=0)
-        candidates = uniform(np.array([-high, high]), _CANDIDATES, self._rng, self._free)
+        candidates = sample_uniform(np.array([-high, high]), _CANDIDATES, self._rng, self._free)
         pressed = recording.presses_mm
         for number in range(press, min(press + EVERY, len(plan))):
             places[number] = candidates[np.argmax(uncertainty(candidates, recording.presses_mm, errors, pressed))]
@@ -100,7 +106,7 @@ def record_simulated(
         InputError: settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
     if not replacing:
-        refuse_existing(out)
+        check_new_folder(out)
     options = spec.section(RigSettings, **overrides)
     plan = pad.morphology if isinstance(pad, Twin) else pad
     size = spec.section(PadSettings, **plan.layout.settings)
@@ -198,7 +204,7 @@ def record(
             if resume and (told := kept_plan(setup)):
                 say(told)
             if not (resume or dry):
-                refuse_begun(setup.out)
+                check_new_recording(setup.out)
             devices = {"board": converter.connect(), "arm": arm.connect()}
             require_tool(rig.tcp_mm, devices["arm"])
             require_ready(arm.state(), Limits.of(rig))  # before there is a folder that would be in the way
@@ -217,7 +223,7 @@ def _steering(setup: RigConfig, rig: RigSettings, model: Path | None) -> Callabl
         return lambda plan, press: plan
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
-    free = free_of(setup.pad, size_of(setup.pad, setup.size))
+    free = pressable_test(setup.pad, fit_pad_settings(setup.pad, setup.size))
     return AdaptivePlanner(LocalizerModel.load(model), setup.out, np.random.default_rng(rig.seed), free)
 
 

@@ -229,7 +229,7 @@ class Session:
         self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz
         self._averager = Averager(ratio, recorder.fibres)
         self._recent: deque[float] = deque(maxlen=_KEPT)
-        self._disk, self._readings = DiskThread(), recorder.readings
+        self._disk, self._readings = DiskThread(), recorder.n_readings
         self._interrupts = Interrupts()
         self._zero_s = 0.0
         self._forces_n: list[float] = []  # since the probe last came to rest

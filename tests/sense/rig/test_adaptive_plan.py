@@ -1,7 +1,7 @@
 import numpy as np
 
 from padforge.sense.localizer.calibration import calibrate
-from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
 from padforge.sense.rig.operation import EVERY, AdaptivePlanner, uncertainty
@@ -27,8 +27,8 @@ def test_a_recording_steers_itself_where_the_localizer_is_poor(tmp_path):
     arm = FakeArm(time)
     fast = {"readings_per_press": 24, "press_mm_s": 250, "clearance_mm": 5}
     options = RIG.model_copy(update={"presses": EVERY + 10, "plan": "adaptive", **fast})
-    plan = planned(PAD, options, np.random.default_rng(3))
-    learnt = planned(PAD, options, np.random.default_rng(4))
+    plan = make_plan(PAD, options, np.random.default_rng(3))
+    learnt = make_plan(PAD, options, np.random.default_rng(4))
     known = PressPlan(
         np.column_stack([-np.abs(learnt.positions_mm[:, 0]), learnt.positions_mm[:, 1]]), learnt.depths_mm
     )

@@ -142,7 +142,7 @@ def test_what_is_missing_is_asked_for_of_the_plan_that_was_kept(down_command: Ri
     with recorder:
         assert targets.tolist() == source["plan"]["presses"]
         np.testing.assert_array_equal(left, targets[2:])
-        assert recorder.readings == 20
+        assert recorder.n_readings == 20
 
 
 @pytest.mark.parametrize(

@@ -112,12 +112,12 @@ def hands(tmp_path: Path) -> Callable[..., Hands]:
 
 
 def known(recording: Recording) -> np.ndarray:
-    return recording.presses_mm[recording.known]
+    return recording.presses_mm[recording.has_position]
 
 
 def off_from(recording: Recording, strokes: np.ndarray) -> list[float]:
     """How far off their places, mm, the strokes of those presses went that count."""
-    made = zip(strokes[recording.known], known(recording), strict=True)
+    made = zip(strokes[recording.has_position], known(recording), strict=True)
     return [float(np.linalg.norm(stroke.place_mm - place)) for stroke, place in made]
 
 
@@ -133,7 +133,7 @@ def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hand
     np.testing.assert_array_equal(known(recording), hand.targets)
     strokes = np.array(hand.strokes_of(recording))
     refused, counted = (
-        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.known, recording.known)
+        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.has_position, recording.has_position)
     )
     assert refused["short"] >= 2
     assert refused["echo"] >= 2
@@ -142,7 +142,7 @@ def test_every_target_is_pressed_once_and_nothing_else_counts(clumsy: tuple[Hand
     off_mm = off_from(recording, strokes)
     assert max(off_mm) < 4 * SCATTER_MM
     assert np.sqrt(np.mean(np.square(off_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
-    held_s = (recording.up_command - recording.down_command)[recording.known] / RIG.rate_hz
+    held_s = (recording.up_command - recording.down_command)[recording.has_position] / RIG.rate_hz
     assert held_s.min() > 0.45
     assert all(line.startswith(("counted: x ", "not counted: it ", "not counted: nothing")) for line in hand.told)
     assert hand.views[-1]["done"] == hand.views[-1]["of"] == 60
@@ -183,7 +183,7 @@ def test_a_finder_that_lost_its_way_is_not_believed(hands, monkeypatch: pytest.M
     recording = hand.record()
     np.testing.assert_array_equal(known(recording), hand.targets)
     assert not Turned.once
-    assert 1 <= (~recording.known).sum() <= 3
+    assert 1 <= (~recording.has_position).sum() <= 3
     assert max(off_from(recording, np.array(hand.strokes_of(recording)))) < 4 * SCATTER_MM
 
 

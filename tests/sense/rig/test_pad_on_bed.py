@@ -11,7 +11,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import build
-from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.rig.config import on_bed
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.press_loop import require_safe_plan
@@ -48,7 +48,7 @@ def test_the_mould_tells_all_that_a_printer_has_to_know_and_what_rig_says_counts
     rig = on_bed(RIG, folder)
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm) == ((100.0, 90.0), 0.0, 8.0)
     assert rig.box_mm == pytest.approx((100 - HALF, 100 + HALF, 90 - HALF, 90 + HALF, 3.0, 130.0), abs=1e-5)
-    require_safe_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
+    require_safe_plan(make_plan(PAD, rig, np.random.default_rng(0)), rig)
     box = on_bed(
         RIG.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder
     ).box_mm  # it ends where the nozzle does

@@ -14,7 +14,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
-from padforge.sense.recording.press_plan import planned
+from padforge.sense.recording.press_plan import make_plan
 from padforge.sense.recording.run_directory import START
 from padforge.sense.rig.config import RigConfig, kept_plan, plan_of, recorder_of
 from padforge.sense.settings import RigSettings
@@ -32,14 +32,14 @@ def setup(out: Path, pad: Morphology = PAD) -> RigConfig:
 
 def resumed(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
     """The plan that is gone on with under other settings."""
-    return plan_of(setup(out, pad), RIG.model_copy(update=settings), resume=True).document()
+    return plan_of(setup(out, pad), RIG.model_copy(update=settings), resume=True).to_rows()
 
 
 @pytest.fixture(scope="module")
 def down_command(tmp_path_factory) -> Path:
     """A recording of no press so far, which nobody may change."""
     out = tmp_path_factory.mktemp("down_command")
-    with recorder_of(setup(out), RIG, planned(PAD, RIG, np.random.default_rng(0)), out, False, DEVICES):
+    with recorder_of(setup(out), RIG, make_plan(PAD, RIG, np.random.default_rng(0)), out, False, DEVICES):
         pass
     return out
 
@@ -53,7 +53,7 @@ def test_a_plan_is_of_a_kind_or_from_a_file_and_is_kept_where_another_is_asked_f
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
     named = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
     assert named.plan_file == tmp_path / "places.csv"
-    assert plan_of(setup(tmp_path / "run"), named, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
+    assert plan_of(setup(tmp_path / "run"), named, resume=False).to_rows() == [[1, 2, 3], [-3.5, 4, 3]]
     grid = RigSettings(plan="grid", presses=4)
     assert grid.plan_file is None
     assert len(plan_of(setup(tmp_path / "run"), grid, resume=False)) == 4
@@ -63,10 +63,10 @@ def test_a_plan_is_of_a_kind_or_from_a_file_and_is_kept_where_another_is_asked_f
 
 def test_a_recording_of_a_rectangle_is_resumed_but_for_holes_that_were_made_since(tmp_path):
     pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
-    plan = planned(pad, RIG, np.random.default_rng(0))
+    plan = make_plan(pad, RIG, np.random.default_rng(0))
     with recorder_of(setup(tmp_path, pad), RIG, plan, tmp_path, False, DEVICES):
         pass
-    assert resumed(tmp_path, pad) == plan.document()
+    assert resumed(tmp_path, pad) == plan.to_rows()
     with pytest.raises(InputError, match="another pad"):
         resumed(tmp_path, Morphology.straight((1, 3), (8.0, 15.0)))
     x, y = plan.positions_mm[1].tolist()
