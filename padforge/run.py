@@ -166,7 +166,7 @@ def check_run(run: Run) -> None:
     from padforge.fabricate.export import require_formats
     from padforge.sense.localizer.calibration import split_presses
     from padforge.sense.localizer.model import FORMAT as LOCALIZER_FORMAT
-    from padforge.sense.recording.recording import refuse_replacing
+    from padforge.sense.recording.recording import check_replaceable
     from padforge.sense.settings import LocalizerSettings, RigSettings
 
     for model in section_models().values():
@@ -180,7 +180,7 @@ def check_run(run: Run) -> None:
     split_presses(
         run.spec.section(RigSettings).presses, localizer.split, localizer.test_share, np.random.default_rng(0)
     )
-    refuse_replacing(run.out / "recording")
+    check_replaceable(run.out / "recording")
     check_design(run.spec, run.out, {"seed": run.seed}, _regenerated_files(), run.force)
     path = run.out / "localizer.json"
     if path.exists() and not run.force:

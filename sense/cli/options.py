@@ -73,7 +73,7 @@ def recording_line(recording: "Recording", out: Path) -> str:
     """A recording in one line, with what is missing of it."""
     import numpy as np
 
-    unknown = int((~recording.known).sum())
+    unknown = int((~recording.has_position).sum())
     missing = int(np.isnan(recording.readings).sum())
     return (
         f"{len(recording.presses_mm)} presses{f' ({unknown} of unknown place)' * (unknown > 0)}, "

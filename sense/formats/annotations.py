@@ -1,18 +1,24 @@
-"""What a trained model says of the presses and fibres of a recording, for those who write it to files of others."""
+"""What a trained model predicts for the presses and fibres of a recording, as exports carry it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from padforge.design.common.validation import check_path as as_path
-from padforge.design.common.validation import check_type
+from padforge.design.common.validation import check_path, check_type
 from padforge.sense.arrays import Array
 from padforge.sense.recording.recording import Recording
 
 
 @dataclass(frozen=True)
-class FaultFound:
-    """A fibre at fault: `kind` in a word and `text` in a line, by index, and the press at which it was named."""
+class FaultAnnotation:
+    """A fault that a model names.
+
+    Attributes:
+        press: index of the press at which it is named.
+        fibres: indices of the fibres at fault.
+        kind: one word.
+        text: one line.
+    """
 
     press: int
     fibres: tuple[int, ...]
@@ -21,14 +27,17 @@ class FaultFound:
 
 
 @dataclass(frozen=True)
-class ModelFindings:
-    """What a model says of Q presses.
+class ModelAnnotations:
+    """Predictions for Q presses.
 
     Attributes:
-        positions_mm: (Q, 2). std_mm: (Q, 2) standard deviations. r90_mm: (Q,) radius that holds 90 % of presses.
-        depths_mm: (Q,) and depths_r90_mm: (Q,) how far beside it 90 % are at most; NaN where depth was not learnt.
-        faults: by the press at which they were named; None where health was not learnt.
-        dead: fibres, by index, that never lived.
+        positions_mm: (Q, 2).
+        std_mm: (Q, 2) standard deviations.
+        r90_mm: (Q,) radius that holds the true position in 90 % of presses.
+        depths_mm: (Q,) NaN where the model predicts no depth.
+        depths_r90_mm: (Q,) error of the depth that 90 % of presses stay below.
+        faults: in the order of presses; None if the model has no health model.
+        dead: indices of fibres that never responded.
     """
 
     positions_mm: Array
@@ -36,17 +45,13 @@ class ModelFindings:
     r90_mm: Array
     depths_mm: Array
     depths_r90_mm: Array
-    faults: Sequence[FaultFound] | None = None
+    faults: Sequence[FaultAnnotation] | None = None
     dead: Sequence[int] = ()
 
 
-def export_path(recording: object, path: object, findings: object = None) -> Path:
-    """Where a recording, and what a model says of it, is to be written.
-
-    Raises:
-        InputError: one of them is something else.
-    """
+def check_export(recording: object, path: object, annotations: object = None) -> Path:
+    """Check the arguments of an export, and return the path; raise InputError where one is of another type."""
     check_type("recording", recording, Recording)
-    if findings is not None:
-        check_type("findings", findings, ModelFindings)
-    return as_path("path", path)
+    if annotations is not None:
+        check_type("annotations", annotations, ModelAnnotations)
+    return check_path("path", path)

@@ -1,9 +1,8 @@
-"""What the columns or datasets of somebody's file hold: `time=t_ms:ms,fibres=ch*:mV,x=px,y=py`.
-A mapping has `QUANTITY=NAME` or `QUANTITY=NAME:UNIT` with commas between them. In a name, `*` stands for any
-characters and `?` for any one, so also for a comma or a colon. A unit is one that `UNITS` lists for the quantity, or a
-factor, such as 0.001; without any, times are s, readings V, places and depths mm and forces N.
+"""What the columns, datasets or topics of a foreign file hold, and the recording in them.
 
-A recording put together from arrays that a mapping has named, however presses are told in them.
+A mapping such as `time=t_ms:ms,fibres=ch*:mV,x=px,y=py` has entries QUANTITY=NAME or QUANTITY=NAME:UNIT. In a name `*`
+stands for any characters and `?` for any one, also for a comma or a colon. A unit is one of `UNITS` or a factor, such
+as 0.001; without any, times are s, readings V, positions and depths mm, and forces N.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.validation import InputError, check_type, short_repr
-from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import Array, Indices, Mask, check_numbers
 from padforge.sense.recording.csv_table import UNKNOWN
 from padforge.sense.recording.recording import Recording
@@ -30,7 +28,7 @@ UNITS: dict[str, Mapping[str, float]] = {
     "fibres": VOLTS,
     "x": MILLIMETRES,
     "y": MILLIMETRES,
-    "places": MILLIMETRES,
+    "positions": MILLIMETRES,
     "depth": MILLIMETRES,
     "reached": MILLIMETRES,
     "force": NEWTONS,
@@ -38,21 +36,26 @@ UNITS: dict[str, Mapping[str, float]] = {
     "down_command": SECONDS,
     "up_command": SECONDS,
 }
-"""Quantities that a mapping may name, and how many s, V, mm or N their units are.
+"""Quantities that a mapping may name, and their units in s, V, mm or N.
 
-`press` numbers the presses, or is 1 while the pad is pressed; `places` are x and y in one array; `depth`
-is how deep a press was to be, `reached` how deep it was, and `force` how hard; `down_command` and `up_command`
-are numbers of readings, or times where a unit is said.
+`positions` are x and y in one array. `depth` was commanded and `reached` was measured. `press` numbers the presses, or
+is 1 while the pad is pressed. `down_command` and `up_command` are indices of readings, or times if they have a unit.
 """
-_LONGEST = 10_000
+MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
+"""Quantities with one value a press, and their attributes of a `Recording`."""
+PRESSES_DETECTED = {"presses": "detected"}
+"""Entry of the source of a recording whose presses were detected in its readings."""
+MAX_CHARACTERS = 10_000
+_MAX_LISTED = 12
 
 
-class Part(NamedTuple):
-    """One part of a mapping.
+class ColumnEntry(NamedTuple):
+    """Entry of a mapping.
 
     Attributes:
-        quantity: one of `UNITS`. name: of a column or dataset, or a pattern of such.
-        factor: by which its values become s, V, mm or N; None where no unit is said.
+        quantity: one of `UNITS`.
+        name: of a column, dataset or topic, or a pattern.
+        factor: from its values to s, V, mm or N; None without a unit.
     """
 
     quantity: str
@@ -60,56 +63,58 @@ class Part(NamedTuple):
     factor: float | None = None
 
 
-def file_and_mapping(path: object, mapping: object) -> tuple[Path, str]:
-    """What a caller hands to a reader of files: a path and the text of a mapping, "" for none.
+def check_import(path: object, columns: object) -> tuple[Path, str]:
+    """Check the arguments of an import, a path and the text of a mapping, and return them."""
+    return check_path("path", path), check_type("columns", columns, str)
+
+
+def parse_columns(text: str, quantities: Sequence[str] = tuple(UNITS)) -> list[ColumnEntry]:
+    """Return the entries of a mapping, in its order; `fibres` may have several.
+
+    Args:
+        text: the mapping.
+        quantities: that it may name.
 
     Raises:
-        InputError: one of them is something else.
+        InputError: no mapping, a quantity that is not allowed or named twice, one of two that belong together, two
+            that exclude each other, or no `time` (where it is allowed) or `fibres`.
     """
-    return as_path("path", path), check_type("mapping", mapping, str)
-
-
-def parse_mapping(text: str, allowed: Sequence[str] = tuple(UNITS)) -> list[Part]:
-    """The parts of a mapping, in its order; of `fibres` there may be several.
-
-    Raises:
-        InputError: no mapping, a quantity that is not `allowed` or named twice, one of two that belong together, two
-            that say the same, or no `time` (where it is allowed) or `fibres`; the message names the part.
-    """
-    if len(text) > _LONGEST:
-        raise InputError(f"mapping has {len(text)} characters, allowed are {_LONGEST}")
-    parts = [_part(each.strip(), allowed) for each in text.split(",")]
-    named = [part.quantity for part in parts]
+    if len(text) > MAX_CHARACTERS:
+        raise InputError(f"mapping has {len(text)} characters, allowed are {MAX_CHARACTERS}")
+    entries = [_parse_entry(entry.strip(), quantities) for entry in text.split(",")]
+    named = [entry.quantity for entry in entries]
     for quantity in named:
         if quantity != "fibres" and named.count(quantity) > 1:
             raise InputError(f"mapping {short_repr(text)} names {quantity} twice, expected once")
-    needed = [quantity for quantity in ("time", "fibres") if quantity in allowed]
-    for quantity in needed:
+    required = [quantity for quantity in ("time", "fibres") if quantity in quantities]
+    for quantity in required:
         if quantity not in named:
             raise InputError(
-                f"mapping {short_repr(text)} does not name {quantity}, expected {' and '.join(needed)} in each"
+                f"mapping {short_repr(text)} does not name {quantity}, expected {' and '.join(required)} in each"
             )
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
             raise InputError(f"mapping {short_repr(text)} names one of {one} and {other}, expected both or neither")
-    for one, other in (("x", "places"), ("press", "down_command")):
+    for one, other in (("x", "positions"), ("press", "down_command")):
         if one in named and other in named:
             raise InputError(f"mapping {short_repr(text)} names {one} and {other}, expected one of them")
-    return parts
+    return entries
 
 
-def _part(text: str, allowed: Sequence[str]) -> Part:
-    quantity, _, rest = (piece.strip() for piece in text.partition("="))
-    name, colon, unit = (piece.strip() for piece in (rest.rpartition(":") if ":" in rest else (rest, "", "")))
-    if quantity not in allowed or not name:
+def _parse_entry(text: str, quantities: Sequence[str]) -> ColumnEntry:
+    quantity, _, name = (piece.strip() for piece in text.partition("="))
+    unit = None
+    if ":" in name:
+        name, _, unit = (piece.strip() for piece in name.rpartition(":"))
+    if quantity not in quantities or not name:
         raise InputError(
             f"mapping has {short_repr(text)}, expected QUANTITY=NAME or QUANTITY=NAME:UNIT, "
-            f"where QUANTITY is one of {', '.join(allowed)}"
+            f"where QUANTITY is one of {', '.join(quantities)}"
         )
-    return Part(quantity, name, _factor(quantity, unit) if colon else None)
+    return ColumnEntry(quantity, name, None if unit is None else _parse_unit(quantity, unit))
 
 
-def _factor(quantity: str, unit: str) -> float:
+def _parse_unit(quantity: str, unit: str) -> float:
     units = UNITS[quantity]
     if unit in units:
         return units[unit]
@@ -123,227 +128,200 @@ def _factor(quantity: str, unit: str) -> float:
     return factor
 
 
-def chosen(parts: Sequence[Part], names: Sequence[str]) -> list[tuple[Part, list[int]]]:
-    """Which of `names` each part means; a pattern leaves out what parts before it take, and fibres come last.
+def matches(name: str, pattern: str) -> bool:
+    """Whether a name is that of an entry, or matches its pattern."""
+    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))  # brackets hold units, no characters
+
+
+def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[tuple[ColumnEntry, list[int]]]:
+    """Find the columns of each entry. A pattern leaves out those of entries before it; fibres come last.
+
+    Args:
+        entries: of a mapping.
+        names: of all columns.
 
     Returns:
-        Parts with their places in `names`, ascending: one place each, but for fibres.
+        The entries with the indices of their columns, ascending: one each, but for fibres.
 
     Raises:
-        InputError: a part means none of them, what another one has, or several where it is not of fibres.
+        InputError: an entry matches none, the column of another one, or several that are not of fibres.
     """
-    found: list[tuple[Part, list[int]]] = []
-    taken: set[int] = set()
-    for part in sorted(parts, key=lambda part: part.quantity == "fibres"):
-        if part.name in names:
-            places = [at for at, name in enumerate(names) if name == part.name]
-        else:
-            pattern = part.name.replace("[", "[[]")  # units stand in such brackets
-            places = [at for at, name in enumerate(names) if fnmatchcase(name, pattern) and at not in taken]
-        if not places:
-            raise InputError(f"{part.quantity} is {short_repr(part.name)}, expected one of {listed(names)}")
-        if len(places) > 1 and part.quantity != "fibres":
-            several = listed([names[at] for at in places])
-            raise InputError(
-                f"{part.quantity} is {short_repr(part.name)}, which may be each of {several}; expected one"
-            )
-        if not taken.isdisjoint(places):
-            raise InputError(f"{part.quantity} is {short_repr(part.name)}, which is named before; expected each once")
-        taken.update(places)
-        found.append((part, places))
-    return found
+    matched: list[tuple[ColumnEntry, list[int]]] = []
+    used: set[int] = set()
+    for entry in sorted(entries, key=lambda entry: entry.quantity == "fibres"):
+        what = f"{entry.quantity} is {short_repr(entry.name)}"
+        columns = [i for i, name in enumerate(names) if name == entry.name]
+        columns = columns or [i for i, name in enumerate(names) if i not in used and matches(name, entry.name)]
+        if not columns:
+            raise InputError(f"{what}, expected one of {join_names(names)}")
+        if len(columns) > 1 and entry.quantity != "fibres":
+            raise InputError(f"{what}, which may be each of {join_names([names[i] for i in columns])}; expected one")
+        if not used.isdisjoint(columns):
+            raise InputError(f"{what}, which is named before; expected each once")
+        used.update(columns)
+        matched.append((entry, columns))
+    return matched
 
 
-def listed(names: Sequence[str], most: int = 12) -> str:
-    """Names with commas between them, the first of many."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return (", ".join(short_repr(name) for name in names[:most]) or "nothing") + more
+def join_names(names: Sequence[str]) -> str:
+    """Return the first names with commas between them, for a message."""
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return (", ".join(short_repr(name) for name in names[:_MAX_LISTED]) or "nothing") + more
 
 
-MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
-"""Quantities of which each press has one, and what they are called in a `Recording`."""
-FOUND = {"presses": "found"}
-"""What the source of a recording says whose presses were found in its readings."""
+def assemble_recording(
+    path: Path, arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mapping[str, Any]
+) -> Recording:
+    """Make a recording of the arrays of a file.
 
+    Presses are where `down_command` and `up_command` are, else `press`, else where positions are missing between
+    presses; or they are detected in the readings. Of positions, depths and forces with one value a reading, a press
+    gets the one in its middle.
 
-class _PressColumns(NamedTuple):
-    """(Q,) readings at which presses begin and end, as in a `Recording`, and how they are known."""
-
-    down_command: Indices
-    up_command: Indices
-    source: Mapping[str, str]
-
-
-def assembled(path: Path, found: Sequence[tuple[Part, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
-    """The recording in the arrays of a file, each with the part of a mapping that it belongs to.
-
-    `time` has R values, `fibres` is (R, C), (C, R) or R values of one fibre, in one array or several. `press` has R
-    values. Places are (2, n) or (n, 2), or x and y of n values, for n = R readings or n = Q presses. Presses are where
-    `down_command` and `up_command` say so, else `press`, else where places stand that are missing between presses; or they are
-    found in the readings. Where places, depths or forces are given a reading, that of a press is the one in the middle
-    of it.
+    Args:
+        path: of the file, for messages.
+        arrays: each with its entry. `time` and `press` have R values; `fibres` is (R, C), (C, R) or (R,), in one
+            array or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
+        source: of the recording.
 
     Raises:
-        InputError: shapes that do not fit together, no press, or as `Recording`; the message names the file.
+        InputError: shapes that do not fit together, no press, or as `Recording`.
     """
     try:
-        return _assembled(found, source)
+        return _assemble(arrays, source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _assembled(found: Sequence[tuple[Part, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
-    given: dict[str, Array] = {}
+def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
+    columns: dict[str, Array] = {}
     fibres: list[Array] = []
-    for part, array in found:
-        factor = 1.0 if part.factor is None else part.factor
-        numbers = _numbers(part.quantity, array)
-        numbers = numbers if factor == 1 else _scaled(numbers, factor)
-        if part.quantity == "fibres":
-            fibres.append(numbers)
+    for entry, array in arrays:
+        values = _scaled(entry, array)
+        if entry.quantity == "fibres":
+            fibres.append(values)
+        elif entry.quantity == "positions" or values.size in values.shape:
+            columns[entry.quantity] = values if entry.quantity == "positions" else values.ravel()
         else:
-            given[part.quantity] = numbers if part.quantity == "places" else _vector(part.quantity, numbers)
-    times = given["time"]
-    columns = [_oriented(each, len(times)) for each in fibres]
-    readings = columns[0] if len(columns) == 1 else np.column_stack(columns)
-    places = _places(given)
-    timed = {part.quantity for part, _ in found if part.factor is not None}
-    for name in ("down_command", "up_command"):
-        if name in timed:
-            given[name] = _first_at(times, given[name]).astype(np.float64)
-    presses = _told(given, places, len(times)) or _found(readings, times, source)
-    measures: dict[str, Any] = {
-        attribute: _of_presses(name, given[name], presses, len(times))
-        for name, attribute in MEASURES.items()
-        if name in given
-    }
-    said = {**source, **presses.source}
-    return Recording(readings, times, _pressed(places, presses, len(times)), *presses[:2], said, **measures)
+            raise InputError(f"{entry.quantity} has shape {values.shape}, expected one row or column")
+    times = columns["time"]
+    fibres = [_by_readings(values, len(times)) for values in fibres]
+    readings = fibres[0] if len(fibres) == 1 else np.column_stack(fibres)
+    timed = {entry.quantity for entry, _ in arrays if entry.factor is not None}
+    for name in timed & {"down_command", "up_command"}:
+        # A thousandth of an interval is allowed for: times that were converted to another unit and back are rounded.
+        tolerance = 1e-3 * np.median(np.diff(times)) if len(times) > 1 else 0.0
+        columns[name] = np.searchsorted(times, columns[name] - tolerance).astype(np.float64)
+    positions = _join_positions(columns)
+    presses = _find_presses(columns, positions, len(times))
+    if presses is None:
+        presses, source = _detect(readings, times, source), {**source, **PRESSES_DETECTED}
+    down, up = presses
+
+    def at_presses(name: str, values: Array) -> Array:
+        if len(values) == len(down):
+            return values
+        if len(values) != len(times):
+            raise InputError(
+                f"{name} are {len(values)}, expected one for each of {len(down)} presses or {len(times)} readings"
+            )
+        return values[np.clip((down + up) // 2, 0, len(times) - 1)]
+
+    measures: dict[str, Any] = {MEASURES[name]: at_presses(name, columns[name]) for name in MEASURES if name in columns}
+    at = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
+    return Recording(readings, times, np.where(at == UNKNOWN, np.nan, at), down, up, source, **measures)
 
 
-def _first_at(times_s: Array, events_s: Array) -> Indices:
-    """First of (R,) readings at or after each of (n,) times.
-
-    Times that were turned into another unit and back are off by a rounding, so the last thousandth of an interval
-    before an event counts as at it.
-    """
-    steps = np.diff(times_s)
-    return np.searchsorted(times_s, events_s - (1e-3 * np.median(steps) if len(steps) else 0.0))
-
-
-def _numbers(name: str, values: NDArray[Any]) -> Array:
-    values = np.asarray(values)
-    return check_numbers(values.astype(np.uint8) if values.dtype.kind == "b" else values, np.float64, name, copy=False)
+def _scaled(entry: ColumnEntry, array: NDArray[Any]) -> Array:
+    """Return values in s, V, mm or N; UNKNOWN stays what it is."""
+    array = np.asarray(array)
+    array = array.astype(np.uint8) if array.dtype.kind == "b" else array
+    values = check_numbers(array, np.float64, entry.quantity, copy=False)
+    if entry.factor in (None, 1):
+        return values
+    with np.errstate(over="ignore"):  # a recording refuses infinity
+        return np.where(values == UNKNOWN, UNKNOWN, values * entry.factor)
 
 
-def _scaled(numbers: Array, factor: float) -> Array:
-    """Numbers in another unit; what stands for an unknown place stays what it is."""
-    with np.errstate(over="ignore"):  # what becomes infinite is refused as such
-        return np.where(numbers == UNKNOWN, UNKNOWN, numbers * factor)
+def _by_readings(values: Array, n_readings: int) -> Array:
+    """Return (R, c) readings from (R, c), (c, R) or (R,)."""
+    if values.ndim in (1, 2) and len(values) == n_readings:
+        return values[:, None] if values.ndim == 1 else values
+    if values.ndim == 2 and values.shape[1] == n_readings:
+        return values.T
+    raise InputError(
+        f"fibres have shape {values.shape}, expected ({n_readings}, C) or (C, {n_readings}), as time has it"
+    )
 
 
-def _vector(name: str, values: Array) -> Array:
-    if values.size not in values.shape:
-        raise InputError(f"{name} has shape {values.shape}, expected one row or column")
-    return values.ravel()
+def _join_positions(columns: Mapping[str, Array]) -> Array | None:
+    """Return (n, 2) positions of readings or presses; None if there are none."""
+    if "x" in columns:
+        x, y = columns["x"], columns["y"]
+        if len(x) != len(y):
+            raise InputError(f"x has {len(x)} values and y {len(y)}, expected as many")
+        return np.column_stack([x, y])
+    positions = columns.get("positions")
+    if positions is not None and (positions.ndim != 2 or 2 not in positions.shape):
+        raise InputError(f"positions have shape {positions.shape}, expected (n, 2) or (2, n)")
+    return positions if positions is None or positions.shape[1] == 2 else positions.T
 
 
-def _oriented(readings: Array, count: int) -> Array:
-    """Readings (R, c) of R = `count`, from such, (c, R) or (R,)."""
-    if readings.ndim in (1, 2) and len(readings) == count:
-        return readings[:, None] if readings.ndim == 1 else readings
-    if readings.ndim == 2 and readings.shape[1] == count:
-        return readings.T
-    raise InputError(f"fibres have shape {readings.shape}, expected ({count}, C) or (C, {count}), as time has it")
-
-
-def _places(given: Mapping[str, Array]) -> Array | None:
-    """Places (n, 2) of readings or presses; None where there are none."""
-    if "x" in given:
-        if len(given["x"]) != len(given["y"]):
-            raise InputError(f"x has {len(given['x'])} values and y {len(given['y'])}, expected as many")
-        return np.column_stack([given["x"], given["y"]])
-    places = given.get("places")
-    if places is not None and (places.ndim != 2 or 2 not in places.shape):
-        raise InputError(f"places have shape {places.shape}, expected (n, 2) or (2, n)")
-    return places if places is None or places.shape[1] == 2 else places.T
-
-
-def _told(given: Mapping[str, Array], places: Array | None, count: int) -> _PressColumns | None:
-    """Presses as the arrays tell them; None where they do not."""
-    if "down_command" in given:
-        down_command, up_command = (
-            check_numbers(given[name], np.int64, name) for name in ("down_command", "up_command")
-        )
-        if len(down_command) != len(up_command):
-            raise InputError(f"begun has {len(down_command)} values and lifted {len(up_command)}, expected as many")
-        return _PressColumns(down_command, up_command, {})
-    if "press" in given:
-        press = given["press"]
-        if len(press) != count:
-            raise InputError(f"press has {len(press)} values, expected {count}, one a reading")
-        return _runs(press[:, None], _contact(press))
-    if places is None or len(places) != count:
+def _find_presses(
+    columns: Mapping[str, Array], positions: Array | None, n_readings: int
+) -> tuple[Indices, Indices] | None:
+    """Return the (Q,) down and up commands that the columns say; None if they say nothing."""
+    if "down_command" in columns:
+        down, up = (check_numbers(columns[name], np.int64, name) for name in ("down_command", "up_command"))
+        if len(down) != len(up):
+            raise InputError(f"down_command has {len(down)} values and up_command {len(up)}, expected as many")
+        return down, up
+    if "press" in columns:
+        press = columns["press"]
+        if len(press) != n_readings:
+            raise InputError(f"press has {len(press)} values, expected {n_readings}, one a reading")
+        return _find_runs(press[:, None], _is_pressed(press))
+    if positions is None or len(positions) != n_readings:
         return None
-    empty = np.isnan(places)
-    half = empty[:, 0] != empty[:, 1]
-    if half.any():
-        raise InputError(f"places have one of x and y in row {int(np.argmax(half))}, expected both or neither")
-    down = ~empty[:, 0]
-    return _runs(places, down) if down.any() and not down.all() else None
+    missing = np.isnan(positions)
+    incomplete = missing[:, 0] != missing[:, 1]
+    if incomplete.any():
+        raise InputError(f"positions have one of x and y in row {int(np.argmax(incomplete))}, expected both or neither")
+    pressed = ~missing[:, 0]
+    return _find_runs(positions, pressed) if pressed.any() and not pressed.all() else None
 
 
-def _contact(press: Array) -> Mask:
-    """(R,) whether the pad is pressed: where `press` is not 0, or where it is neither missing nor below 0."""
-    none, zero = ~(press >= 0), press == 0
-    if none.any() and zero.any():
+def _is_pressed(press: Array) -> Mask:
+    """Return (R,) where `press` is not 0, or where it is neither missing nor negative."""
+    missing, zero = ~(press >= 0), press == 0
+    if missing.any() and zero.any():
         raise InputError(
-            f"press is missing or negative in row {int(np.argmax(none))} and 0 in row {int(np.argmax(zero))}, "
+            f"press is missing or negative in row {int(np.argmax(missing))} and 0 in row {int(np.argmax(zero))}, "
             f"expected one of both where the pad is not pressed"
         )
-    down = ~(none | zero)
-    if down.all() or not down.any():
-        what = "0, missing or negative" if down.all() else "above 0"
-        raise InputError(f"press is nowhere {what}; without it, presses are found in the readings")
-    return down
+    pressed = ~(missing | zero)
+    if pressed.all() or not pressed.any():
+        what = "0, missing or negative" if pressed.all() else "above 0"
+        raise InputError(f"press is nowhere {what}; without it, presses are detected in the readings")
+    return pressed
 
 
-def _runs(values: Array, down: Mask) -> _PressColumns:
-    """Presses that last while the pad is `down` (R,) and `values` (R, k) stay the same."""
+def _find_runs(values: Array, pressed: Mask) -> tuple[Indices, Indices]:
+    """Return the down and up commands of presses: runs of readings that are pressed and have equal values (R, k)."""
     before = np.vstack([np.full((1, values.shape[1]), np.nan), values[:-1]])
-    down_command = np.flatnonzero(down & (values != before).any(axis=1))
-    ends = np.append(np.flatnonzero(~down), len(values))
-    up_command = np.minimum(ends[np.searchsorted(ends, down_command)], np.append(down_command[1:], len(values)))
-    return _PressColumns(down_command, up_command, {})
+    down = np.flatnonzero(pressed & (values != before).any(axis=1))
+    ends = np.append(np.flatnonzero(~pressed), len(values))
+    return down, np.minimum(ends[np.searchsorted(ends, down)], np.append(down[1:], len(values)))
 
 
-def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _PressColumns:
-    """Presses that the readings show."""
+def _detect(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
+    """Return the down and up commands of presses that are detected in the readings."""
     from padforge.sense.signals.press_detection import as_commanded, detect_presses
 
-    first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
-    Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)
+    placeholder = np.array([1])
+    Recording(readings, times_s, np.zeros((1, 2)), placeholder, placeholder + 1, source)  # checks the readings first
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
-        raise InputError("has no press: no place or number tells one, and none is found in the readings")
-    return _PressColumns(*as_commanded(presses, times_s), FOUND)
-
-
-def _pressed(places: Array | None, presses: _PressColumns, count: int) -> Array:
-    """(Q, 2) places of presses, NaN where they are unknown."""
-    if places is None:
-        return np.full((len(presses.down_command), 2), np.nan)
-    places = _of_presses("places", places, presses, count)
-    return np.where(places == UNKNOWN, np.nan, places)
-
-
-def _of_presses(name: str, values: Array, presses: _PressColumns, count: int) -> Array:
-    """(Q, ...) values of presses, from such, or from (R, ...) of readings, R = `count`."""
-    if len(values) == len(presses.down_command):
-        return values
-    if len(values) != count:
-        raise InputError(
-            f"{name} are {len(values)}, expected one for each of {len(presses.down_command)} presses or {count} readings"
-        )
-    middle = (presses.down_command + presses.up_command) // 2
-    return values[np.clip(middle, 0, count - 1)]
+        raise InputError("has no press: no position or number tells of one, and none is detected in the readings")
+    down, up = as_commanded(presses, times_s)
+    return down, up

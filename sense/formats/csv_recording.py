@@ -1,104 +1,113 @@
 """Recordings from and to CSV.
 
-The form of padforge has a header and one line a reading: `time_s`, one column of volts per fibre (any names; an empty
-cell is a missing reading), then `x_mm` and `y_mm`. The last two hold the place of the press while the probe is sent
-down, `?` where it is not known, and are empty on every other line; so the first line of a run of equal places is where
-a press begins, and the first line after it where it ends. Where they are known of any press, `depth_mm` (commanded),
-`reached_mm` and `force_n` follow. Where no line has a place, every line has one, or the two columns are not there,
-presses are found in the readings (`press_detection`).
-
-Other forms are told by a mapping (see `mapping`)."""
+Padforge's own columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm`
+and `y_mm`. The last two hold the position of the press while the probe is sent down, `?` where it is unknown, and are empty
+on all other lines: a press begins on the first line of a run of equal positions, and ends on the first one after it.
+Where any press has them, `depth_mm` (commanded), `reached_mm` and `force_n` follow. Where no line has a position, all
+lines have one, or the two columns are missing, presses are detected in the readings. Other columns are named by a
+mapping (`columns`).
+"""
 
 import csv
-from math import isnan
 from pathlib import Path
-from reprlib import repr as shortened
 
 import numpy as np
 
 from padforge.design.common.files import atomic_file, reraise_write_error
-from padforge.design.common.validation import InputError
-from padforge.sense.arrays import MAX_FIBRES, Array
-from padforge.sense.formats.annotations import export_path
-from padforge.sense.formats.columns import MEASURES, Part, assembled, chosen, file_and_mapping, parse_mapping
+from padforge.design.common.validation import InputError, short_repr
+from padforge.sense.arrays import MAX_FIBRES
+from padforge.sense.formats.annotations import check_export
+from padforge.sense.formats.columns import (
+    MEASURES,
+    ColumnEntry,
+    assemble_recording,
+    check_import,
+    match_columns,
+    parse_columns,
+)
 from padforge.sense.recording.csv_table import CsvTable
 from padforge.sense.recording.recording import Recording
 
 QUANTITIES = ("time", "fibres", "x", "y", "depth", "reached", "force", "press")
-"""What a line can hold."""
-TIME, FIBRES, PLACES = Part("time", "time_s"), Part("fibres", "*"), (Part("x", "x_mm"), Part("y", "y_mm"))
-MEASURED = (Part("depth", "depth_mm"), Part("reached", "reached_mm"), Part("force", "force_n"))
-"""Columns of padforge's own form; the last ones are there where any of their values is known."""
+"""Quantities that a column may hold."""
+_MEASURED = {"depth_mm": "depth", "reached_mm": "reached", "force_n": "force"}
 
 
-def import_csv(path: str | Path, mapping: str = "") -> Recording:
-    """Read a recording in the CSV form of this module, or in one that a mapping tells, as `time=t_ms:ms,fibres=ch*`.
+def import_csv(path: str | Path, columns: str = "") -> Recording:
+    """Read a recording from a CSV file.
+
+    Args:
+        path: of the file.
+        columns: what its columns hold, as `time=t_ms:ms,fibres=ch*`; by default they are padforge's own.
 
     Raises:
-        InputError: the file is no such CSV, or no press is in it; the message names the line.
+        InputError: no such CSV file, or no press in it; the message names the line.
     """
-    path, mapping = file_and_mapping(path, mapping)
-    parts = parse_mapping(mapping, QUANTITIES) if mapping else None
+    path, columns = check_import(path, columns)
+    entries = parse_columns(columns, QUANTITIES) if columns else None
     table = CsvTable(path)
     try:
-        columns = chosen(parts or _own(table.names), table.names)
+        matched = match_columns(entries or _own_entries(table.names), table.names)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    numbers = [at for _, places in columns for at in places]
-    unknown = [places[0] for part, places in columns if part.quantity in "xy"]
-    values = table.columns(numbers, unknown)
-    _refuse_half(table, values, numbers, unknown)
-    ends = np.cumsum([len(places) for _, places in columns])
-    arrays = np.split(values, ends[:-1], axis=1)
-    source = {"kind": "csv", "file": path.name} | ({"mapping": mapping} if mapping else {})
-    return assembled(path, [(part, array) for (part, _), array in zip(columns, arrays, strict=True)], source)
+    indices = [i for _, entry_columns in matched for i in entry_columns]
+    x_y = [entry_columns[0] for entry, entry_columns in matched if entry.quantity in "xy"]
+    values = table.read_columns(indices, x_y)
+    missing = np.isnan(values[:, [indices.index(i) for i in x_y]])
+    if (incomplete := missing.any(axis=1) & ~missing.all(axis=1)).any():
+        x, y = (table.names[i] for i in x_y)
+        line = table.line_number(int(np.argmax(incomplete)))
+        raise InputError(f"{path}: line {line} has one of {x} and {y}, expected both or neither")
+    ends = np.cumsum([len(entry_columns) for _, entry_columns in matched])
+    arrays = [(entry, part) for (entry, _), part in zip(matched, np.split(values, ends[:-1], axis=1), strict=True)]
+    return assemble_recording(
+        path, arrays, {"kind": "csv", "file": path.name} | ({"columns": columns} if columns else {})
+    )
 
 
-def _own(names: list[str]) -> list[Part]:
-    """What the columns of padforge's own form hold."""
-    places = [part for part in PLACES if part.name in names]
-    places += [part for part in MEASURED if places and part.name in names]
-    fibres = len(names) - 1 - len(places)
-    if TIME.name not in names or len(places) == 1 or not 1 <= fibres <= MAX_FIBRES:
+def _own_entries(names: list[str]) -> list[ColumnEntry]:
+    entries = [ColumnEntry(name[0], name) for name in ("x_mm", "y_mm") if name in names]
+    if entries:
+        entries += [ColumnEntry(quantity, name) for name, quantity in _MEASURED.items() if name in names]
+    fibres = len(names) - 1 - len(entries)
+    if "time_s" not in names or len(entries) == 1 or not 1 <= fibres <= MAX_FIBRES:
         raise InputError(
-            f"header is {shortened(','.join(names) or 'nothing')}, expected time_s, one column per fibre, x_mm, y_mm; "
-            f"a mapping tells what other columns hold"
+            f"header is {short_repr(','.join(names) or 'nothing')}, expected time_s, one column per fibre, x_mm, y_mm; "
+            f"columns (--columns) say what others hold"
         )
-    return [TIME, *places, FIBRES]
-
-
-def _refuse_half(table: CsvTable, values: Array, numbers: list[int], unknown: list[int]) -> None:
-    """Raise InputError where a line has one coordinate alone."""
-    empty = np.isnan(values[:, [numbers.index(at) for at in unknown]])
-    half = empty.any(axis=1) & ~empty.all(axis=1)
-    if half.any():
-        x, y = (table.names[at] for at in unknown)
-        line = table.line(int(np.argmax(half)))
-        raise InputError(f"{table.path}: line {line} has one of {x} and {y}, expected both or neither")
+    return [ColumnEntry("time", "time_s"), *entries, ColumnEntry("fibres", "*")]
 
 
 def export_csv(recording: Recording, path: str | Path) -> None:
-    """Write `recording` in the CSV form of this module, atomically; importing it gives the same numbers.
+    """Write a recording as CSV, atomically; importing it gives the same numbers.
+
+    Args:
+        recording: to write.
+        path: of the file.
 
     Raises:
-        InputError: `path` cannot be written.
+        InputError: the path cannot be written.
     """
-    path = export_path(recording, path)
-    measures = {part.name: getattr(recording, MEASURES[part.quantity]) for part in MEASURED}
+    path = check_export(recording, path)
+    measures = {name: getattr(recording, MEASURES[quantity]) for name, quantity in _MEASURED.items()}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}
-    header = ["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures]
-    places: list[list[float | str]] = [[""] * (2 + len(measures)) for _ in recording.times_s]
-    presses = np.column_stack([recording.presses_mm, *measures.values()]).tolist()
-    for press, down_command, up_command in zip(presses, recording.down_command, recording.up_command, strict=True):
-        place: list[float | str] = ["?", "?"] if isnan(press[0]) else press[:2]
-        cells = [*place, *("" if isnan(value) else value for value in press[2:])]
-        places[down_command:up_command] = [cells] * int(up_command - down_command)
+    of_readings = [[""] * (2 + len(measures))] * len(recording.times_s)
+    of_presses = zip(
+        recording.presses_mm, *measures.values(), recording.down_command, recording.up_command, strict=True
+    )
+    for (x, y), *press_measures, down, up in of_presses:
+        cells = ["?", "?"] if np.isnan(x) else [float(x), float(y)]
+        of_readings[down:up] = [cells + _cells(press_measures)] * int(up - down)
     with (
         reraise_write_error(path),
         atomic_file(path) as temporary,
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
-        writer.writerow(header)
-        for time, volts, place in zip(recording.times_s.tolist(), recording.readings.tolist(), places, strict=True):
-            writer.writerow([time, *("" if isnan(value) else value for value in volts), *place])
+        writer.writerow(["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures])
+        for time, volts, press in zip(recording.times_s.tolist(), recording.readings, of_readings, strict=True):
+            writer.writerow([time, *_cells(volts), *press])
+
+
+def _cells(values: "np.ndarray | list") -> list[float | str]:
+    return ["" if value != value else value for value in np.asarray(values).tolist()]  # NaN is missing

@@ -1,9 +1,8 @@
-"""Recordings as HDF5: an export made of a finished run directory, for other programs; never written to while recording.
-Datasets: `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `down_command` and `up_command` (Q,), and `depths_mm`,
-`reached_mm` and `forces_n` (Q,) where any is known; the attribute `source` is JSON text. The states of an arm stay in
-the run directory. Files of other programs are told by a mapping (see `mapping`).
+"""Recordings from and to HDF5, and from MATLAB files such as those of the published study.
 
-Recordings of the published study, and others that lie in MATLAB files.
+An exported HDF5 file has the datasets `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `down_command` and
+`up_command` (Q,), and `depths_mm`, `reached_mm` and `forces_n` (Q,) where any press has them; the attribute `source` is
+JSON. The states of an arm stay in the run directory. Other files are named by a mapping (`columns`).
 """
 
 import json
@@ -16,28 +15,41 @@ from padforge.design.common.files import atomic_file, reraise_write_error
 from padforge.design.common.mat_files import load_mat, open_hdf5
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
-from padforge.sense.formats.annotations import export_path
-from padforge.sense.formats.columns import MEASURES, assembled, chosen, file_and_mapping, listed, parse_mapping
+from padforge.sense.formats.annotations import check_export
+from padforge.sense.formats.columns import (
+    MEASURES,
+    assemble_recording,
+    check_import,
+    join_names,
+    match_columns,
+    parse_columns,
+)
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-hdf5/2"
-_ARRAYS = {"times_s": "times_s", "readings_v": "readings"} | {
-    key: key for key in ("presses_mm", "down_command", "up_command")
+NOTE = "note"
+"""Key in the source of a recording that says what was left out of it."""
+_DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")} | {
+    "readings_v": "readings"
 }
-"""Names of the datasets and of what they hold of a `Recording`."""
-_KNOWN = tuple(MEASURES.values())
-"""Datasets that are there where any of their values is known."""
+"""Datasets, and their attributes of a `Recording`."""
+CYCLE, DOWN_AT = 40, 20
+"""Readings of a published press, and the one at which the probe is sent down; it is sent up at the end."""
 
 
 def export_hdf5(recording: Recording, path: str | Path) -> None:
     """Write a recording as HDF5, atomically; importing it gives the same numbers.
 
+    Args:
+        recording: to write.
+        path: of the file.
+
     Raises:
-        InputError: `path` cannot be written.
+        InputError: the path cannot be written.
     """
     import h5py
 
-    path = export_path(recording, path)
+    path = check_export(recording, path)
     with (
         reraise_write_error(path),
         atomic_file(path) as temporary,
@@ -45,122 +57,101 @@ def export_hdf5(recording: Recording, path: str | Path) -> None:
     ):
         file.attrs["format"] = FORMAT
         file.attrs["source"] = json.dumps(dict(recording.source))
-        arrays = {name: getattr(recording, attribute) for name, attribute in _ARRAYS.items()}
-        known = {name: getattr(recording, name) for name in _KNOWN}
-        arrays |= {name: values for name, values in known.items() if not np.isnan(values).all()}
+        arrays = {name: getattr(recording, attribute) for name, attribute in _DATASETS.items()}
+        measures = {name: getattr(recording, name) for name in MEASURES.values()}
+        arrays |= {name: values for name, values in measures.items() if not np.isnan(values).all()}
         for name, values in arrays.items():
             file.create_dataset(name, data=values, compression="gzip", shuffle=True, track_times=False)
 
 
-def import_hdf5(path: str | Path, mapping: str = "") -> Recording:
-    """Read a recording that `export_hdf5` wrote, or a file that a mapping tells, as `time=/t,fibres=/data/volts`.
+def import_hdf5(path: str | Path, columns: str = "") -> Recording:
+    """Read a recording from an HDF5 file.
+
+    Args:
+        path: of the file.
+        columns: what its datasets hold, as `time=/t,fibres=/data/volts`; by default it was exported.
 
     Raises:
         InputError: the file is missing, torn, of another kind, takes values from other files, or its datasets do not
             fit together.
     """
-    path, mapping = file_and_mapping(path, mapping)
-    if mapping:
-        return _mapped(path, mapping)
+    path, columns = check_import(path, columns)
+    if columns:
+        entries = [entry._replace(name=entry.name.removeprefix("/")) for entry in parse_columns(columns)]
+        with open_hdf5(path) as file:
+            matched = match_columns(entries, file.names)
+            arrays = [(entry, file.read(file.names[i])) for entry, indices in matched for i in indices]
+        return assemble_recording(path, arrays, {"kind": "hdf5", "file": path.name, "columns": columns})
     with open_hdf5(path) as file:
-        kind = file.read_text("format")
-        if kind != FORMAT:
+        if (found := file.read_text("format")) != FORMAT:
             raise InputError(
-                f"format is {kind!r}, expected {FORMAT!r}; a mapping tells what other datasets hold, "
-                f"there are {listed(file.names)}"
+                f"format is {found!r}, expected {FORMAT!r}; columns (--columns) say what other datasets hold, "
+                f"there are {join_names(file.names)}"
             )
-        arrays: dict[str, Any] = {attribute: file.read(name) for name, attribute in _ARRAYS.items()}
-        arrays |= {name: file.read(name) for name in _KNOWN if name in file.names}
+        content: dict[str, Any] = {attribute: file.read(name) for name, attribute in _DATASETS.items()}
+        content |= {name: file.read(name) for name in MEASURES.values() if name in file.names}
         source = file.read_text("source")
     try:
-        return Recording(**arrays, source=json.loads(source or ""))
+        return Recording(**content, source=json.loads(source or ""))
     except (InputError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _mapped(path: Path, mapping: str) -> Recording:
-    parts = [part._replace(name=part.name.removeprefix("/")) for part in parse_mapping(mapping)]
-    with open_hdf5(path) as file:
-        found = [(part, file.read(file.names[at])) for part, places in chosen(parts, file.names) for at in places]
-    return assembled(path, found, {"kind": "hdf5", "file": path.name, "mapping": mapping})
+def import_mat(path: str | Path, columns: str = "") -> Recording:
+    """Read a recording from a MATLAB file, by default as published.
 
+    Published are `voltage` (R, C) volts, `pos` (2, Q) mm and `tim` (1, R) s, with 40 readings a press. `pos` may be
+    (Q, 2); without it, or where it is NaN, positions are unknown. If the last press is cut off, its readings stay, as
+    those of the press before need them, but it is no press. Readings may follow the last press.
 
-READINGS_PER_PRESS = 40
-"""Length of the published cycle of a press, readings."""
-DOWN_AT = 20
-"""Reading of the published cycle at which the probe is sent down; it is sent up at the end of the cycle."""
-NOTE = "note"
-"""What the source of a recording says that was left out of it."""
-
-
-def import_mat(path: str | Path, mapping: str = "") -> Recording:
-    """Read a recording from a MATLAB file: as published, or as a mapping of its variables tells (see `mapping`).
-
-    Published are `voltage` (R, C) volts, `pos` (2, Q) mm, `tim` (1, R) s, 40 readings a press. `pos` may lie the other
-    way, (Q, 2); without it, or where it is NaN, the places of the presses are unknown. The last press may be cut off:
-    its readings are kept, as those of the press before need them, but it is no press. More readings may follow.
+    Args:
+        path: of the file.
+        columns: what its variables hold, as `time=t,fibres=volts`.
 
     Raises:
         InputError: the file is torn, of another kind, or its variables do not fit together.
     """
-    path, mapping = file_and_mapping(path, mapping)
-    return _mapped_mat(path, mapping) if mapping else _published(path)
+    path, columns = check_import(path, columns)
+    content = load_mat(path, () if columns else ("voltage", "tim"))
+    try:
+        if not columns:
+            return _import_published(path, content)
+        names = [name for name in content if not name.startswith("__")]
+        matched = match_columns(parse_columns(columns), names)
+        arrays = [(entry, _matrix(content, names[i])) for entry, indices in matched for i in indices]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return assemble_recording(path, arrays, {"kind": "mat", "file": path.name, "columns": columns})
 
 
-def _published(path: Path) -> Recording:
-    content = load_mat(path, ("voltage", "tim"))
-    voltage, tim = (_numbers(content[name], f"{path}: {name}") for name in ("voltage", "tim"))
-    if voltage.ndim != 2 or len(voltage) < READINGS_PER_PRESS:
-        raise InputError(f"{path}: voltage has shape {voltage.shape}, expected at least {READINGS_PER_PRESS} rows")
-    whole = len(voltage) // READINGS_PER_PRESS
-    if "pos" in content:
-        pos = _numbers(content["pos"], f"{path}: pos")
-        if pos.ndim != 2 or 2 not in pos.shape or 0 in pos.shape:
-            raise InputError(f"{path}: pos has shape {pos.shape}, expected (2, presses)")
-        places = pos.T if pos.shape[0] == 2 else pos
-    else:
-        places = np.full((whole, 2), np.nan)
-    if len(places) > whole + 1:
+def _import_published(path: Path, content: dict[str, Any]) -> Recording:
+    voltage, times = _matrix(content, "voltage"), _matrix(content, "tim").ravel()
+    n_cycles = len(voltage) // CYCLE if voltage.ndim == 2 else 0
+    if n_cycles == 0:
+        raise InputError(f"voltage has shape {voltage.shape}, expected at least {CYCLE} rows")
+    positions = _matrix(content, "pos") if "pos" in content else np.full((2, n_cycles), np.nan)
+    if positions.ndim != 2 or 2 not in positions.shape or 0 in positions.shape:
+        raise InputError(f"pos has shape {positions.shape}, expected (2, presses)")
+    positions = positions.T if positions.shape[0] == 2 else positions
+    n_presses = len(positions)
+    if n_presses > n_cycles + 1:
         raise InputError(
-            f"{path}: voltage has shape {voltage.shape}, expected {READINGS_PER_PRESS} rows for each of the "
-            f"{len(places)} presses of pos, {READINGS_PER_PRESS * len(places)} in all; only the last may be cut off"
+            f"voltage has shape {voltage.shape}, expected {CYCLE} rows for each of the {n_presses} presses of pos, "
+            f"{CYCLE * n_presses} in all; only the last may be cut off"
         )
-    source = {"kind": "published", "file": path.name} | _note(len(places), len(voltage))
-    places = places[:whole]
-    down_command = READINGS_PER_PRESS * np.arange(len(places)) + DOWN_AT
-    try:
-        return Recording(
-            voltage, tim.ravel(), places, down_command, down_command - DOWN_AT + READINGS_PER_PRESS, source
-        )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    source, n_more = {"kind": "published", "file": path.name}, len(voltage) - CYCLE * n_presses
+    if n_more > 0:
+        source[NOTE] = f"the last {n_more} readings belong to no press"
+    elif n_more < 0:
+        source[NOTE] = f"the last of {n_presses} presses is left out, with {CYCLE + n_more} of {CYCLE} readings"
+    positions = positions[:n_cycles]
+    starts = CYCLE * np.arange(len(positions))
+    return Recording(voltage, times, positions, starts + DOWN_AT, starts + CYCLE, source)
 
 
-def _note(presses: int, readings: int) -> dict[str, str]:
-    """What the source says where presses and readings do not end together."""
-    rest = readings - READINGS_PER_PRESS * presses
-    if rest > 0:
-        return {NOTE: f"the last {rest} readings belong to no press"}
-    if rest < 0:
-        there = READINGS_PER_PRESS + rest
-        return {NOTE: f"the last of {presses} presses is left out, with {there} of {READINGS_PER_PRESS} readings"}
-    return {}
-
-
-def _mapped_mat(path: Path, mapping: str) -> Recording:
-    parts = parse_mapping(mapping)
-    content = load_mat(path, ())
-    names = [name for name in content if not name.startswith("__")]
-    try:
-        found = [(part, names[at]) for part, places in chosen(parts, names) for at in places]
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    arrays = [(part, _numbers(content[name], f"{path}: {name}")) for part, name in found]
-    return assembled(path, arrays, {"kind": "mat", "file": path.name, "mapping": mapping})
-
-
-def _numbers(values: object, what: str) -> Array:
+def _matrix(content: dict[str, Any], name: str) -> Array:
+    values = content[name]
     if not isinstance(values, np.ndarray):
-        told = values if isinstance(values, str) else "a structure"
-        raise InputError(f"{what} is {told}, expected a full matrix of real numbers")
+        kind = values if isinstance(values, str) else "a structure"
+        raise InputError(f"{name} is {kind}, expected a full matrix of real numbers")
     return values.astype(np.float64)

@@ -1,13 +1,12 @@
-"""Recordings from files and to files, by the ends of their names."""
+"""Recordings from files and to files, by the extensions of their names."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 from padforge.design.common.mat_files import load_mat
-from padforge.design.common.validation import InputError
-from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.validation import InputError, check_path
 from padforge.sense.arrays import Array
-from padforge.sense.formats.annotations import ModelFindings
+from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.csv_recording import export_csv, import_csv
 from padforge.sense.formats.hdf5_mat import export_hdf5, import_hdf5, import_mat
 from padforge.sense.formats.lerobot import export_lerobot
@@ -24,57 +23,54 @@ _READERS: dict[str, Callable[[Path, str], Recording]] = {
     **dict.fromkeys(SUFFIXES, import_bag),
 }
 _WRITERS: dict[str, Callable[[Recording, Path], None]] = {".csv": export_csv, ".h5": export_hdf5}
-_MCAP, _LEROBOT = ".mcap", "lerobot"
-FILES = tuple(_READERS)
-"""Ends of the names of files that hold a recording."""
-FORMATS = (_LEROBOT,)
-"""Formats that are folders, so that no end of a name tells them."""
+FORMATS = ("lerobot",)
+"""Formats that are folders, without an extension."""
 
 
 def open_recording(path: str | Path) -> Recording:
-    """A recording, wherever it lies: a run directory, finished or not, or what `import_file` knows.
+    """Open a recording: a run directory, finished or not, or a file that `import_file` reads without a mapping.
+
+    Args:
+        path: of the folder or file.
 
     Raises:
         InputError: as `Recording.open` and `import_file`.
     """
-    path = as_path("path", path)
-    return import_file(path) if _is_bag(path) or _is_file(path) else Recording.open(path)
+    path = check_path("path", path)
+    is_file = path.suffix.lower() in _READERS and not path.is_dir()
+    return import_file(path) if is_file or _is_bag_folder(path) else Recording.open(path)
 
 
-def _is_bag(path: Path) -> bool:
-    """Whether a path is a rosbag2 folder."""
+def _is_bag_folder(path: Path) -> bool:
     return path.is_dir() and (path / METADATA).is_file() and not (path / START).exists()
 
 
-def _is_file(path: Path) -> bool:
-    return path.suffix.lower() in FILES and not path.is_dir()
-
-
 def is_recording(path: Path) -> bool:
-    """Whether a path is that of a recording: a folder, or a file that holds readings."""
+    """Whether a path is a folder, or a file that may hold a recording; a .mat must have its `voltage`."""
     if path.suffix.lower() == ".mat" and path.is_file():
         return "voltage" in load_mat(path, ())
-    return path.is_dir() or path.suffix.lower() in FILES
+    return path.is_dir() or path.suffix.lower() in _READERS
 
 
-def import_file(path: Path, mapping: str = "") -> Recording:
-    """Read a recording from a MATLAB, CSV, HDF5, MCAP or SQLite file, by the end of its name, or a rosbag2 folder.
+def import_file(path: Path, columns: str = "") -> Recording:
+    """Read a recording from a MATLAB, CSV, HDF5, MCAP or SQLite file, by its extension, or a rosbag2 folder.
 
     Args:
-        mapping: tells what a file of another program holds.
+        path: of the file or folder.
+        columns: what the columns, datasets or topics of a foreign file hold.
 
     Raises:
-        InputError: a name with another end, a folder that is no bag, or as the reader of that format.
+        InputError: another extension, a folder that is no bag, or as the reader of that format.
     """
-    if _is_bag(path):
-        return import_bag(path, mapping)
+    if _is_bag_folder(path):
+        return import_bag(path, columns)
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_READERS)}, or a rosbag2 folder")
-    return _READERS[path.suffix.lower()](path, mapping)
+    return _READERS[path.suffix.lower()](path, columns)
 
 
 def arm_states(path: Path) -> Array | None:
-    """(n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None where there are none.
+    """Return the (n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None if it has none.
 
     Raises:
         InputError: their file is damaged elsewhere than at its end.
@@ -87,27 +83,30 @@ def export_file(
     recording: Recording,
     path: Path,
     kind: str = "",
-    findings: ModelFindings | None = None,
+    annotations: ModelAnnotations | None = None,
     states: Array | None = None,
 ) -> None:
-    """Write a recording as .csv, .h5 or .mcap, by the end of the name, or as a folder of a `kind` of `FORMATS`.
+    """Write a recording as .csv, .h5 or .mcap, by the extension, or as a folder of a kind of `FORMATS`.
 
     Args:
-        findings: what a model says of the recording; only .mcap and LeRobot can hold it.
-        states: of the arm, by `STATE_COLUMNS`; they become a part of an .mcap.
+        recording: to write.
+        path: of the file or folder.
+        kind: one of `FORMATS`; "" for a file.
+        annotations: of a model, for .mcap and LeRobot.
+        states: (n, 10) of the arm, by `STATE_COLUMNS`, for .mcap.
 
     Raises:
-        InputError: a name with another end, findings for what cannot hold them, or `check_path` cannot be written.
+        InputError: another extension, annotations for what cannot hold them, or the path cannot be written.
     """
-    end = path.suffix.lower()
-    if kind == _LEROBOT:
-        export_lerobot(recording, path, findings)
-    elif end == _MCAP:
-        export_bag(recording, path, findings, states)
-    elif end not in _WRITERS:
+    extension = path.suffix.lower()
+    if kind == "lerobot":
+        export_lerobot(recording, path, annotations)
+    elif extension == ".mcap":
+        export_bag(recording, path, annotations, states)
+    elif extension not in _WRITERS:
         folders = ", ".join(f"--format {name}" for name in FORMATS)
-        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join((*_WRITERS, _MCAP))}, or {folders}")
-    elif findings is not None:
-        raise InputError(f"{path}: what a model says can be written as {_MCAP} or {_LEROBOT} only")
+        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_WRITERS)}, .mcap, or {folders}")
+    elif annotations is not None:
+        raise InputError(f"{path}: predictions of a model can be written as .mcap or lerobot only")
     else:
-        _WRITERS[end](recording, path)
+        _WRITERS[extension](recording, path)

@@ -1,249 +1,371 @@
-"""A recording as messages of ROS 2: which topics there are, and what their messages say.
-Numbers are in the units that ROS has by REP 103: m, N, V. Places lie in the frame `pad`: its origin is the middle of
-the pad, x and y run as on the plan, z points away from the surface; of a pad that lay mirrored into it, for the frame
-to be right-handed there too. A press has its messages at the reading that follows its begin or its end.
+"""A recording as topics of ROS 2: which messages they have, and their numbers as arrays.
 
-What messages round off of a recording, in one message beside them: stamps are whole ns, places m instead of mm.
+Numbers are in the units of REP 103: m, N and V. Positions are in the frame `pad`: its origin is the middle of the pad,
+x and y run as on the plan, and z points away from the surface; for a pad that lay mirrored z points into it, so that
+the frame is right-handed there, too. The messages of a press come with the reading that follows its begin or its end.
 
-The health of a pad as `diagnostic_msgs`.
+Messages round a recording, to whole ns and from mm to m. The topic RECORDING holds its exact numbers as JSON; they are
+taken where the other messages still say the same.
 """
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from padforge.design.common.validation import InputError, check_float
-from padforge.sense.arrays import MAX_S, Array
-from padforge.sense.formats.annotations import ModelFindings
-from padforge.sense.formats.ros_bag import blank
+from padforge.sense.arrays import MAX_S, Array, Indices, Mask
+from padforge.sense.formats.annotations import ModelAnnotations
+from padforge.sense.formats.ros_bag import RawMessages
 from padforge.sense.recording.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-
+FORMAT = "padforge-ros/2"
 READINGS, PRESSED, PLACE = "/pad/readings", "/pad/pressed", "/pad/place"
 REACHED, FORCE, RECORDING = "/pad/reached", "/pad/force", "/pad/recording"
 TOUCHES, HEALTH, ARM = "/pad/touches", "/pad/health", "/arm/pose"
 FRAME, ARM_FRAME = "pad", "base"
-KINDS = {
-    READINGS: "std_msgs/msg/Float64MultiArray",
-    PRESSED: "std_msgs/msg/Bool",
-    PLACE: "geometry_msgs/msg/PoseWithCovarianceStamped",
-    REACHED: "geometry_msgs/msg/PointStamped",
-    FORCE: "geometry_msgs/msg/WrenchStamped",
-    RECORDING: "std_msgs/msg/String",
-    TOUCHES: "geometry_msgs/msg/PoseWithCovarianceStamped",
-    HEALTH: "diagnostic_msgs/msg/DiagnosticArray",
-    ARM: "geometry_msgs/msg/PoseStamped",
+_POSITION = ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z", "pose.covariance")
+DEPTH_VARIANCE = 14
+"""Index of the variance of z in a covariance of 6 x 6; those of x and y are 0 and 7."""
+UNKNOWN_VARIANCE = -1.0
+"""Variance of an unknown quantity, as in `sensor_msgs/msg/Imu`."""
+Z90 = 1.6449
+"""Standard deviations that hold 90 % of a normal distribution, two-sided."""
+MAX_MESSAGE_BYTES = 2**16
+"""Size of a message of numbers; decoded, it takes a multiple of it."""
+MAX_TEXT, MAX_TEXT_PARTS = 2**26, 2**21
+"""Length of the text of RECORDING, and brackets, braces and quotes in it: each becomes an object in memory."""
+_MAX_STAMP_S = 2**31
+_INDICES = ("down_command", "up_command")
+_NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
+
+
+class TopicType(NamedTuple):
+    """What a topic holds.
+
+    Attributes:
+        msgtype: type of its messages.
+        description: what it means, in the metadata of the bag.
+        paths: attributes that hold its numbers.
+    """
+
+    msgtype: str
+    description: str
+    paths: tuple[str, ...] = ()
+
+
+TOPICS = {
+    READINGS: TopicType(
+        "std_msgs/msg/Float64MultiArray", "V, one value for each fibre; NaN where one is missing", ("data",)
+    ),
+    PRESSED: TopicType("std_msgs/msg/Bool", "true while the probe is sent down", ("data",)),
+    PLACE: TopicType(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "m, z is minus the depth commanded (plus, where the pad lay mirrored: frames are right-handed); "
+        "covariance 0 is as commanded, -1 unknown; unknown positions are left out",
+        _POSITION,
+    ),
+    REACHED: TopicType(
+        "geometry_msgs/msg/PointStamped",
+        "m, z is minus the depth that the arm measured",
+        ("point.x", "point.y", "point.z"),
+    ),
+    FORCE: TopicType("geometry_msgs/msg/WrenchStamped", "N on the probe, along z", ("wrench.force.z",)),
+    RECORDING: TopicType(
+        "std_msgs/msg/String",
+        "what the messages round off, as JSON: times in s, positions and depths in mm, forces in N",
+    ),
+    TOUCHES: TopicType(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "m, positions predicted by a model, with their variances in m^2; -1 where it predicts no depth",
+        _POSITION,
+    ),
+    HEALTH: TopicType("diagnostic_msgs/msg/DiagnosticArray", "which fibre is at fault, by a model"),
+    ARM: TopicType(
+        "geometry_msgs/msg/PoseStamped",
+        "m and a quaternion, pose of the tool in the frame of the arm",
+        (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")),
+    ),
 }
-UNITS = {
-    READINGS: "V, one value for each fibre; NaN where one is missing",
-    PRESSED: "true while the probe is sent down",
-    PLACE: "m, z is minus the depth commanded (plus, where the pad lay mirrored: frames are right-handed); "
-    "covariance 0 is as commanded, -1 not known; unknown places are left out",
-    REACHED: "m, z is minus the depth that the arm found itself at",
-    FORCE: "N on the probe, along z",
-    RECORDING: "what the messages round off, as JSON: times in s, places and depths in mm, forces in N",
-    TOUCHES: "m, places found by a model, with their variances in m^2; -1 where depth was not learnt",
-    HEALTH: "which fibre is at fault, by a model",
-    ARM: "m and a quaternion, pose of the tool in the frame of the arm",
-}
-"""What is said of each topic in the bag."""
-X, Y, Z = (f"pose.pose.position.{axis}" for axis in "xyz")
-COVARIANCE = "pose.covariance"
-NOT_KNOWN = -1.0
-"""A variance of what is not known, as in `sensor_msgs/msg/Imu`."""
-R90 = 1.6449
-"""Standard deviations that hold 90 % of a normal distribution, to both sides."""
-_LONGEST_S = 2**31
-"""Seconds that the stamp of a message can count."""
 
 
-@dataclass(frozen=True)
-class Stream:
-    """Messages of one topic: (n,) stamps in ns, ascending, and the numbers in them, (n,) or (n, k) by their path."""
+class TopicSeries(NamedTuple):
+    """Numbers of a topic.
 
-    stamps: NDArray[np.int64]
-    fields: Mapping[str, NDArray[Any]]
+    Attributes:
+        stamps: (n,) ns, ascending.
+        values: (n, k), in the order of the paths.
+    """
 
-    def same(self, other: "Stream") -> bool:
-        """Whether the messages of another one say the same at the same times."""
-        return np.array_equal(self.stamps, other.stamps) and all(
-            np.array_equal(values, other.fields[path], equal_nan=True) for path, values in self.fields.items()
-        )
+    stamps: Indices
+    values: Array
+
+    def equals(self, other: "TopicSeries") -> bool:
+        """Whether another topic has the same numbers at the same times."""
+        return np.array_equal(self.stamps, other.stamps) and np.array_equal(self.values, other.values, equal_nan=True)
 
 
-def epoch_of(times_s: Array) -> float:
-    """What is taken from (n,) times for stamps to count from 0: nothing, where stamps hold the times as they are.
+def choose_epoch(times_s: Array) -> float:
+    """Return the time that stamps count from: 0, unless they cannot hold the (n,) times as they are.
 
     Raises:
-        InputError: they last longer than stamps can count.
+        InputError: the times last longer than stamps can count.
     """
-    if times_s[-1] - times_s[0] >= _LONGEST_S - 2:
-        raise InputError(f"recording lasts {times_s[-1] - times_s[0]:g} s, allowed in a bag are {_LONGEST_S - 2}")
-    return 0.0 if times_s[0] >= 0 and times_s[-1] < _LONGEST_S - 1 else float(np.floor(times_s[0]))
+    if times_s[-1] - times_s[0] >= _MAX_STAMP_S - 2:
+        raise InputError(f"recording lasts {times_s[-1] - times_s[0]:g} s, allowed in a bag are {_MAX_STAMP_S - 2}")
+    return 0.0 if times_s[0] >= 0 and times_s[-1] < _MAX_STAMP_S - 1 else float(np.floor(times_s[0]))
 
 
-def stamps_of(times_s: Array, epoch_s: float) -> NDArray[np.int64]:
-    """(n,) times in ns since an epoch."""
+def to_stamps(times_s: Array, epoch_s: float) -> Indices:
+    """Return (n,) times in ns since the epoch."""
     seconds = np.floor(times_s)
     return (seconds - epoch_s).astype(np.int64) * 10**9 + np.round((times_s - seconds) * 1e9).astype(np.int64)
 
 
-def stamps_at(readings: NDArray[np.int64], indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Stamps of readings by their indices; a reading that was not taken would have come one step after the last."""
-    step = max(int(readings[-1] - readings[-2]), 1)
-    return np.append(readings, readings[-1] + step)[indices]
+def stamps_at(stamps: Indices, readings: Indices) -> Indices:
+    """Return the stamps of readings by their indices; the one after the last would come one interval later."""
+    interval = max(int(stamps[-1] - stamps[-2]), 1)
+    return np.append(stamps, stamps[-1] + interval)[readings]
 
 
-def streams_of(recording: Recording, epoch_s: float) -> dict[str, Stream]:
-    """What a recording says, by its topics; those without a message are left out."""
-    stamps = stamps_of(recording.times_s, epoch_s)
-    down_command, up_command = (
-        stamps_at(stamps, indices) for indices in (recording.down_command, recording.up_command)
-    )
-    metres = recording.presses_mm / 1000
-    deep = ~np.isnan(recording.depths_mm)
-    variances = np.zeros((len(down_command), 36))
-    variances[~deep, 14] = NOT_KNOWN
-    places = {X: metres[:, 0], Y: metres[:, 1], Z: heights(recording, recording.depths_mm), COVARIANCE: variances}
-    heights_m = heights(recording, recording.reached_mm)
-    reached = {"point.x": metres[:, 0], "point.y": metres[:, 1], "point.z": heights_m}
-    forces = {"wrench.force.z": _up(recording) * recording.forces_n}
-    streams = {
-        READINGS: Stream(stamps, {"data": recording.readings}),
-        PRESSED: Stream(
-            np.column_stack([down_command, up_command]).ravel(),
-            {"data": np.tile(np.array([1, 0], np.uint8), len(down_command))},
-        ),
-        PLACE: _where(recording.known, down_command, places),
-        REACHED: _where(~np.isnan(recording.reached_mm), down_command, reached),
-        FORCE: _where(~np.isnan(recording.forces_n), down_command, forces),
-    }
-    return {topic: stream for topic, stream in streams.items() if len(stream.stamps)}
+def depths_to_z(recording: Recording, depths_mm: Array) -> Array:
+    """Return the z of depths below the surface, m; 0 where they are unknown."""
+    return 0 - upward(recording) * np.nan_to_num(depths_mm) / 1000
 
 
-def heights(recording: Recording, depths_mm: Array) -> Array:
-    """Where on z depths below the surface are, m; 0 where they are unknown."""
-    return 0 - _up(recording) * np.nan_to_num(depths_mm) / 1000
-
-
-def _up(recording: Recording) -> float:
-    """Which way z has to point from the surface, for x and y of the plan to be right-handed with it."""
+def upward(recording: Recording) -> float:
+    """Return the sign of z above the surface, with which x and y of the plan are right-handed."""
     return -1.0 if recording.mirrored else 1.0
 
 
-def _where(there: NDArray[np.bool_], stamps: NDArray[np.int64], fields: Mapping[str, Array]) -> Stream:
-    return Stream(stamps[there], {path: values[there] for path, values in fields.items()})
+def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
+    """Return the topics of a recording that have messages, but for RECORDING."""
+    stamps = to_stamps(recording.times_s, epoch_s)
+    down, up = stamps_at(stamps, recording.down_command), stamps_at(stamps, recording.up_command)
+    x_y = recording.presses_mm / 1000
+    covariances = np.zeros((len(down), 36))
+    covariances[np.isnan(recording.depths_mm), DEPTH_VARIANCE] = UNKNOWN_VARIANCE
+    z, reached_z = depths_to_z(recording, recording.depths_mm), depths_to_z(recording, recording.reached_mm)
+
+    def at_presses(valid: Mask, *columns: Array) -> TopicSeries:
+        return TopicSeries(down[valid], np.column_stack(columns)[valid])
+
+    topics = {
+        READINGS: TopicSeries(stamps, recording.readings),
+        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(down), 1))),
+        PLACE: at_presses(recording.has_position, x_y, z, covariances),
+        REACHED: at_presses(~np.isnan(recording.reached_mm), x_y, reached_z),
+        FORCE: at_presses(~np.isnan(recording.forces_n), upward(recording) * recording.forces_n),
+    }
+    return {topic: series for topic, series in topics.items() if len(series.stamps)}
 
 
-FORMAT = "padforge-ros/2"
-_WHOLE = ("down_command", "up_command")
-_NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
-MOST_BYTES, MOST_PARTS = 2**26, 2**21
-"""Most that the text may have, and most brackets, braces and quotes in it: Python makes much of little text."""
+def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float) -> TopicSeries:
+    """Return TOUCHES: the predicted positions, at the end of each press."""
+    covariances = np.zeros((len(recording.up_command), 36))
+    covariances[:, [0, 7]] = (annotations.std_mm / 1000) ** 2
+    depth_variances = (annotations.depths_r90_mm / 1000 / Z90) ** 2
+    covariances[:, DEPTH_VARIANCE] = np.where(np.isnan(annotations.depths_mm), UNKNOWN_VARIANCE, depth_variances)
+    z = depths_to_z(recording, annotations.depths_mm)
+    stamps = stamps_at(to_stamps(recording.times_s, epoch_s), recording.up_command)
+    return TopicSeries(stamps, np.column_stack([annotations.positions_mm / 1000, z, covariances]))
 
 
-def written(recording: Recording, epoch_s: float, topics: Mapping[str, object]) -> str:
-    """The text for a recording whose stamps count from `epoch_s`, and what is said of the `topics` of its bag.
+def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
+    """Return ARM from (n, 10) states, in m and with rotation vectors as quaternions, from the epoch on."""
+    states = states[np.isfinite(states[:, :7]).all(axis=1) & (states[:, 0] >= epoch_s)]
+    angle = np.linalg.norm(states[:, 4:7], axis=1)
+    x_y_z = states[:, 4:7] * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]  # sin(angle / 2) along the axis
+    return TopicSeries(
+        to_stamps(states[:, 0], epoch_s), np.column_stack([states[:, 1:4] / 1000, x_y_z, np.cos(angle / 2)])
+    )
+
+
+def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryview]:
+    """Serialize the messages of a topic."""
+    msgtype, _, paths = TOPICS[topic]
+    message = _empty(store, msgtype)
+    if topic == READINGS:
+        n = series.values.shape[1]
+        message.layout.dim = [_empty(store, "std_msgs/msg/MultiArrayDimension", label="fibre", size=n, stride=n)]
+        message.data = np.zeros(n)
+    if topic in (PLACE, TOUCHES):
+        message.pose.pose.orientation.w = 1.0
+    header = getattr(message, "header", None)
+    if header is not None:
+        header.frame_id = ARM_FRAME if topic == ARM else FRAME
+    parents = [attrgetter(path.rpartition(".")[0])(message) if "." in path else message for path in paths]
+    names = [path.rpartition(".")[2] for path in paths]
+    is_array = [isinstance(getattr(*target), np.ndarray) for target in zip(parents, names, strict=True)]
+    encoded = []
+    for stamp, row in zip(series.stamps.tolist(), np.ascontiguousarray(series.values), strict=True):
+        if header is not None:
+            header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
+        for column, (parent, name, rest) in enumerate(zip(parents, names, is_array, strict=True)):
+            setattr(parent, name, row[column:] if rest else float(row[column]))  # an array is the last path
+        encoded.append(store.serialize_cdr(message, msgtype))
+    return encoded
+
+
+def encode_text(store: "Typestore", text: str) -> memoryview:
+    """Serialize the message of RECORDING."""
+    return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
+
+
+def decode(store: "Typestore", raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
+    """Return the numbers of messages in the order of their stamps.
+
+    Args:
+        store: definitions of the types.
+        raw: messages of a type that has numbers at the paths.
+        paths: attributes that hold a number or an array of numbers.
+
+    Raises:
+        InputError: messages that are damaged, have no numbers, or a different number of them.
+    """
+    from rosbags.serde import SerdeError
+
+    getters, rows, width = [attrgetter(path) for path in paths], bytearray(), 0
+    for index, content in enumerate(raw.messages):
+        if len(content) > MAX_MESSAGE_BYTES:
+            raise InputError(f"a message of {raw.msgtype} has {len(content)} bytes, allowed are {MAX_MESSAGE_BYTES}")
+        try:
+            message = store.deserialize_cdr(content, raw.msgtype)
+        except (SerdeError, IndexError) as error:
+            raise InputError(f"message {index} of {raw.msgtype} is damaged ({error})") from error
+        row = b"".join(np.asarray(get(message), np.float64).tobytes() for get in getters)
+        if not row:
+            raise InputError(f"message {index} has no {paths[0]}")
+        width = width or len(row)
+        if len(row) != width:
+            raise InputError(f"{paths[0]} has {width // 8} values in some messages and {len(row) // 8} in others")
+        rows += row
+    stamps = np.array(raw.stamps, np.int64)
+    order = np.argsort(stamps, kind="stable")
+    return TopicSeries(stamps[order], np.frombuffer(rows, np.float64).reshape(len(stamps), -1)[order])
+
+
+def decode_text(store: "Typestore", raw: RawMessages) -> str:
+    """Return the text of the last message of RECORDING; "" if it is damaged."""
+    from rosbags.serde import SerdeError
+
+    try:
+        message: Any = store.deserialize_cdr(raw.messages[-1], raw.msgtype)
+    except (SerdeError, IndexError):
+        return ""
+    return message.data
+
+
+def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:
+    """Return a message of zeros and empty texts and arrays, but for `fields`."""
+    from rosbags.interfaces import Nodetype
+
+    def zero(node: Any) -> Any:
+        kind, content = node
+        if kind == Nodetype.BASE:
+            return "" if content[0] == "string" else 0
+        if kind == Nodetype.NAME:
+            return _empty(store, content)
+        (item, size) = content
+        size = size if kind == Nodetype.ARRAY else 0
+        return np.zeros(size) if item[0] == Nodetype.BASE else [zero(item) for _ in range(size)]
+
+    return store.types[msgtype](**({name: zero(node) for name, node in store.fielddefs[msgtype][1]} | fields))
+
+
+def to_text(recording: Recording, epoch_s: float, topics: Iterable[str]) -> str:
+    """Return the text of RECORDING.
+
+    Args:
+        recording: whose exact numbers it holds.
+        epoch_s: time that stamps count from.
+        topics: that the bag has, for a description of each.
 
     Raises:
         InputError: the text is too long to be read back.
     """
-    arrays = {name: getattr(recording, name) for name in (*_NUMBERS, *_WHOLE)}
+    arrays = {name: getattr(recording, name) for name in (*_NUMBERS, *_INDICES)}
     document = {
         "format": FORMAT,
-        "topics": {topic: UNITS[topic] for topic in topics},
+        "topics": {topic: TOPICS[topic].description for topic in topics},
         "digest": recording.digest,
         "epoch_s": epoch_s,
         "source": dict(recording.source),
-        **{name: _listed(values) for name, values in arrays.items()},
+        **{name: np.where(np.isnan(values), np.array(None), values).tolist() for name, values in arrays.items()},
     }
     text = json.dumps(document, allow_nan=False)
-    if not _fits(text.encode()):
+    if not _is_readable(text):
         raise InputError(
             f"recording is too long for a bag: {len(text)} characters of times, presses and source, "
-            f"allowed are {MOST_BYTES}, with {MOST_PARTS} brackets and quotes"
+            f"allowed are {MAX_TEXT}, with {MAX_TEXT_PARTS} brackets and quotes"
         )
     return text
 
 
-def _fits(text: bytes) -> bool:
-    return len(text) <= MOST_BYTES and sum(map(text.count, (b"[", b"{", b'"'))) <= MOST_PARTS
+def _is_readable(text: str) -> bool:
+    return len(text) <= MAX_TEXT and sum(map(text.count, '[{"')) <= MAX_TEXT_PARTS
 
 
-def _listed(values: Any) -> list[Any]:
-    """Numbers for JSON, which has no NaN: None."""
-    missing = np.isnan(values)
-    return np.where(missing, np.array(None), values).tolist() if missing.any() else values.tolist()
-
-
-def read(text: bytes, readings: Array) -> tuple[Recording, float, str] | None:
-    """The recording of a text, with its (R, C) readings from the messages, its epoch and the digest it had.
-
-    None where the text is of another kind, or does not go with the readings.
-    """
-    if not _fits(text):
+def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None:
+    """Return the recording of a text, its epoch and its digest; None if the text does not fit the readings (R, C)."""
+    if not _is_readable(text):
         return None
     try:
         document = json.loads(text)
         if document["format"] != FORMAT:
             return None
-        arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_WHOLE)}
+        arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_INDICES)}
         recording = Recording(readings=readings, **arrays, source=document["source"])
-        epoch_s = check_float("epoch_s", document["epoch_s"], -MAX_S, MAX_S)
-        return recording, epoch_s, str(document["digest"])
+        return recording, check_float("epoch_s", document["epoch_s"], -MAX_S, MAX_S), str(document["digest"])
     except (InputError, KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None
 
 
-_OK, _ERROR = 0, 2
-
-
-def health_messages(
-    store: "Typestore", recording: Recording, findings: ModelFindings, readings: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], list[NDArray[np.uint8]]]:
-    """A message with the state of every fibre at the first reading, and one whenever a fault is found.
+def encode_health(
+    store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
+) -> tuple[Indices, list[memoryview]]:
+    """Return HEALTH: the state of all fibres at the first reading, and whenever a fault was named.
 
     Args:
-        readings: (R,) stamps, ns.
+        store: definitions of the types.
+        recording: that the model was applied to.
+        annotations: with faults.
+        stamps: (R,) of the readings, ns.
 
     Returns:
-        (n,) stamps and the bytes of as many messages.
+        (n,) stamps, and as many messages.
     """
-    bad: dict[int, tuple[str, str]] = {}
-    for fibre in findings.dead:
-        bad[fibre] = ("dead", "was dead in the recording that health was learnt from")
-    stamps, messages = [int(readings[0])], [_message(store, recording.fibres, bad, int(readings[0]))]
-    ends = stamps_at(readings, recording.up_command)
-    for fault in findings.faults or ():
-        bad |= dict.fromkeys(fault.fibres, (fault.kind, fault.text))
-        stamps.append(int(ends[min(fault.press, len(ends) - 1)]))
-        messages.append(_message(store, recording.fibres, bad, stamps[-1]))
-    return np.array(stamps, np.int64), messages
+    faults = dict.fromkeys(annotations.dead, ("dead", "was dead in the recording that health was learnt from"))
+    health_stamps, messages = [int(stamps[0])], [_health_message(store, recording.fibres, faults, int(stamps[0]))]
+    ends = stamps_at(stamps, recording.up_command)
+    for fault in annotations.faults or ():
+        faults |= dict.fromkeys(fault.fibres, (fault.kind, fault.text))
+        health_stamps.append(int(ends[min(fault.press, len(ends) - 1)]))
+        messages.append(_health_message(store, recording.fibres, faults, health_stamps[-1]))
+    return np.array(health_stamps, np.int64), messages
 
 
-def _message(store: "Typestore", fibres: int, bad: dict[int, tuple[str, str]], stamp: int) -> NDArray[np.uint8]:
-    status = [_status(store, fibre, *bad.get(fibre, ("", "sound"))) for fibre in range(fibres)]
-    message = blank(store, KINDS[HEALTH], status=status)
+def _health_message(store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int) -> memoryview:
+    message = _empty(store, TOPICS[HEALTH].msgtype)
     message.header.frame_id = FRAME
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-    return np.frombuffer(bytes(store.serialize_cdr(message, message.__msgtype__)), np.uint8)
-
-
-def _status(store: "Typestore", fibre: int, kind: str, text: str) -> Any:
-    values = [blank(store, "diagnostic_msgs/msg/KeyValue", key="fault", value=kind)] if kind else []
-    return blank(
-        store,
-        "diagnostic_msgs/msg/DiagnosticStatus",
-        level=_ERROR if kind else _OK,
-        name=f"pad: fibre {fibre + 1}",
-        message=text,
-        hardware_id="pad",
-        values=values,
-    )
+    for fibre in range(fibres):
+        kind, text = faults.get(fibre, ("", "sound"))
+        values = [_empty(store, "diagnostic_msgs/msg/KeyValue", key="fault", value=kind)] if kind else []
+        message.status.append(
+            _empty(
+                store,
+                "diagnostic_msgs/msg/DiagnosticStatus",
+                level=2 if kind else 0,  # ERROR or OK
+                name=f"pad: fibre {fibre + 1}",
+                message=text,
+                hardware_id="pad",
+                values=values,
+            )
+        )
+    return store.serialize_cdr(message, TOPICS[HEALTH].msgtype)

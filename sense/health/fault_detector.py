@@ -15,7 +15,7 @@ import numpy as np
 from padforge.design.common.files import resolve_exchange
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Indices, Mask, check_magnitude, check_numbers
-from padforge.sense.formats.columns import FOUND
+from padforge.sense.formats.columns import PRESSES_DETECTED
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, MOST, climb, noise_of
 from padforge.sense.health.health_model import COMMANDED, DETECTED, SETTLED, HealthModel, checked_presses
 from padforge.sense.health.trace_model import RELEASED, REST, History, expected, press_ranges, press_trace
@@ -331,7 +331,7 @@ def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[Fibre
     Raises:
         InputError: health was not learnt into this folder, or does not suit the recording.
     """
-    known = HealthModel.load(model, DETECTED if FOUND.items() <= recording.source.items() else COMMANDED)
+    known = HealthModel.load(model, DETECTED if PRESSES_DETECTED.items() <= recording.source.items() else COMMANDED)
     return known, examine(known, recording.readings, recording.times_s, recording.down_command, recording.up_command)
 
 

@@ -50,7 +50,7 @@ from padforge.sense.health.trace_model import (
     train_predictors,
 )
 from padforge.sense.localizer.model_files import files_of, refuse_other_pad
-from padforge.sense.recording.recording import Recording, rate_of
+from padforge.sense.recording.recording import Recording, median_rate_hz
 
 FORMAT = "padforge-health/2"
 MAX_FALSE_ALARMS = 0.1
@@ -167,7 +167,7 @@ class HealthModel:
 
     def refuse_other(self, readings: Array, times_s: Array) -> None:
         """Raise InputError if a recording has other fibres or another rate than the one that was learnt from."""
-        refuse_other_pad(self, "health", readings.shape[1], rate_of(times_s))
+        refuse_other_pad(self, "health", readings.shape[1], median_rate_hz(times_s))
 
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; reading them back gives the same to the last bit.
@@ -331,7 +331,7 @@ def fit_health_model(
         rests=np.stack([rests.min(axis=0), rests.max(axis=0)]),
         fibres=readings.shape[1],
         dead=tuple(dead.tolist()),
-        rate_hz=rate_of(times_s),
+        rate_hz=median_rate_hz(times_s),
         presses=len(traces),
         false_alarms=false_alarms,
         provenance=provenance or {},

@@ -23,7 +23,16 @@ from typing import Any, Protocol, Self
 from padforge.design.common.server import HOST, ConnectionServer, LocalPage, page_text
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array
-from padforge.sense.formats.ros_messages import FRAME, HEALTH, KINDS, NOT_KNOWN, PRESSED, R90, READINGS, TOUCHES
+from padforge.sense.formats.ros_messages import (
+    FRAME,
+    HEALTH,
+    PRESSED,
+    READINGS,
+    TOPICS,
+    TOUCHES,
+    UNKNOWN_VARIANCE,
+    Z90,
+)
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live
 
@@ -38,7 +47,7 @@ class Message:
     """One message.
 
     Attributes:
-        topic: a key of `KINDS`. msg: the ROS message, as JSON. pad: the same in plain numbers; has "event".
+        topic: one of `TOPICS`. msg: the ROS message, as JSON. pad: the same in plain numbers; has "event".
     """
 
     topic: str
@@ -48,7 +57,7 @@ class Message:
     def line(self, number: int) -> str:
         """The message as one line of JSON, the `number`-th that was told, from 0."""
         pad = {"format": FORMAT, "number": number, **self.pad}
-        operation = {"op": "publish", "topic": self.topic, "type": KINDS[self.topic], "msg": self.msg, "pad": pad}
+        operation = {"op": "publish", "topic": self.topic, "type": TOPICS[self.topic].msgtype, "msg": self.msg, "pad": pad}
         return json.dumps(operation, allow_nan=False)
 
 
@@ -115,7 +124,7 @@ def _readings(time_s: float, volts: list[float]) -> Message:
 def _touch(found: Estimate, inwards: float) -> Message:
     variances = [0.0] * 36
     variances[0], variances[7] = (found.sd_x_mm / 1000) ** 2, (found.sd_y_mm / 1000) ** 2
-    variances[14] = (found.depth_r90_mm / 1000 / R90) ** 2 if found.depth_r90_mm is not None else NOT_KNOWN
+    variances[14] = (found.depth_r90_mm / 1000 / Z90) ** 2 if found.depth_r90_mm is not None else UNKNOWN_VARIANCE
     position = {"x": found.x_mm / 1000, "y": found.y_mm / 1000, "z": 0.0 + inwards * (found.depth_mm or 0.0) / 1000}
     pose = {"position": position, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
     return Message(

@@ -75,7 +75,7 @@ def calibrate(
             raise InputError("time_budget is given: method published trains until it gains no more, expected masked")
         options = options.model_copy(update={"features": "published"})
     rng = np.random.default_rng(options.seed)
-    known = np.flatnonzero(recording.known)
+    known = np.flatnonzero(recording.has_position)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
@@ -233,7 +233,7 @@ def left_out(recording: Recording, localizer: LocalizerModel) -> list[str]:
     if localizer.method != "ensemble":
         return []
     learnt = {target.name for target in localizer.scaler.measures}
-    measures = {name: values[recording.known] for name, values in recording.measures.items()}
+    measures = {name: values[recording.has_position] for name, values in recording.measures.items()}
     deep, force = measures["depth_mm"], measures["force_n"]
     out = []
     if "depth_mm" not in learnt:
@@ -269,7 +269,7 @@ def split_unseen(
     Raises:
         InputError: the localizer was recalibrated by the recording, or there are too few presses.
     """
-    known, digest = np.flatnonzero(recording.known), recording.digest
+    known, digest = np.flatnonzero(recording.has_position), recording.digest
     if localizer is not None and digest in localizer.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     if localizer is not None and digest == localizer.training_recording_sha256:

@@ -51,7 +51,7 @@ def evaluate(localizer: LocalizerModel, recording: Recording, levels: Iterable[i
     if digest in localizer.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     own = digest == localizer.training_recording_sha256
-    test = held_back(localizer, recording) if own else np.flatnonzero(recording.known)
+    test = held_back(localizer, recording) if own else np.flatnonzero(recording.has_position)
     if len(test) == 0:
         raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
     inputs, positions_mm = localizer.scaled_features(recording)[test], recording.presses_mm[test]
@@ -86,7 +86,7 @@ def held_back(localizer: LocalizerModel, recording: Recording) -> Indices:
     """
     presses = len(recording.presses_mm)
     for press in localizer.test:
-        if not 0 <= press < presses or not recording.known[press]:
+        if not 0 <= press < presses or not recording.has_position[press]:
             raise InputError(
                 f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known place"
             )

@@ -1,9 +1,9 @@
-"""An append-only stream of readings in blocks, each of which proves itself whole.
+"""An append-only file of readings in blocks, each with a checksum.
 
-A file is a run of blocks of one size. A block is a header (magic, sequence number, index of its first reading, count
-of readings, checksum), `count` rows of float64 (time in s, then one voltage per fibre) and zeros up to the size; the
-CRC-32 covers all of the block but itself. A writer that dies leaves at worst a torn last block, which a reader cuts
-off; damage before an intact block cannot come from that and is an error."""
+Blocks have one size: a header (magic, sequence number, index of the first reading, number of readings, CRC-32 of all
+but itself), rows of float64 (time in s, then one voltage per fibre) and zeros. A writer that dies leaves at worst a
+torn last block, which is cut off by readers; damage before an intact block has another cause, and is an error.
+"""
 
 import os
 import re
@@ -36,12 +36,12 @@ def open_in_place(path: Path) -> BinaryIO:
     file = path.open("r+b", buffering=0)
     if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
         file.close()
-        raise InputError(f"{path}: is a link, and none is followed where a file is gone on with")
+        raise InputError(f"{path}: is a link, and none is followed where a file is continued")
     return file
 
 
 def block_dtype(fibres: int) -> np.dtype[np.void]:
-    """The layout of a block of rows of 1 + `fibres` numbers: little-endian, at least four rows, n x 256 bytes."""
+    """Return the layout of a block: little-endian, four or more rows of 1 + `fibres` numbers, n x 256 bytes."""
     row = 8 * (1 + fibres)
     size = -(-(_HEADER + 4 * row) // _UNIT) * _UNIT
     rows = (size - _HEADER) // row
@@ -56,13 +56,18 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
 
 
 class BlockWriter:
-    """Appends rows to an open stream. Rows reach the file a full block at a time, or at `flush`.
+    """Appends rows to an open file: full blocks at once, the remaining rows at `flush`.
 
-    A write that fails adds nothing, and the next one overwrites whatever it left.
+    A write that fails adds nothing, and the next one overwrites what it left.
+
+    Args:
+        file: open for writing in place.
+        fibres: C.
+        blocks: that the file has already.
+        rows: that the file has already.
     """
 
     def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:
-        """Append to `file`, which holds so many blocks and rows already."""
         self._file = file
         self.fibres = fibres
         self._dtype = block_dtype(fibres)
@@ -73,10 +78,10 @@ class BlockWriter:
 
     @classmethod
     def resume(cls, path: Path, fibres: int) -> tuple["BlockWriter", BinaryIO, Array]:
-        """Go on with a stream, its torn tail cut off.
+        """Continue a file; its torn tail is cut off.
 
         Returns:
-            The writer, the open file it appends to, and the (R, 1 + C) rows that are there.
+            The writer, the open file it appends to, and the (R, 1 + C) rows of the file.
 
         Raises:
             InputError: as `read_blocks`, or it is a link.
@@ -84,7 +89,7 @@ class BlockWriter:
         rows, _ = read_blocks(path, fibres)
         dtype = block_dtype(fibres)
         file = open_in_place(path)
-        blocks = int(np.argmin(np.append(_sound(_blocks(file.read(), dtype)), False)))
+        blocks = int(np.argmin(np.append(_is_intact(_blocks(file.read(), dtype)), False)))
         file.seek(blocks * dtype.itemsize)
         file.truncate()
         return cls(file, fibres, blocks, len(rows)), file, rows
@@ -92,12 +97,12 @@ class BlockWriter:
     def append(self, rows: Array) -> None:
         """Add (n, 1 + C) rows of time and volts."""
         rows = np.concatenate([self._waiting, rows])
-        whole = len(rows) // self._rows * self._rows
-        self._write(rows[:whole])
-        self._waiting = rows[whole:]
+        n_full = len(rows) // self._rows * self._rows
+        self._write(rows[:n_full])
+        self._waiting = rows[n_full:]
 
     def flush(self) -> None:
-        """Hand what waits to the operating system as a block that is not full."""
+        """Write the waiting rows as a block that is not full."""
         self._write(self._waiting)
         self._waiting = self._waiting[:0]
         self._file.flush()
@@ -119,18 +124,18 @@ class BlockWriter:
 
 
 def write_at(file: BinaryIO, position: int, data: bytes) -> None:
-    """Write `data` from a position on, all of it; where that fails, doing it again sets right what is half there."""
+    """Write all data at a position; after a failure, writing again repairs what is there in part."""
     file.seek(position)
-    left = memoryview(data)
-    while left:
-        left = left[file.write(left) :]
+    remaining = memoryview(data)
+    while remaining:
+        remaining = remaining[file.write(remaining) :]
 
 
 def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
-    """All intact rows of a stream.
+    """Read all intact rows of a file.
 
     Returns:
-        (R, 1 + C) rows, and whether a torn tail was cut off behind them.
+        (R, 1 + C) rows, and whether a torn tail follows them.
 
     Raises:
         InputError: the file is missing, of another number of fibres, or a block is damaged although intact ones follow.
@@ -138,28 +143,27 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
     dtype = block_dtype(fibres)
     content = read_bytes(path, MAX_BYTES)
     blocks = _blocks(content, dtype)
-    sound = _sound(blocks)
-    end = len(blocks) if sound.all() else int(np.argmin(sound))
+    end = int(np.argmin(np.append(_is_intact(blocks), False)))
     tail = content[end * dtype.itemsize :]
-    if _holds_block(tail, dtype):
+    if _has_block(tail, dtype):
         raise InputError(
             f"{path}: block {end} (byte {end * dtype.itemsize}) is damaged although intact blocks follow, "
             "allowed is a torn end of the file only"
         )
-    if _begins_with_block(tail):  # no writer that died has left it
+    if _begins_with_block(tail):  # a writer that died does not leave it
         raise InputError(f"{path}: block {end} is whole, but not of {fibres} fibres, as the recording says it is")
     blocks = blocks[:end]
-    kept = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
-    return blocks["rows"][kept], bool(tail)
+    valid = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
+    return blocks["rows"][valid], bool(tail)
 
 
 def _blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """Whatever lies where whole blocks should, intact or not."""
+    """Return the content as blocks, intact or not."""
     return np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
 
 
-def _sound(blocks: NDArray[np.void]) -> Mask:
-    """(B,) whether each block has its magic and checksum and stands where it was written."""
+def _is_intact(blocks: NDArray[np.void]) -> Mask:
+    """Return (B,) whether each block has its magic and checksum, and is where it was written."""
     counts = blocks["count"].astype(np.int64)
     return (
         (blocks["magic"] == _MAGIC)
@@ -171,7 +175,7 @@ def _sound(blocks: NDArray[np.void]) -> Mask:
 
 
 def _begins_with_block(content: bytes) -> bool:
-    """Whether an intact block comes first, of any number of fibres."""
+    """Whether the content begins with an intact block of any number of fibres."""
     if not content.startswith(_MAGIC):
         return False
     for dtype in map(block_dtype, range(1, MAX_FIBRES + 1)):
@@ -183,13 +187,12 @@ def _begins_with_block(content: bytes) -> bool:
     return False
 
 
-def _holds_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
-    """Whether an intact block lies anywhere in `content`, at whatever offset."""
-    most = dtype["rows"].shape[0]
-    for found in re.finditer(re.escape(_MAGIC), content[: max(len(content) - dtype.itemsize + len(_MAGIC), 0)]):
-        start = found.start()
+def _has_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
+    """Whether the content has an intact block at any offset."""
+    for match in re.finditer(re.escape(_MAGIC), content[: max(len(content) - dtype.itemsize + len(_MAGIC), 0)]):
+        start = match.start()
         (count,) = _COUNT.unpack_from(content, start + _COUNT_OFFSET)
-        if count > most:  # told at once, where a file is full of magic words
+        if count > dtype["rows"].shape[0]:  # quick, in a file full of magic words
             continue
         block = np.frombuffer(content, dtype, count=1, offset=start)
         if block["crc"][0] == _checksums(block)[0]:
@@ -198,7 +201,7 @@ def _holds_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
 
 
 def _checksums(blocks: NDArray[np.void]) -> NDArray[np.uint32]:
-    """(B,) CRC-32 of every block without its checksum field."""
+    """Return (B,) CRC-32 of each block without its checksum field."""
     view = memoryview(blocks.tobytes())
     size = blocks.dtype.itemsize
     crcs = np.empty(len(blocks), np.uint32)

@@ -1,4 +1,4 @@
-"""Recordings: what the fibres gave while a probe pressed known places, as read from a run directory (`recorder`)."""
+"""Recordings: readings of the fibres while a probe presses known positions."""
 
 import hashlib
 import json
@@ -13,10 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.design.common.files import locked, read_json, reraise_write_error, sync, temporary_folder
-from padforge.design.common.validation import InputError, check_type, short_repr
-from padforge.design.common.validation import check_path as as_path
-from padforge.sense import arrays as limits
-from padforge.sense.arrays import Array, Indices, Mask
+from padforge.design.common.validation import InputError, check_path, check_type, short_repr
+from padforge.sense.arrays import (
+    MAX_FIBRES,
+    MAX_MM,
+    MAX_N,
+    MAX_RATE_HZ,
+    MAX_S,
+    MAX_VOLTS,
+    MIN_RATE_HZ,
+    Array,
+    Indices,
+    Mask,
+    check_ascending,
+    check_magnitude,
+    check_numbers,
+)
 from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.run_directory import (
     FILES,
@@ -26,21 +38,17 @@ from padforge.sense.recording.run_directory import (
     START,
     Press,
     Recorder,
-    busy,
-    fibres_of,
+    busy_message,
+    check_new_folder,
+    is_uncommitted,
+    read_fibres,
     read_journal,
-    refuse_existing,
-    unborn,
 )
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64) | dict.fromkeys(
     ("down_command", "up_command"), np.int64
 )
-_MEASURED = {
-    "depths_mm": (limits.MAX_MM, "mm"),
-    "reached_mm": (limits.MAX_MM, "mm"),
-    "forces_n": (limits.MAX_N, "N"),
-}
+_MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
 @dataclass(frozen=True)
@@ -50,19 +58,19 @@ class Recording:
     Attributes:
         readings: (R, C) volts, one row per reading, one column per fibre; NaN where one is missing.
         times_s: (R,) ascending, s.
-        presses_mm: (Q, 2) places, mm from the pad's centre; NaN where a press's place is not known.
+        presses_mm: (Q, 2) commanded positions, mm from the pad's centre; NaN where unknown.
         down_command: (Q,) index of the first reading after the probe was sent down.
-        up_command: (Q,) index of the first reading after it was sent up; R if none was taken.
-        source: where the recording came from; free JSON.
-        torn_presses: presses that were left out because the end of the stream was torn off.
-        depths_mm: (Q,) how deep the probe was to go below the surface, mm, > 0; NaN where that is not known.
-        reached_mm: (Q,) how deep an arm found itself while it held the press, mm; NaN where none told.
-        forces_n: (Q,) force on the probe meanwhile, N, >= 0; NaN where no sensor told.
+        up_command: (Q,) index of the first reading after it was sent up; R without one.
+        source: where the recording came from; JSON.
+        torn_presses: presses that were left out because the end of the readings was torn off.
+        depths_mm: (Q,) commanded depth below the surface, mm, > 0; NaN where unknown.
+        reached_mm: (Q,) depth that the arm measured while it held the press, mm; NaN where unknown.
+        forces_n: (Q,) force on the probe meanwhile, N, >= 0; NaN where unknown.
 
     Raises:
-        InputError: no numbers, shapes that do not fit together, infinite values or such beyond the limits of
-            `limits`, no reading at all, half a place, times that do not ascend, presses that overlap, one without a
-            reading before it, depths or forces below 0, or a source that JSON cannot hold.
+        InputError: no numbers, shapes that do not fit together, infinite values or beyond the limits of `arrays`, no
+            reading at all, one of x and y, times that do not ascend, presses that overlap, one without a reading before
+            it, depths or forces below 0, or a source that JSON cannot hold.
     """
 
     readings: Array
@@ -78,22 +86,24 @@ class Recording:
 
     def __post_init__(self) -> None:
         for name, kind in _ARRAYS.items():
-            self._keep(name, limits.check_numbers(getattr(self, name), kind, name))
-        _validate(self)
-        for name, (limit, unit) in _MEASURED.items():
-            values = limits.check_numbers(getattr(self, name), np.float64, name)
-            unknown = np.isnan(values).all()  # of however many: `replace` may have left some presses out
-            self._keep(name, np.full(len(self.presses_mm), np.nan) if unknown else values)
-            _validate_measured(self, name, limit, unit)
+            self._freeze(name, check_numbers(getattr(self, name), kind, name))
+        _check_source(self.source)
+        _check_readings(self)
+        _check_presses(self)
+        for name in _MEASURES:
+            values = check_numbers(getattr(self, name), np.float64, name)
+            is_unknown = np.isnan(values).all()  # of any length: `replace` may have left some presses out
+            self._freeze(name, np.full(len(self.presses_mm), np.nan) if is_unknown else values)
+            _check_measure(self, name)
 
-    def _keep(self, name: str, array: NDArray[Any]) -> None:
+    def _freeze(self, name: str, array: NDArray[Any]) -> None:
         array.setflags(write=False)
         object.__setattr__(self, name, array)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Recording):
             return NotImplemented
-        names = (*_ARRAYS, *_MEASURED)
+        names = (*_ARRAYS, *_MEASURES)
         return all(np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True) for name in names)
 
     __hash__ = None  # type: ignore[assignment]
@@ -104,33 +114,33 @@ class Recording:
         return self.readings.shape[1]
 
     @property
-    def known(self) -> Mask:
-        """(Q,) whether the place of each press is known."""
-        return ~(np.isnan(self.presses_mm[:, 0]) | np.isnan(self.presses_mm[:, 1]))
+    def has_position(self) -> Mask:
+        """(Q,) whether the position of each press is known."""
+        return ~np.isnan(self.presses_mm).any(axis=1)
 
     @property
-    def deep_mm(self) -> Array:
-        """(Q,) how deep each press was, mm: as reached, or else as commanded; NaN where neither is known."""
+    def actual_depths_mm(self) -> Array:
+        """(Q,) depth of each press, mm: as reached, or else as commanded; NaN where neither is known."""
         return np.where(np.isnan(self.reached_mm), self.depths_mm, self.reached_mm)
 
     @property
     def measures(self) -> dict[str, Array]:
-        """What else than its place is known of each press, by its name: (Q,) how deep and with which force it was."""
-        return {"depth_mm": self.deep_mm, "force_n": self.forces_n}
+        """Depth and force of each press, (Q,), by name; NaN where unknown."""
+        return {"depth_mm": self.actual_depths_mm, "force_n": self.forces_n}
 
     @property
     def mirrored(self) -> bool:
-        """Whether `[rig]` said that the pad lay with its tracks up: seen from above, x ran to the left of y."""
+        """Whether the pad lay with its tracks up, by `[rig]`: seen from above, x ran to the left of y."""
         return is_mirrored(self.source)
 
     @property
     def rate_hz(self) -> float:
         """Readings per second, by the median interval."""
-        return rate_of(self.times_s)
+        return median_rate_hz(self.times_s)
 
     @property
     def digest(self) -> str:
-        """Hex SHA-256 of all readings and presses, wherever they are kept, and whether or not depth and force are."""
+        """Hex SHA-256 of the readings and presses, without depths and forces."""
         digest = hashlib.sha256()
         for array in (getattr(self, name) for name in _ARRAYS):
             plain = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # one NaN of many
@@ -141,14 +151,16 @@ class Recording:
     def open(cls, path: str | Path) -> "Recording":
         """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
 
-        The torn tail of a run directory is cut off, with the presses it had.
+        A torn end of the readings is cut off, with the presses in it.
+
+        Args:
+            path: of the folder.
 
         Raises:
             InputError: no run directory, a file damaged elsewhere than at its end, or no press in it.
         """
-        path = as_path("path", path)
-        fibres = fibres_of(path)
-        start = read_json(path / START, FORMAT)
+        path = check_path("path", path)
+        fibres = read_fibres(path)
         rows, _ = read_blocks(path / READINGS, fibres)
         done = read_journal(path / JOURNAL)
         presses = [press for press in done.values() if press.up_command <= len(rows)]
@@ -160,7 +172,7 @@ class Recording:
                 presses_mm=table[:, :2],
                 down_command=table[:, 2].astype(np.int64),
                 up_command=table[:, 3].astype(np.int64),
-                source=start.get("source", {}),
+                source=read_json(path / START, FORMAT).get("source", {}),
                 torn_presses=len(done) - len(presses),
                 depths_mm=table[:, 4],
                 reached_mm=table[:, 5],
@@ -170,141 +182,139 @@ class Recording:
             raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | Path, provenance: Mapping[str, Any], replacing: bool = False) -> None:
-        """Write a run directory that appears whole or not at all.
+        """Write a run directory that appears complete or not at all.
 
         Args:
-            replacing: whether a simulated recording that is there gives way, see `refuse_replacing`.
+            path: of the folder.
+            provenance: of the recording; JSON.
+            replacing: whether an existing simulated recording is replaced, see `check_replaceable`.
 
         Raises:
-            InputError: `check_path` exists and is not an empty directory (no other recording is written over, not even
-            one
+            InputError: the path exists and is not an empty folder (no other recording is written over, not even one
                 that appeared meanwhile), or cannot be written.
         """
-        refuse = refuse_replacing if check_type("replacing", replacing, bool) else refuse_existing
-        refuse(path := as_path("path", path))
+        check_target = check_replaceable if check_type("replacing", replacing, bool) else check_new_folder
+        check_target(path := check_path("path", path))
         path = path.resolve()
         with reraise_write_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with temporary_folder(path.parent) as folder:
                 self._write(folder / path.name, provenance)
                 if replacing:
-                    refuse(path)
+                    check_target(path)
                     with suppress(FileNotFoundError):
                         path.rename(folder / f"{path.name}-old")
-                _put(folder / path.name, path)
+                try:
+                    if path.exists():
+                        path.rmdir()
+                    (folder / path.name).rename(path)
+                except OSError:
+                    check_new_folder(path)  # another one came first
+                    raise
+                sync(path.parent)
 
     def _write(self, path: Path, provenance: Mapping[str, Any]) -> None:
         with Recorder(path, self.fibres, self.source, provenance) as recorder:
             recorder.append(self.times_s, self.readings)
-            measured = np.column_stack([getattr(self, name) for name in _MEASURED]).tolist()
-            edges = zip(self.presses_mm, self.down_command, self.up_command, measured, strict=True)
-            for place, down_command, up_command, (depth, reached, force) in edges:
-                recorder.begin(place, int(down_command), **({} if isnan(depth) else {"depth_mm": depth}))
-                told = {} if isnan(reached) else {"at_mm": [None, None, reached]}
-                recorder.finish(int(up_command), **told, **({} if isnan(force) else {"force_n": force}))
+            measures = np.column_stack([getattr(self, name) for name in _MEASURES]).tolist()
+            presses = zip(self.presses_mm, self.down_command, self.up_command, measures, strict=True)
+            for position_mm, down, up, (depth, reached, force) in presses:
+                recorder.begin(position_mm, int(down), **({} if isnan(depth) else {"depth_mm": depth}))
+                at_mm = {} if isnan(reached) else {"at_mm": [None, None, reached]}
+                recorder.finish(int(up), **at_mm, **({} if isnan(force) else {"force_n": force}))
 
 
-def _put(unfinished: Path, path: Path) -> None:
-    """Rename a run directory to `check_path`, unless another came there first."""
-    try:
-        if path.exists():
-            path.rmdir()
-        unfinished.rename(path)
-    except OSError:
-        refuse_existing(path)
-        raise
-    sync(path.parent)
+def check_replaceable(path: Path) -> None:
+    """Raise InputError unless a path is absent or a simulated recording, which the same seed makes again.
 
-
-def refuse_replacing(path: Path) -> None:
-    """Raise InputError if `check_path` holds anything but a simulated recording, which the same seed gives again.
-
-    It is never a link, and nobody may be recording into it.
+    Links are not followed, and nobody may be recording into it.
     """
-    other = "choose another --out"
+    advice = "choose another --out"
     if path.is_symlink():
-        raise InputError(f"{path}: is a link, and none is followed where a recording is replaced; {other}")
+        raise InputError(f"{path}: is a link, and none is followed where a recording is replaced; {advice}")
     if not path.exists():
         return
     if not path.is_dir():
-        raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {other}")
-    if not unborn(path):
+        raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {advice}")
+    if not is_uncommitted(path):
         for file in sorted(path.iterdir()):
             if file.name not in FILES or file.is_symlink() or not file.is_file():
-                raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {other}")
-    if (path / START).exists() or not unborn(path):
+                raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {advice}")
+    if (path / START).exists() or not is_uncommitted(path):
         source = read_json(path / START, FORMAT).get("source")
         kind = source.get("kind") if isinstance(source, dict) else None
         if kind != "simulated":
-            raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; {other}")
+            raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; {advice}")
     if (path / JOURNAL).exists():
-        with locked(path / JOURNAL, busy(path)):
+        with locked(path / JOURNAL, busy_message(path)):
             pass
 
 
-def _validate(recording: Recording) -> None:
-    if not isinstance(recording.source, Mapping):
-        raise InputError(f"source is {short_repr(recording.source)}, expected a mapping")
+def _check_source(source: object) -> None:
+    if not isinstance(source, Mapping):
+        raise InputError(f"source is {short_repr(source)}, expected a mapping")
     try:
-        json.dumps(dict(recording.source), allow_nan=False)
+        json.dumps(dict(source), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"source is {short_repr(dict(recording.source))}, expected what JSON can hold ({error})"
-        ) from error
-    readings, presses = recording.readings, recording.presses_mm
-    if readings.ndim != 2 or not 1 <= readings.shape[1] <= limits.MAX_FIBRES or len(readings) < 2:
-        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {limits.MAX_FIBRES}")
-    if recording.times_s.shape != (len(readings),):
-        raise InputError(f"times have shape {recording.times_s.shape}, expected ({len(readings)},)")
-    if presses.ndim != 2 or presses.shape[1] != 2 or len(presses) == 0:
-        raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
-    if recording.down_command.shape != (len(presses),) or recording.up_command.shape != (len(presses),):
-        raise InputError(
-            f"{len(presses)} presses have {recording.down_command.size} begins and {recording.up_command.size} ends"
-        )
-    limits.check_magnitude("readings", readings, limits.MAX_VOLTS, "V", missing=True)
-    limits.check_magnitude("times", recording.times_s[:, None], limits.MAX_S, "s")
-    limits.check_magnitude("presses", presses, limits.MAX_MM, "mm", missing=True)
+        raise InputError(f"source is {short_repr(dict(source))}, expected what JSON can hold ({error})") from error
+
+
+def _check_readings(recording: Recording) -> None:
+    readings, times_s = recording.readings, recording.times_s
+    if readings.ndim != 2 or not 1 <= readings.shape[1] <= MAX_FIBRES or len(readings) < 2:
+        raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
+    if times_s.shape != (len(readings),):
+        raise InputError(f"times have shape {times_s.shape}, expected ({len(readings)},)")
+    check_magnitude("readings", readings, MAX_VOLTS, "V", missing=True)
+    check_magnitude("times", times_s[:, None], MAX_S, "s")
     if np.isnan(readings).all():
         raise InputError(f"readings are all missing (NaN), all {readings.size} of them, expected some numbers")
-    half = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
-    if half.any():
-        raise InputError(f"press {int(np.argmax(half))} has one of x and y, expected both or neither")
-    limits.check_ascending(recording.times_s)
-    if not limits.MIN_RATE_HZ <= recording.rate_hz <= limits.MAX_RATE_HZ:
+    check_ascending(times_s)
+    if not MIN_RATE_HZ <= recording.rate_hz <= MAX_RATE_HZ:
         raise InputError(
-            f"times give {recording.rate_hz:g} readings a second, "
-            f"allowed is {limits.MIN_RATE_HZ:g} to {limits.MAX_RATE_HZ:g}"
-        )
-    edges = np.column_stack([recording.down_command, recording.up_command]).ravel()
-    late = np.diff(edges, prepend=0, append=len(readings) + 1) < 1
-    if late.any():
-        press = min(int(np.argmax(late)) // 2, len(presses) - 1)
-        raise InputError(
-            f"press {press} goes from reading {recording.down_command[press]} to {recording.up_command[press]}, "
-            f"expected presses that do not overlap, each after at least one reading and within {len(readings)}"
+            f"times give {recording.rate_hz:g} readings a second, allowed is {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"
         )
 
 
-def _validate_measured(recording: Recording, name: str, limit: float, unit: str) -> None:
-    """Refuse measures of presses that do not go with them; only an arm may tell of one that it is above the pad."""
-    values = getattr(recording, name)
+def _check_presses(recording: Recording) -> None:
+    presses, down, up = recording.presses_mm, recording.down_command, recording.up_command
+    if presses.ndim != 2 or presses.shape[1] != 2 or len(presses) == 0:
+        raise InputError(f"presses have shape {presses.shape}, expected (Q, 2) with at least one press")
+    if down.shape != (len(presses),) or up.shape != (len(presses),):
+        raise InputError(f"{len(presses)} presses have {down.size} down commands and {up.size} up commands")
+    check_magnitude("presses", presses, MAX_MM, "mm", missing=True)
+    incomplete = np.isnan(presses[:, 0]) != np.isnan(presses[:, 1])
+    if incomplete.any():
+        raise InputError(f"press {int(np.argmax(incomplete))} has one of x and y, expected both or neither")
+    n_readings = len(recording.readings)
+    is_early = np.diff(np.column_stack([down, up]).ravel(), prepend=0, append=n_readings + 1) < 1
+    if is_early.any():
+        press = min(int(np.argmax(is_early)) // 2, len(presses) - 1)
+        raise InputError(
+            f"press {press} goes from reading {down[press]} to {up[press]}, "
+            f"expected presses that do not overlap, each after at least one reading and within {n_readings}"
+        )
+
+
+def _check_measure(recording: Recording, name: str) -> None:
+    values, (limit, unit) = getattr(recording, name), _MEASURES[name]
     if values.shape != (len(recording.presses_mm),):
         raise InputError(f"{name} have shape {values.shape}, expected ({len(recording.presses_mm)},)")
-    limits.check_magnitude(name, values[:, None], limit, unit, missing=True)
-    wrong = {"depths_mm": values <= 0, "forces_n": values < 0}.get(name, np.zeros(len(values), bool))
-    if wrong.any():
-        press = int(np.argmax(wrong))
-        least = "more than 0" if name == "depths_mm" else "0 or more"
-        raise InputError(f"{name} of press {press} is {values[press]:g} {unit}, allowed is {least}")
+    check_magnitude(name, values[:, None], limit, unit, missing=True)
+    # An arm may measure that it is above the pad.
+    is_wrong = {"depths_mm": values <= 0, "forces_n": values < 0}.get(name, np.zeros(len(values), bool))
+    if is_wrong.any():
+        press = int(np.argmax(is_wrong))
+        allowed = "more than 0" if name == "depths_mm" else "0 or more"
+        raise InputError(f"{name} of press {press} is {values[press]:g} {unit}, allowed is {allowed}")
 
 
 def is_mirrored(source: object) -> bool:
-    """Return whether the source of a recording says that the pad lay with its tracks up, see `Recording.mirrored`."""
+    """Whether the source of a recording says that the pad lay with its tracks up, see `Recording.mirrored`."""
     rig = source.get("rig") if isinstance(source, Mapping) else None
     return isinstance(rig, Mapping) and rig.get("mirrored") is True
 
 
-def rate_of(times_s: Array) -> float:
-    """Readings per second of a recording, by the median of the steps of its (R,) times, s."""
+def median_rate_hz(times_s: Array) -> float:
+    """Return the readings per second, by the median interval of (R,) times."""
     return 1 / float(np.median(np.diff(times_s)))

@@ -1,11 +1,10 @@
-"""Reading `journal.ndjson`: which presses of a run directory are done, where, how deep and with which force.
+"""The run directory of a recording: written so that no finished press is ever lost.
 
-The run directory that keeps a recording, written so that nothing finished is ever lost.
-It holds `start.json` (what was recorded, with what), `readings.bin` and, of a real or emulated arm, `states.bin`
-(see `block_file`), and `journal.ndjson`: one line as a press begins, with its place and the index of its first
-reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done, so
-after a kill every press the journal calls done can be used, and the others are repeated. `start.json` comes last when a
-recording is born: a folder without it holds nothing, and a recording can begin there.
+It holds `start.json` (what was recorded, and with what), `readings.bin` and, for a real or emulated arm, `states.bin`
+(see `block_file`), and `journal.ndjson`: one line as a press begins, with its position and the index of its first
+reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done: after
+a kill all presses that the journal calls done can be used, and the others are repeated. `start.json` is written last
+when a recording is created: a folder without it holds nothing, and a recording can begin there.
 """
 
 import contextlib
@@ -31,14 +30,21 @@ from padforge.design.common.files import (
     to_disk,
     write_json,
 )
-from padforge.design.common.validation import InputError, check_int, check_mapping, short_repr
-from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.validation import InputError, check_int, check_mapping, check_path, short_repr
 from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, MAX_MM, MAX_N, Array, check_numbers
 from padforge.sense.recording.block_file import BlockWriter, open_in_place, read_blocks, write_at
 
+FORMAT = "padforge-recording/2"
+START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
+"""Columns of a state of the arm; force is NaN without a sensor, safety 1 normal and 0 stopped."""
+_NEW_START = UNFINISHED + START
+_BEFORE_START = (JOURNAL, READINGS, _NEW_START)
+"""Files that are created before `start.json`, in this order."""
+
 
 class Press(NamedTuple):
-    """A press that is done; see `Recording`, whose arrays hold one entry of each. NaN where something is not known."""
+    """A press that is done: an entry of the arrays of a `Recording`; NaN where a number is unknown."""
 
     x_mm: float
     y_mm: float
@@ -50,9 +56,7 @@ class Press(NamedTuple):
 
 
 def read_journal(path: Path) -> dict[int, Press]:
-    """Every press that is done, by its number.
-
-    Numbers ascend. A press that was aborted and begun again counts as it was begun last.
+    """Return the presses that are done by their numbers, ascending; one that was repeated counts as begun last.
 
     Raises:
         InputError: the file is missing, or a line other than a torn last one is no entry.
@@ -61,60 +65,56 @@ def read_journal(path: Path) -> dict[int, Press]:
         text = read_bytes(path).decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: no journal ({error})") from error
-    down_command: dict[int, tuple[float, float, int, float]] = {}
-    done: dict[int, tuple[int, float, float]] = {}
-    for number, line in enumerate(text.split("\n")[:-1], start=1):  # what follows the last newline is a torn line
+    started: dict[int, Mapping[str, Any]] = {}
+    done: dict[int, Press] = {}
+    for line_number, line in enumerate(text.split("\n")[:-1], start=1):  # after the last newline is a torn line
         try:
             event = json.loads(line)
             if not isinstance(event, dict):
                 raise ValueError(f"{shortened(event)}, expected an object")
-            press, reading = _whole(event, "press"), _whole(event, "reading")
-            if event.get("event") == "started":
-                place = (_number(event, "x_mm", MAX_MM), _number(event, "y_mm", MAX_MM))
-                down_command[press] = (*place, reading, _number(event, "depth_mm", MAX_MM, None))
+            press, kind = _index(event, "press"), event.get("event")
+            _index(event, "reading")
+            if kind == "started":
+                for key, default in (("x_mm", "missing"), ("y_mm", "missing"), ("depth_mm", None)):
+                    _number(event, key, MAX_MM, default)
+                started[press] = event
                 done.pop(press, None)
-            elif event.get("event") == "done" and press in down_command:
-                done[press] = (reading, _reached(event), _number(event, "force_n", MAX_N, None))
-            elif event.get("event") == "aborted" and press in down_command:
-                del down_command[press]
+            elif kind == "done" and press in started:
+                done[press] = _finished_press(started[press], event)
+            elif kind == "aborted" and press in started:
+                del started[press]
                 done.pop(press, None)
             else:
-                raise ValueError(f"event {shortened(event.get('event'))} of press {press}")
+                raise ValueError(f"event {shortened(kind)} of press {press}")
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: line {number} is no journal entry ({error})") from error
-    presses = ((press, *down_command[press], *done[press]) for press in sorted(done))
-    return {
-        press: Press(x, y, first, up_command, depth, reached, force)
-        for press, x, y, first, depth, up_command, reached, force in presses
-    }
+            raise InputError(f"{path}: line {line_number} is no journal entry ({error})") from error
+    return dict(sorted(done.items()))
 
 
-def cut_torn_line(path: Path) -> None:
-    """Take away what follows the last whole line of a journal."""
-    content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        with open_in_place(path) as file:
-            file.truncate(whole)
+def _finished_press(started: Mapping[str, Any], done: Mapping[str, Any]) -> Press:
+    at_mm = done.get("at_mm", [None] * 3)
+    if not isinstance(at_mm, list) or len(at_mm) != 3:
+        raise ValueError(f"at_mm is {shortened(at_mm)}, expected x, y and depth")
+    return Press(
+        x_mm=_number(started, "x_mm", MAX_MM),
+        y_mm=_number(started, "y_mm", MAX_MM),
+        down_command=_index(started, "reading"),
+        up_command=_index(done, "reading"),
+        depth_mm=_number(started, "depth_mm", MAX_MM, None),
+        reached_mm=_number({"at_mm": at_mm[2]}, "at_mm", MAX_MM),
+        force_n=_number(done, "force_n", MAX_N, None),
+    )
 
 
-def _whole(event: Mapping[str, Any], key: str) -> int:
+def _index(event: Mapping[str, Any], key: str) -> int:
     value = event.get(key)
     if type(value) is not int or not 0 <= value <= MAX_INDEX:
         raise ValueError(f"{key} is {shortened(value)}, expected a whole number from 0 to {MAX_INDEX}")
     return value
 
 
-def _reached(event: Mapping[str, Any]) -> float:
-    """The last of `at_mm`, where the tip was on the pad: x, y and depth."""
-    at = event.get("at_mm", [None] * 3)
-    if not isinstance(at, list) or len(at) != 3:
-        raise ValueError(f"at_mm is {shortened(at)}, expected x, y and depth")
-    return _number({"at_mm": at[2]}, "at_mm", MAX_MM)
-
-
-def _number(event: Mapping[str, Any], key: str, limit: float, missing: object = "missing") -> float:
-    value = event.get(key, missing)
+def _number(event: Mapping[str, Any], key: str, limit: float, default: object = "missing") -> float:
+    value = event.get(key, default)
     if value is None:
         return float("nan")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= limit:
@@ -122,97 +122,98 @@ def _number(event: Mapping[str, Any], key: str, limit: float, missing: object = 
     return float(value)
 
 
-FORMAT = "padforge-recording/2"
-START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
-_UNBORN = UNFINISHED + START
-_BIRTH = (JOURNAL, READINGS, _UNBORN)
-"""What is made before `start.json`, in this order."""
-
-
 class Recorder:
-    """Writes a run directory as it is recorded: append readings, begin a press, end it, `sync`.
+    """Writes a run directory while it is recorded: append readings, begin a press, finish it, `sync`.
 
-    Nothing is promised to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
+    Nothing is sure to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
+
+    Args:
+        path: of the folder.
+        fibres: C, values of a reading.
+        source: what is recorded; JSON.
+        provenance: of the recording; JSON.
 
     Attributes:
-        fibres: C, values of a reading.
+        fibres: C.
         done: numbers of the presses that are done.
-        readings: how many readings there are.
-        last_s: time of the last reading or state, s; -inf where there is none.
+        n_readings: number of readings so far.
+        last_s: time of the last reading or state, s; -inf without any.
 
     Raises:
-        InputError: `check_path` is in the way, see `refuse_begun`, or cannot be written, or too few or many fibres.
+        InputError: the folder holds something, see `check_new_recording`, or cannot be written, or too few or many
+            fibres.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
-        fibres, path = check_int("fibres", fibres, 1, MAX_FIBRES), as_path("path", path)
-        told = {
+        fibres, path = check_int("fibres", fibres, 1, MAX_FIBRES), check_path("path", path)
+        document = {
+            "format": FORMAT,
+            "fibres": fibres,
             "source": dict(check_mapping("source", source)),
             "provenance": dict(check_mapping("provenance", provenance)),
         }
-        refuse_begun(path)
-        document = {"format": FORMAT, "fibres": fibres, **told}
+        check_new_recording(path)
         with reraise_write_error(path):
             path.mkdir(parents=True, exist_ok=True)
-            there = {file.name for file in path.iterdir()}
-            self._journal: BinaryIO = _claimed(path)
+            present = {file.name for file in path.iterdir()}
+            self._journal: BinaryIO = _lock_new_journal(path)
             with contextlib.ExitStack() as undo:
-                undo.callback(self._journal.close)  # the last thing, for it lets others in
-                for name in {*_BIRTH, START} - there:
+                undo.callback(self._journal.close)  # last, as it lets others in
+                for name in {*_BEFORE_START, START} - present:
                     undo.callback((path / name).unlink, missing_ok=True)
-                self._stream: BinaryIO = _opened(path / READINGS)
+                self._stream: BinaryIO = _create(path / READINGS)
                 undo.callback(self._stream.close)
-                write_json(path / _UNBORN, document)
-                sync(path / _UNBORN)
-                (path / _UNBORN).replace(path / START)
+                write_json(path / _NEW_START, document)
+                sync(path / _NEW_START)
+                (path / _NEW_START).replace(path / START)
                 sync(path)
                 sync(path.parent)
                 undo.pop_all()
-        self._begin_with(path, BlockWriter(self._stream, fibres), 0)
+        self._set_state(path, BlockWriter(self._stream, fibres), journal_bytes=0)
 
-    def _begin_with(self, path: Path, blocks: BlockWriter, noted: int) -> None:
+    def _set_state(self, path: Path, blocks: BlockWriter, journal_bytes: int) -> None:
         self._path, self._blocks, self.fibres = path, blocks, blocks.fibres
-        self._noted = noted  # bytes of the journal
+        self._journal_bytes = journal_bytes
         self._states: tuple[BlockWriter, BinaryIO] | None = None
         self._lines: list[str] = []
-        self._press, self._down = 0, False
+        self._press, self._is_down = 0, False
         self.done: set[int] = set()
-        self.readings = 0
+        self.n_readings = 0
         self.last_s = -np.inf
 
     @classmethod
     def resume(cls, path: Path) -> "Recorder":
-        """Go on with a run directory that was left unfinished; torn tails are cut off.
+        """Continue an unfinished run directory; torn tails are cut off.
 
         Raises:
             InputError: no run directory, damage elsewhere than at its end, links, or presses without any reading.
         """
-        fibres = fibres_of(path := as_path("path", path))
+        fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
         with reraise_write_error(path):
-            for name in (JOURNAL, READINGS) if unborn(path) else ():  # broken off before the first reading
-                (path / name).touch()
+            if is_uncommitted(path):  # broken off before the first reading
+                for name in (JOURNAL, READINGS):
+                    (path / name).touch()
             self._journal = open_in_place(path / JOURNAL)
             try:
-                lock(self._journal, busy(path))
-                done = read_journal(path / JOURNAL)
-                _refuse_other_readings(path, fibres, len(done))
+                lock(self._journal, busy_message(path))
+                journal = read_journal(path / JOURNAL)
+                _check_readings(path, fibres, len(journal))
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
                 raise
-            cut_torn_line(path / JOURNAL)
-            self._begin_with(path, blocks, (path / JOURNAL).stat().st_size)
-            self._note_time(rows)
+            _cut_torn_line(path / JOURNAL)
+            self._set_state(path, blocks, (path / JOURNAL).stat().st_size)
+            self._update_last_time(rows)
             if (path / STATES).exists():
                 states, file, state_rows = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
                 self._states = (states, file)
-                self._note_time(state_rows)
-        self.done = {press for press, entry in done.items() if entry[3] <= len(rows)}
-        self.readings = len(rows)
-        for press in sorted(set(done) - self.done):  # or they would count again as soon as enough rows follow
-            gone = {"event": "aborted", "press": press, "reading": len(rows), "reason": "its readings were torn off"}
-            self._note(gone)
+                self._update_last_time(state_rows)
+        self.n_readings = len(rows)
+        self.done = {number for number, press in journal.items() if press.up_command <= len(rows)}
+        for number in sorted(journal.keys() - self.done):  # or they would count again as soon as enough rows follow
+            self._write_event("aborted", number, len(rows), reason="its readings were torn off")
         self.sync()
         self._press = max(self.done, default=-1) + 1
         return self
@@ -232,8 +233,8 @@ class Recorder:
             )
         rows = np.column_stack([times, volts])
         self._blocks.append(rows)
-        self._note_time(rows)
-        self.readings += len(rows)
+        self._update_last_time(rows)
+        self.n_readings += len(rows)
 
     def append_states(self, rows: Array) -> None:
         """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
@@ -241,68 +242,74 @@ class Recorder:
             file = (self._path / STATES).open("xb", buffering=0)
             self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
         self._states[0].append(rows)
-        self._note_time(rows)
+        self._update_last_time(rows)
 
-    def _note_time(self, rows: Array) -> None:
+    def _update_last_time(self, rows: Array) -> None:
         if len(rows):
             self.last_s = max(self.last_s, float(rows[-1, 0]))
 
-    def begin(self, place_mm: ArrayLike, reading: int, press: int | None = None, **more: Any) -> None:
-        """Note that the probe is sent down at `place_mm` (2,); `reading` is the index of the reading that follows.
+    def begin(self, position_mm: ArrayLike, reading: int, press: int | None = None, **more: Any) -> None:
+        """Note that the probe is sent down.
 
         Args:
-            place_mm: NaN where it is not known.
+            position_mm: (2,); NaN where it is unknown.
+            reading: index of the reading that follows.
             press: its number, by default one more than that of the last.
-            more: what else is known of it, as JSON.
+            more: JSON that is added to the entry, such as `depth_mm`.
 
         Raises:
-            InputError: a place, index or number that no press has, or what JSON cannot hold.
+            InputError: a position, index or number that no press has, or what JSON cannot hold.
         """
-        place = check_numbers(place_mm, np.float64, "place")
-        if place.shape != (2,) or not (np.isnan(place).all() or (np.abs(place) <= MAX_MM).all()):
-            raise InputError(f"place is {short_repr(place_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice")
+        position = check_numbers(position_mm, np.float64, "position")
+        if position.shape != (2,) or not (np.isnan(position).all() or (np.abs(position) <= MAX_MM).all()):
+            raise InputError(
+                f"position is {short_repr(position_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice"
+            )
         number = self._press if press is None else check_int("press", press, 0, MAX_INDEX)
         reading = check_int("reading", reading, 0, MAX_INDEX)
-        x, y = (None if np.isnan(value) else value for value in place.tolist())
-        self._note({"event": "started", "press": number, "reading": reading, "x_mm": x, "y_mm": y, **more})
-        self._press, self._down = number, True
+        x, y = (None if np.isnan(value) else value for value in position.tolist())
+        self._write_event("started", number, reading, x_mm=x, y_mm=y, **more)
+        self._press, self._is_down = number, True
 
     def finish(self, reading: int, **more: Any) -> None:
-        """Note that the probe is sent up; `reading` is the index of the reading that follows.
+        """Note that the probe is sent up.
+
+        Args:
+            reading: index of the reading that follows.
+            more: JSON that is added to the entry, such as `at_mm` and `force_n`.
 
         Raises:
-            InputError: no press was begun, an index that no reading has, or `more` is what JSON cannot hold.
+            InputError: no press was begun, an index that no reading has, or what JSON cannot hold.
         """
-        if not self._down:
+        if not self._is_down:
             raise InputError(f"press {self._press} was not begun, so it cannot be finished")
-        reading = check_int("reading", reading, 0, MAX_INDEX)
-        self._note({"event": "done", "press": self._press, "reading": reading, **more})
+        self._write_event("done", self._press, check_int("reading", reading, 0, MAX_INDEX), **more)
         self.done.add(self._press)
-        self._press, self._down = self._press + 1, False
+        self._press, self._is_down = self._press + 1, False
 
     def abort(self, reason: str) -> None:
-        """Note that the press that was begun, if any is, did not come to its end."""
-        if not self._down:
-            return
-        self._down = False
-        self._note({"event": "aborted", "press": self._press, "reading": self.readings, "reason": reason})
+        """Note that the press that was begun, if any, did not come to its end."""
+        if self._is_down:
+            self._is_down = False
+            self._write_event("aborted", self._press, self.n_readings, reason=reason)
 
-    def _note(self, event: Mapping[str, Any]) -> None:
+    def _write_event(self, event: str, press: int, reading: int, **more: Any) -> None:
+        document = {"event": event, "press": press, "reading": reading, **more}
         try:
-            self._lines.append(json.dumps(event, allow_nan=False) + "\n")
+            self._lines.append(json.dumps(document, allow_nan=False) + "\n")
         except (TypeError, ValueError, RecursionError) as error:
-            raise InputError(f"press {event['press']}: {short_repr(event)}, expected what JSON can hold") from error
+            raise InputError(f"press {press}: {short_repr(document)}, expected what JSON can hold") from error
 
     def sync(self) -> None:
-        """Put all so far on the disk: the readings and states first, then what the journal says of them."""
+        """Put everything on the disk: first the readings and states, then the journal about them."""
         self._blocks.flush()
         to_disk(self._stream.fileno())
         if self._states is not None:
             self._states[0].flush()
             to_disk(self._states[1].fileno())
         lines = "".join(self._lines).encode()
-        write_at(self._journal, self._noted, lines)
-        self._noted += len(lines)
+        write_at(self._journal, self._journal_bytes, lines)
+        self._journal_bytes += len(lines)
         self._lines.clear()
         to_disk(self._journal.fileno())
 
@@ -313,56 +320,15 @@ class Recorder:
         with contextlib.ExitStack() as files:
             for file in (self._journal, self._stream, *(self._states or ())[1:]):
                 files.enter_context(file)
-            with contextlib.suppress(*([OSError] if kind else [])):  # the error under way tells more
+            with contextlib.suppress(*([OSError] if kind else [])):  # do not hide the error under way
                 self.sync()
 
 
-def busy(path: Path) -> str:
-    """What to say where a recording is locked by the recorder that is at work."""
-    return f"{path}: another program is recording into it"
-
-
-def _refuse_other_readings(path: Path, fibres: int, presses: int) -> None:
-    """Raise InputError where no break has left the readings as they are: nothing of them is to be cut off then."""
-    times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
-    if (presses and not len(times_s)) or not (np.diff(times_s) > 0).all():
-        raise InputError(f"{path / READINGS}: not the readings of {presses} presses of {fibres} fibres, told beside it")
-
-
-def _opened(path: Path) -> BinaryIO:
-    path.touch()
-    return path.open("r+b", buffering=0)
-
-
-def _claimed(path: Path) -> BinaryIO:
-    """The journal of a recording that is to be born in `check_path`, kept from others; of several that come, one gets
-    it."""
-    journal = _opened(path / JOURNAL)
-    try:
-        lock(journal, busy(path))
-        if not os.path.samestat(os.fstat(journal.fileno()), (path / JOURNAL).stat()):
-            raise InputError(busy(path))  # who had it first gave up and took it away
-        refuse_begun(path)
-    except BaseException:
-        journal.close()
-        raise
-    return journal
-
-
-def unborn(path: Path) -> bool:
-    """Whether a folder holds nothing but what is made before `start.json`, and that itself; no reading, no press."""
-    return all(
-        stat.S_ISREG(file.lstat().st_mode)
-        and (file.name in (START, _UNBORN) or (file.name in _BIRTH and file.stat().st_size == 0))
-        for file in path.iterdir()
-    )
-
-
-def fibres_of(path: Path) -> int:
-    """The number of fibres a run directory was recorded of.
+def read_fibres(path: Path) -> int:
+    """Return the number of fibres of a run directory.
 
     Raises:
-        InputError: no run directory, or one that does not say.
+        InputError: no run directory, or one without it.
     """
     if not (path / START).is_file():
         raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
@@ -372,19 +338,66 @@ def fibres_of(path: Path) -> int:
     return fibres
 
 
-def refuse_begun(path: Path) -> None:
-    """As `refuse_existing`, but for a recording that was broken off while it was being born: one can begin there."""
-    check_writable(path)
-    if path.exists() and ((path / START).exists() or not unborn(path)):
-        refuse_existing(path)
-
-
-def refuse_existing(path: Path) -> None:
-    """Raise InputError if `check_path` is anything but absent or an empty directory, or cannot be written."""
+def check_new_folder(path: Path) -> None:
+    """Raise InputError unless a path is absent or an empty folder, and can be written."""
     check_writable(path)
     if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
 
 
-STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
-"""Columns of a row of `Arm.drain`; force is NaN where the arm has no sensor, safety 1 normal, 0 stopped."""
+def check_new_recording(path: Path) -> None:
+    """As `check_new_folder`, but allow a recording that was broken off while it was created."""
+    check_writable(path)
+    if path.exists() and ((path / START).exists() or not is_uncommitted(path)):
+        check_new_folder(path)
+
+
+def is_uncommitted(path: Path) -> bool:
+    """Whether a folder holds only files that are created up to `start.json`, without a reading or press."""
+    return all(
+        stat.S_ISREG(file.lstat().st_mode)
+        and (file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0))
+        for file in path.iterdir()
+    )
+
+
+def busy_message(path: Path) -> str:
+    """Return the message for a recording that another recorder has locked."""
+    return f"{path}: another program is recording into it"
+
+
+def _check_readings(path: Path, fibres: int, n_presses: int) -> None:
+    """Refuse readings that cannot be what a break left: nothing of them may be cut off then."""
+    times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
+    if (n_presses and not len(times_s)) or not (np.diff(times_s) > 0).all():
+        raise InputError(
+            f"{path / READINGS}: not the readings of {n_presses} presses of {fibres} fibres in the journal"
+        )
+
+
+def _cut_torn_line(path: Path) -> None:
+    """Cut off what follows the last complete line of a journal."""
+    content = path.read_bytes()
+    end = content.rfind(b"\n") + 1
+    if end < len(content):
+        with open_in_place(path) as file:
+            file.truncate(end)
+
+
+def _create(path: Path) -> BinaryIO:
+    path.touch()
+    return path.open("r+b", buffering=0)
+
+
+def _lock_new_journal(path: Path) -> BinaryIO:
+    """Open the journal of a recording that is created, and lock it; of several programs one gets it."""
+    journal = _create(path / JOURNAL)
+    try:
+        lock(journal, busy_message(path))
+        if not os.path.samestat(os.fstat(journal.fileno()), (path / JOURNAL).stat()):
+            raise InputError(busy_message(path))  # the first one gave up and deleted it
+        check_new_recording(path)
+    except BaseException:
+        journal.close()
+        raise
+    return journal

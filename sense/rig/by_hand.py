@@ -15,9 +15,9 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.features import REST, bridged
-from padforge.sense.recording.press_plan import free_of, planned, size_of
+from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, read_journal, refuse_begun
+from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, check_new_recording, read_journal
 from padforge.sense.rig.by_hand_presses import (
     MAX_HOLD,
     RELEASE_S,
@@ -68,11 +68,11 @@ def plan_targets(config: RigConfig) -> Array:
     rig = config.rig
     if rig.plan == "adaptive":
         raise InputError("[rig] plan is adaptive, by hand allowed are uniform, grid, serpentine or a .csv of positions")
-    positions_mm = planned(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings).positions_mm
+    positions_mm = make_plan(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings).positions_mm
     if rig.plan != "uniform":
         return positions_mm
     rounded_mm = np.rint(positions_mm)
-    free = free_of(config.pad, size_of(config.pad, config.pad_settings))(rounded_mm)
+    free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))(rounded_mm)
     return order_in_rounds(np.where(free[:, None], rounded_mm, positions_mm))
 
 
@@ -140,7 +140,7 @@ class HandSession:
         # Times of a recording begin at 0, and go on a second after the last ones if it is resumed.
         self._start_s = recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0
         self._zero_s: float | None = None
-        self._first = recorder.readings  # of this session, in the recording; other indices count from it
+        self._first = recorder.n_readings  # of this session, in the recording; other indices count from it
         self._number = max(recorder.done, default=-1) + 1
         self._sequence = PressSequence(targets_mm, hold_s, self._start_s)
         self._ring, self._now_s = Ring(1 + n_fibres), self._start_s
@@ -346,7 +346,7 @@ def record_by_hand(
         RigFault: The board failed, or the disk.
     """
     if not resume:
-        refuse_begun(config.out)
+        check_new_recording(config.out)
     rig = config.rig
     source = connected(board, rig.rate_hz)
     recorder, targets_mm, remaining_mm = open_recorder_by_hand(config, source.converter, resume)

@@ -20,7 +20,15 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import Array
-from padforge.sense.recording.press_plan import COLUMNS, PressPlan, all_free, free_of, planned, size_of, told_pad
+from padforge.sense.recording.press_plan import (
+    COLUMNS,
+    PressPlan,
+    check_pressable,
+    fit_pad_settings,
+    make_plan,
+    pad_source,
+    pressable_test,
+)
 from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
 from padforge.sense.settings import Millimetres, RigSettings
@@ -189,9 +197,11 @@ class RigConfig:
 def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
     """Return the stored plan of a resumed recording, otherwise the one that `rig` asks for."""
     if resume and (config.out / START).exists():
-        plan = PressPlan.of(read_source(config, rig, KIND)["plan"]["presses"])
-        return all_free(plan, config.out, free_of(config.pad, size_of(config.pad, config.pad_settings)))
-    return planned(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings)
+        plan = PressPlan.from_rows(read_source(config, rig, KIND)["plan"]["presses"])
+        return check_pressable(
+            plan, config.out, pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
+        )
+    return make_plan(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings)
 
 
 def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
@@ -264,7 +274,7 @@ def open_recorder(
 def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
     """Settings, with the wired inputs and the side of the pad filled in, and the pad."""
     wired = rig.model_copy(update={"channels": rig.inputs(len(config.pad.knots)), "mirrored": bool(rig.mirrored)})
-    return {"rig": wired.model_dump(mode="json"), "morphology": told_pad(config.pad)}
+    return {"rig": wired.model_dump(mode="json"), "morphology": pad_source(config.pad)}
 
 
 def _get(mapping: object, key: str) -> Any:

@@ -22,10 +22,16 @@ from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.recording.press_plan import Free, PressPlan, free_of, size_of, uniform
+from padforge.sense.recording.press_plan import (
+    PositionTest,
+    PressPlan,
+    fit_pad_settings,
+    pressable_test,
+    sample_uniform,
+)
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import refuse_begun, refuse_existing
-from padforge.sense.rig.config import RigConfig, locate_on_bed, load_or_make_plan, open_recorder, plan_notice
+from padforge.sense.recording.run_directory import check_new_folder, check_new_recording
+from padforge.sense.rig.config import RigConfig, load_or_make_plan, locate_on_bed, open_recorder, plan_notice
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
 from padforge.sense.rig.press_loop import Interrupts, OnProgress, PressLoop, check_plan
@@ -52,7 +58,7 @@ class AdaptivePlanner:
         free: Which of them may be pressed.
     """
 
-    def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: Free) -> None:
+    def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: PositionTest) -> None:
         self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
 
     def __call__(self, plan: PressPlan, press: int) -> PressPlan:
@@ -63,7 +69,7 @@ class AdaptivePlanner:
         errors_mm = np.linalg.norm(self._localizer.predict(recording).positions_mm - recording.presses_mm, axis=1)
         positions_mm = plan.positions_mm.copy()
         corner_mm = np.abs(plan.positions_mm).max(axis=0)
-        candidates = uniform(np.array([-corner_mm, corner_mm]), _N_CANDIDATES, self._rng, self._free)
+        candidates = sample_uniform(np.array([-corner_mm, corner_mm]), _N_CANDIDATES, self._rng, self._free)
         pressed = recording.presses_mm
         for number in range(press, min(press + ADAPT_EVERY, len(plan))):
             score = acquisition(candidates, recording.presses_mm, errors_mm, pressed)
@@ -113,7 +119,7 @@ def record_simulated(
         InputError: Settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
     if not replacing:
-        refuse_existing(out)
+        check_new_folder(out)
     rig = spec.section(RigSettings, **overrides)
     plan = pad.morphology if isinstance(pad, Twin) else pad
     pad_settings = spec.section(PadSettings, **plan.layout.settings)
@@ -183,7 +189,7 @@ def record(
             if resume and (notice := plan_notice(config)):
                 on_message(notice)
             if not (resume or dry):
-                refuse_begun(config.out)
+                check_new_recording(config.out)
             identities = {"board": board.connect(), "arm": arm.connect()}
             check_tcp(rig.tcp_mm, identities["arm"])
             # Before there is a folder that would be in the way.
@@ -193,7 +199,7 @@ def record(
             on_message('[rig] max_force_n is "unwatched": no force stops the arm')
         folder = temporary_folder(Path(tempfile.gettempdir()), _DRY_PREFIX) if dry else nullcontext(config.out)
         with folder as out:
-            with open_recorder(config, rig, plan.document(), out, resume, identities) as recorder:
+            with open_recorder(config, rig, plan.to_rows(), out, resume, identities) as recorder:
                 on_progress(len(recorder.done), len(plan))
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)
@@ -204,7 +210,7 @@ def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Ca
         return lambda plan, press: plan
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
-    free = free_of(config.pad, size_of(config.pad, config.pad_settings))
+    free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
     return AdaptivePlanner(LocalizerModel.load(model), config.out, np.random.default_rng(rig.seed), free)
 
 

@@ -151,7 +151,7 @@ class PressLoop:
         self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz  # half the cycle of a press
         self._averager = Averager(ratio, recorder.fibres)
         self._recent: deque[float] = deque(maxlen=_RECENT)
-        self._disk, self._n_readings = DiskThread(), recorder.readings
+        self._disk, self._n_readings = DiskThread(), recorder.n_readings
         self._interrupts = Interrupts()
         self._zero_s = 0.0
         self._forces_n: list[float] = []  # since the probe last came to rest

@@ -22,7 +22,14 @@ from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
 from padforge.design.twin import TwinChannel
 from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array, Indices
-from padforge.sense.recording.press_plan import Free, free_of, planned_in, size_of, told_pad, uniform
+from padforge.sense.recording.press_plan import (
+    PositionTest,
+    fit_pad_settings,
+    make_plan_in,
+    pad_source,
+    pressable_test,
+    sample_uniform,
+)
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import DELAY_S, DRIFT_S, TRAVEL_S, Cycle, read_pad
@@ -46,7 +53,7 @@ class SimulatedPad:
 
     channels: int
     pressed_mm: Array
-    free: Free
+    free: PositionTest
     answers: Callable[[Array], Array]
     noise_v: Array | None
     strengths: dict[str, float]
@@ -57,19 +64,19 @@ def planned(pad: Morphology, contact: Contact, size: PadSettings | None = None) 
     """A pad as it is planned; `size` says where it is pressed.
 
     Raises:
-        InputError: as `size_of`.
+        InputError: as `fit_pad_settings`.
     """
-    size = size_of(pad, size)
+    size = fit_pad_settings(pad, size)
     told = size.model_dump(mode="json")
     source = {
         "contact": contact.model_dump(mode="json"),
         "sensed_mm": told["sensed_mm"],
-        "morphology": told_pad(pad),
+        "morphology": pad_source(pad),
     }
     return SimulatedPad(
         len(pad.knots),
         pad.to_mm(size.sensed),
-        free_of(pad, size),
+        pressable_test(pad, size),
         lambda positions_mm: relative_stretch(pad, pad.to_grid(positions_mm), contact),
         None,
         {},
@@ -81,7 +88,7 @@ def measured(twin: Twin, size: PadSettings | None = None) -> SimulatedPad:
     """The twin's own pad: fibres as laid and wired, pressed where the arm pressed; a dead channel stays at rest.
 
     Raises:
-        InputError: no channel of the twin reads a fibre; or as `size_of`.
+        InputError: no channel of the twin reads a fibre; or as `fit_pad_settings`.
     """
     live = _live(twin)
     columns = [twin.channels.index(channel) for channel in live]
@@ -120,7 +127,7 @@ def measured_alike(pad: Morphology, twin: Twin, size: PadSettings | None = None)
     How its channels will differ nobody knows before it is laid: fibre i is on channel i, all alike.
 
     Raises:
-        InputError: no channel of the twin reads a fibre; or as `size_of`.
+        InputError: no channel of the twin reads a fibre; or as `fit_pad_settings`.
     """
     gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live(twin)]).T
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
@@ -200,7 +207,7 @@ def simulate(
     model = _modelled(pad, contact, size, like)
     rig = rig.model_copy(update=model.strengths)
     rng = np.random.default_rng(rig.seed)
-    plan = planned_in(model.pressed_mm, rig, rng, model.free)
+    plan = make_plan_in(model.pressed_mm, rig, rng, model.free)
     values = len(plan) * rig.readings_per_press * channels
     if values > MAX_VALUES:
         raise InputError(
@@ -229,9 +236,9 @@ def _modelled(pad: Morphology | Twin, contact: Contact, size: PadSettings | None
 
 
 def random_places(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:
-    """(Q, 2) places in mm, uniform over what is pressed of the pad, see `size_of`."""
-    size = size_of(pad, size)
-    return uniform(pad.to_mm(size.sensed), presses, rng, free_of(pad, size))
+    """(Q, 2) places in mm, uniform over what is pressed of the pad, see `fit_pad_settings`."""
+    size = fit_pad_settings(pad, size)
+    return sample_uniform(pad.to_mm(size.sensed), presses, rng, pressable_test(pad, size))
 
 
 LEAST_PRESSES = 100

@@ -261,7 +261,7 @@ def drift_study(
     sources |= {label: (lambda own=recording: own) for label, recording in recordings.items()}
     simulated = {*pads, *(label for label, own in recordings.items() if own.source.get("kind") == SIMULATED)}
     kinds = {label: SIMULATED if label in simulated else "recorded" for label in sources}
-    known = {**dict.fromkeys(pads, presses), **{label: int(own.known.sum()) for label, own in recordings.items()}}
+    known = {**dict.fromkeys(pads, presses), **{label: int(own.has_position.sum()) for label, own in recordings.items()}}
     for label, count in known.items():
         try:
             _split(np.arange(count), test_share, seed)
@@ -366,7 +366,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
     filtered = FILTERS[name](readings)
     state: State = {"seconds": np.array((perf_counter() - clock) * 1e4 / len(readings))}
     state["idle"] = np.array(recorded_idle_share(replace(recording, readings=filtered)).mean())
-    split = _split(np.flatnonzero(recording.known), share, seed)
+    split = _split(np.flatnonzero(recording.has_position), share, seed)
     for number, scheme in enumerate(SCHEMES):
         inputs = scheme_inputs(scheme, filtered, down_command, up_command, split.taught)
         rngs = np.random.default_rng([8, seed]).spawn(MEMBERS)

@@ -88,7 +88,7 @@ def learning_curve(
     check_type("recording", recording, Recording)
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
-    known = np.flatnonzero(recording.known)
+    known = np.flatnonzero(recording.has_position)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     if len(training) * SHARES[0] < LEAST_PRESSES:
         raise InputError(

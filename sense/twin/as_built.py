@@ -181,14 +181,14 @@ def of_one_depth(recording: Recording) -> Recording:
 
     They stay in what came before the others. Where no depth is known, all are taken to be alike.
     """
-    deep_mm = np.where(recording.known, recording.deep_mm, np.nan)
-    known = np.sort(deep_mm[deep_mm > 0])[::-1]
+    actual_depths_mm = np.where(recording.has_position, recording.actual_depths_mm, np.nan)
+    known = np.sort(actual_depths_mm[actual_depths_mm > 0])[::-1]
     if not len(known):
         return recording
     as_deep = np.searchsorted(-known, -(1 - ALIKE) * known, "right")
     deeper = np.searchsorted(-known, -(1 + ALIKE) * known, "left")
     usual = known[np.argmax(as_deep - deeper)]  # the deepest of the most common, as it is heard best
-    alike = np.abs(deep_mm - usual) <= ALIKE * usual
+    alike = np.abs(actual_depths_mm - usual) <= ALIKE * usual
     return replace(recording, presses_mm=np.where(alike[:, None], recording.presses_mm, np.nan))
 
 
@@ -198,7 +198,7 @@ def responses(recording: Recording, learnt: Mask) -> Responses:
     Args:
         learnt: (Q,) of these presses, those from which is learnt what of its history a channel still shows.
     """
-    known = recording.known
+    known = recording.has_position
     inputs = press_inputs(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
     places = recording.presses_mm[known]
     about = _about(places)
@@ -213,7 +213,7 @@ def information(recording: Recording, channels: Indices) -> Array:
     Args:
         channels: (C',) which ones, each by the presses in which it gave enough readings.
     """
-    known = recording.known
+    known = recording.has_position
     inputs = press_inputs(
         recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
     )

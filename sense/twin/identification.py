@@ -174,7 +174,7 @@ def identify(
     check_type("pad", pad, Morphology)
     recording = of_one_depth(recording)
     rng = np.random.default_rng(check_int("seed", seed, 0, 2**32 - 1))
-    places = recording.presses_mm[recording.known]
+    places = recording.presses_mm[recording.has_position]
     _refuse_places(places, pad)
     report("responses", 0, 1)
     held = np.zeros(len(places), bool)

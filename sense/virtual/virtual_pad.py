@@ -10,7 +10,7 @@ import numpy as np
 from padforge.design import Contact, Morphology, signals
 from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
-from padforge.sense.recording.press_plan import planned
+from padforge.sense.recording.press_plan import make_plan
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
@@ -34,7 +34,7 @@ class SimulatedConverter:
     ) -> None:
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
-            planned(pad, rig, rng, size)  # the presses of the recording, drawn before the pad is
+            make_plan(pad, rig, rng, size)  # the presses of the recording, drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig, self._clock = pad, contact, rig, clock
         self._depths_mm = rig.depths_mm or (rig.depth_mm,)

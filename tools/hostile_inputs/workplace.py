@@ -19,8 +19,8 @@ from .files import CHEAP, SPECIAL, fill, published
 
 LAB = "time=time_s,fibres=fibre*,x=x_mm,y=y_mm"
 """How a table of another program is named, `lab.csv`."""
-LAB_H5 = "time=/t,fibres=/volts,places=/xy,begun=/on,lifted=/off"
-BAG = "fibres=/skin,places=/probe"
+LAB_H5 = "time=/t,fibres=/volts,positions=/xy,down_command=/on,up_command=/off"
+BAG = "fibres=/skin,positions=/probe"
 
 
 class Workplace:

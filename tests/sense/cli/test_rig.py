@@ -106,7 +106,7 @@ def test_record_with_a_virtual_hand(padforge_sense) -> None:
     assert code == 0
     assert "http://127.0.0.1:" in err
     recording = Recording.open("rec")
-    assert recording.known.sum() == 2
+    assert recording.has_position.sum() == 2
     assert recording.source["kind"] == "hand"
     *messages, last = out.splitlines()
     assert sum(line.startswith("counted: x ") for line in messages) == 2

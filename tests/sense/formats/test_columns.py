@@ -1,38 +1,49 @@
-"""Mappings: what they name, and what they leave to guess."""
+"""Mappings of columns, and recordings assembled from arrays."""
 
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from padforge.design.common.validation import InputError
-from padforge.sense.formats.columns import Part, chosen, parse_mapping
+from padforge.sense import Recording
+from padforge.sense.formats.columns import (
+    PRESSES_DETECTED,
+    ColumnEntry,
+    assemble_recording,
+    match_columns,
+    parse_columns,
+)
 
 NAMES = ["t_ms", "Time [s]", "ch1", "ch2", "a,b", "a:b", "px", "py", "contact"]
 
 
-def meant(mapping: str, names: list[str] = NAMES) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for part, places in chosen(parse_mapping(mapping), names):
-        found.setdefault(part.quantity, []).extend(names[at] for at in places)
-    return found
+def matched(mapping: str, names: list[str] = NAMES) -> dict[str, list[str]]:
+    columns: dict[str, list[str]] = {}
+    for entry, indices in match_columns(parse_columns(mapping), names):
+        columns.setdefault(entry.quantity, []).extend(names[i] for i in indices)
+    return columns
 
 
-def test_a_mapping_names_columns_and_units() -> None:
-    assert parse_mapping("time=t_ms:ms, fibres = ch* : 0.005 ,fibres=ü:uV,x=px:cm,y=py,press=contact") == [
-        Part("time", "t_ms", 1e-3),
-        Part("fibres", "ch*", 0.005),
-        Part("fibres", "ü", 1e-6),
-        *(Part("x", "px", 10), Part("y", "py", None), Part("press", "contact", None)),
+def test_parse_columns_reads_names_and_units() -> None:
+    assert parse_columns("time=t_ms:ms, fibres = ch* : 0.005 ,fibres=ü:uV,x=px:cm,y=py,press=contact") == [
+        ColumnEntry("time", "t_ms", 1e-3),
+        ColumnEntry("fibres", "ch*", 0.005),
+        ColumnEntry("fibres", "ü", 1e-6),
+        *(ColumnEntry("x", "px", 10), ColumnEntry("y", "py", None), ColumnEntry("press", "contact", None)),
     ]
-    units = ["time=t:min,fibres=c:V,places=p:um,depth=d:m,force=f:mN", "time=t:us,fibres=c:mV,reached=r:mm,force=f:N"]
-    factors = [[part.factor for part in parse_mapping(each)] for each in units]
+    units = ["time=t:min,fibres=c:V,positions=p:um,depth=d:m,force=f:mN", "time=t:us,fibres=c:mV,reached=r:mm,force=f:N"]
+    factors = [[entry.factor for entry in parse_columns(each)] for each in units]
     assert factors == [[60, 1, 1e-3, 1000, 1e-3], [1e-6, 1e-3, 1, 1]]
 
 
-def test_parts_mean_columns() -> None:
-    assert meant("time=t_ms,fibres=ch*") == {"time": ["t_ms"], "fibres": ["ch1", "ch2"]}
-    assert meant("time=Time [s],fibres=ch2,fibres=ch1") == {"time": ["Time [s]"], "fibres": ["ch2", "ch1"]}
-    assert meant("time=a?b,fibres=ch?", ["a,b", "ch1", "ch22"]) == {"time": ["a,b"], "fibres": ["ch1"]}
-    assert meant("time=T*,fibres=*,x=px,y=py", ["px", "c", "Time", "py"])["fibres"] == ["c"]
-    assert meant("time=*,fibres=c*", ["*", "c", "d"]) == {"time": ["*"], "fibres": ["c"]}
+def test_match_columns_by_name_and_pattern() -> None:
+    assert matched("time=t_ms,fibres=ch*") == {"time": ["t_ms"], "fibres": ["ch1", "ch2"]}
+    assert matched("time=Time [s],fibres=ch2,fibres=ch1") == {"time": ["Time [s]"], "fibres": ["ch2", "ch1"]}
+    assert matched("time=a?b,fibres=ch?", ["a,b", "ch1", "ch22"]) == {"time": ["a,b"], "fibres": ["ch1"]}
+    assert matched("time=T*,fibres=*,x=px,y=py", ["px", "c", "Time", "py"])["fibres"] == ["c"]
+    assert matched("time=*,fibres=c*", ["*", "c", "d"]) == {"time": ["*"], "fibres": ["c"]}
 
 
 @pytest.mark.parametrize(
@@ -44,9 +55,9 @@ def test_parts_mean_columns() -> None:
         ("time=t_ms", "does not name fibres"),
         ("time=t_ms,time=t_ms,fibres=ch*", "names time twice"),
         ("time=t_ms,fibres=ch*,x=px", "names one of x and y, expected both or neither"),
-        ("time=t_ms,fibres=ch*,lifted=px", "names one of begun and lifted"),
-        ("time=t_ms,fibres=ch*,x=px,y=py,places=contact", "names x and places, expected one of them"),
-        ("time=t_ms,fibres=ch*,press=contact,begun=px,lifted=py", "names press and begun"),
+        ("time=t_ms,fibres=ch*,up_command=px", "names one of down_command and up_command"),
+        ("time=t_ms,fibres=ch*,x=px,y=py,positions=contact", "names x and positions, expected one of them"),
+        ("time=t_ms,fibres=ch*,press=contact,down_command=px,up_command=py", "names press and down_command"),
         ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, min or a factor"),
         ("time=t_ms:0,fibres=ch*", "unit of time is '0'"),
         ("time=t_ms:nan,fibres=ch*", "unit of time is 'nan'"),
@@ -59,8 +70,115 @@ def test_parts_mean_columns() -> None:
         ("time=" + "t" * 20_000, "mapping has 20005 characters"),
     ],
 )
-def test_a_mapping_that_leaves_something_open_is_refused(mapping: str, message: str) -> None:
-    with pytest.raises(InputError, match=message) as refused:
-        meant(mapping)
-    assert "\n" not in str(refused.value)
-    assert len(str(refused.value)) < 400
+def test_columns_refuse_an_ambiguous_mapping(mapping: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as refusal:
+        matched(mapping)
+    assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 400
+
+
+TIMES = np.arange(12) / 10
+VOLTS = np.arange(24.0).reshape(12, 2)
+PRESSED = np.array([0, 0, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0])
+POSITIONS = np.array([[1.0, 2], [-3, 4]])
+COMMANDS = {"down_command": np.array([2, 7]), "up_command": np.array([5, 9])}
+PROBE = POSITIONS[[0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1]]
+"""Position of the probe at each reading."""
+NUMBERED = PRESSED * np.array([5] * 6 + [3] * 6)
+
+
+def assembled(arrays: Mapping[str, np.ndarray], **factors: float) -> Recording:
+    content = {"time": TIMES, "fibres": VOLTS} | dict(arrays)
+    entries = [(ColumnEntry(name, "?", factors.get(name)), content[name]) for name in content]
+    return assemble_recording(Path("f"), entries, {})
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        COMMANDS | {"positions": POSITIONS},
+        COMMANDS | {"x": POSITIONS[:, 0], "y": POSITIONS[None, :, 1]},
+        COMMANDS | {"positions": PROBE.T},
+        {"press": PRESSED, "positions": POSITIONS},
+        {"press": PRESSED.astype(bool)[:, None], "positions": PROBE},
+        {"press": np.where(PRESSED, NUMBERED, np.nan), "positions": PROBE},
+        {"press": np.where(PRESSED, NUMBERED, -1), "positions": POSITIONS.T.astype(np.float32)},
+        {"positions": np.where(PRESSED[:, None], PROBE, np.nan)},
+        {"x": np.where(PRESSED, PROBE[:, 0], np.nan), "y": np.where(PRESSED, PROBE[:, 1], np.nan)},
+    ],
+)
+def test_assemble_recording_finds_presses_in_any_form(arrays: dict[str, np.ndarray]) -> None:
+    recording = assembled(arrays)
+    assert recording.down_command.tolist() == [2, 7]
+    assert recording.up_command.tolist() == [5, 9]
+    # Two positions of two presses may be (2, n) or (n, 2): rows are presses.
+    expected = POSITIONS.T if arrays.get("positions", PROBE).dtype == "f4" else POSITIONS
+    assert recording.presses_mm.tolist() == expected.tolist()
+
+
+def test_assemble_recording_accepts_fibres_as_rows_or_columns() -> None:
+    assert np.array_equal(assembled(COMMANDS | {"fibres": VOLTS.T}).readings, VOLTS)
+    one = assembled(COMMANDS | {"fibres": VOLTS[:, 0], "time": TIMES[None]})
+    assert np.array_equal(one.readings, VOLTS[:, :1])
+    arrays = [(ColumnEntry("time", ""), TIMES), (ColumnEntry("fibres", ""), VOLTS[:, 1])]
+    arrays += [(ColumnEntry("fibres", "", 2.0), VOLTS.T), *((ColumnEntry(name, ""), COMMANDS[name]) for name in COMMANDS)]
+    several = assemble_recording(Path("f"), arrays, {})
+    assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
+
+
+def test_assemble_recording_converts_units() -> None:
+    arrays = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "positions": POSITIONS / 10}
+    commands = {"down_command": np.array([150, 601]), "up_command": np.array([500, 801])}
+    milli = dict.fromkeys(("time", "fibres", "down_command", "up_command"), 1e-3)
+    recording = assembled(arrays | commands, **milli, positions=10)
+    expected = assembled(COMMANDS | {"positions": POSITIONS})
+    for name in ("times_s", "readings", "presses_mm", "down_command", "up_command"):
+        np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
+
+
+def test_assemble_recording_allows_for_rounded_times_of_commands() -> None:
+    times, down = 0.0751879 * np.arange(4000), np.arange(20, 3900, 40)
+    arrays = {"time": times, "fibres": np.ones((4000, 1)), "positions": np.zeros((len(down), 2))}
+    commands = {"down_command": 1000 * times[down], "up_command": 1000 * times[down + 20]}
+    recording = assembled(arrays | commands, down_command=1e-3, up_command=1e-3)
+    assert np.array_equal([recording.down_command, recording.up_command], [down, down + 20])
+
+
+def test_assemble_recording_detects_presses_in_the_readings(recording: Recording) -> None:
+    probe = np.full((len(recording.readings), 2), np.nan)
+    for position, down in zip(recording.presses_mm, recording.down_command, strict=True):
+        probe[down - 10 :] = position
+    probe[:10] = recording.presses_mm[0]
+    content = {"time": recording.times_s[:800], "fibres": recording.readings[:800]}
+    for positions in (recording.presses_mm[:20], probe[:800]):
+        detected = assembled(content | {"positions": positions})
+        assert np.array_equal(detected.presses_mm, recording.presses_mm[:20])
+        assert np.abs(detected.down_command - recording.down_command[:20]).max() <= 3
+        assert PRESSES_DETECTED.items() <= detected.source.items()
+    with pytest.raises(InputError, match="positions are 19, expected one for each of 20 presses or 800 readings"):
+        assembled(content | {"positions": recording.presses_mm[:19]})
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"time": np.ones((3, 4))}, r"time has shape \(3, 4\), expected one row or column"),
+        ({"time": np.array(["a", "b"])}, "time are"),
+        ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), as time has it"),
+        ({"press": PRESSED[:11]}, "press has 11 values, expected 12, one a reading"),
+        ({"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))}, "press is missing or negative in row 11 and 0"),
+        ({"press": 0 * PRESSED}, "press is nowhere above 0; without it, presses are detected"),
+        ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
+        ({"press": np.array([0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0, 0])}, "press 1 goes from reading 4"),
+        (COMMANDS | {"up_command": np.array([5])}, "down_command has 2 values and up_command 1"),
+        (COMMANDS | {"down_command": np.array([2.5, 7])}, "down_command are .* whole numbers"),
+        (COMMANDS | {"positions": np.ones((3, 2))}, "positions are 3, expected one for each of 2 presses or 12"),
+        (COMMANDS | {"positions": np.ones((2, 2, 2))}, r"positions have shape \(2, 2, 2\)"),
+        (COMMANDS | {"x": np.ones(2), "y": np.ones(3)}, "x has 2 values and y 3"),
+        ({"positions": np.where(np.arange(24).reshape(12, 2) == 6, 1.0, np.nan)}, "positions have one of x and y in row 3"),
+        ({}, "has no press"),
+    ],
+)
+def test_assemble_recording_refuses_arrays_that_do_not_fit(arrays: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(InputError, match=f"f: {message}"):
+        assembled(arrays)

@@ -37,7 +37,7 @@ def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_p
     rows = [",".join(map(str, row)) + end for row in table[:1000].tolist()]
     (tmp_path / "r.csv").write_text(lines(rows, header))
     found = import_csv(tmp_path / "r.csv")
-    assert not found.known.any()
+    assert not found.has_position.any()
     assert len(found.down_command) == 25
     assert np.abs(found.down_command - recording.down_command[:25]).max() <= 3
     export_csv(found, tmp_path / "again.csv")
@@ -111,7 +111,7 @@ def test_a_mapping_tells_what_other_columns_hold_in_any_unit_and_by_names_with_s
     ("mapping", "message"),
     [
         ("time=note,fibres=ch*", "line 3 holds no numbers .could not convert string to float: 'begin'"),
-        ("time=t_ms,fibres=ch*,begun=px,lifted=py", "mapping has 'begun=px'.* one of time, fibres, x, y, depth"),
+        ("time=t_ms,fibres=ch*,down_command=px,up_command=py", "mapping has 'down_command=px'.* one of time, fibres, x, y, depth"),
         ("time=px,fibres=ch*:mV", "times do not ascend"),
         ("time=t_ms,fibres=c*:mV,press=ch2", "press is nowhere 0"),
     ],

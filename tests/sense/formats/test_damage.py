@@ -16,7 +16,7 @@ from padforge.sense.formats.import_export import import_file
 from .foreign import array, make, write_bag
 
 FILES = ("plain.mat", "packed.mat", "r.csv", "r.h5", "r.mcap", "packed.mcap", "plain.db3")
-MAPPED = {"r.h5": "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"}
+MAPPED = {"r.h5": "time=times_s,fibres=readings_v,positions=presses_mm,down_command=down_command,up_command=up_command"}
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, export_hdf5, import_hdf5, open_recording
 
-MAPPING = "time=times_s,fibres=readings_v,places=presses_mm,begun=begun,lifted=lifted"
+MAPPING = "time=times_s,fibres=readings_v,positions=presses_mm,down_command=down_command,up_command=up_command"
 
 
 def refused(path: Path, mapping: str = "") -> str:
@@ -66,7 +66,7 @@ def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
         ({"times_s": "group"}, "times_s is no dataset"),
         ({"times_s": h5py.Empty("f8")}, "times_s holds None values"),
         ({"readings_v": "text"}, "readings_v holds object values, expected an array of real numbers"),
-        ({"down_command": np.array([20.5])}, "begun are .*whole numbers"),
+        ({"down_command": np.array([20.5])}, "down_command are .*whole numbers"),
         ({"readings_v": (10**6, 10**6, 100)}, "readings_v holds 1000000000000 values, allowed are 268435456"),
         ({"readings_v": (2**24, 1, 2**20)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
         ({"readings_v": (2**29, 1, 2**20)}, "readings_v holds 536870912 values, allowed are 268435456 in all"),
@@ -113,13 +113,13 @@ def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
 
 def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_path: Path) -> None:
     content = lab(tmp_path)
-    mapping = "time=/t:ms,fibres=/data/volts:mV,places=/xy:cm,begun=/on,lifted=off"
+    mapping = "time=/t:ms,fibres=/data/volts:mV,positions=/xy:cm,down_command=/on,up_command=off"
     recording = import_hdf5(tmp_path / "lab.h5", mapping)
     assert np.array_equal(recording.times_s, content["t"] * 1e-3)
     assert np.array_equal(recording.readings, content["data/volts"].T * 1e-3)
     assert recording.presses_mm.tolist() == [[10, 20], [-30, 40]]
     assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([10, 25], [20, 35])
-    assert recording.source == {"kind": "hdf5", "file": "lab.h5", "mapping": mapping}
+    assert recording.source == {"kind": "hdf5", "file": "lab.h5", "columns": mapping}
     lab(tmp_path, on=content["t"][content["on"]], off=content["t"][content["off"]])
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
     lab(tmp_path, **{"data/volts": None, "data/ch0": content["data/volts"][0], "data/ch1": content["data/volts"][1]})
@@ -127,7 +127,7 @@ def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_
     lab(tmp_path)
     there = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     for mapping, reason in (
-        ("", f"format is None, expected 'padforge-hdf5/2'; a mapping tells what other datasets hold, {there}"),
+        ("", f"format is None, expected 'padforge-hdf5/2'; columns (--columns) say what other datasets hold, {there}"),
         ("time=/s,fibres=data/volts", "time is 's', expected one of 'data/volts', 'note'"),
         ("time=t,fibres=data", "fibres is 'data', expected one of"),
         ("time=t,fibres=note", "note holds object values, expected an array of real numbers"),

@@ -35,7 +35,7 @@ def test_what_is_missing_stays_missing_and_nothing_else_is(eight: Recording, tmp
     found = open_recording(tmp_path / name)
     assert found == eight
     assert found.digest == eight.digest
-    assert found.known.sum() == 7
+    assert found.has_position.sum() == 7
 
 
 def unrelated(folder: Path) -> dict[str, bytes]:
@@ -116,7 +116,7 @@ def test_what_is_no_path_mapping_or_recording_is_refused_in_one_line(brief: Reco
             with pytest.raises(InputError, match=r"path is .*, expected a path"):
                 make(other)
     for write in (export_bag, export_lerobot):
-        with pytest.raises(InputError, match="findings is 3, expected a ModelFindings"):
+        with pytest.raises(InputError, match="findings is 3, expected a ModelAnnotations"):
             write(brief, tmp_path / "x", 3)  # pyright: ignore[reportArgumentType]
     for states in (np.ones((3, 9)), np.ones(10), "a", 3.0):
         with pytest.raises(InputError, match="states"):

@@ -12,7 +12,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.formats import lerobot
-from padforge.sense.formats.annotations import ModelFindings
+from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.import_export import export_file
 from padforge.sense.formats.lerobot import export_lerobot
 
@@ -131,11 +131,11 @@ def test_a_dataset_has_all_that_the_format_asks_for(eight: Recording, tmp_path: 
 def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recording, tmp_path: Path) -> None:
     known = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm), forces_n=np.arange(8.0))
     nan = np.full(8, np.nan)
-    touches = ModelFindings(np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), nan, nan)
+    touches = ModelAnnotations(np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), nan, nan)
     export_lerobot(known, tmp_path / "set", touches)
     info, columns, _ = checked(tmp_path / "set")
     assert info["total_frames"] == len(known.readings)
-    assert info["features"]["observation.touch"]["names"] == ["x_mm", "y_mm", "r90_mm", "found"]
+    assert info["features"]["observation.touch"]["names"] == ["x_mm", "y_mm", "r90_mm", "valid"]
     over = columns["observation.touch"][:, 3] == 1
     assert set(map(tuple, columns["observation.touch"][over])) == {(3.0, 3.0, 2.5, 1.0)}
     assert not columns["observation.touch"][~over].any()
@@ -147,7 +147,7 @@ def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recordi
 def test_rates_are_whole_if_that_is_near_long_recordings_go_to_several_files_and_one_fibre_is_a_number(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slower: float, fps: float
 ) -> None:
-    monkeypatch.setattr(lerobot, "_MB", 50)
+    monkeypatch.setattr(lerobot, "FILE_MB", 100 * 50 / 2**20)
     monkeypatch.setattr(lerobot, "CHUNK_FILES", 2)
     changed = replace(eight, readings=eight.readings[:, :1], times_s=eight.times_s * slower)
     export_lerobot(changed, tmp_path / "set")

@@ -148,9 +148,9 @@ def test_a_mat_may_hold_what_real_rigs_give_and_no_places(tmp_path: Path) -> Non
     content = good()
     scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
     blind = import_mat(tmp_path / "blind.mat")
-    assert not blind.known.any()
+    assert not blind.has_position.any()
     assert blind.down_command.tolist() == [20, 60, 100]
     pos = np.array(content["pos"], dtype=float)
     pos[:, 1] = np.nan
     scipy.io.savemat(tmp_path / "partly.mat", content | {"pos": pos})
-    assert import_mat(tmp_path / "partly.mat").known.tolist() == [True, False, True]
+    assert import_mat(tmp_path / "partly.mat").has_position.tolist() == [True, False, True]

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.formats import ros_recording as exporting
-from padforge.sense.formats.annotations import FaultFound, ModelFindings
+from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
 from padforge.sense.formats.import_export import export_file
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 
@@ -54,7 +54,7 @@ def test_an_independent_reader_finds_types_frames_stamps_and_values(eight: Recor
     assert (dim.label, dim.size, dim.stride) == ("fibre", 4, 4)
     assert [content.data for _, content in found["/pad/pressed"]] == [True, False] * 8
     assert [stamp for stamp, _ in found["/pad/pressed"]][::2] == [stamps[at] for at in eight.down_command]
-    places = dict(zip(np.flatnonzero(eight.known).tolist(), found["/pad/place"], strict=True))
+    places = dict(zip(np.flatnonzero(eight.has_position).tolist(), found["/pad/place"], strict=True))
     for press, (stamp, place) in places.items():
         assert place.header.frame_id == "pad"
         assert place.header.stamp.sec * 10**9 + place.header.stamp.nanosec == stamp == stamps[eight.down_command[press]]
@@ -94,8 +94,8 @@ def test_an_export_reads_back_the_same_and_is_reproducible(eight: Recording, bag
 def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: Path) -> None:
     depth = np.where(np.arange(8) < 4, 2.0, np.nan)
     places = np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])
-    faults = [FaultFound(5, (1,), "open", "fibre 2 is open")]
-    findings = ModelFindings(*places, np.ones(8), depth, depth / 4, faults, (3,))
+    faults = [FaultAnnotation(5, (1,), "open", "fibre 2 is open")]
+    findings = ModelAnnotations(*places, np.ones(8), depth, depth / 4, faults, (3,))
     export_bag(eight, tmp_path / "r.mcap", findings)
     found, kinds = others_read(tmp_path / "r.mcap")
     assert kinds["/pad/touches"] == "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -112,7 +112,7 @@ def test_what_a_model_says_is_there_with_its_spread(eight: Recording, tmp_path: 
     assert (told.name, told.message, told.values[0].value) == ("pad: fibre 2", "fibre 2 is open", "open")
     assert import_bag(tmp_path / "r.mcap") == eight
     with pytest.raises(InputError, match=r"what a model says can be written as \.mcap"):
-        export_file(eight, tmp_path / "r.csv", findings=findings)
+        export_file(eight, tmp_path / "r.csv", annotations=findings)
 
 
 def test_poses_of_an_arm_are_metres_and_quaternions(eight: Recording, tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_poses_of_an_arm_are_metres_and_quaternions(eight: Recording, tmp_path: 
 def test_what_import_would_not_take_or_nothing_can_write_is_not_written(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exporting, "MOST_MESSAGES", 100)
+    monkeypatch.setattr(exporting, "MAX_MESSAGES", 100)
     with pytest.raises(InputError, match=r"would be \d+ messages .* allowed in a bag are 100"):
         export_bag(eight, tmp_path / "r.mcap")
     monkeypatch.undo()

@@ -34,7 +34,7 @@ def changed(bag: Path, folder: Path, change: Callable[[str, float, Any], bool]) 
 
 def close(found: Recording, expected: Recording) -> None:
     """See that a recording is another one, but for what messages round off, and for depths at unknown places."""
-    expected = replace(expected, depths_mm=np.where(expected.known, expected.depths_mm, np.nan))
+    expected = replace(expected, depths_mm=np.where(expected.has_position, expected.depths_mm, np.nan))
     np.testing.assert_array_equal(found.readings, expected.readings)
     np.testing.assert_array_equal([found.down_command, found.up_command], [expected.down_command, expected.up_command])
     for name in ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n"):
@@ -48,7 +48,7 @@ def test_messages_alone_are_the_recording_but_for_roundings(eight: Recording, ba
     untold = import_bag(changed(bag, tmp_path / "untold", lambda topic, *_: topic == READINGS))
     assert untold.source["presses"] == "found"
     assert len(untold.presses_mm) >= 7
-    assert not untold.known.any()
+    assert not untold.has_position.any()
 
 
 def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_of_a_pad_that_lay_mirrored_z_points_into_it(eight: Recording, tmp_path:
         return topic != "/pad/recording"
 
     close(import_bag(changed(tmp_path / "r.mcap", tmp_path / "bag", seen)), eight)
-    np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.known]) / 1000)
+    np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.has_position]) / 1000)
 
 
 def test_a_part_of_a_bag_is_what_its_messages_say_and_what_is_edited_counts(
@@ -119,7 +119,7 @@ def lab() -> Iterator[Message]:
         yield "/at/x", time + 0.001, make("Float32", step)
 
 
-ALL = "fibres=/skin/all:mV,places=/probe,force=/wrench,press=/down"
+ALL = "fibres=/skin/all:mV,positions=/probe,force=/wrench,press=/down"
 
 
 @pytest.mark.parametrize("form", ["mcap", "sqlite3", "packed", "folder", "sqlite3 folder"])
@@ -151,11 +151,11 @@ def test_topics_of_one_number_are_fibres_too_and_hold_until_the_next(tmp_path: P
         ("", r"has no topic /pad/readings; a mapping tells .* there are '/camera', '/skin/all', .* '/probe'"),
         ("fibres=/skin", r"fibres is '/skin', expected one of '/camera', '/skin/all'"),
         ("fibres=/camera", r"fibres is '/camera' of 'std_msgs/msg/String', expected std_msgs/msg/Float32MultiArray"),
-        ("fibres=/skin/all,places=/wrench", r"places is '/wrench' of .*WrenchStamped', expected geometry_msgs/"),
+        ("fibres=/skin/all,positions=/wrench", r"places is '/wrench' of .*WrenchStamped', expected geometry_msgs/"),
         ("fibres=/skin/all,press=/skin/1", r"press is '/skin/1' of 'std_msgs/msg/Int16', expected std_msgs/msg/Bool"),
         ("fibres=/skin/all,time=/skin/1", "mapping has 'time=/skin/1', expected QUANTITY=NAME"),
-        ("places=/probe", "does not name fibres, expected fibres in each"),
-        ("fibres=/skin/all,fibres=/skin/1,places=/probe:furlong", "unit of places is 'furlong'"),
+        ("positions=/probe", "does not name fibres, expected fibres in each"),
+        ("fibres=/skin/all,fibres=/skin/1,positions=/probe:furlong", "unit of places is 'furlong'"),
     ],
 )  # fmt: skip
 def test_a_mapping_that_does_not_fit_is_one_clear_line(tmp_path: Path, mapping: str, reason: str) -> None:

@@ -19,7 +19,7 @@ import pytest
 from padforge.design.common import server as listening
 from padforge.design.common.validation import InputError
 from padforge.sense import Live, Recording
-from padforge.sense.formats.ros_messages import HEALTH, KINDS, PRESSED, READINGS, TOUCHES, heights
+from padforge.sense.formats.ros_messages import HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, depths_to_z
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live import outputs as outlets
 from padforge.sense.live.outputs import FORMAT, Lines, Message, Messages, Osc
@@ -65,7 +65,7 @@ def test_every_reading_and_press_is_told_in_turn(told, brief: Recording) -> None
     assert len(pressed) // 2 >= len(brief.presses_mm) - 2
     for number, message in enumerate(told[:50]):  # a line is an operation of rosbridge
         line = json.loads(message.line(number))
-        assert (line["op"], line["type"]) == ("publish", KINDS[line["topic"]])
+        assert (line["op"], line["type"]) == ("publish", TOPICS[line["topic"]].msgtype)
         assert (line["pad"]["format"], line["pad"]["number"]) == (FORMAT, number)
         assert json.loads(json.dumps(message.msg)) == line["msg"]
 
@@ -95,7 +95,7 @@ def test_a_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer
     assert pose["pose"]["position"]["z"] == pytest.approx(np.dot([0, 0, -2.5e-3], z_axis))
     assert pose["covariance"][14] == pytest.approx((0.5e-3 / 1.6449) ** 2)
     exported = replace(brief, source={"rig": {"mirrored": mirrored}})
-    assert pose["pose"]["position"]["z"] == heights(exported, np.array([2.5]))[0]
+    assert pose["pose"]["position"]["z"] == depths_to_z(exported, np.array([2.5]))[0]
 
 
 def test_health_is_told_first_and_with_every_fault(told, brief: Recording, localizer: LocalizerModel) -> None:

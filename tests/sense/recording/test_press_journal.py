@@ -18,7 +18,7 @@ def test_a_torn_journal_line_and_one_that_begins_again_lose_their_press_only(
     journal.write_text(journal.read_text()[:-9])
     assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
     with Recorder.resume(folder) as recorder:
-        recorder.begin((0.0, 0.0), recorder.readings, press=7)
+        recorder.begin((0.0, 0.0), recorder.n_readings, press=7)
     assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 2
 
 

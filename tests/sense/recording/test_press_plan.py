@@ -8,7 +8,7 @@ import pytest
 from padforge.design import InputError, Morphology
 from padforge.design.common.settings import validate
 from padforge.design.settings import PadSettings
-from padforge.sense.recording.press_plan import PressPlan, planned, read_plan
+from padforge.sense.recording.press_plan import PressPlan, make_plan, read_plan
 from padforge.sense.settings import RigSettings
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
@@ -17,19 +17,19 @@ KINDS = ("uniform", "grid", "serpentine", "adaptive")
 
 def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
     pad = Morphology.straight(4 if size is None else size.layout)
-    return planned(pad, validate(RigSettings, settings, "rig"), np.random.default_rng(0), size)
+    return make_plan(pad, validate(RigSettings, settings, "rig"), np.random.default_rng(0), size)
 
 
 def test_a_plan_survives_json_and_comes_from_a_file(tmp_path):
     plan = made(presses=7, depths_mm=[2.0, 4.0])
-    again = PressPlan.of(plan.document())
+    again = PressPlan.from_rows(plan.to_rows())
     assert np.array_equal(again.positions_mm, plan.positions_mm)
     assert again.depths_mm.tolist() == [2, 4, 2, 4, 2, 4, 2]
     assert set(made(presses=30).depths_mm) == {5.0}
     (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
-    assert read_plan(tmp_path / "gaps.csv", 2.5).document() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
+    assert read_plan(tmp_path / "gaps.csv", 2.5).to_rows() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
     (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,1.5\n")
-    assert read_plan(tmp_path / "deep.csv", 3.0).document() == [[1, 2, 1.5]]
+    assert read_plan(tmp_path / "deep.csv", 3.0).to_rows() == [[1, 2, 1.5]]
 
 
 def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row():
@@ -52,7 +52,7 @@ def test_plans_keep_to_what_is_pressed_of_the_pad(kind: str) -> None:
 
     def places(**size) -> np.ndarray:
         rig = validate(RigSettings, presses, "rig")
-        return planned(pad, rig, np.random.default_rng(0), PadSettings(**size)).positions_mm
+        return make_plan(pad, rig, np.random.default_rng(0), PadSettings(**size)).positions_mm
 
     strip = places(sensed_mm=(50.0, 8.0))
     np.testing.assert_allclose(np.abs(strip).max(axis=0), [25, 4], rtol=0.02)
@@ -118,8 +118,8 @@ def test_depths_of_a_grid_tell_nothing_of_the_place(plan, presses):
 )
 def test_plans_that_no_probe_can_press_are_refused(rows, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        PressPlan.of(rows)
-    assert len(PressPlan.of([[0, 0, 1e-3]])) == 1
+        PressPlan.from_rows(rows)
+    assert len(PressPlan.from_rows([[0, 0, 1e-3]])) == 1
 
 
 @pytest.mark.parametrize(

@@ -30,9 +30,9 @@ def record(recorder: Recorder, presses: range, time_s: float) -> float:
         times = time_s + np.arange(20) / 10
         recorder.append(times[:10], np.full((10, FIBRES), press + 0.25))
         recorder.append_states(np.column_stack([times[:10], np.full((10, 9), float(press))]))
-        recorder.begin((press, -press), recorder.readings, press)
+        recorder.begin((press, -press), recorder.n_readings, press)
         recorder.append(times[10:], np.full((10, FIBRES), press + 0.5))
-        recorder.finish(recorder.readings)
+        recorder.finish(recorder.n_readings)
         recorder.sync()
         time_s += 2
     return time_s
@@ -66,7 +66,7 @@ def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
     before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
     with Recorder.resume(path) as recorder:
         assert recorder.done == set(range(5))
-        assert recorder.readings == 100
+        assert recorder.n_readings == 100
         assert recorder.last_s == pytest.approx(9.9)
     assert {name: (path / name).read_bytes() for name in before} == before
 
@@ -172,7 +172,7 @@ def test_an_aborted_press_is_made_again(tmp_path):
     with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
         time_s = record(recorder, range(2), 0.0)
         recorder.append([time_s], np.zeros((1, FIBRES)))
-        recorder.begin((2, -2), recorder.readings, 2)
+        recorder.begin((2, -2), recorder.n_readings, 2)
         recorder.abort("the arm was stopped")
         recorder.abort("told twice")
     events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
@@ -207,7 +207,7 @@ def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
         recorder.append(times, np.zeros((100, FIBRES)))
     with Recorder.resume(path) as recorder:
         assert recorder.done == kept
-        recorder.begin((9, 9), recorder.readings, max(kept) + 1)
+        recorder.begin((9, 9), recorder.n_readings, max(kept) + 1)
         recorder.abort("broken off")
     assert len(Recording.open(path).presses_mm) == len(kept)
 
@@ -273,17 +273,17 @@ def test_presses_without_a_number_count_on_from_the_last(tmp_path):
     with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
         recorder.append(np.arange(5) / 10, np.zeros((5, FIBRES)))
         for press in (None, None, "aborted", None, 7):
-            recorder.begin((0, 0), recorder.readings, press=None if press == "aborted" else press)
+            recorder.begin((0, 0), recorder.n_readings, press=None if press == "aborted" else press)
             if press == "aborted":
                 recorder.abort("the arm stopped")
             else:
-                recorder.finish(recorder.readings)
+                recorder.finish(recorder.n_readings)
         assert recorder.done == {0, 1, 2, 7}
         with pytest.raises(InputError, match="press 8 was not begun"):
-            recorder.finish(recorder.readings)
+            recorder.finish(recorder.n_readings)
     with Recorder.resume(tmp_path / "run") as recorder:
-        recorder.begin((0, 0), recorder.readings)
-        recorder.finish(recorder.readings)
+        recorder.begin((0, 0), recorder.n_readings)
+        recorder.finish(recorder.n_readings)
         assert recorder.done == {0, 1, 2, 7, 8}
 
 

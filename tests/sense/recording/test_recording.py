@@ -150,7 +150,7 @@ def test_one_missing_reading_is_as_another(recording: Recording) -> None:
     )
     assert one == other != recording
     assert one.digest == other.digest != recording.digest
-    assert one.known.tolist() == [press != 3 for press in range(300)]
+    assert one.has_position.tolist() == [press != 3 for press in range(300)]
 
 
 def test_what_is_uneven_little_or_at_the_ends_of_what_is_allowed_is_fine(recording: Recording, tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_depth_and_force_belong_to_a_press_but_not_to_the_digest(recording: Reco
     known = replace(recording, reached_mm=reached, forces_n=np.linspace(0, 9, count))
     assert known != recording
     assert known.digest == recording.digest == unknown.digest
-    assert known.deep_mm[:4].tolist() == [5, 4.9, 5, 4.9]
+    assert known.actual_depths_mm[:4].tolist() == [5, 4.9, 5, 4.9]
     for number, each in enumerate((unknown, known)):
         each.save(tmp_path / str(number), {})
         assert Recording.open(tmp_path / str(number)) == each

@@ -150,7 +150,7 @@ def test_open_recorder_by_hand_resumes_the_stored_plan(config: RigConfig) -> Non
     with recorder:
         assert targets.tolist() == source["plan"]["presses"]
         np.testing.assert_array_equal(remaining, targets[2:])
-        assert recorder.readings == 20
+        assert recorder.n_readings == 20
 
 
 @pytest.mark.parametrize(
@@ -267,12 +267,12 @@ def hands(tmp_path: Path) -> Callable[..., Hands]:
 
 
 def accepted_mm(recording: Recording) -> np.ndarray:
-    return recording.presses_mm[recording.known]
+    return recording.presses_mm[recording.has_position]
 
 
 def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
     """Distances of accepted presses from their targets."""
-    made = zip(strokes[recording.known], accepted_mm(recording), strict=True)
+    made = zip(strokes[recording.has_position], accepted_mm(recording), strict=True)
     return [float(np.linalg.norm(stroke.position_mm - place)) for stroke, place in made]
 
 
@@ -288,7 +288,7 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
     strokes = np.array(hand.strokes_of(recording))
     rejected, accepted = (
-        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.known, recording.known)
+        Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.has_position, recording.has_position)
     )
     assert rejected["short"] >= 2
     assert rejected["echo"] >= 2
@@ -297,7 +297,7 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     error_mm = distances_mm(recording, strokes)
     assert max(error_mm) < 4 * SCATTER_MM
     assert np.sqrt(np.mean(np.square(error_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
-    held_s = (recording.up_command - recording.down_command)[recording.known] / HAND_RIG.rate_hz
+    held_s = (recording.up_command - recording.down_command)[recording.has_position] / HAND_RIG.rate_hz
     assert held_s.min() > 0.45
     assert all(line.startswith(("counted: x ", "not counted: it ", "not counted: nothing")) for line in hand.messages)
     assert hand.views[-1]["done"] == hand.views[-1]["total"] == 60
@@ -337,7 +337,7 @@ def test_session_restarts_a_confused_detector(hands, monkeypatch: pytest.MonkeyP
     recording = hand.record()
     np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
     assert not Inverted.once
-    assert 1 <= (~recording.known).sum() <= 3
+    assert 1 <= (~recording.has_position).sum() <= 3
     assert max(distances_mm(recording, np.array(hand.strokes_of(recording)))) < 4 * SCATTER_MM
 
 

@@ -19,13 +19,13 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 from padforge.design.twin import PlanTransform
 from padforge.fabricate import build
-from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.run_directory import START
 from padforge.sense.rig.config import (
     RigConfig,
     RobotFrame,
-    locate_on_bed,
     load_or_make_plan,
+    locate_on_bed,
     open_recorder,
     plan_notice,
 )
@@ -102,7 +102,7 @@ def test_locate_on_bed_reads_the_holder(folder, with_frame):
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm, rig.mirrored) == ((100.0, 90.0), 0.0, 8.0, True)
     half = HALF_MM
     assert rig.box_mm == pytest.approx((100 - half, 100 + half, 90 - half, 90 + half, 3.0, 130.0), abs=1e-5)
-    check_plan(planned(PAD, rig, np.random.default_rng(0)), rig)
+    check_plan(make_plan(PAD, rig, np.random.default_rng(0)), rig)
     box = box_of(locate_on_bed(PRINTER.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder))
     assert (box[0], box[3]) == (95, 90)  # it ends where the nozzle does
     for angle_deg, (x, y) in ((0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))):
@@ -166,14 +166,14 @@ def config_of(out: Path, pad: Morphology = PAD) -> RigConfig:
 
 
 def resumed_plan(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
-    return load_or_make_plan(config_of(out, pad), RIG.model_copy(update=settings), resume=True).document()
+    return load_or_make_plan(config_of(out, pad), RIG.model_copy(update=settings), resume=True).to_rows()
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A recording of no press so far, which nobody may change."""
-    out, plan = tmp_path_factory.mktemp("run"), planned(PAD, RIG, np.random.default_rng(0))
-    with open_recorder(config_of(out), RIG, plan.document(), out, False, IDENTITIES):
+    out, plan = tmp_path_factory.mktemp("run"), make_plan(PAD, RIG, np.random.default_rng(0))
+    with open_recorder(config_of(out), RIG, plan.to_rows(), out, False, IDENTITIES):
         pass
     return out
 
@@ -182,7 +182,7 @@ def test_make_plan_reads_a_file(tmp_path):
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
     rig = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
     assert rig.plan_file == tmp_path / "places.csv"
-    assert load_or_make_plan(config_of(tmp_path / "run"), rig, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
+    assert load_or_make_plan(config_of(tmp_path / "run"), rig, resume=False).to_rows() == [[1, 2, 3], [-3.5, 4, 3]]
     assert RigSettings(plan="grid").plan_file is None
 
 
@@ -195,10 +195,10 @@ def test_make_plan_keeps_the_plan_of_a_resumed_recording(run, tmp_path):
 
 def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
     pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
-    plan = planned(pad, RIG, np.random.default_rng(0))
-    with open_recorder(config_of(tmp_path, pad), RIG, plan.document(), tmp_path, False, IDENTITIES):
+    plan = make_plan(pad, RIG, np.random.default_rng(0))
+    with open_recorder(config_of(tmp_path, pad), RIG, plan.to_rows(), tmp_path, False, IDENTITIES):
         pass
-    assert resumed_plan(tmp_path, pad) == plan.document()
+    assert resumed_plan(tmp_path, pad) == plan.to_rows()
     x, y = plan.positions_mm[1].tolist()
     hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
     config = replace(config_of(tmp_path, pad), pad_settings=PadSettings(keep_out_mm=(hole,)))

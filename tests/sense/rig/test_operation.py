@@ -1,7 +1,7 @@
 import numpy as np
 
 from padforge.sense.localizer.calibration import calibrate
-from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
 from padforge.sense.rig.operation import ADAPT_EVERY, AdaptivePlanner, acquisition
@@ -28,7 +28,7 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
     arm = FakeArm(time)
     fast = {"readings_per_press": 24, "press_mm_s": 250, "clearance_mm": 5}
     options = RIG.model_copy(update={"presses": ADAPT_EVERY + 10, "plan": "adaptive", **fast})
-    plan, training = (planned(PAD, options, np.random.default_rng(seed)) for seed in (3, 4))
+    plan, training = (make_plan(PAD, options, np.random.default_rng(seed)) for seed in (3, 4))
     left_mm = np.column_stack([-np.abs(training.positions_mm[:, 0]), training.positions_mm[:, 1]])
     board = FakeBoard(arm)
 

@@ -10,7 +10,7 @@ from padforge.design import Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording, calibrate, evaluate
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.recording.press_plan import told_pad
+from padforge.sense.recording.press_plan import pad_source
 from padforge.sense.rig.streams import simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
@@ -40,7 +40,7 @@ def test_a_recording_says_which_pad_it_is_of(recording: Recording, tmp_path: Pat
     recording.save(tmp_path / "recording", {})
     assert simulated(tmp_path).connect()["channels"] == 5
     square = Morphology.straight(2)
-    assert json.dumps(told_pad(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
+    assert json.dumps(pad_source(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
 
 
 def test_places_are_found_in_mm(recording: Recording, calibrated: tuple[LocalizerModel, dict]) -> None:

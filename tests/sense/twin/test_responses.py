@@ -71,7 +71,7 @@ def test_an_answer_is_what_is_held_less_the_rest_and_short_presses_tell_of_their
 def test_presses_as_deep_as_most_are_kept_the_deeper_of_two_kinds_and_all_of_unknown_depth() -> None:
     recording = simulate(Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)))
     kept = of_one_depth(recording)
-    assert kept.presses_mm[kept.known].tolist() == recording.presses_mm[2::3].tolist()
+    assert kept.presses_mm[kept.has_position].tolist() == recording.presses_mm[2::3].tolist()
     unknown = replace(recording, depths_mm=np.full(9, np.nan))
     assert of_one_depth(unknown) is unknown
-    assert of_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).known.all()
+    assert of_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).has_position.all()

@@ -18,7 +18,7 @@ import pytest
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
-from padforge.sense.recording.press_plan import PressPlan, planned
+from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig.arms.rtde import RTDE_PORT
@@ -65,7 +65,7 @@ class Rig:
         self.arm, self.board_driver, self.robot, self.board = devices
 
     def plan(self, presses: int) -> PressPlan:
-        return planned(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
+        return make_plan(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
 
     def record(self, run: Path, plan: PressPlan, report: OnProgress = lambda done, of: None) -> float:
         """Record into `run` or go on with it; when that began."""

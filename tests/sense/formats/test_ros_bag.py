@@ -1,0 +1,221 @@
+"""Bags that are torn, lie, or were made to do harm: one line each, in little memory."""
+
+import json
+import resource
+import sqlite3
+import struct
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+
+from padforge.design.common.validation import InputError
+from padforge.sense import Recording, import_bag
+from padforge.sense.formats import ros_bag
+
+from .foreign import STORE, array, channel, chunk, make, mcap_file, message, record, text, write_bag
+
+FLOATS = "std_msgs/msg/Float64MultiArray"
+MAX_PEAK_BYTES = 2**30
+
+
+def refusal_of(path: Path, columns: str = "fibres=/f") -> str:
+    """Return the one line that a bag is refused with, within a GiB."""
+    before = peak_bytes()
+    with pytest.raises(InputError) as refusal:
+        import_bag(path, columns)
+    line = str(refusal.value)
+    assert path.name in line
+    assert "\n" not in line
+    assert len(line) < 400 + len(str(path))
+    assert peak_bytes() - before < MAX_PEAK_BYTES
+    return line
+
+
+def peak_bytes() -> int:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def test_import_bag_refuses_a_file_cut_anywhere(bag: Path, tmp_path: Path) -> None:
+    content = bag.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for size in sorted({*range(0, 200, 9), *np.linspace(200, len(content) - 1, 30).astype(int), len(content) - 1}):
+        cut.write_bytes(content[:size])
+        refusal_of(cut, "")
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+@pytest.mark.parametrize("claim", ["true", "less", "an exabyte"])
+def test_import_bag_does_not_unpack_a_bomb(tmp_path: Path, compression: str, claim: str) -> None:
+    compressors: dict[str, Callable[[bytes], bytes]] = {
+        "lz4": lz4.frame.compress,
+        "zstd": zstandard.ZstdCompressor(1).compress,
+    }
+    packed = compressors[compression](bytes(2**27))
+    size = {"true": 2**27, "less": 1000, "an exabyte": 2**60}[claim]
+    path = mcap_file(tmp_path / "bomb.mcap", [chunk(packed, compression, size)] * 3)
+    tracemalloc.start()
+    assert ("expected 1000 bytes, got 1001" if claim == "less" else "a chunk claims") in refusal_of(path)
+    assert tracemalloc.get_traced_memory()[1] < 2**25
+    tracemalloc.stop()
+
+
+def test_import_bag_refuses_chunks_that_lie(tmp_path: Path) -> None:
+    content = channel(1, "/f", FLOATS)
+    for name, made, reason in (
+        ("compression", chunk(content, "brotli"), "Unsupported chunk compression 'brotli'"),
+        ("checksum", chunk(content, "", checksum=1), "checksum mismatch"),
+        ("short", chunk(content[:-9]), "cut off or damaged"),
+        ("noise", chunk(b"no such thing", "zstd", 50), "cut off or damaged"),
+        ("noise4", chunk(b"no such thing", "lz4", 50), "cut off or damaged"),
+        ("record", record(6, b"short"), "cut off or damaged"),
+        ("json", channel(1, "/f", FLOATS, "json"), "is written as 'json', expected 'cdr'"),
+        ("twice", channel(1, "/f", FLOATS) + channel(2, "/f", "std_msgs/msg/Bool"), "and of 'std_msgs/msg/Bool'"),
+        ("letters", record(3, struct.pack("<H", 1) + struct.pack("<I", 2) + b"\xff\xfe"), "cut off or damaged"),
+        ("long", record(3, bytes(2) + struct.pack("<I", 2**31)), "cut off or damaged"),
+    ):
+        assert reason in refusal_of(mcap_file(tmp_path / f"{name}.mcap", [made]))
+
+
+def test_import_bag_refuses_a_record_beyond_its_chunk(tmp_path: Path) -> None:
+    """Also where the library would end without an error, and without the messages that follow."""
+    readings = [("/f", 0.1 * i, array("Float64MultiArray", np.arange(4.0) + i)) for i in range(40)]
+    content = bytearray(write_bag(tmp_path / "bag", readings).read_bytes())
+    body = bytes(STORE.serialize_cdr(readings[20][2], FLOATS))
+    start = content.index(body) - 31  # of the record
+    content[start : start + 9] = struct.pack("<BQ", 127, 2**20)
+    (tmp_path / "long.mcap").write_bytes(content)
+    assert "20 of 40 messages can be read" in refusal_of(tmp_path / "long.mcap")
+
+
+def cdr(*parts: bytes) -> bytes:
+    return b"\0\1\0\0" + b"".join(parts)
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        (cdr(struct.pack("<III", 0, 0, 2**32 - 1), bytes(8)), "message 0 of .* is damaged"),
+        (cdr(struct.pack("<I", 2**32 - 1), bytes(400)), "is damaged"),
+        (cdr(struct.pack("<I", 10**5), bytes(2**20)), "1048584 bytes, allowed are 65536"),
+        (cdr(struct.pack("<II", 1, 2**31)), "is damaged"),
+        (b"\0\7\0\0" + bytes(20), "is damaged .*CDR encapsulation"),
+        (cdr(struct.pack("<III", 0, 0, 1), bytes(4), struct.pack("<d", np.inf)), "readings hold infinity"),
+        (cdr(struct.pack("<III", 0, 0, 600), bytes(4), bytes(4800)), r"expected \(R, C\), R >= 2, C = 1 to 512"),
+        (b"", "is damaged"),
+        (cdr(bytes(3)), "is damaged"),
+    ],
+)
+def test_import_bag_refuses_messages_that_lie(tmp_path: Path, body: bytes, reason: str) -> None:
+    messages = [message(1, 10**9 * step, body) for step in range(1, 9)]
+    path = mcap_file(tmp_path / "lies.mcap", [channel(1, "/f", FLOATS), chunk(b"".join(messages))])
+    with pytest.raises(InputError, match=reason):
+        import_bag(path, "fibres=/f")
+    refusal_of(path)
+
+
+def test_import_bag_refuses_stamps_and_counts_beyond_the_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = bytes(STORE.serialize_cdr(array("Float64MultiArray", np.ones(2)), FLOATS))
+    for stamps, reason in (([1, 2**64 - 1], "1 of 2 messages"), ([5, 5, 5], "do not ascend"), ([1, 2**62], "")):
+        path = mcap_file(tmp_path / "r.mcap", [channel(1, "/f", FLOATS), *(message(1, each, body) for each in stamps)])
+        assert reason in refusal_of(path)
+    many = mcap_file(tmp_path / "many.mcap", [chunk(channel(1, "/f", FLOATS) + message(1, 1, body) * 300)])
+    for name, limit, reason in (
+        ("MAX_MESSAGES", 200, "more than 200 messages"),
+        ("MAX_BYTES", 5000, "or 5000 bytes"),
+        ("MAX_TOPICS", 0, "more than 0 topics"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(ros_bag, name, limit)
+            assert reason in refusal_of(many)
+
+
+DOCUMENTS = {
+    "null": "null",
+    "deep": "[" * 10**5,
+    "wide": "[" + "[]," * 2**22 + "[]]",
+    "bare": '{"format": "padforge-ros/2"}',
+    "zero": "\x00",
+    "wrong": json.dumps(
+        {"format": "padforge-ros/2", "digest": "", "epoch_s": float("nan"), "source": {}, "times_s": [1e400]}
+        | {key: [{}] for key in ("presses_mm", "depths_mm", "down_command", "up_command")}
+    ),
+}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_import_bag_ignores_a_text_that_does_not_fit_the_messages(
+    tmp_path: Path, eight: Recording, document: str
+) -> None:
+    messages = [
+        ("/pad/recording", 0.0, make("String", DOCUMENTS[document])),
+        *(
+            ("/pad/readings", time, array("Float64MultiArray", row))
+            for time, row in zip(eight.times_s[:99], eight.readings[:99], strict=True)
+        ),
+        ("/pad/pressed", 2.0, make("Bool", True)),
+        ("/pad/pressed", 4.0, make("Bool", False)),
+    ]
+    before = peak_bytes()
+    recording = import_bag(write_bag(tmp_path / "bag", messages))
+    assert peak_bytes() - before < 2**28
+    assert len(recording.down_command) == 1
+    assert "was changed" in recording.source["note"]
+
+
+TOPICS = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);"
+ROW = f"INSERT INTO topics VALUES (1, '/f', '{FLOATS}', 'cdr');"
+PLAIN = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
+ENDLESS = (
+    "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
+    "SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
+)
+
+
+def test_import_bag_refuses_sqlite_that_computes_or_lies(tmp_path: Path) -> None:
+    computed = PLAIN.replace("data BLOB", "data BLOB AS (zeroblob(1000000000))")
+    values = "INSERT INTO messages VALUES (1, 1,"
+    long_default = f"ALTER TABLE messages ADD COLUMN data BLOB DEFAULT x'{'00' * 480_000}'"
+    for name, script, reason in (
+        ("view", TOPICS + ROW + ENDLESS, "has 'messages', which is computed"),
+        ("computed", TOPICS + ROW + computed, "has 'messages', which is computed"),
+        ("column", f"{TOPICS}{ROW}CREATE TABLE messages(id INTEGER, topic_id INTEGER)", "no such column: data"),
+        ("text", f"{TOPICS}{ROW}{PLAIN}{values} 5, 'text')", "has a str where rosbag2 has bytes"),
+        ("stamp", f"{TOPICS}{ROW}{PLAIN}{values} -5, x'0001000000')", "message 0 of"),
+        ("name", f"{TOPICS}{PLAIN}INSERT INTO topics VALUES (1, NULL, NULL, NULL)", "expected one of 'None'"),
+        (
+            "long",
+            f"{TOPICS}{ROW}CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER);"
+            + "INSERT INTO messages VALUES (1, 1, 5);" * 600
+            + long_default,
+            "its messages claim 288000000 bytes in",
+        ),
+    ):
+        path = tmp_path / f"{name}.db3"
+        with sqlite3.connect(path) as file:
+            file.executescript(script)
+        file.close()
+        assert reason in refusal_of(path)
+
+
+def test_import_bag_writes_nothing_beside_sqlite_without_an_index(tmp_path: Path) -> None:
+    body = bytes(STORE.serialize_cdr(array("Float64MultiArray", np.zeros(400)), FLOATS))
+    path = tmp_path / "100%25?.db3"
+    with sqlite3.connect(path) as file:
+        file.executescript(TOPICS + ROW + PLAIN)
+        rows = ((step, 1, (9000 - step) * 10**8, body) for step in range(2000))
+        file.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+    file.close()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, before[1]))
+    try:
+        assert "has no press" in refusal_of(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
