@@ -186,7 +186,7 @@ def _record_by_hand(setup: "RigConfig", resume: bool, emulated: bool) -> "Record
                 draw(view_lines(latest))
 
         def said() -> list[str]:
-            return [*page.said(), *(words[key] for key in typed() if key in words), *answer()]
+            return [*page.read_commands(), *(words[key] for key in typed() if key in words), *answer()]
 
         return record_by_hand(setup, converter, show, said, resume)
 

@@ -26,7 +26,7 @@ from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, rea
 from padforge.sense.rig.by_hand_presses import GONE_S, MOST, SOON_S, Judge, Phase, Place, Turns, answers
 from padforge.sense.rig.config import RigConfig, begun_source, require_same_devices, source_of
 from padforge.sense.rig.devices import Board, RigFault
-from padforge.sense.rig.streams import HISTORY, SLACK, Ring, connected
+from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
 ROUND = 25
@@ -148,7 +148,7 @@ class HandSession:
         self._number = max(recorder.done, default=-1) + 1
         self._made = made
         self._turns = Turns(targets_mm, hold_s, self._start_s)
-        self._ring, self._now_s = Ring(1 + fibres), self._start_s
+        self._ring, self._now_s = RingBuffer(1 + fibres), self._start_s
         self._finder: PressDetector | None = PressDetector(fibres)  # None while it has lost its way
         self._found_from, self._judge = 0, Judge()
         self._touched = self._down_command = self._free = 0
@@ -201,14 +201,14 @@ class HandSession:
     def _touch(self, touched: int) -> None:
         place = self._turns.touch(self._time_s(touched))
         self._touched = touched
-        self._down_command = max(self._ring.sent(touched, SENT_DOWN_S), self._free + 1)
+        self._down_command = max(self._ring.command_index(touched, SENT_DOWN_S), self._free + 1)
         self._rest = self._rest_before(self._down_command)
         self._refused = None
         self._recorder.begin(place or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
 
     def _release(self, released: int) -> None:
-        up_command = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
+        up_command = max(self._ring.command_index(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
         target, fault = self._turns.target, self._turns.release(self._time_s(released))
         answered = self._answers(up_command)
         fault = fault or self._judge.fault_of(answered)
@@ -347,8 +347,8 @@ def record_by_hand(
     if not resume:
         refuse_begun(setup.out)
     rig = setup.rig
-    source = connected(converter, rig.rate_hz)
-    recorder, targets, left = opened(setup, source.converter, resume)
+    source = stream_board(converter, rig.rate_hz)
+    recorder, targets, left = opened(setup, source.board, resume)
     with recorder:
         hold_s = rig.readings_per_press / 2 / source.rate_hz
         HandSession(recorder, source.fibres, left, hold_s, len(targets) - len(left)).run(source.blocks, show, said)

@@ -295,7 +295,7 @@ class Session:
         up_s = self._clock()
         self._move(above, self._rig.press_mm_s)
         self._await_reading(up_s)
-        reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.lost} | held
+        reached = {"at_mm": [*tip[0].round(4).tolist(), round(float(depths[0]), 4)], "lost": self._averager.n_missing} | held
         self._disk.do(self._recorder.finish, self._reading(up_s), **reached)
         self._disk.do(self._recorder.sync)
         self._still()

@@ -325,4 +325,4 @@ def test_readings_are_means_of_whole_stretches_whatever_the_pieces(ratio, count,
     assert np.allclose(volts[:, 0], expected)
     assert np.allclose(volts[:, 1], -np.array(expected))
     assert np.allclose(1000 * times, expected)
-    assert averager.lost == sum(i <= last for i in lost)
+    assert averager.n_missing == sum(i <= last for i in lost)
