@@ -1,4 +1,4 @@
-"""`padforge sense live`: the edge where readings come in as they are taken and places are shown at once."""
+"""`padforge sense live`: presses are localized while they happen, and shown and sent at once."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -16,26 +16,24 @@ from padforge.sense.cli.rig import rig_option
 
 if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel
-    from padforge.sense.live.outputs import Outlet
+    from padforge.sense.live.outputs import OutputStream
     from padforge.sense.live.pipeline import Event
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.devices import Board
-    from padforge.sense.rig.streams import Source
+    from padforge.sense.rig.streams import ReadingStream
 
-    Show = Callable[[dict[str, Any], Sequence[Event]], None]
-    """Takes what there is to show, see `Live.view`, and what has just come to light."""
+    Show = Callable[[dict[str, Any], Sequence[Event]], None]  # takes `Live.view()` and the latest events
 
 PORT = 8321
-BAR = 12
-"""Characters of a fibre's bar on a terminal, to either side."""
+BAR = 12  # characters of a fibre's bar on a terminal, to either side
 
 
-def _ways_out(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options that say to which other programs it is told as well, and from where they may listen."""
+def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of outputs to other programs, and of who may listen."""
     options = (
-        click.option("--tcp", type=click.IntRange(0, 65_535), help="Tell it in lines of JSON on this port; 0: any."),
-        click.option("--osc", metavar="HOST:PORT", help="Tell it in Open Sound Control to this address."),
-        click.option("--lsl", metavar="NAME", help="Tell it as streams of the Lab Streaming Layer, by this name."),
+        click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any."),
+        click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address."),
+        click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name."),
         click.option("--host", default=HOST, show_default=True, help="Of page and --tcp; for others with a --token."),
         click.option("--token", default="", envvar="PADFORGE_TOKEN", help="What must be known to listen."),
     )
@@ -58,7 +56,7 @@ def _ways_out(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Folder that calibrate wrote; may be given again for one that answers earlier, or better.",
 )
 @click.option("--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Of the page; 0: any.")
-@_ways_out
+@_output_options
 @spec_option
 @json_option
 def live(
@@ -69,7 +67,7 @@ def live(
     port: int,
     spec: Path | None,
     as_json: bool,
-    **out: Any,
+    **output: Any,
 ) -> None:
     """Show where a pad is pressed, as it is pressed: here, and on a page for the browsers of this machine.
 
@@ -77,7 +75,7 @@ def live(
     padforge sense live --model out/pad
 
     \b
-    --rig simulated      the simulated pad that the model was learnt from, pressed at random
+    --rig simulated      the simulated pad that the model was trained on, pressed at random
     --rig ur5            the board, as [rig] says; the arm is not used
     --replay RECORDING   what was recorded
 
@@ -86,144 +84,145 @@ def live(
     padforge sense live --osc 127.0.0.1:9001 --lsl pad            for music, for labs
     padforge sense live --tcp 9000 --host 0.0.0.0 --token WORD    for other machines
 
-    Whoever knows the token sees page and lines from anywhere in the network, and nothing is encrypted.
+    Anyone who knows the token sees page and lines from anywhere in the network, and nothing is encrypted.
 
-    A fibre found bad is left out from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
+    A faulty fibre is masked from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
-    from padforge.sense.live.outputs import LivePage, Messages, tell_all
+    from padforge.sense.live.outputs import LivePage, MessageBuilder, broadcast
     from padforge.sense.live.pipeline import Live
     from padforge.sense.localizer.model import LocalizerModel
 
     localizers = [LocalizerModel.load(model) for model in models]
     with ExitStack() as stack:
-        rigged = (stack, rig, models[0], localizers[0], spec)
-        source, mirrored = _connected(*rigged) if replay is None else _replayed(replay, speed)
-        pipeline = Live(localizers, _health(models[0]), source.fibres, source.rate_hz)
-        page = stack.enter_context(LivePage(port, host=out["host"], token=out["token"]))
+        if replay is None:
+            stream, mirrored = _stream_rig(stack, rig, models[0], localizers[0], spec)
+        else:
+            stream, mirrored = _stream_replay(replay, speed)
+        pipeline = Live(localizers, _load_health(models[0]), stream.fibres, stream.rate_hz)
+        page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
-        outlets, messages = _outlets(stack, source, **out), Messages(pipeline, mirrored)
-        show = _json if as_json else stack.enter_context(_terminal())
-        pad = _pad(f"{replay or f'{rig} rig'}, {models[0]}", localizers[0], mirrored)
+        outputs, builder = _open_outputs(stack, stream, **output), MessageBuilder(pipeline, mirrored)
+        show = _show_json if as_json else stack.enter_context(_terminal())
+        pad = _pad_view(f"{replay or f'{rig} rig'}, {models[0]}", localizers[0], mirrored)
 
         @stack.push
-        def tell_the_end(kind: object, error: BaseException | None, trace: object) -> None:
+        def show_end(kind: object, error: BaseException | None, trace: object) -> None:
             page.show(pad | pipeline.view() | {"ended": str(error or "") or "ended"})
 
-        for times_s, readings in source.blocks:
+        for times_s, readings in stream.blocks:
             events = pipeline.feed(times_s, readings)
             if len(times_s):
                 view = pad | pipeline.view() | {"ended": ""}
                 page.show(view)
                 show(view, events)
-                if outlets:
-                    tell_all(outlets, messages.of(times_s, readings, events))
+                if outputs:
+                    broadcast(outputs, builder.build(times_s, readings, events))
 
 
-def _connected(
+def _stream_rig(
     stack: ExitStack, rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None
-) -> "tuple[Source, bool]":
-    """The readings of a converter, until `stack` is left, and whether the pad lies with its tracks up."""
-    from padforge.sense.rig.streams import connected, lies_mirrored
+) -> "tuple[ReadingStream, bool]":
+    """Return the readings of a board, which `stack` closes, and whether the pad lies with its tracks up."""
+    from padforge.sense.rig.streams import is_pad_mirrored, stream_board
     from padforge.sense.settings import RigSettings
 
-    mirrored = lies_mirrored(model, load_spec(spec).section(RigSettings))
-    converter = _converter(rig, model, localizer, spec)
-    stack.callback(converter.close)
-    return connected(converter, localizer.rate_hz), mirrored
+    options = load_spec(spec).section(RigSettings)
+    mirrored = is_pad_mirrored(model, options)
+    board = _make_board(rig, model, localizer, options)
+    stack.callback(board.close)
+    return stream_board(board, localizer.rate_hz), mirrored
 
 
-def _replayed(replay: Path, speed: float) -> "tuple[Source, bool]":
-    """The readings of a recording, and whether the pad lay with its tracks up."""
+def _stream_replay(replay: Path, speed: float) -> "tuple[ReadingStream, bool]":
+    """Return the readings of a recording, and whether the pad lay with its tracks up."""
     from padforge.sense.formats.import_export import open_recording
-    from padforge.sense.rig.streams import replayed
+    from padforge.sense.rig.streams import stream_recording
 
     recording = open_recording(replay)
-    return replayed(recording, speed), recording.mirrored
+    return stream_recording(recording, speed), recording.mirrored
 
 
-def _pad(title: str, localizer: "LocalizerModel", mirrored: bool) -> dict[str, Any]:
-    """What stays the same of the view."""
-    scaling = localizer.scaler
-    half_mm = scaling.half_mm
+def _pad_view(title: str, localizer: "LocalizerModel", mirrored: bool) -> dict[str, Any]:
+    """Return the part of the view that stays the same."""
+    scaler = localizer.scaler
+    half_mm = scaler.half_mm
     return {
         "title": title,
-        "origin_mm": scaling.origin_mm.tolist(),
-        "half_mm": [scaling.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
+        "origin_mm": scaler.origin_mm.tolist(),
+        "half_mm": [scaler.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
         "mirrored": mirrored,
     }
 
 
-def _outlets(
-    stack: ExitStack, source: "Source", tcp: int | None, osc: str | None, lsl: str | None, host: str, token: str
-) -> "list[Outlet]":
-    """The ways out that were asked for, open until `stack` is left."""
-    from padforge.sense.live.outputs import Lines, Lsl, Osc
+def _open_outputs(
+    stack: ExitStack, stream: "ReadingStream", tcp: int | None, osc: str | None, lsl: str | None, host: str, token: str
+) -> "list[OutputStream]":
+    """Open the outputs that were asked for; `stack` closes them."""
+    from padforge.sense.live.outputs import JsonLines, LslOutput, OscOutput
 
-    outlets: list[Outlet] = []
+    outputs: list[OutputStream] = []
     if tcp is not None:
-        lines = stack.enter_context(Lines(host, tcp, token))
+        lines = stack.enter_context(JsonLines(host, tcp, token))
         click.echo(f"lines: {lines.address[0]}:{lines.address[1]}", err=True)
-        outlets.append(lines)
+        outputs.append(lines)
     if osc is not None:
-        outlets.append(stack.enter_context(Osc(osc)))
+        outputs.append(stack.enter_context(OscOutput(osc)))
     if lsl is not None:
-        outlets.append(Lsl(lsl, source.fibres, source.rate_hz))
-    return outlets
+        outputs.append(LslOutput(lsl, stream.fibres, stream.rate_hz))
+    return outputs
 
 
-def _converter(rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None) -> "Board":
-    """The converter alone, not yet connected: whoever presses the pad, it is not the arm."""
+def _make_board(rig: str, model: Path, localizer: "LocalizerModel", options: Any) -> "Board":
+    """Return the board alone, not yet connected: a person presses the pad, not the arm."""
     if rig == "simulated":
-        from padforge.sense.rig.streams import simulated
+        from padforge.sense.virtual.virtual_pad import virtual_pad_of
 
-        return simulated(model)
+        return virtual_pad_of(model)
     from padforge.sense.rig.devices import load_device
-    from padforge.sense.settings import RigSettings
 
-    options = load_spec(spec).section(RigSettings)
     return load_device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
 
 
-def _health(model: Path) -> "HealthModel | None":
-    """What was learnt of a healthy pad, if it was."""
+def _load_health(model: Path) -> "HealthModel | None":
+    """Load the health model in the folder of a model, if there is one."""
     from padforge.sense.health.fault_detector import has_health
     from padforge.sense.health.health_model import DETECTED, HealthModel
 
     if not has_health(model, DETECTED):
-        click.echo(f"{model}: health was not learnt, so no fibre will be found bad", err=True)
+        click.echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
         return None
     return HealthModel.load(model, DETECTED)
 
 
-def _json(view: dict[str, Any], events: "Sequence[Event]") -> None:
+def _show_json(view: dict[str, Any], events: "Sequence[Event]") -> None:
     from padforge.sense.live.pipeline import Estimate
 
     for event in events:
-        kind = {"event": type(event).__name__.lower()}
-        click.echo(json.dumps(kind | (event.document if isinstance(event, Estimate) else asdict(event))))
+        values = event.to_dict() if isinstance(event, Estimate) else asdict(event)
+        click.echo(json.dumps({"event": type(event).__name__.lower()} | values))
 
 
-def _plain(view: dict[str, Any], events: "Sequence[Event]") -> None:
+def _show_lines(view: dict[str, Any], events: "Sequence[Event]") -> None:
     for event in events:
-        click.echo(event.text)  # a line for each, as soon as it is known: click flushes
+        click.echo(event.text)  # which flushes, so that each line appears at once
 
 
 @contextmanager
 def _terminal() -> "Iterator[Show]":
-    """What shows on stdout: all there is, drawn anew and again; or a line an event, where it is no terminal."""
+    """Yield what draws the view again and again, or prints a line an event where stdout is no terminal."""
     with drawn_anew() as draw:
-        yield _plain if draw is None else lambda view, events: draw(view_lines(view))
+        yield _show_lines if draw is None else lambda view, events: draw(view_lines(view))
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:
-    """What there is to show (`Live.view`) as text."""
+    """Return the view of a pad (`Live.view`) as text."""
     latest = view["presses"][-1] if view["presses"] else None
     return [
         "pressed" if view["pressed"] else "waiting for a press",
         latest["text"] if latest else "no press yet",
         *(f"fibre {c:<3} {_bar(fibre['swing'] or 0.0)} {fibre['state']}" for c, fibre in enumerate(view["fibres"], 1)),
-        *view["findings"],
+        *view["faults"],
     ]
 
 

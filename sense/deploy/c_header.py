@@ -1,37 +1,75 @@
-"""`localizer.h`: a student written out as one C99 file."""
+"""`localizer.h`: a student network as one C99 file, rendered from the template `localizer.h.j2`."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from padforge.design.common.files import write_text
 from padforge.sense.arrays import Array, Floats
-from padforge.sense.deploy import streaming as press_stream
-from padforge.sense.deploy.streaming import CODE, LAYERS, POLES, Budget, rates, state_bytes, table_bytes
-from padforge.sense.deploy.student import Student, causal_beside, examine, split, teach
-from padforge.sense.localizer.features import MAX_INPUT
-from padforge.sense.localizer.model import MEASURED, UNKNOWN, LocalizerModel
-from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
+from padforge.sense.deploy import streaming
+from padforge.sense.deploy.streaming import CODE_BYTES, N_LAYERS, MemoryBudget, state_bytes, table_bytes
+from padforge.sense.deploy.student import (
+    StudentNetwork,
+    causal_reference,
+    distill,
+    evaluate_student,
+    split_student_presses,
+)
+from padforge.sense.localizer import model as localizer_model
+from padforge.sense.localizer import network, scaler
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-WRAP, BACK = 2**30, 2**29
-"""Readings at which the count of them goes back, and by how many: before 32 bits run over."""
-LINE = 118
+WRAP_AT, WRAP_BY = 2**30, 2**29  # readings at which the 32-bit counter goes back, and by how many
+LINE = 118  # characters
 
 
-class Header(NamedTuple):
-    """What was written: the student, the bytes of its tables and of its state at most, and how far off it is."""
+@dataclass(frozen=True)
+class HeaderReport:
+    """A written header.
 
-    student: Student
-    tables: int
-    state: int
+    Attributes:
+        student: in it.
+        table_bytes: of its constant tables.
+        state_bytes: of its state, at most.
+        errors: of the student, see `evaluate_student`, with the numbers of "test_presses" and "training_presses".
+    """
+
+    student: StudentNetwork
+    table_bytes: int
+    state_bytes: int
     errors: Mapping[str, Any]
+
+    def lines(self, budget: MemoryBudget) -> list[str]:
+        """Return the report as text, beside the budget that it was made for."""
+        student, errors = self.student, self.errors
+        kind = "int8" if student.quantized else "float32"
+        flash = f"flash {(self.table_bytes + CODE_BYTES) / 1024:.1f} KiB of {budget.flash / 1024:.4g}"
+        columns: Mapping[str, Any] = errors["errors"]
+        width = max(7, *map(len, columns))
+        lines = [
+            f"{student.hidden} neurons in each of {N_LAYERS + 1} layers, {kind}: {flash}, {CODE_BYTES / 1024:g} of them "
+            f"for code; RAM {self.state_bytes / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
+            f"mean error in mm on {errors['test_presses']} presses never trained on",
+            "failed  sets" + "".join(f" {name:>{width}}" for name in columns),
+        ]
+        for row in zip(*columns.values(), strict=True):
+            means = "".join(f" {each['mean_mm']:{width}.2f}" for each in row)
+            lines.append(f"{row[0]['n_failed']:6d} {row[0]['subsets']:5d}{means}")
+        mean_mm = errors["detected_mean_mm"]
+        of_detected = "" if mean_mm is None else f"; mean error of these {mean_mm:.2f} mm"
+        return [
+            *lines,
+            f"its own detector detects {errors['n_detected']} of {errors['test_presses']} presses, "
+            f"with {errors['n_false']} false detections{of_detected}",
+        ]
 
 
 def export_header(
@@ -39,163 +77,107 @@ def export_header(
     digest: str,
     path: Path,
     recording: Recording,
-    budget: Budget,
+    budget: MemoryBudget,
     options: LocalizerSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Header:
-    """Teach a student what `teacher` knows, on the presses of a recording, and write it as a C header.
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> HeaderReport:
+    """Distill a localizer into a student, and write that as a C header.
 
     Args:
-        digest: of the teacher's `localizer.json`.
+        teacher: localizer to distill.
+        digest: SHA-256 of its `localizer.json`.
+        path: of the header.
+        recording: whose presses the student is trained and tested on.
+        budget: memory that the student may use.
+        options: length and rate of the training, and its seed.
+        on_progress: called with steps done and steps in all.
 
     Raises:
-        InputError: as `student.split` and `student.teach`, or `path` cannot be written.
+        InputError: raised by `split_student_presses` and `distill`, or `path` cannot be written.
     """
-    training, test = split(recording, teacher, options)
-    student = teach(recording, teacher, training, budget, options, progress)
-    fibres, measures = teacher.fibres, len(student.localizer.scaler.measures)
-    levels = len(student.localizer.interval_factors)
-    causal = causal_beside(teacher, recording, training, options, progress)
-    errors = examine(student, [causal] if causal is teacher else [causal, teacher], recording, test)
+    training, test = split_student_presses(recording, teacher, options)
+    student = distill(recording, teacher, training, budget, options, on_progress)
+    n_fibres, n_measures = teacher.fibres, len(student.model.scaler.measures)
+    n_levels = len(student.model.interval_factors)
+    causal = causal_reference(teacher, recording, training, options, on_progress)
+    errors = evaluate_student(student, [causal] if causal is teacher else [causal, teacher], recording, test)
     about = [
         f"by padforge {version('padforge')}, of localizer.json with SHA-256",
-        f"{digest}",
-        f"A touch is found by a simple detector, which found {errors['found']} of {len(test)} presses "
-        f"and {errors['false']} that were none.",
+        digest,
+        f"A simple detector detects touches: {errors['n_detected']} of {len(test)} presses, "
+        f"with {errors['n_false']} false detections.",
         f"Mean error on these presses, never trained on: {errors['errors']['header'][0]['mean_mm']:.2f} mm.",
     ]
-    write_text(path, c_header(student, budget, about))
-    return Header(
+    write_text(path, render_header(student, budget, about))
+    return HeaderReport(
         student,
-        table_bytes(fibres, measures, levels, student.hidden, budget.quantized),
-        state_bytes(fibres, measures, student.hidden),
+        table_bytes(n_fibres, n_measures, n_levels, student.hidden, budget.quantized),
+        state_bytes(n_fibres, n_measures, student.hidden),
         errors | {"test_presses": len(test), "training_presses": len(training)},
     )
 
 
-def header_lines(header: Header, budget: Budget) -> list[str]:
-    """The same for people."""
-    student, errors = header.student, header.errors
-    kind = "int8" if student.quantized else "float32"
-    predicted_mm = "" if errors["predicted_mm"] is None else f"; mean error of these {errors['predicted_mm']:.2f} mm"
-    size = f"{student.hidden} neurons in each of {LAYERS + 1} layers"
-    flash = (
-        f"flash {(header.tables + CODE) / 1024:.1f} KiB of {budget.flash / 1024:.4g}, {CODE / 1024:g} of them for code"
-    )
-    columns: Mapping[str, Any] = errors["errors"]
-    width = max(7, *map(len, columns))
-    lines = [
-        f"{size}, {kind}: {flash}; RAM {header.state / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
-        f"mean error in mm on {errors['test_presses']} presses never trained on",
-        "lost  sets" + "".join(f" {name:>{width}}" for name in columns),
-    ]
-    for row in zip(*columns.values(), strict=True):
-        means = "".join(f" {each['mean_mm']:{width}.2f}" for each in row)
-        lines.append(f"{row[0]['n_failed']:4d} {row[0]['subsets']:5d}{means}")
-    return [
-        *lines,
-        f"its own detector finds {errors['found']} of {errors['test_presses']} presses, "
-        f"{errors['false']} touches that are none{predicted_mm}",
-    ]
-
-
-def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
-    """The text of the header.
+def render_header(student: StudentNetwork, budget: MemoryBudget, about: Sequence[str]) -> str:
+    """Render the template.
 
     Args:
-        about: lines that say what it was made of and how far off it is.
+        student: network and detector.
+        budget: beyond which the header does not compile.
+        about: lines of its first comment.
     """
-    localizer, detector = student.localizer, student.detector
-    scaling = localizer.scaler
-    span, hidden = scaling.span_mm, student.hidden
     environment = Environment(
-        loader=PackageLoader("padforge.sense.deploy", "."),
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
+        loader=PackageLoader("padforge.sense.deploy", "."), undefined=StrictUndefined, keep_trailing_newline=True
     )
-    environment.filters["rows"] = lambda values: fill(
-        ", ".join(values), LINE, initial_indent="  ", subsequent_indent="  "
-    )
+    environment.filters |= {"f": _float, "literal": _literal, "numbers": _numbers}
+    modules = (streaming, network, scaler, localizer_model)
+    constants = {name: value for module in modules for name, value in vars(module).items() if name.isupper()}
     return environment.get_template("localizer.h.j2").render(
+        constants,
         about=about,
-        fibres=localizer.fibres,
-        rate=f"{localizer.rate_hz:.4g}",
-        rate_hz=_literal(f"{localizer.rate_hz:.4g}"),
-        flash=budget.flash,
-        code=CODE,
-        ram=budget.ram,
-        hidden=hidden,
-        layers=len(localizer.weights["hidden.w"]),
-        numbers=2 + len(scaling.measures),
-        levels=len(localizer.interval_factors),
-        poles=POLES,
-        inputs=len(press_stream.WINDOWS),
-        **_stream_constants(),
-        threshold=_float(detector.threshold),
-        judge=detector.threshold,
-        late=detector.late,
-        wrap=WRAP,
-        back=BACK,
-        max_input=_float(MAX_INPUT),
-        epsilon=_float(EPSILON),
-        least_log=_float(LEAST_LOG),
-        most_log=_float(MOST_LOG),
-        span=_float(span),
-        middle=[_float(each) for each in scaling.origin_mm],
-        unknown=[_float(each * span) for each in UNKNOWN[1:]],
-        measures=[
-            dict(zip(("value", "r90"), MEASURED[each.name], strict=True))
-            | {"span": _float(each.span), "middle": _float(each.middle)}
-            for each in scaling.measures
-        ],
+        budget=budget,
+        model=student.model,
+        scaler=student.model.scaler,
+        detector=student.detector,
+        hidden=student.hidden,
         quantized=student.quantized,
-        kind="int8_t" if student.quantized else "float",
         tables=_tables(student),
+        wrap_at=WRAP_AT,
+        wrap_by=WRAP_BY,
     )
 
 
-def _stream_constants() -> dict[str, Any]:
-    """What the header has of its twin's numbers, by their names in lower case."""
-    counts = {
-        name.lower(): getattr(press_stream, name) for name in ("RING", "LAG", "REST", "SEEN", "SETTLING", "LONGEST")
+def _tables(student: StudentNetwork) -> dict[str, Any]:
+    """Return the constant arrays by name."""
+    model, of = student.model, student.model.scaler
+    units = [of.scale_mm] * 3 + [measure.scale for measure in of.measures]
+    tables: dict[str, Any] = {
+        "rates": streaming.RATES,
+        "inverse_noise": student.detector.inverse_noise,
+        "mean": of.mean_v,
+        "scale": of.scale_v,
+        "history_coef": of.history_coef,
+        "history_mean": of.history_mean_v,
+        "interval_factors": model.interval_factors * units,
     }
-    floats = {name.lower(): _float(getattr(press_stream, name)) for name in ("MOST_V", "FOLLOWING", "GONE_BACK")}
-    windows = ", ".join(f"{{{first}, {end}}}" for first, end in press_stream.WINDOWS)
-    return {**counts, **floats, "windows": windows, "follows": round(1 / press_stream.FOLLOWING)}
+    for name, layer in student.layers().items():
+        tables[f"{name}_b"] = layer.bias
+        if layer.scale is not None:
+            tables[f"{name}_scale"] = layer.scale
+        tables[f"{name}_w"] = layer.weights
+    return tables
 
 
-def _tables(student: Student) -> list[dict[str, Any]]:
-    localizer, scaling = student.localizer, student.localizer.scaler
-    units = [scaling.span_mm] * 3 + [each.span for each in scaling.measures]
-    floats = {
-        "rates": rates(),
-        "quiet": student.detector.quiet,
-        "centre": scaling.centre,
-        "spread": scaling.spread,
-        "memory": scaling.memory,
-        "usual": scaling.usual,
-        "interval_factors": localizer.interval_factors * units,
-    }
-    out = [_table(name, values) for name, values in floats.items()]
-    for name, matrix in student.matrices().items():
-        out.append(_table(f"{name}_b", matrix.bias))
-        if matrix.scale is None:
-            out.append(_table(f"{name}_w", matrix.rows))
-        else:
-            out.append(_table(f"{name}_scale", matrix.scale))
-            out.append({"name": f"{name}_w", "kind": "int8_t", "entries": [str(each) for each in matrix.rows.ravel()]})
-    return out
-
-
-def _table(name: str, values: Array | Floats) -> dict[str, Any]:
-    return {"name": name, "kind": "float", "entries": [_float(each) for each in values.ravel().tolist()]}
+def _numbers(table: Array | Floats) -> str:
+    """Write an array as rows of C."""
+    texts = map(str if table.dtype.kind == "i" else _float, table.ravel().tolist())
+    return fill(", ".join(texts), LINE, initial_indent="  ", subsequent_indent="  ")
 
 
 def _float(value: float) -> str:
-    """A number as C reads it back to the same float."""
+    """Write a number as C reads it back to the same float."""
     return _literal(f"{np.float32(value):.9g}")
 
 
 def _literal(number: str) -> str:
-    """A number in digits as a float of C, which 13f is not."""
+    """Write digits as a float of C, which 13f is not."""
     return f"{number}f" if set(".e") & set(number) else f"{number}.0f"

@@ -1,15 +1,15 @@
-"""What `sense.localizer.features` computes, as nodes of an ONNX graph: from readings to the windows of presses.
+"""`localizer.onnx`: the localizer as one graph, from readings and the commands of presses to positions and radii.
 
-What `padforge.sense.localizer.bayes` computes, as nodes of an ONNX graph: from inputs to a place.
-
-The localizer as one ONNX graph: from readings, and when they were of a press, to places with their radii.
-
-`localizer.onnx`: written only if onnxruntime finds the places in it that the localizer itself finds.
+The graph is `torch.onnx`'s trace of a torch module, which shares its networks and its Bayesian localizer with the rest of
+padforge. It is written only if onnxruntime computes from it what the localizer predicts. The exporter is the one by
+tracing (`dynamo=False`): the other one needs onnxscript, and specializes data-dependent windows.
 """
 
+import io
 import json
+import warnings
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,244 +17,41 @@ from typing import Any, NamedTuple
 import numpy as np
 import onnx
 import onnxruntime
-from numpy.typing import ArrayLike
-from onnx import TensorProto, helper, numpy_helper
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
 
 from padforge.design.common.files import atomic_file
+from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.validation import Fault, InputError
-from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer import features
-from padforge.sense.localizer.bayes import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, BayesianLocalizer
+from padforge.sense.arrays import Array, Indices
+from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import (
     DOWN,
-    MAX_INPUT,
+    FEATURES,
     MEDIAN,
+    MEDIAN_OFFSET,
     PAST,
     REST,
-    SIZES,
     SLOW,
     SLOW_SAMPLES,
-    UP,
     Window,
-    bridged,
-    press_inputs,
+    compute_features,
+    interpolate_gaps,
 )
-from padforge.sense.localizer.model import MEASURED, UNKNOWN, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
-from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
+from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR
+from padforge.sense.localizer.scaler import MAX_INPUT
+from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
 from padforge.sense.recording.recording import Recording
 
-END = np.iinfo(np.int64).max
-
-
-class GraphNodes:
-    """The nodes and constants of a graph, each made by a call that gives the name of what it computes."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def __call__(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """A node of the ONNX operator `kind`."""
-        name = f"{kind.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
-        return name
-
-    def constant(self, values: Any, kind: type = np.int64) -> str:
-        """Numbers that are part of the graph."""
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.array(values, dtype=kind, order="C"), name))
-        return name
-
-    def part(self, array: str, begin: int, end: int, axis: int = 0) -> str:
-        """begin <= index < end along an axis."""
-        return self("Slice", array, *(self.constant([each]) for each in (begin, end, axis)))
-
-    def column(self, array: str) -> str:
-        """(Q,) to (Q, 1)."""
-        return self("Unsqueeze", array, self.constant([1]))
-
-    def mean(self, array: str, axis: int, keep: bool = False) -> str:
-        """Means along an axis, which is gone then unless it is to be kept."""
-        return self("ReduceMean", array, self.constant([axis]), keepdims=int(keep))
-
-    def median(self, array: str, size: int) -> str:
-        """(Q, size, C) to (Q, C)."""
-        middle = size // 2
-        name = f"least_{len(self.nodes)}"
-        size_wanted = self.constant([middle + 1])
-        outputs = [name, f"{name}_at"]
-        self.nodes.append(helper.make_node("TopK", [array, size_wanted], outputs, axis=1, largest=0, sorted=1))
-        return self.mean(self.part(name, middle - (size % 2 == 0), middle + 1, axis=1), 1)
-
-
-class PressFeatures:
-    """The inputs of presses, from `readings` (R, C) V in double precision, `down_command` and `up_command` (Q,)."""
-
-    def __init__(self, graph: GraphNodes, fibres: int) -> None:
-        self._g, self._fibres = graph, fibres
-        self._length = graph.part(graph("Shape", "readings"), 0, 1)
-        self._free = graph("Concat", graph.constant([0]), graph.part("up_command", 0, -1), axis=0)
-        self._following = graph("Concat", graph.part("down_command", 1, END), self._length, axis=0)
-
-    def windows(self, kind: str) -> str:
-        """(Q, C, F) V, as `features.press_inputs`."""
-        if kind == "published":
-            reach = (-(MEDIAN // 2), MEDIAN // 2 + 1)
-            ranges = (
-                ("down_command", -10, self._free, "down_command"),
-                ("down_command", 10, "down_command", "up_command"),
-                ("up_command", 10, "down_command", self._following),
-            )
-            found = [
-                self._g.median(self._gathered(at, (reach[0] + by, reach[1] + by), low, high), MEDIAN)
-                for at, by, low, high in ranges
-            ]
-            return self._stacked(found)
-        found = [self._mean("down_command", window, "down_command", "up_command") for window in DOWN[: SIZES[kind]]]
-        if kind == "press_and_release":
-            found += [self._mean("up_command", window, "down_command", self._following) for window in UP]
-        return self._g("Sub", self._stacked(found), self._rest(REST, "down_command"))
-
-    def history(self) -> str:
-        """(Q, C, J) V, as `features.history`."""
-        g = self._g
-        level = g.part("readings", 0, 1)
-        sums = g("CumSum", g("Sub", "readings", level), g.constant(np.int64(0)))
-        sums = g("Concat", g.constant(np.zeros((1, self._fibres)), np.float64), sums, axis=0)
-
-        def mean(window: Window) -> str:
-            first = g("Max", g("Add", "down_command", g.constant([window[0]])), g.constant([0]))
-            end = g("Max", g("Add", "down_command", g.constant([window[1]])), g("Add", first, g.constant([1])))
-            count = g("Cast", g.column(g("Sub", end, first)), to=onnx.TensorProto.DOUBLE)
-            total = g("Sub", g("Gather", sums, end, axis=0), g("Gather", sums, first, axis=0))
-            return g("Add", g("Div", total, count), level)
-
-        found = [mean(window) for window in PAST]
-        for length in SLOW:
-            offsets = np.arange(-length, 0, length // SLOW_SAMPLES)
-            index = g("Max", g("Add", g.column("down_command"), g.constant(offsets)), g.constant([0]))
-            found.append(g.median(g("Gather", "readings", index, axis=0), len(offsets)))
-        return g("Sub", self._stacked(found), g("Unsqueeze", mean(features.REST), g.constant([2])))
-
-    def _rest(self, window: Window, at: str) -> str:
-        return self._g("Unsqueeze", self._mean(at, window, self._free, at), self._g.constant([2]))
-
-    def _mean(self, at: str, window: Window, low: str, high: str) -> str:
-        return self._g.mean(self._gathered(at, window, low, high), 1)
-
-    def _gathered(self, at: str, window: Window, low: str, high: str) -> str:
-        """(Q, W, C) readings `at` + window, held within low <= index < high (and within the readings)."""
-        g = self._g
-        index = g("Add", g.column(at), g.constant(np.arange(*window)))
-        most = g("Sub", g("Min", high, self._length), g.constant([1]))
-        index = g("Min", g("Max", index, g.column(low)), g.column(most))
-        return g("Gather", "readings", index, axis=0)
-
-    def _stacked(self, columns: list[str]) -> str:
-        """(Q, C) each, to (Q, C, n)."""
-        axis = self._g.constant([2])
-        return self._g("Concat", *(self._g("Unsqueeze", each, axis) for each in columns), axis=2)
-
-
-def volts(values: Array, graph: GraphNodes) -> str:
-    """Numbers in double precision, as readings are."""
-    return graph.constant(values, np.float64)
-
-
-def observed(g: GraphNodes, bayes: BayesianLocalizer, inputs: str, fibre_mask: str) -> tuple[str, str]:
-    """Places (Q, 2) and what is told of them (Q, `TOLD`), as `BayesianLocalizer.__call__`, of inputs that are 0 where lost."""
-    fibres, size = len(bayes.projection), COMPONENTS
-    inputs, fibre_mask = (g("Cast", each, to=TensorProto.DOUBLE) for each in (inputs, fibre_mask))
-    there = g("Unsqueeze", fibre_mask, g.constant([2]))
-    by_fibre = g("MatMul", g("Transpose", inputs, perm=[1, 0, 2]), _number(g, bayes.projection))
-    seen = g("Transpose", by_fibre, perm=[1, 0, 2])
-    mean, variance, both = _on_grid(g, bayes, seen, there)
-    known, place = g("Div", _number(g, BEFOREHAND), variance), mean
-    spread, answers = variance, _number(g, bayes.answers.reshape(len(bayes.answers) ** 2, -1))
-    for _ in range(LOOKS):
-        found = _looked_up(g, answers, len(bayes.answers), place)
-
-        def per_fibre(begin: int, end: int, *shape: int, found: str = found) -> str:
-            part = g.part(found, begin * fibres, end * fibres, axis=1)
-            return g("Reshape", part, g.constant([-1, fibres, *shape]))
-
-        off = g("Mul", there, g("Sub", seen, per_fibre(0, size, size)))
-        slopes = g("Mul", per_fibre(size, 3 * size, 2, size), g("Unsqueeze", off, g.constant([2])))
-        weighed = g("Mul", there, per_fibre(3 * size, 3 * size + 3, 3))
-        curved = g("ReduceSum", weighed, g.constant([1]), keepdims=0)
-        pull = g("ReduceSum", slopes, g.constant([1, 3]), keepdims=0)
-        pull = g("Add", pull, g("Mul", known, g("Sub", mean, place)))
-        spread, step = _solved(g, curved, known, pull)
-        step = g("Clip", step, _number(g, -FARTHEST), _number(g, FARTHEST))
-        within = g("Max", g("Add", place, step), _number(g, bayes.bounds[0]))
-        place = g("Min", within, _number(g, bayes.bounds[1]))
-    two = _number(g, 2)
-    logs = (g("Add", _number(g, 1), g("Mul", _number(g, 0.25), g("Log", each))) for each in (spread, variance))
-    of_place, of_mean = logs
-    told = g("Concat", g("Mul", two, place), of_place, g("Mul", two, mean), of_mean, both, axis=1)
-    place = g("Add", g("MatMul", place, _number(g, bayes.turn.T)), _number(g, bayes.shift))
-    return g("Cast", place, to=TensorProto.FLOAT), g("Cast", told, to=TensorProto.FLOAT)
-
-
-def _number(g: GraphNodes, value: ArrayLike) -> str:
-    """Numbers in double precision: arrays, which single precision holds, take half the room in it."""
-    if np.ndim(value) == 0:
-        return g.constant(value, np.float64)
-    return g("Cast", g.constant(value, np.float32), to=TensorProto.DOUBLE)
-
-
-def _on_grid(g: GraphNodes, bayes: BayesianLocalizer, seen: str, there: str) -> tuple[str, str, str]:
-    """Mean place (Q, 2), its variances (Q, 2) and correlation (Q, 1)."""
-    first, second = (g.constant(each) for each in np.triu_indices(COMPONENTS))
-    products = g("Mul", g("Gather", seen, first, axis=2), g("Gather", seen, second, axis=2))
-    known = g("Reshape", g("Concat", products, seen, there, axis=2), g.constant([-1, len(bayes.terms)]))
-    share = g("Softmax", g("MatMul", known, _number(g, bayes.terms)), axis=1)
-    grid = bayes.grid
-    moments = g("MatMul", share, g.constant(np.column_stack([grid, grid**2, grid[:, 0] * grid[:, 1]]), np.float64))
-    mean = g.part(moments, 0, 2, axis=1)
-    limits = (_number(g, limit) for limit in (LEAST_SPREAD**2, 4))
-    variance = g("Clip", g("Sub", g.part(moments, 2, 4, axis=1), g("Mul", mean, mean)), *limits)
-    between = g("Sub", g.part(moments, 4, 5, axis=1), g("Mul", g.part(mean, 0, 1, axis=1), g.part(mean, 1, 2, axis=1)))
-    whole = g("Sqrt", g("Mul", g.part(variance, 0, 1, axis=1), g.part(variance, 1, 2, axis=1)))
-    return mean, variance, g("Clip", g("Div", between, whole), _number(g, -1), _number(g, 1))
-
-
-def _looked_up(g: GraphNodes, flat: str, side: int, place: str) -> str:
-    """(Q, C (3 D + 3)), as `response_model.looked_up`."""
-    at = g("Mul", g("Add", place, _number(g, 1)), _number(g, (side - 1) / 2))
-    at = g("Clip", at, _number(g, 0), _number(g, side - 1 - 1e-3))
-    whole = g("Floor", at)
-    part = g("Sub", at, whole)
-    corner = g("ReduceSum", g("Mul", whole, _number(g, [side, 1])), g.constant([1]), keepdims=0)
-    corner = g("Cast", corner, to=TensorProto.INT64)
-    x, y = g.part(part, 0, 1, axis=1), g.part(part, 1, END, axis=1)
-
-    def between(low: str, high: str, share: str) -> str:
-        return g("Add", low, g("Mul", share, g("Sub", high, low)))
-
-    def row(by: int) -> str:
-        return g("Gather", flat, g("Add", corner, g.constant(by)), axis=0)
-
-    return between(between(row(0), row(1), y), between(row(side), row(side + 1), y), x)
-
-
-def _solved(g: GraphNodes, curved: str, known: str, pull: str) -> tuple[str, str]:
-    """(Q, 2) variances and steps, as `observer._solved`."""
-    own, both = g.part(curved, 0, 2, axis=1), g.part(curved, 2, 3, axis=1)
-    x, y = g.part(own, 0, 1, axis=1), g.part(own, 1, 2, axis=1)
-    known_x, known_y = g.part(known, 0, 1, axis=1), g.part(known, 1, 2, axis=1)
-    plain = g("Relu", g("Sub", g("Mul", x, y), g("Mul", both, both)))
-    more = g("Add", g("Add", g("Mul", x, known_y), g("Mul", y, known_x)), g("Mul", known_x, known_y))
-    whole = g("Add", plain, more)
-    swap = g.constant([1, 0])
-    turned = g("Gather", g("Add", own, known), swap, axis=1)
-    across = g("Mul", both, g("Gather", pull, swap, axis=1))
-    return g("Div", turned, whole), g("Div", g("Sub", g("Mul", turned, pull), across), whole)
-
-
-OPSET = 18
-"""Of the operators: that of ONNX 1.13, from 2022 on."""
+FORMAT = "padforge-onnx/3"
+OPSET = 18  # of the operators: ONNX 1.13, 2022
+MAX_DIFFERENCE_MM = 1e-4
+"""A graph whose positions differ more from those of its localizer is not written."""
+N_TRIALS, TRIAL_READINGS = 64, 40
+"""Presses that are made up to test a graph where there is no recording, and readings from one to the next."""
 INPUTS = {
     "readings": "V, (R, C): one row a reading, one column a fibre, none missing",
     "down_command": "(Q,), ascending: row of the first reading after the probe was sent down",
@@ -264,264 +61,309 @@ INPUTS = {
 OUTPUTS = {
     "positions_mm": "mm from the middle of the pad, x and y",
     "std_mm": "mm, standard deviation in x and in y",
-    "r50_mm": "mm, radius around the place that holds the press in 50 % of cases",
+    "r50_mm": "mm, radius around the position that holds the press in 50 % of cases",
     "r90_mm": "mm, the same in 90 % of cases",
-}
-MEASURES = {
-    "depth_mm": "mm, how deep the press was",
-    "depth_r90_mm": "mm, how far beside it 90 % of presses are at most",
+    "depth_mm": "mm, depth of the press",
+    "depth_r90_mm": "mm, half the width of its 90 % interval",
     "force_n": "N, force of the press",
-    "force_r90_n": "N, how far beside it 90 % of presses are at most",
+    "force_r90_n": "N, half the width of its 90 % interval",
 }
+"""Inputs and outputs of a graph; depth and force only where the localizer predicts them."""
 
 
-def onnx_model(localizer: LocalizerModel, metadata: Mapping[str, str]) -> onnx.ModelProto:
-    """One graph that gives, of any number of presses, what `locate` gives.
+class _Traceable:
+    """torch as `BayesianLocalizer.predict` calls it, without the argument `out`, which cannot be exported."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(torch, name)
+
+    @staticmethod
+    def clip(x: Tensor, low: Any, high: Any, out: object = None) -> Tensor:
+        if isinstance(low, Tensor):
+            return torch.minimum(torch.maximum(x, low), high)
+        return torch.clip(x, low, high)
+
+    @staticmethod
+    def exp(x: Tensor, out: object = None) -> Tensor:
+        return torch.exp(x)
+
+
+class FeatureModule(nn.Module):
+    """`compute_features` and `FeatureScaler.transform` in torch.
 
     Args:
-        metadata: what the file says of itself, beside its inputs and outputs.
+        model: localizer whose features and scaler these are.
     """
-    graph = GraphNodes()
-    outputs = _located(graph, localizer)
-    for name, computed in outputs.items():
-        graph.nodes.append(helper.make_node("Cast", [computed], [name], to=TensorProto.FLOAT))
-    fibres = localizer.fibres
-    given = {
-        "readings": (TensorProto.DOUBLE, ["readings", fibres]),
-        "down_command": (TensorProto.INT64, ["presses"]),
-        "up_command": (TensorProto.INT64, ["presses"]),
-        "fibre_mask": (TensorProto.BOOL, ["presses", fibres]),
-    }
-    about = INPUTS | OUTPUTS | MEASURES
-    shapes = {name: ["presses", 2] if name in ("positions_mm", "std_mm") else ["presses"] for name in outputs}
-    model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            "localizer",
-            [helper.make_tensor_value_info(name, *of, doc_string=about[name]) for name, of in given.items()],
-            [
-                helper.make_tensor_value_info(name, TensorProto.FLOAT, shape, doc_string=about[name])
-                for name, shape in shapes.items()
-            ],
-            graph.constants,
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=8,
-        producer_name="padforge",
-    )
-    helper.set_model_props(model, dict(metadata))
-    return model
+
+    def __init__(self, model: LocalizerModel) -> None:
+        super().__init__()
+        self.kind, scaler = FEATURES[model.features], model.scaler
+        for name in ("mean_v", "scale_v", "history_coef", "history_mean_v"):
+            self.register_buffer(name, torch.from_numpy(getattr(scaler, name)))
+
+    def forward(self, readings: Tensor, down_command: Tensor, up_command: Tensor) -> Tensor:
+        """Return (Q, C, F + G) scaled features."""
+        n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
+        previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
+        next_begin = torch.cat([down_command[1:], n_readings])
+
+        def gather(origin: Tensor, window: Window, low: Tensor, high: Tensor) -> Tensor:
+            index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
+            return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)]
+
+        if not self.kind.n_history:  # the published running medians
+            half = -(MEDIAN // 2), MEDIAN // 2 + 1
+            before = _median(gather(down_command - MEDIAN_OFFSET, half, previous_end, down_command))
+            within = _median(gather(down_command + MEDIAN_OFFSET, half, down_command, up_command))
+            after = _median(gather(up_command + MEDIAN_OFFSET, half, down_command, next_begin))
+            return self._scale(torch.stack([before, within, after], dim=2))
+        means = [gather(down_command, each, down_command, up_command).mean(dim=1) for each in self.kind.down]
+        means += [gather(up_command, each, down_command, next_begin).mean(dim=1) for each in self.kind.up]
+        rest = gather(down_command, REST, previous_end, down_command).mean(dim=1)
+        windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(self.kind.phases)))
+        history = _history(readings, down_command) - self.history_mean_v
+        effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
+        if effect.shape[2] < windows.shape[2]:  # a scaler without modulations of the sensitivity
+            windows = windows[:, :, : effect.shape[2]]
+        return self._scale(windows - effect)
+
+    def _scale(self, windows: Tensor) -> Tensor:
+        return torch.clip((windows - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()
 
 
-def _located(g: GraphNodes, localizer: LocalizerModel) -> dict[str, str]:
-    """What computes each output, by its name, as `LocalizerModel.predict_features`."""
-    scaling, fibre_mask = localizer.scaler, g("Cast", "fibre_mask", to=TensorProto.FLOAT)
-    kept = _inputs(g, localizer)
-    entries = g("Concat", g("Reshape", kept, g.constant([0, scaling.centre.size])), fibre_mask, axis=1)
-    outputs = _network(g, localizer.weights, entries)
-    if localizer.bayes is not None:
-        place, told = observed(g, localizer.bayes, kept, fibre_mask)
-        corrected = _network(g, localizer.residual_network, g("Concat", entries, told, axis=1))
-        more = g("Pad", place, g.constant([0, 0, 0, 2]), g.constant(0, np.float32))
-        outputs = g("Concat", outputs, g("Add", corrected, more), axis=0)
-    numbers, spreads = _pooled(g, outputs, localizer)
-    left = g("ReduceSum", fibre_mask, g.constant([1]), keepdims=0)
-    blind = g("Less", left, g.constant(0.5, np.float32))
-    lost = g("Cast", g("Sub", g.constant(localizer.fibres, np.float32), left), to=TensorProto.INT64)
-    level = g("Min", lost, g.constant(len(localizer.interval_factors) - 1))
-
-    def factor(column: int, unit: float) -> str:
-        return g("Gather", g.constant(localizer.interval_factors[:, column] * unit, np.float32), level, axis=0)
-
-    def known(value: str, unknown: float, condition: str = blind) -> str:
-        return g("Where", condition, g.constant(unknown, np.float32), value)
-
-    place, spread = (g.part(each, 0, 2, axis=1) for each in (numbers, spreads))
-    radius = g("ReduceL2", spread, g.constant([1]), keepdims=0)
-    span, every = scaling.span_mm, g.column(blind)
-    there = g("Mul", known(place, 0.0, every), g.constant(span, np.float32))
-    out = {
-        "positions_mm": g("Add", there, g.constant(scaling.origin_mm, np.float32)),
-        "std_mm": known(g("Mul", g.column(factor(0, span)), spread), UNKNOWN[0] * span, every),
-        "r50_mm": known(g("Mul", factor(1, span), radius), UNKNOWN[1] * span),
-        "r90_mm": known(g("Mul", factor(2, span), radius), UNKNOWN[2] * span),
-    }
-    for column, target in enumerate(scaling.measures):
-        value, half = (g("Gather", each, g.constant(2 + column), axis=1) for each in (numbers, spreads))
-        scaled = g("Mul", known(value, 0.0), g.constant(target.span, np.float32))
-        value_name, half_name = MEASURED[target.name]
-        out[value_name] = g("Add", scaled, g.constant(target.middle, np.float32))
-        out[half_name] = known(g("Mul", factor(3 + column, target.span), half), target.span)
-    return out
+def _median(values: Tensor) -> Tensor:
+    """(Q, W, C) to (Q, C), as `np.median`."""
+    n = values.shape[1]
+    return torch.sort(values, dim=1).values[:, (n - 1) // 2 : n // 2 + 1].mean(dim=1)
 
 
-def _inputs(g: GraphNodes, localizer: LocalizerModel) -> str:
-    """(Q, C, F + G) scaled inputs, 0 for lost fibres."""
-    scaling, features = localizer.scaler, PressFeatures(g, localizer.fibres)
-    windows = features.windows(localizer.features)
-    if scaling.usual.size:
-        history = g("Sub", features.history(), volts(scaling.usual, g))
-        shown = g("MatMul", g("Transpose", history, perm=[1, 0, 2]), volts(scaling.memory, g))
-        gains = scaling.memory.shape[2] - SIZES[localizer.features]
-        windows = g("Pad", windows, g.constant([0, 0, 0, 0, 0, gains]), volts(np.array(0.0), g))
-        windows = g("Sub", windows, g("Transpose", shown, perm=[1, 0, 2]))
-    scaled = g("Div", g("Sub", windows, volts(scaling.centre, g)), volts(scaling.spread, g))
-    limits = (volts(np.array(limit), g) for limit in (-MAX_INPUT, MAX_INPUT))
-    inputs = g("Cast", g("Clip", scaled, *limits), to=TensorProto.FLOAT)
-    return g("Where", g("Unsqueeze", "fibre_mask", g.constant([2])), inputs, g.constant(0, np.float32))
+def _history(readings: Tensor, down_command: Tensor) -> Tensor:
+    """(Q, C, J) V, as `features.compute_history`."""
+    sums = torch.cumsum(readings - readings[:1], dim=0)
+    sums = torch.cat([torch.zeros_like(sums[:1]), sums])
+
+    def mean(window: Window) -> Tensor:
+        first = torch.clamp(down_command + window[0], min=0)
+        end = torch.maximum(down_command + window[1], first + 1)
+        return (sums[end] - sums[first]) / (end - first)[:, None] + readings[:1]
+
+    means = [mean(window) for window in PAST]
+    for length in SLOW:
+        offsets = torch.arange(-length, 0, length // SLOW_SAMPLES)
+        means.append(_median(readings[torch.clamp(down_command[:, None] + offsets, min=0)]))
+    return torch.stack(means, dim=2) - mean(REST)[:, :, None]
 
 
-def _network(g: GraphNodes, weights: Weights, entries: str) -> str:
-    """(E, Q, 2 N), as `network.forward`."""
+class LocalizerModule(nn.Module):
+    """`LocalizerModel.predict` in torch, from readings and commands to `OUTPUTS`.
 
-    def layer(x: str, w: np.ndarray, b: np.ndarray) -> str:
-        return g("Add", g("MatMul", x, g.constant(w, np.float32)), g.constant(b, np.float32))
+    Args:
+        model: localizer of method "ensemble".
+    """
 
-    def ready(x: str) -> str:
-        ones = g.constant(np.ones(weights["first.w"].shape[2]), np.float32)
-        x = g("LayerNormalization", x, ones, axis=-1, epsilon=EPSILON)
-        tails = g("Erf", g("Mul", x, g.constant(0.5**0.5, np.float32)))
-        return g("Mul", g("Mul", x, g.constant(0.5, np.float32)), g("Add", tails, g.constant(1, np.float32)))
+    def __init__(self, model: LocalizerModel) -> None:
+        super().__init__()
+        scaler = model.scaler
+        self.features, self.members = FeatureModule(model), EnsembleMlp.from_numpy(model.weights)
+        self.residual = EnsembleMlp.from_numpy(model.residual_network) if model.bayes is not None else None
+        if model.bayes is not None:
+            for each in fields(model.bayes):  # single precision is exact, and half the size
+                self.register_buffer(each.name, torch.from_numpy(getattr(model.bayes, each.name).astype(np.float32)))
+        self.scale_mm, self.measures = scaler.scale_mm, scaler.measures
+        units = [self.scale_mm] * 3 + [measure.scale for measure in self.measures]
+        self.register_buffer("interval_factors", torch.from_numpy(model.interval_factors * units).float())
+        self.register_buffer("origin_mm", torch.from_numpy(scaler.origin_mm).float())
 
-    h = layer(entries, weights["first.w"], weights["first.b"])
-    for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
-        h = g("Add", h, layer(ready(h), w, b))
-    return layer(ready(h), weights["last.w"], weights["last.b"])
+    @property
+    def output_names(self) -> list[str]:
+        """Names of the outputs, in order."""
+        return [*list(OUTPUTS)[:4], *(name for measure in self.measures for name in MEASURE_COLUMNS[measure.name])]
+
+    def forward(
+        self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Return the outputs for Q presses, see `INPUTS`."""
+        features = self.features(readings, down_command, up_command)
+        x, _ = network_inputs(features, fibre_mask, None)
+        outputs = self.members(x.expand(self.members.n_members, -1, -1))
+        if self.residual is not None:
+            bayes = BayesianLocalizer(*(getattr(self, each.name).double() for each in fields(BayesianLocalizer)))
+            position, summary = bayes.predict(features.double(), fibre_mask, _Traceable())
+            corrected = self.residual(torch.cat([x, summary.float()], dim=1)[None])
+            outputs = torch.cat([outputs, corrected + functional.pad(position.float(), (0, 2))])
+        targets, std = _combine_members(outputs)
+        n_failed = (~fibre_mask).sum(dim=1)
+        factors = self.interval_factors[torch.clamp(n_failed, max=len(self.interval_factors) - 1)]
+        blind = ~fibre_mask.any(dim=1)  # which may be anywhere
+        radius = torch.linalg.vector_norm(std[:, :2], dim=1)
+
+        def unless_blind(value: Tensor, otherwise: float) -> Tensor:
+            return torch.where(blind if value.ndim == 1 else blind[:, None], otherwise, value)
+
+        values = [
+            unless_blind(targets[:, :2], 0.0) * self.scale_mm + self.origin_mm,
+            unless_blind(factors[:, :1] * std[:, :2], UNIFORM[0] * self.scale_mm),
+            unless_blind(factors[:, 1] * radius, UNIFORM[1] * self.scale_mm),
+            unless_blind(factors[:, 2] * radius, UNIFORM[2] * self.scale_mm),
+        ]
+        for column, measure in enumerate(self.measures):
+            values.append(unless_blind(targets[:, 2 + column], 0.0) * measure.scale + measure.origin)
+            values.append(unless_blind(factors[:, 3 + column] * std[:, 2 + column], measure.scale))
+        return tuple(values)
 
 
-def _pooled(g: GraphNodes, outputs: str, localizer: LocalizerModel) -> tuple[str, str]:
-    """(Q, N) numbers learnt and their standard deviations, as `network.pooled`."""
-    numbers = 2 + len(localizer.scaler.measures)
-    learnt = g.part(outputs, 0, numbers, axis=2)
-    limits = (g.constant(limit, np.float32) for limit in (LEAST_LOG, MOST_LOG))
-    logs = g("Clip", g.part(outputs, numbers, END, axis=2), *limits)
-    two, members = g.constant(2, np.float32), g.constant([0])
-    variance = g("Mul", two, g("Exp", g("Mul", two, logs)))
-    doubt = g.mean(g.part(variance, 0, 2, axis=2), 2, keep=True)
-    sure = g("Reciprocal", g("Concat", doubt, doubt, g.part(variance, 2, END, axis=2), axis=2))
-    share = g("Div", sure, g("ReduceSum", sure, members, keepdims=1))
-    mean = g("ReduceSum", g("Mul", share, learnt), members, keepdims=1)
-    off = g("Sub", learnt, mean)
-    whole = g("Mul", share, g("Add", variance, g("Mul", off, off)))
-    return g("Squeeze", mean, members), g("Sqrt", g("ReduceSum", whole, members, keepdims=0))
+def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """(E, Q, 2 N) outputs to (Q, N) targets and their standard deviations, as `network.combine_members`."""
+    targets, log_errors = outputs.chunk(2, dim=2)
+    variance = 2 * torch.exp(2 * torch.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
+    pooled = variance[:, :, :2].mean(dim=2, keepdim=True)
+    precision = 1 / torch.cat([pooled, pooled, variance[:, :, 2:]], dim=2)
+    weight = precision / precision.sum(dim=0)
+    mean = (weight * targets).sum(dim=0)
+    return mean, torch.sqrt((weight * (variance + (targets - mean) ** 2)).sum(dim=0))
 
 
-FORMAT = "padforge-onnx/2"
-MOST_OFF_MM = 1e-4
-"""A graph whose places differ by more from those of its localizer is not written."""
-TRIED = 64
-"""Presses made up to try a graph on where there is no recording."""
-CYCLE = 40
-"""Readings from one of them to the next."""
+def build_graph(model: LocalizerModel, metadata: Mapping[str, str]) -> onnx.ModelProto:
+    """Export a localizer as a graph for any number of presses and readings.
+
+    Args:
+        model: localizer of method "ensemble".
+        metadata: texts in the file, beside those of inputs and outputs.
+    """
+    module, trial = LocalizerModule(model), _made_up_presses(model)
+    mask = np.ones((N_TRIALS, model.fibres), bool)
+    arguments = tuple(map(torch.from_numpy, (trial.readings, trial.down_command, trial.up_command, mask)))
+    names = module.output_names
+    axes = {"readings": {0: "readings"}} | {name: {0: "presses"} for name in [*list(INPUTS)[1:], *names]}
+    content = io.BytesIO()
+    with warnings.catch_warnings(), one_torch_thread(), torch.no_grad():
+        warnings.simplefilter("ignore")  # the exporter is deprecated, and constants are traced as such
+        torch.onnx.export(
+            module,
+            arguments,
+            content,
+            input_names=list(INPUTS),
+            output_names=names,
+            dynamic_axes=axes,
+            opset_version=OPSET,
+            do_constant_folding=False,  # which would double the size
+            dynamo=False,
+        )
+    graph = onnx.load_model_from_string(content.getvalue())
+    for each in (*graph.graph.input, *graph.graph.output):
+        each.doc_string = (INPUTS | OUTPUTS)[each.name]
+    graph.producer_name = "padforge"
+    onnx.helper.set_model_props(graph, dict(metadata))
+    return graph
 
 
-class Exported(NamedTuple):
-    """What was written: bytes of the file, presses it was tried on, with up to so many fibres lost, and the greatest
-    distance, mm, of a place from that of the localizer, and difference, mm, of a radius of 90 %."""
+@dataclass(frozen=True)
+class OnnxReport:
+    """A written graph, and how it compares with its localizer.
+
+    Attributes:
+        size: bytes of the file.
+        n_presses: that it was tested on.
+        max_failures: fibres that were masked in the tests, at most.
+        position_difference_mm: largest distance of two positions.
+        r90_difference_mm: largest difference of two radii of 90 %.
+    """
 
     size: int
-    presses: int
-    lost: int
-    positions_mm: float
-    radii_mm: float
+    n_presses: int
+    max_failures: int
+    position_difference_mm: float
+    r90_difference_mm: float
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        return (
+            f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses with up to {self.max_failures} failed fibres: "
+            f"positions within {1e3 * self.position_difference_mm:.2f} µm of the localizer's, "
+            f"radii within {1e3 * self.r90_difference_mm:.2f} µm"
+        )
 
 
-class _Readings(NamedTuple):
+class _TrialPresses(NamedTuple):
     readings: Array
     down_command: Indices
     up_command: Indices
 
 
-def onnx_line(found: Exported) -> str:
-    """The same for people."""
-    return (
-        f"{found.size / 1e6:.1f} MB, tried on {found.presses} presses with up to {found.lost} fibres lost: "
-        f"places within {1e3 * found.positions_mm:.2f} µm of the localizer's, radii within {1e3 * found.radii_mm:.2f} µm"
-    )
-
-
-def export_onnx(localizer: LocalizerModel, digest: str, path: Path, recording: Recording | None = None) -> Exported:
-    """Write `localizer` as an ONNX graph, tried on the presses of `recording`, or on some made up.
+def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recording | None = None) -> OnnxReport:
+    """Write a localizer as an ONNX graph, and test it.
 
     Args:
-        digest: of its `localizer.json`, which has that of its weights.
+        model: localizer to export.
+        digest: SHA-256 of its `localizer.json`, which has that of its weights.
+        path: of the graph.
+        recording: whose presses it is tested on; None for made-up ones.
 
     Raises:
-        InputError: it is of the published method, the recording is of another pad or rate, or `path` cannot be written.
-        Fault: places differ by more than `MOST_OFF_MM`.
+        InputError: the localizer is of the published method, the recording of another pad or rate, or `path` cannot be
+            written.
+        Fault: positions differ by more than MAX_DIFFERENCE_MM.
     """
-    if localizer.method != "ensemble":
-        raise InputError(f"the localizer is of method {localizer.method}, expected masked: calibrate again")
+    if model.method != "ensemble":
+        raise InputError(f"the localizer is of method {model.method}, expected ensemble: calibrate again")
     if recording is not None:
-        refuse_other_pad(localizer, "the localizer", recording.fibres, recording.rate_hz)
+        check_same_pad(model, "the localizer", recording.fibres, recording.rate_hz)
+    names = LocalizerModule(model).output_names
+    document = {name: getattr(model, name) for name in ("training_recording_sha256", "features")}
     metadata = {
         "format": FORMAT,
         "padforge": version("padforge"),
         "localizer_sha256": digest,
-        "training_recording_sha256": localizer.training_recording_sha256,
-        "features": localizer.features,
-        "rate_hz": f"{localizer.rate_hz:.9g}",
-        "fibres": json.dumps([f"fibre_{fibre}_v" for fibre in range(localizer.fibres)]),
+        **document,
+        "rate_hz": f"{model.rate_hz:.9g}",
+        "fibres": json.dumps([f"fibre_{fibre}_v" for fibre in range(model.fibres)]),
         "inputs": json.dumps(INPUTS),
-        "outputs": json.dumps(OUTPUTS | {name: MEASURES[name] for name in _measured(localizer)}),
+        "outputs": json.dumps({name: OUTPUTS[name] for name in names}),
     }
-    content = onnx_model(localizer, metadata).SerializeToString()
+    content = build_graph(model, metadata).SerializeToString()
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    tried = _made_up(localizer) if recording is None else _of(recording)
-    places, radii, lost = _differences(localizer, session, tried)
-    if not places <= MOST_OFF_MM:
+    if recording is None:
+        trial = _made_up_presses(model)
+    else:
+        trial = _TrialPresses(recording.readings, recording.down_command, recording.up_command)
+    positions, radii, max_failures = _compare(model, session, trial)
+    if not positions <= MAX_DIFFERENCE_MM:
         raise Fault(
-            f"{path}: not written, onnxruntime finds places {places:.2g} mm off those of the localizer, "
-            f"allowed are {MOST_OFF_MM:g} mm"
+            f"{path}: not written, positions by onnxruntime differ by {positions:.2g} mm from those of the localizer, "
+            f"allowed are {MAX_DIFFERENCE_MM:g} mm"
         )
     with atomic_file(path) as temporary:
         temporary.write_bytes(content)
-    return Exported(len(content), len(tried.down_command), lost, places, radii)
+    return OnnxReport(len(content), len(trial.down_command), max_failures, positions, radii)
 
 
-def _measured(localizer: LocalizerModel) -> list[str]:
-    kinds = [target.name.rsplit("_", 1) for target in localizer.scaler.measures]
-    return [f"{kind}{part}_{unit}" for kind, unit in kinds for part in ("", "_r90")]
-
-
-def _of(recording: Recording) -> _Readings:
-    return _Readings(recording.readings, recording.down_command, recording.up_command)
-
-
-def _made_up(localizer: LocalizerModel) -> _Readings:
-    """Readings of presses as strong as those that were learnt from, wherever such may be."""
-    rng, scaling = np.random.default_rng(0), localizer.scaler
-    down_command = CYCLE // 2 + CYCLE * np.arange(TRIED)
+def _made_up_presses(model: LocalizerModel) -> _TrialPresses:
+    """Return noise with presses as strong as those of the training."""
+    rng, scaler = np.random.default_rng(0), model.scaler
+    down_command = TRIAL_READINGS // 2 + TRIAL_READINGS * np.arange(N_TRIALS)
     up_command = down_command + DOWN[-1][1]
-    readings = 1e-3 * rng.standard_normal((TRIED * CYCLE + CYCLE, localizer.fibres))
-    strength = np.abs(scaling.centre).max(axis=1) + scaling.spread.max(axis=1)
+    readings = 1e-3 * rng.standard_normal(((N_TRIALS + 1) * TRIAL_READINGS, model.fibres))
+    response = np.abs(scaler.mean_v).max(axis=1) + scaler.scale_v.max(axis=1)
     for first, end in zip(down_command, up_command, strict=True):
-        readings[first:end] += strength * rng.uniform(-1, 1, localizer.fibres)
-    return _Readings(readings, down_command, up_command)
+        readings[first:end] += response * rng.uniform(-1, 1, model.fibres)
+    return _TrialPresses(readings, down_command, up_command)
 
 
-def _differences(
-    localizer: LocalizerModel, session: onnxruntime.InferenceSession, tried: _Readings
+def _compare(
+    model: LocalizerModel, session: onnxruntime.InferenceSession, trial: _TrialPresses
 ) -> tuple[float, float, int]:
-    """Greatest distance of places, and difference of radii, mm, over all levels of loss that it was trained for."""
-    presses = localizer.scaler.inputs(press_inputs(*tried, localizer.features))
-    rng, most = np.random.default_rng(0), len(localizer.interval_factors) - 1
-    off: list[tuple[float, float]] = []
-    for lost in range(most + 1):
-        fibre_mask = presses.fibre_mask & _without(presses.fibre_mask.shape, lost, rng)
-        found = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
-        given = {
-            "readings": bridged(tried.readings),
-            "down_command": tried.down_command,
-            "up_command": tried.up_command,
-            "fibre_mask": fibre_mask,
-        }
-        places, r90 = map(np.asarray, session.run(["positions_mm", "r90_mm"], given))
-        off.append((float(np.hypot(*(places - found.positions_mm).T).max()), float(np.abs(r90 - found.r90_mm).max())))
-    worst = np.max(off, axis=0)
-    return float(worst[0]), float(worst[1]), most
-
-
-def _without(shape: tuple[int, ...], lost: int, rng: np.random.Generator) -> Mask:
-    """(Q, C) masks, in every press another random set of so many fibres lost."""
-    return rng.random(shape).argsort(axis=1) >= lost
+    """Return the largest differences of positions and radii, mm, for up to so many failed fibres, which it returns too."""
+    presses = model.scaler.transform(compute_features(*trial, model.features))
+    rng, max_failures = np.random.default_rng(0), len(model.interval_factors) - 1
+    differences = []
+    for n_failed in range(max_failures + 1):
+        # In every press another random set of fibres is masked.
+        fibre_mask = presses.fibre_mask & (rng.random(presses.fibre_mask.shape).argsort(axis=1) >= n_failed)
+        expected = model.predict_features(replace(presses, fibre_mask=fibre_mask))
+        arrays = trial._replace(readings=interpolate_gaps(trial.readings))._asdict() | {"fibre_mask": fibre_mask}
+        positions_mm, r90_mm = map(np.asarray, session.run(["positions_mm", "r90_mm"], arrays))
+        distance = np.hypot(*(positions_mm - expected.positions_mm).T)
+        differences.append((distance.max(), np.abs(r90_mm - expected.r90_mm).max()))
+    positions, radii = np.max(differences, axis=0)
+    return float(positions), float(radii), max_failures

@@ -1,4 +1,8 @@
-"""The student: a small network, taught by the localizer, for what a microcontroller has seen by the end of a press."""
+"""The student: a small network distilled from the localizer, for what a microcontroller knows at the end of a press.
+
+Knowledge distillation (Hinton et al. 2015, "Distilling the knowledge in a neural network"): the targets are halfway
+between the true positions and those that the localizer, the teacher, predicts.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,254 +12,279 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread
-from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.deploy.streaming import LAYERS, Budget, Detector, Seen, commanded, owners, seen, widest
-from padforge.sense.localizer.calibration import CHECKED, learn, radii, split_presses, split_unseen
+from padforge.sense.deploy.streaming import (
+    N_LAYERS,
+    MemoryBudget,
+    StreamedPresses,
+    ThresholdDetector,
+    commanded_features,
+    match_presses,
+    max_hidden,
+    stream_presses,
+)
+from padforge.sense.localizer.calibration import (
+    CALIBRATION_SHARE,
+    calibrate_intervals,
+    check_trained,
+    fit_recording,
+    split_presses,
+    split_unseen,
+)
 from padforge.sense.localizer.evaluation import distances, errors_by_loss
-from padforge.sense.localizer.features import FeatureScaler, PressFeatures, TrainingPresses
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
-from padforge.sense.localizer.network import Weights, refuse_unsound
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.network import Weights
+from padforge.sense.localizer.scaler import FeatureScaler
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-TRUSTED = 0.5
-"""Share of what the teacher finds in what a press is taught as, beside what is known of it."""
-LONGER = 4
-"""How much longer than a localizer a student is trained, which has no observer beside it; its steps are short."""
-MOST_INT8 = 127
+TEACHER_WEIGHT = 0.5
+"""Weight of the teacher's predictions in the targets."""
+EPOCHS_FACTOR = 4
+"""A student is trained so much longer than a localizer: it has no Bayesian localizer, and its steps are short."""
+MAX_INT8 = 127
 
 
-class Matrix(NamedTuple):
-    """A layer y = b + w x: (out, in) `rows` of w, float32, or int8 with a `scale` (out,) each; (out,) `bias`."""
+class Layer(NamedTuple):
+    """A layer y = b + W x.
 
-    rows: Array
+    Attributes:
+        weights: W (out, in), float32 or int8.
+        bias: b (out,).
+        scale: (out,) that rows of int8 are multiplied by; None for float32.
+    """
+
+    weights: Array
     bias: Floats
     scale: Floats | None
 
 
 @dataclass(frozen=True)
-class Student:
+class StudentNetwork:
     """What `localizer.h` holds.
 
     Attributes:
-        localizer: takes what is `commanded` or `seen`, scaled by its own normalisation; of int8, its weights are what
-            these come to.
-        detector: finds touches.
+        model: localizer of the features of `commanded_features` or `stream_presses`, of one member; int8 weights are
+            dequantized in it.
+        detector: of touches.
         quantized: whether the weights are int8.
     """
 
-    localizer: LocalizerModel
-    detector: Detector
+    model: LocalizerModel
+    detector: ThresholdDetector
     quantized: bool
 
     @property
     def hidden(self) -> int:
         """Neurons of a layer."""
-        return self.localizer.weights["first.w"].shape[2]
+        return self.model.weights["first.w"].shape[2]
 
-    def touches(
-        self, readings: Array, held: Mask | None = None, lost: tuple[int, ...] = ()
-    ) -> tuple[Seen, Localization]:
-        """What `localizer.h` tells of (R, C) readings, V: the presses it sees, and their places.
+    def predict(
+        self, readings: Array, pressed: Mask | None = None, failed: tuple[int, ...] = ()
+    ) -> tuple[StreamedPresses, Localization]:
+        """Detect and localize presses as `localizer.h` does.
 
         Args:
-            held: (R,) whether the pad is pressed, where somebody else says so. lost: fibres left out, by index.
+            readings: (R, C) V, NaN where missing.
+            pressed: (R,) whether the pad is pressed; None for the detector to decide.
+            failed: indices of fibres to mask.
         """
-        fibre_mask = ~np.isin(np.arange(self.localizer.fibres), lost)
-        presses = seen(readings, self.detector, held, fibre_mask)
-        shown = self.localizer.scaler.inputs(presses.inputs)
-        return presses, self.localizer.predict_features(replace(shown, fibre_mask=shown.fibre_mask & fibre_mask))
+        fibre_mask = ~np.isin(np.arange(self.model.fibres), failed)
+        presses = stream_presses(readings, self.detector, pressed, fibre_mask)
+        scaled = self.model.scaler.transform(presses.features)
+        return presses, self.model.predict_features(replace(scaled, fibre_mask=scaled.fibre_mask & fibre_mask))
 
-    def matrices(self) -> dict[str, Matrix]:
-        """The layers in order, by name."""
-        weights = self.localizer.weights
+    def layers(self) -> dict[str, Layer]:
+        """Return the layers in order, by name."""
+        weights = self.model.weights
         pairs = {"first": (weights["first.w"][0], weights["first.b"][0, 0])}
         for number, (w, b) in enumerate(zip(weights["hidden.w"], weights["hidden.b"], strict=True)):
             pairs[f"hidden_{number}"] = (w[0], b[0, 0])
         pairs["last"] = (weights["last.w"][0], weights["last.b"][0, 0])
-        out = {}
-        for name, (w, b) in pairs.items():
-            scale = scales(w) if self.quantized else None
-            rows = w.T if scale is None else np.rint(w / scale).astype(np.int8).T
-            out[name] = Matrix(rows, b, None if scale is None else scale)
-        return out
+        if not self.quantized:
+            return {name: Layer(w.T, b, None) for name, (w, b) in pairs.items()}
+        scaled = {name: (w, b, int8_scale(w)) for name, (w, b) in pairs.items()}
+        return {name: Layer(np.rint(w / scale).astype(np.int8).T, b, scale) for name, (w, b, scale) in scaled.items()}
 
 
-def scales(w: Floats) -> Floats:
-    """(out,) what 1 of an int8 is worth in each column of (in, out) weights."""
-    most = np.abs(w).max(axis=-2)
-    return np.where(most > 0, most / np.float32(MOST_INT8), np.float32(1)).astype(np.float32)
+def int8_scale(w: Floats) -> Floats:
+    """Return the (..., out) value of 1 as int8 in each column of (..., in, out) weights."""
+    largest = np.abs(w).max(axis=-2)
+    return np.where(largest > 0, largest / np.float32(MAX_INT8), np.float32(1)).astype(np.float32)
 
 
-def as_int8(weights: Weights) -> dict[str, Floats]:
-    """Weights as int8 with a scale for each output give them back; biases stay as they are."""
+def quantize(weights: Weights) -> dict[str, Floats]:
+    """Round weights to int8 with a scale for each output, and dequantize them; biases stay as they are."""
 
     def rounded(w: Floats) -> Floats:
-        scale = scales(w)[..., None, :]
+        scale = int8_scale(w)[..., None, :]
         return (np.rint(w / scale) * scale).astype(np.float32)
 
     return {name: rounded(w) if name.endswith(".w") else w for name, w in weights.items()}
 
 
 @dataclass(frozen=True)
-class Lessons:
-    """What presses are taught as: (Q, 2) places in mm, and (Q,) of each measure."""
+class DistillationTargets:
+    """Targets of Q presses.
+
+    Attributes:
+        positions_mm: (Q, 2).
+        measures: (Q,) of each of depth and force that the teacher predicts.
+    """
 
     positions_mm: Array
     measures: Mapping[str, Array]
 
-    def __getitem__(self, presses: Indices) -> "Lessons":
-        return Lessons(self.positions_mm[presses], {name: values[presses] for name, values in self.measures.items()})
+    def __getitem__(self, presses: Indices) -> "DistillationTargets":
+        measures = {name: values[presses] for name, values in self.measures.items()}
+        return DistillationTargets(self.positions_mm[presses], measures)
 
     @classmethod
-    def of(cls, recording: Recording, teacher: LocalizerModel) -> "Lessons":
-        """Of every press, between what is known of it and what the teacher finds, or the latter."""
-        found = teacher.predict_features(teacher.scaled_features(recording))
+    def compute(cls, recording: Recording, teacher: LocalizerModel) -> "DistillationTargets":
+        """Mix what is known of every press with what the teacher predicts, or take the latter where nothing is known."""
+        prediction = teacher.predict(recording)
 
-        def between(known: Array, told: Array) -> Array:
-            return np.where(np.isnan(known), told, (1 - TRUSTED) * known + TRUSTED * told)
+        def mix(known: Array, predicted: Array) -> Array:
+            mixed = (1 - TEACHER_WEIGHT) * known + TEACHER_WEIGHT * predicted
+            return np.where(np.isnan(known), predicted, mixed)
 
-        measures = {name: between(recording.measures[name], each.values) for name, each in found.measures.items()}
-        return cls(between(recording.presses_mm, found.positions_mm), measures)
+        measures = {name: mix(recording.measures[name], each.values) for name, each in prediction.measures.items()}
+        return cls(mix(recording.presses_mm, prediction.positions_mm), measures)
 
 
-def teach(
+def distill(
     recording: Recording,
     teacher: LocalizerModel,
     training: Indices,
-    budget: Budget,
+    budget: MemoryBudget,
     options: LocalizerSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Student:
-    """Train a student on the presses `training` of a recording, by index, whose places are known.
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StudentNetwork:
+    """Train a student.
 
-    Each press is shown as it was commanded and, where the detector finds it, as the detector does.
+    Every press is used with the features of its command and, where the detector finds it, with those of its detection.
 
     Args:
-        options: how long and how fast to learn, and the seed; size, loss and inputs are the student's own.
+        recording: of the pad of the teacher.
+        teacher: localizer to distill.
+        training: indices of presses of known position.
+        budget: memory that the student may use, which decides its size.
+        options: length and rate of the training, and its seed.
+        on_progress: called with steps done and steps in all.
 
     Raises:
-        InputError: a budget that is too small, too few presses, or a training that diverged.
+        InputError: the budget is too small, there are too few presses, or the training diverged.
     """
+    from padforge.sense.localizer.training import train_members
+
     rng = np.random.default_rng(options.seed)
-    taught, checked = (
-        training[part] for part in split_presses(len(training), options.split, CHECKED["ensemble"], rng, least=2)
-    )
-    lessons, levels = Lessons.of(recording, teacher), len(teacher.interval_factors)
-    hidden = widest(teacher.fibres, len(lessons.measures), levels, budget)
-    detector, plain = Detector.fit(recording, training), commanded(recording)
-    found = seen(recording.readings, detector)
-    press = owners(recording, found.down_command)
-    also = np.flatnonzero(np.isin(press, taught))
-    shown, rows = plain[taught] + found.inputs[also], np.concatenate([taught, press[also]])
-    scaling, table = FeatureScaler.fit(shown, lessons[rows].positions_mm, lessons[rows].measures)
-    size = {
-        "members": 1,
-        "hidden": hidden,
-        "layers": LAYERS,
-        "max_failures": levels - 1,
-        "epochs": LONGER * options.epochs,
-    }
-    # LONGER alone says for how long, whichever features the localizer is to take.
-    own = options.model_copy(update={**size, "features": "press_and_release"})
-    weights = _trained(_samples(scaling, shown, lessons[rows]), table, own, rng, progress)
-    localizer = LocalizerModel(
-        as_int8(weights) if budget.quantized else weights,
-        scaling,
-        table,
+    detector = ThresholdDetector.fit(recording, training)
+    shares = split_presses(len(training), options.split, CALIBRATION_SHARE["ensemble"], rng, min_training=2)
+    training, calibration = (training[share] for share in shares)
+    targets, n_levels = DistillationTargets.compute(recording, teacher), len(teacher.interval_factors)
+    hidden = max_hidden(teacher.fibres, len(targets.measures), n_levels, budget)
+    commanded, detected = commanded_features(recording), stream_presses(recording.readings, detector)
+    press = match_presses(recording, detected.down_command)
+    matched = np.flatnonzero(np.isin(press, training))
+    features = commanded[training] + detected.features[matched]
+    targets = targets[np.concatenate([training, press[matched]])]
+    scaler, table = FeatureScaler.fit(features, targets.positions_mm, targets.measures)
+    size = {"members": 1, "hidden": hidden, "layers": N_LAYERS, "max_failures": n_levels - 1}
+    # `train_members` lengthens the training of other features by a factor of its own.
+    length = {"epochs": EPOCHS_FACTOR * options.epochs, "features": "press_and_release"}
+    options = options.model_copy(update={**size, **length})
+    presses = scaler.training_presses(features, targets.positions_mm, targets.measures)
+    with one_torch_thread():
+        weights = train_members(presses, table, options, rng, on_progress).weights
+    check_trained(weights, {}, scaler, options)
+    model = LocalizerModel(
+        weights=quantize(weights) if budget.quantized else weights,
+        scaler=scaler,
+        table=table,
         method="ensemble",
         features="causal",
-        interval_factors=np.ones((1, 3 + len(lessons.measures))),
+        interval_factors=np.ones((1, 3 + len(targets.measures))),
         rate_hz=recording.rate_hz,
         training_recording_sha256=recording.digest,
     )
-    known = {name: recording.measures[name][checked] for name in lessons.measures}
-    factors = radii(localizer, scaling.inputs(plain[checked]), recording.presses_mm[checked], levels, known)
-    return Student(replace(localizer, interval_factors=factors), detector, budget.quantized)
+    known = {name: recording.measures[name][calibration] for name in targets.measures}
+    scaled, positions_mm = scaler.transform(commanded[calibration]), recording.presses_mm[calibration]
+    factors = calibrate_intervals(model, scaled, positions_mm, n_levels, known)
+    return StudentNetwork(replace(model, interval_factors=factors), detector, budget.quantized)
 
 
-def _samples(scaling: FeatureScaler, inputs: PressFeatures, lessons: Lessons) -> TrainingPresses:
-    presses = scaling.inputs(inputs)
-    targets = scaling.targets(lessons.positions_mm, lessons.measures)
-    return TrainingPresses(presses.inputs, presses.fibre_mask, targets, scaling.stretch)
-
-
-def _trained(
-    learn: TrainingPresses,
-    table: Floats,
-    options: LocalizerSettings,
-    rng: np.random.Generator,
-    progress: Callable[[int, int], None],
-) -> Weights:
-    from padforge.sense.localizer.training import train_members
-
-    with one_torch_thread():
-        weights = train_members(learn, table, options, rng, progress).weights
-    fibres, inputs = learn.inputs.shape[1:]
-    try:
-        refuse_unsound(weights, fibres * (inputs + 1), "ensemble", learn.targets.shape[1] - 2)
-    except InputError as error:
-        raise InputError(
-            f"training diverged at [localizer] learning_rate {options.learning_rate:g}, try a lower one: {error}"
-        ) from error
-    return weights
-
-
-def split(recording: Recording, teacher: LocalizerModel, options: LocalizerSettings) -> tuple[Indices, Indices]:
-    """Presses of known place to learn from, and those to test on, which neither the student nor the teacher learns.
+def split_student_presses(
+    recording: Recording, teacher: LocalizerModel, options: LocalizerSettings
+) -> tuple[Indices, Indices]:
+    """Return presses of known position to train on, and those to test on, which the teacher was not trained on either.
 
     Raises:
         InputError: the teacher was recalibrated by the recording, or there are too few presses.
     """
-    refuse_other_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
+    check_same_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
     return split_unseen(recording, teacher, options)
 
 
-def causal_beside(
+def causal_reference(
     teacher: LocalizerModel,
     recording: Recording,
     training: Indices,
     options: LocalizerSettings,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> LocalizerModel:
-    """A localizer of full size that knows what can be known by the end of a press, as the student does.
+    """Return a localizer of full size that uses no readings after the end of a press, as the student.
 
-    It is the teacher, or one trained here on the presses `training` of a recording, by index.
+    Args:
+        teacher: returned, if it is such a localizer.
+        recording: of its pad.
+        training: indices of the presses that another one is trained on.
+        options: of that training.
+        on_progress: called with steps done and steps in all.
 
     Raises:
-        InputError: as `calibration.learn`.
+        InputError: raised by the training.
     """
     if teacher.features == "causal":
         return teacher
-    options = options.model_copy(
-        update={"features": "causal", "method": "ensemble", "max_failures": len(teacher.interval_factors) - 1}
-    )
+    max_failures = len(teacher.interval_factors) - 1
+    update = {"features": "causal", "method": "ensemble", "max_failures": max_failures}
     with one_torch_thread():
-        return learn(recording, training, options, np.random.default_rng(options.seed), progress)
+        rng = np.random.default_rng(options.seed)
+        return fit_recording(recording, training, options.model_copy(update=update), rng, on_progress)
 
 
-def examine(student: Student, beside: Sequence[LocalizerModel], recording: Recording, test: Indices) -> dict[str, Any]:
-    """How far off a student is on the presses `test`, by index, beside localizers.
+def evaluate_student(
+    student: StudentNetwork, references: Sequence[LocalizerModel], recording: Recording, test: Indices
+) -> dict[str, Any]:
+    """Evaluate a student and localizers on presses.
+
+    Args:
+        student: network and detector.
+        references: localizers to compare it with.
+        recording: of the pad.
+        test: indices of presses of known position.
 
     Returns:
-        "errors", by "header" and the features of the localizers: rows as `evaluation.evaluate` has them; "found", how
-        many of the presses the detector finds, "false", how many more it finds from the first to the last reading of
-        them, and "predicted_mm", the mean error of those found.
+        "errors": by "header" and the features of the localizers, a row for each number of failed fibres;
+        "n_detected": how many presses the detector finds; "n_false": its false detections after them, each up to the
+        next press; "detected_mean_mm": mean error of those detected, None if there are none.
     """
-    positions_mm, localizer = recording.presses_mm[test], student.localizer
-    shown = {"header": (localizer, localizer.scaler.inputs(commanded(recording)[test]))}
-    shown |= {each.features: (each, each.scaled_features(recording)[test]) for each in beside}
-    levels = range(len(localizer.interval_factors))
-    rows = {
-        name: errors_by_loss(model.fibres, levels, partial(model.predict_features, inputs), positions_mm)[0]
-        for name, (model, inputs) in shown.items()
+    positions_mm, model = recording.presses_mm[test], student.model
+    compared = {"header": (model, model.scaler.transform(commanded_features(recording)[test]))}
+    compared |= {each.features: (each, each.scaled_features(recording)[test]) for each in references}
+    levels = range(len(model.interval_factors))
+    errors = {
+        name: errors_by_loss(each.fibres, levels, partial(each.predict_features, features), positions_mm)[0]
+        for name, (each, features) in compared.items()
     }
-    presses, found = student.touches(recording.readings)
-    press = owners(recording, presses.down_command)
-    own = np.flatnonzero(np.isin(press, test))
-    false = int(np.isin(-1 - press, test).sum())
-    off = distances(found.positions_mm[own], recording.presses_mm[press[own]])
-    mean = float(off.mean()) if len(own) else None
-    return {"errors": rows, "found": len(own), "false": false, "predicted_mm": mean}
+    presses, prediction = student.predict(recording.readings)
+    press = match_presses(recording, presses.down_command)
+    detected = np.flatnonzero(np.isin(press, test))
+    distance = distances(prediction.positions_mm[detected], recording.presses_mm[press[detected]])
+    return {
+        "errors": errors,
+        "n_detected": len(detected),
+        "n_false": int(np.isin(-1 - press, test).sum()),
+        "detected_mean_mm": float(distance.mean()) if len(detected) else None,
+    }

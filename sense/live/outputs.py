@@ -1,10 +1,7 @@
-"""What happens to a pad, as messages that are the same over every way out (docs/live-protocol.md).
-A message is a `publish` operation of the rosbridge protocol, with a standard message of ROS 2 under the same topic as
-in an exported bag, so a bridge has nothing to convert; beside it stands the same in plain numbers, mm and V.
+"""Outputs of a live pad: messages (docs/live-protocol.md), and the streams and the page that send them.
 
-Ways out of this program: lines over TCP, OSC over UDP, and streams of the Lab Streaming Layer.
-
-The page of a pad that is pressed: it shows what happens as it happens, and may say a few words itself.
+A message is a `publish` operation of the rosbridge protocol with a standard message of ROS 2, under the topic that it
+has in an exported bag, so that a bridge has nothing to convert. Beside it stand the same values in mm and V.
 """
 
 import contextlib
@@ -16,7 +13,6 @@ import socket
 import socketserver
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol, Self
 
@@ -37,9 +33,14 @@ from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live
 
 FORMAT = "padforge-live/2"
-_OK, _ERROR = 0, 2
-"""Levels of a `DiagnosticStatus`."""
-SOUND = ("sound", "unwatched")
+MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behind is disconnected
+MAX_SUBSCRIBERS = 32
+SEND_TIMEOUT_S = 10.0  # a subscriber that receives nothing for this time is disconnected
+MAX_COMMANDS = 16  # of a page that wait to be read: a button may be hit again and again
+TOUCH_UNITS = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm"}
+"""Values of a touch that OSC and LSL send, with their units."""
+_OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
+_OK_STATES = ("sound", "unmonitored")
 
 
 @dataclass(frozen=True)
@@ -47,247 +48,223 @@ class Message:
     """One message.
 
     Attributes:
-        topic: one of `TOPICS`. msg: the ROS message, as JSON. pad: the same in plain numbers; has "event".
+        topic: a key of `TOPICS`.
+        msg: the message of ROS 2, as JSON.
+        pad: the same values in mm and V, with the name of the "event".
     """
 
     topic: str
     msg: dict[str, Any]
     pad: dict[str, Any]
 
-    def line(self, number: int) -> str:
-        """The message as one line of JSON, the `number`-th that was told, from 0."""
+    def to_json(self, number: int) -> str:
+        """Return the message as a line of JSON, the `number`-th of its stream, from 0."""
         pad = {"format": FORMAT, "number": number, **self.pad}
         operation = {"op": "publish", "topic": self.topic, "type": TOPICS[self.topic].msgtype, "msg": self.msg, "pad": pad}
         return json.dumps(operation, allow_nan=False)
 
 
-class Messages:
-    """Makes messages of what a pipeline is fed and finds.
+class MessageBuilder:
+    """Build the messages of a pipeline.
 
     Args:
-        mirrored: whether the pad lies with its tracks up, so that z has to point into it, as in an exported bag.
+        pipeline: that is fed.
+        mirrored: whether the pad lies with its tracks up, so that z points into it, as in an exported bag.
     """
 
     def __init__(self, pipeline: Live, mirrored: bool = False) -> None:
         self._pipeline, self._pressed = pipeline, False
-        self._inwards = 1.0 if mirrored else -1.0
-        self._told_health = False
+        self._z_sign = 1.0 if mirrored else -1.0
+        self._is_first = True
 
-    def of(self, times_s: Array, readings: Array, events: Sequence[Event]) -> Iterator[Message]:
-        """Messages of a block of readings, (n,) s and (n, C) V, and of what came to light with it."""
+    def build(self, times_s: Array, readings: Array, events: Sequence[Event]) -> Iterator[Message]:
+        """Yield the messages of a block of readings, (n,) s and (n, C) V, and of the events that it led to."""
         if not len(times_s):
             return
         now_s = float(times_s[-1])
-        if not self._told_health:
+        if self._is_first:
+            self._is_first = False
             yield self._health(float(times_s[0]), None)
         for time_s, volts in zip(times_s.tolist(), readings.tolist(), strict=True):
-            yield _readings(time_s, volts)
+            yield _readings_message(time_s, volts)
         if self._pipeline.pressed != self._pressed:
             self._pressed = not self._pressed
-            yield Message(PRESSED, {"data": self._pressed}, _plain("pressed", now_s, pressed=self._pressed))
+            pad = {"event": "pressed", "time_s": now_s, "pressed": self._pressed}
+            yield Message(PRESSED, {"data": self._pressed}, pad)
         for event in events:
-            yield _touch(event, self._inwards) if isinstance(event, Estimate) else self._health(now_s, event)
+            is_touch = isinstance(event, Estimate)
+            yield _touch_message(event, self._z_sign) if is_touch else self._health(now_s, event)
 
     def _health(self, time_s: float, fault: FibreFault | None) -> Message:
-        self._told_health = True
         states = [fibre["state"] for fibre in self._pipeline.view()["fibres"]]
         status = [
             {
-                "level": _OK if state in SOUND else _ERROR,
-                "name": f"pad: fibre {fibre}",
+                "level": _OK if state in _OK_STATES else _ERROR,
+                "name": f"pad: fibre {number}",
                 "message": state,
                 "hardware_id": "pad",
                 "values": [],
             }
-            for fibre, state in enumerate(states, 1)
+            for number, state in enumerate(states, 1)
         ]
-        told = {} if fault is None else {"fault": {**asdict(fault), "text": fault.text}}
-        return Message(
-            HEALTH, {"header": _header(time_s), "status": status}, _plain("health", time_s, states=states, **told)
-        )
+        pad: dict[str, Any] = {"event": "health", "time_s": time_s, "states": states}
+        if fault is not None:
+            pad["fault"] = {**asdict(fault), "text": fault.text}
+        return Message(HEALTH, {"header": _header(time_s), "status": status}, pad)
 
 
-def _plain(event: str, time_s: float, **more: Any) -> dict[str, Any]:
-    return {"event": event, "time_s": time_s, **more}
+def _readings_message(time_s: float, volts: list[float]) -> Message:
+    data = [None if math.isnan(value) else value for value in volts]
+    dimension = {"label": "fibre", "size": len(data), "stride": len(data)}
+    msg = {"layout": {"dim": [dimension], "data_offset": 0}, "data": data}
+    return Message(READINGS, msg, {"event": "readings", "time_s": time_s, "volts": data})
 
 
-def _readings(time_s: float, volts: list[float]) -> Message:
-    told = [None if math.isnan(each) else each for each in volts]
-    dimension = {"label": "fibre", "size": len(told), "stride": len(told)}
-    return Message(
-        READINGS,
-        {"layout": {"dim": [dimension], "data_offset": 0}, "data": told},
-        _plain("readings", time_s, volts=told),
-    )
-
-
-def _touch(found: Estimate, inwards: float) -> Message:
-    variances = [0.0] * 36
-    variances[0], variances[7] = (found.sd_x_mm / 1000) ** 2, (found.sd_y_mm / 1000) ** 2
-    variances[14] = (found.depth_r90_mm / 1000 / Z90) ** 2 if found.depth_r90_mm is not None else UNKNOWN_VARIANCE
-    position = {"x": found.x_mm / 1000, "y": found.y_mm / 1000, "z": 0.0 + inwards * (found.depth_mm or 0.0) / 1000}
+def _touch_message(estimate: Estimate, z_sign: float) -> Message:
+    covariance = [0.0] * 36
+    covariance[0], covariance[7] = (estimate.std_x_mm / 1000) ** 2, (estimate.std_y_mm / 1000) ** 2  # mm to m
+    depth_mm, depth_r90_mm = estimate.depth_mm or 0.0, estimate.depth_r90_mm
+    covariance[14] = UNKNOWN_VARIANCE if depth_r90_mm is None else (depth_r90_mm / 1000 / Z90) ** 2
+    position = {"x": estimate.x_mm / 1000, "y": estimate.y_mm / 1000, "z": 0.0 + z_sign * depth_mm / 1000}
     pose = {"position": position, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
-    return Message(
-        TOUCHES,
-        {"header": _header(found.time_s), "pose": {"pose": pose, "covariance": variances}},
-        {"event": "touch", **found.document, "failed": list(found.lost)},
-    )
+    msg = {"header": _header(estimate.time_s), "pose": {"pose": pose, "covariance": covariance}}
+    return Message(TOUCHES, msg, {"event": "touch", **estimate.to_dict()})
 
 
 def _header(time_s: float) -> dict[str, Any]:
-    """A header of that time of the readings' clock, which begins when the readings do."""
+    """Return the header of a time by the clock of the readings, which starts with them."""
     seconds = math.floor(time_s)
     return {"stamp": {"sec": seconds, "nanosec": round((time_s - seconds) * 1e9) % 10**9}, "frame_id": FRAME}
 
 
-MOST_BEHIND = 4096
-"""Lines that wait for a client; one that is further behind is let go, so that nobody else waits for it."""
-MOST_CLIENTS = 32
-TAKEN_S = 10.0
-"""A client that takes nothing for so long is let go."""
-PLACE = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm"}
-"""What of a touch OSC and LSL tell, and its units."""
+class OutputStream(Protocol):
+    """Anything that sends messages to other programs."""
 
-
-class Outlet(Protocol):
-    """Something that messages go out by."""
-
-    def tell(self, message: Message) -> None:
-        """Send one message; never waits for who listens."""
+    def send(self, message: Message) -> None:
+        """Send one message; never wait for who receives it."""
         ...
 
 
-def tell_all(outlets: Iterable[Outlet], messages: Iterable[Message]) -> None:
-    """Send messages by all ways out, in their order."""
+def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> None:
+    """Send messages by all outputs, in their order."""
     for message in messages:
-        for outlet in outlets:
-            outlet.tell(message)
+        for output in outputs:
+            output.send(message)
 
 
-class Lines:
-    """A server that tells every client all messages from when it came, a line of JSON each, from `with` to its end.
+class JsonLines(ConnectionServer):
+    """Lines of JSON over TCP, within `with`: each subscriber gets all messages from when it came.
 
-    The first is the fibres' state as it is then.
+    The first that it gets is the latest state of the fibres.
 
-    Attributes:
-        address: host and port.
+    Args:
+        host: address to listen on.
+        port: of it; 0 for any that is free.
+        token: the first line that a subscriber must send; "" for none.
+
+    Raises:
+        InputError: the port cannot be used, or other machines could listen without a token.
     """
 
     def __init__(self, host: str, port: int, token: str = "") -> None:
-        """Take `port` of `host`, or any that is free if 0; a client's first line must be `token` if there is one.
-
-        Raises:
-            InputError: the port is taken, or not for this user, or others could listen without a token.
-        """
-        self._server = _LineServer((host, port), token)
-        self.address: tuple[str, int] = self._server.server_address[:2]  # type: ignore[assignment]
+        self._subscribers: set[_Subscriber] = set()
+        self._health: bytes | None = None
         self._number = 0
-
-    def tell(self, message: Message) -> None:
-        """Send one message to all who listen."""
-        line = f"{message.line(self._number)}\n".encode()
-        self._number += 1
-        self._server.tell(line, kept=message.topic == HEALTH)
-
-    def __enter__(self) -> Self:
-        self._server.__enter__()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._server.__exit__()
-
-
-class _LineServer(ConnectionServer):
-    def __init__(self, address: tuple[str, int], token: str) -> None:
-        self._clients: set[_Client] = set()
-        self._kept: bytes | None = None
         self._changed = threading.Condition()
-        super().__init__(address, _Client, token, "--tcp")
+        super().__init__((host, port), _Subscriber, token, "--tcp")
+        self.address: tuple[str, int] = self.server_address[:2]  # type: ignore[assignment]
 
-    def tell(self, line: bytes, kept: bool = False) -> None:
-        """Give a line to all who listen, and if it is `kept` to those who come later."""
+    def send(self, message: Message) -> None:
+        """Send one message to all subscribers."""
+        line = f"{message.to_json(self._number)}\n".encode()
+        self._number += 1
         with self._changed:
-            self._kept = line if kept else self._kept
-            for client in self._clients:
-                client.take(line)
+            if message.topic == HEALTH:
+                self._health = line
+            for subscriber in self._subscribers:
+                subscriber.put(line)
 
     def end(self, timeout_s: float) -> None:
-        """There will be no more; waits until all who listen have been sent all, for `timeout_s` at most."""
+        """Send no more, and wait until every subscriber has got all, `timeout_s` at most."""
         with self._changed:
-            for client in self._clients:
-                client.take(None)
-            self._changed.wait_for(lambda: not self._clients, timeout_s)
+            for subscriber in self._subscribers:
+                subscriber.put(None)
+            self._changed.wait_for(lambda: not self._subscribers, timeout_s)
 
-    def join(self, client: "_Client") -> bool:
+    def subscribe(self, subscriber: "_Subscriber") -> bool:
+        """Add a subscriber, unless there are too many."""
         with self._changed:
-            if len(self._clients) >= MOST_CLIENTS:
+            if len(self._subscribers) >= MAX_SUBSCRIBERS:
                 return False
-            self._clients.add(client)
-            if self._kept is not None:
-                client.take(self._kept)
+            self._subscribers.add(subscriber)
+            if self._health is not None:
+                subscriber.put(self._health)
             return True
 
-    def leave(self, client: "_Client") -> None:
+    def unsubscribe(self, subscriber: "_Subscriber") -> None:
+        """Remove a subscriber."""
         with self._changed:
-            self._clients.discard(client)
+            self._subscribers.discard(subscriber)
             self._changed.notify_all()
 
 
-class _Client(socketserver.StreamRequestHandler):
-    server: _LineServer  # pyright: ignore[reportIncompatibleVariableOverride]
-    timeout = TAKEN_S
+class _Subscriber(socketserver.StreamRequestHandler):
+    server: JsonLines  # pyright: ignore[reportIncompatibleVariableOverride]
+    timeout = SEND_TIMEOUT_S
 
     def setup(self) -> None:
         super().setup()
-        self._waiting: queue.Queue[bytes | None] = queue.Queue(MOST_BEHIND)
-        self._behind = False
+        self._lines: queue.Queue[bytes | None] = queue.Queue(MAX_QUEUED)
+        self._is_behind = False
 
-    def take(self, line: bytes | None) -> None:
+    def put(self, line: bytes | None) -> None:
         try:
-            self._waiting.put_nowait(line)
+            self._lines.put_nowait(line)
         except queue.Full:
-            self._behind = True
+            self._is_behind = True
 
     def handle(self) -> None:
         token = self.server.token.encode()
         if token and not hmac.compare_digest(self.rfile.readline(len(token) + 2).rstrip(b"\r\n"), token):
             return
         self.server.admit(self.request)
-        if not self.server.join(self):
+        if not self.server.subscribe(self):
             return
         try:
-            while not self._behind and (line := self._waiting.get()) is not None:
+            while not self._is_behind and (line := self._lines.get()) is not None:
                 self.wfile.write(line)
         finally:
-            self.server.leave(self)
+            self.server.unsubscribe(self)
 
 
-class Osc:
-    """Open Sound Control over UDP: /pad/touches, /pad/readings, /pad/pressed and /pad/health."""
+class OscOutput:
+    """Open Sound Control over UDP: /pad/touches, /pad/readings, /pad/pressed and /pad/health.
+
+    Args:
+        address: HOST:PORT to send to.
+
+    Raises:
+        InputError: no such address, or one that nothing can be sent to.
+        ModuleNotFoundError: python-osc is not installed.
+    """
 
     def __init__(self, address: str) -> None:
-        """Send to `address`, HOST:PORT.
-
-        Raises:
-            InputError: no such address, or one that nothing can be sent to.
-            ModuleNotFoundError: python-osc is not installed.
-        """
         from pythonosc.udp_client import SimpleUDPClient
 
         host, _, port = address.rpartition(":")
         if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
             raise InputError(f"--osc is {address!r}, expected HOST:PORT")
         try:
-            family, *_, there = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
+            family, *_, target = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
         except (OSError, UnicodeError) as error:
             raise InputError(f"--osc is {address!r}: no such host ({error})") from error
         try:
-            with socket.socket(family, socket.SOCK_DGRAM) as asking:
-                asking.connect(there)
+            with socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.connect(target)
         except OSError as error:
             raise InputError(f"--osc is {address!r}: nothing can be sent there ({error})") from error
-        # By its number: a name would be looked up for every message, and all wait for that.
-        self._client = SimpleUDPClient(str(there[0]), int(port), family=family)
+        # The numeric address: a name would be resolved for every message, and all outputs wait for that.
+        self._client = SimpleUDPClient(str(target[0]), int(port), family=family)
 
     def __enter__(self) -> Self:
         return self
@@ -295,85 +272,94 @@ class Osc:
     def __exit__(self, *error: object) -> None:
         self._client.close()
 
-    def tell(self, message: Message) -> None:
+    def send(self, message: Message) -> None:
         """Send one message."""
-        with suppress(OSError):  # nobody listens, or too slowly, or a cable is out: as UDP has it, that is lost
+        with contextlib.suppress(OSError):  # UDP: what nobody receives, or a cable that is out, is lost
             self._client.send_message(message.topic, _osc_values(message))
 
 
 def _osc_values(message: Message) -> list[Any]:
     pad = message.pad
     if message.topic == READINGS:
-        return [float("nan") if each is None else each for each in pad["volts"]]
+        return _with_nan(pad["volts"])
     if message.topic == TOUCHES:
-        return [pad[name] for name in PLACE]
+        return [pad[name] for name in TOUCH_UNITS]
     return [pad["pressed"]] if message.topic == PRESSED else list(pad["states"])
 
 
-class Lsl:
-    """Two streams of the Lab Streaming Layer: readings at their rate in V, and touches as they are found."""
+def _with_nan(volts: list[float | None]) -> list[float]:
+    return [float("nan") if value is None else value for value in volts]
+
+
+class LslOutput:
+    """Streams of the Lab Streaming Layer: "NAME readings" in V at their rate, and "NAME touches" as they come.
+
+    Args:
+        name: of the streams, which all the network can see.
+        fibres: number of channels of the readings.
+        rate_hz: readings per second.
+
+    Raises:
+        ModuleNotFoundError: pylsl is not installed.
+        InputError: `name` is no text.
+    """
 
     def __init__(self, name: str, fibres: int, rate_hz: float) -> None:
-        """Offer "NAME readings" and "NAME touches" to all who look for streams in this network.
-
-        Raises:
-            ModuleNotFoundError: pylsl is not installed.
-            InputError: a name that is no text.
-        """
         if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes of a command line that are no text
             raise InputError(f"the name of a stream is {short_repr(name)}, expected text")
         volts = {f"fibre {fibre}": "V" for fibre in range(1, fibres + 1)}
-        self._readings = _outlet(f"{name} readings", volts, rate_hz)
-        self._touches = _outlet(f"{name} touches", PLACE, 0.0)
+        self._readings = _open_outlet(f"{name} readings", volts, rate_hz)
+        self._touches = _open_outlet(f"{name} touches", TOUCH_UNITS, 0.0)
 
-    def tell(self, message: Message) -> None:
+    def send(self, message: Message) -> None:
         """Send one message, if it is of readings or of a touch."""
         if message.topic == READINGS:
-            self._readings.push_sample([float("nan") if each is None else each for each in message.pad["volts"]])
+            self._readings.push_sample(_with_nan(message.pad["volts"]))
         elif message.topic == TOUCHES:
-            self._touches.push_sample([float(message.pad[name]) for name in PLACE])
+            self._touches.push_sample([float(message.pad[name]) for name in TOUCH_UNITS])
 
 
-def _outlet(name: str, units: Mapping[str, str], rate_hz: float) -> Any:
-    """A stream whose channels have names and units; of no steady rate if it is 0."""
+def _open_outlet(name: str, units: Mapping[str, str], rate_hz: float) -> Any:
+    """Open a stream whose channels have names and units; rate 0 for an irregular one."""
     from pylsl import IRREGULAR_RATE, StreamInfo, StreamOutlet, cf_double64
 
     info = StreamInfo(name, "Tactile", len(units), rate_hz or IRREGULAR_RATE, cf_double64, f"padforge {name}")
-    listed = info.desc().append_child("channels")
+    channels = info.desc().append_child("channels")
     for label, unit in units.items():
-        listed.append_child("channel").append_child_value("label", label).append_child_value("unit", unit)
+        channels.append_child("channel").append_child_value("label", label).append_child_value("unit", unit)
     return StreamOutlet(info)
 
 
-_MOST_WORDS = 16
-"""That wait to be taken: a button may be hit again and again."""
-
-
 class LivePage(LocalPage):
-    """The page, served from `with` to its end."""
+    """A page of a pad that is pressed, served in the `with` block; it may send commands.
+
+    Args:
+        port: to listen on; 0 for any that is free.
+        page: file in `pages`.
+        commands: that the page may send, see `read_commands`.
+        host: address to listen on.
+        token: required from clients, see `LocalPage`.
+
+    Raises:
+        InputError: raised by `LocalPage`.
+    """
 
     def __init__(
-        self, port: int, page: str = "live.html", words: Collection[str] = (), *, host: str = HOST, token: str = ""
+        self, port: int, page: str = "live.html", commands: Collection[str] = (), *, host: str = HOST, token: str = ""
     ) -> None:
-        """Take `port`, or any that is free if 0.
-
-        Args:
-            page: file among `pages`. words: what the page may say, see `said`. host, token: see `LocalPage`.
-
-        Raises:
-            InputError: as `LocalPage`.
-        """
-        self._words, self._said = frozenset(words), queue.Queue[str](_MOST_WORDS)
+        self._allowed, self._commands = frozenset(commands), queue.Queue[str](MAX_COMMANDS)
         text = page_text("padforge.sense.live", f"pages/{page}", "pages/common.css", "pages/common.js")
-        super().__init__(port, text, {"/say": self._hear}, host=host, token=token)
+        super().__init__(port, text, {"/command": self._on_command}, host=host, token=token)
 
-    def said(self) -> list[str]:
-        """The words that the page has said since the last call, oldest first."""
-        return [self._said.get_nowait() for _ in range(self._said.qsize())]
+    def read_commands(self) -> list[str]:
+        """Return the commands that the page has sent since the last call, oldest first."""
+        return [self._commands.get_nowait() for _ in range(self._commands.qsize())]
 
-    def _hear(self, body: bytes) -> None:
-        word = body.decode("ascii", "replace")
-        if word not in self._words:
-            raise InputError("no word that was agreed on")
+    def _on_command(self, body: bytes) -> None:
+        command = body.decode("ascii", "replace")
+        if command not in self._allowed:
+            raise InputError(
+                f"command is {short_repr(command)}, allowed are {', '.join(sorted(self._allowed)) or 'none'}"
+            )
         with contextlib.suppress(queue.Full):
-            self._said.put_nowait(word)
+            self._commands.put_nowait(command)

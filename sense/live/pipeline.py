@@ -1,13 +1,13 @@
-"""From readings as they come to places as they are pressed: the pipeline behind `padforge sense live`.
+"""The pipeline behind `padforge sense live`: from readings as they arrive to the position of each press.
 
-Readings go in, in blocks of any size. Out comes what they bring to light: where each press was, first from the few
-readings that one localizer can do with, refined by others, and which fibres are bad. Those are left out from the next
-press on."""
+Blocks of readings of any size go in; events come out: the position of a press, first from the few readings that one
+localizer needs, refined by others that need more; and faulty fibres, which are masked from the next press on.
+"""
 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,28 +15,58 @@ from padforge.design.common.validation import InputError, check_float, check_int
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
 from padforge.sense.health.fault_detector import FaultDetector, FibreFault
 from padforge.sense.health.health_model import HealthModel
-from padforge.sense.localizer.features import REST, SIZES, ScaledFeatures, bridged, press_inputs
+from padforge.sense.health.trace_model import RELEASED
+from padforge.sense.localizer.features import (
+    DOWN,
+    EARLY,
+    MEDIAN,
+    REST,
+    SIZES,
+    UP,
+    ScaledFeatures,
+    bridged,
+    press_inputs,
+)
 from padforge.sense.localizer.model import MEASURED, LocalizerModel
 from padforge.sense.localizer.model_files import refuse_other_pad
-from padforge.sense.rig.streams import DONE, NEEDS, BufferedPress, Ring
+from padforge.sense.rig.streams import HISTORY, RingBuffer
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
-TRAIL = 12
-"""Presses that are kept to be shown."""
+MAX_SHOWN = 12
+"""Latest presses that are shown."""
+OPENING = DOWN[-1][1]
+"""Readings after `down_command` that features look at; of those until `up_command`, they look at no more."""
+READINGS_NEEDED = {
+    "onset": (DOWN[EARLY - 1][1], 0),
+    "causal": (OPENING, 0),
+    "published": (OPENING, 10 + MEDIAN // 2 + 1),
+    "press_and_release": (OPENING, UP[-1][1]),
+}
+"""Readings after `down_command`, and after `up_command`, that each kind of features needs."""
+RELEASE = max(UP[-1][1], RELEASED)
+"""Readings after `up_command` with which a press is complete."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Where a press was, by one localizer.
+    """The position of a press, estimated by one localizer.
 
     Attributes:
-        press: its number, counted from 0. time_s: of its touch, by the clock of the readings.
-        features: which the localizer takes. final: whether no other localizer will refine it.
-        x_mm, y_mm: place. sd_x_mm, sd_y_mm: standard deviations.
-        r50_mm, r90_mm: radius around the place that holds the press in 50 % and in 90 % of cases.
-        lost: fibres that were left out, by index.
-        depth_mm, force_n: how deep and hard it was, where that was learnt. depth_r90_mm, force_r90_n: how far beside
-            them 90 % of presses are at most.
+        press: index of the press, from 0.
+        time_s: of its touch, by the clock of the readings.
+        features: of the localizer.
+        final: whether no other localizer will refine it.
+        x_mm: position in x.
+        y_mm: position in y.
+        std_x_mm: standard deviation in x.
+        std_y_mm: standard deviation in y.
+        r50_mm: radius that holds the true position in 50 % of cases.
+        r90_mm: radius that holds the true position in 90 % of cases.
+        failed: indices of the fibres that were masked.
+        depth_mm: depth of the press; None where that was not learnt, as the three that follow.
+        depth_r90_mm: half width of its 90 % interval.
+        force_n: force of the press.
+        force_r90_n: half width of its 90 % interval.
     """
 
     press: int
@@ -45,18 +75,18 @@ class Estimate:
     final: bool
     x_mm: float
     y_mm: float
-    sd_x_mm: float
-    sd_y_mm: float
+    std_x_mm: float
+    std_y_mm: float
     r50_mm: float
     r90_mm: float
-    lost: tuple[int, ...]
+    failed: tuple[int, ...]
     depth_mm: float | None = None
     depth_r90_mm: float | None = None
     force_n: float | None = None
     force_r90_n: float | None = None
 
     @property
-    def measured(self) -> str:
+    def measures_text(self) -> str:
         """Depth and force, as far as they were learnt."""
         depth = "" if self.depth_mm is None else f", {self.depth_mm:.1f} ± {self.depth_r90_mm:.1f} mm deep"
         return depth + ("" if self.force_n is None else f", {self.force_n:.1f} ± {self.force_r90_n:.1f} N")
@@ -65,59 +95,120 @@ class Estimate:
     def text(self) -> str:
         """One line."""
         return (
-            f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, "
-            f"within {self.r50_mm:.1f} mm at 50 %, {self.r90_mm:.1f} mm at 90 %{self.measured} ({self.features})"
+            f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, within {self.r50_mm:.1f} mm at 50 %, "
+            f"{self.r90_mm:.1f} mm at 90 %{self.measures_text} ({self.features})"
         )
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """As JSON, without what was not learnt."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON, without what was not learnt."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 Event = Estimate | FibreFault
 
 
-class Live:
-    """Follows the readings of a pad. Memory is bounded, however long it runs and a press is held.
+class Excerpt(NamedTuple):
+    """Readings (n, C) V around a press, with the indices of its commands and of the end of the press before it."""
+
+    readings: Array
+    down_command: int
+    up_command: int
+    previous_end: int
+
+
+@dataclass
+class BufferedPress:
+    """The press under way; indices are those of readings in the stream.
 
     Attributes:
-        presses: the latest estimates, one for each of the last `TRAIL` presses, oldest first.
-        findings: all that was found of the fibres, oldest first.
+        number: of presses before it.
+        time_s: when the pad was touched.
+        touched: first reading that shows it.
+        down_command: first reading after the probe was sent down, or would have been.
+        previous_end: `up_command` of the press before, < `down_command`.
+        rest: (C,) V before it.
+        up_command: first reading after the probe was sent up; None while it is held.
+        n_estimates: number of localizers that have estimated its position.
+    """
+
+    number: int
+    time_s: float
+    touched: int
+    down_command: int
+    previous_end: int
+    rest: Array
+    up_command: int | None = None
+    n_estimates: int = 0
+    _opening: Array | None = None
+
+    def release(self, up_command: int) -> None:
+        """End the press, one reading after its begin at the earliest."""
+        self.up_command = max(up_command, self.down_command + 1)
+
+    def end_of(self, features: str) -> int | None:
+        """Return the index after the last reading that `features` need; None while that is not known."""
+        after_down, after_up = READINGS_NEEDED[features]
+        if after_up:
+            return None if self.up_command is None else self.up_command + after_up
+        end = self.down_command + after_down
+        return end if self.up_command is None else min(end, self.up_command)
+
+    def store_opening(self, buffer: RingBuffer) -> None:
+        """Copy the readings before it and its first ones once they have arrived: it may be held for hours."""
+        if self._opening is None and self.up_command is None and buffer.end >= self.down_command + OPENING:
+            self._opening = buffer.rows(self.down_command - HISTORY, self.down_command + OPENING)[:, 1:].copy()
+
+    def excerpt(self, buffer: RingBuffer, end: int) -> Excerpt:
+        """Return its readings before index `end`; of a long press without those that no features look at."""
+        up_command = end if self.up_command is None else min(self.up_command, end)
+        if self._opening is None or up_command <= self.down_command + OPENING:
+            readings = buffer.rows(self.down_command - HISTORY, end)[:, 1:]
+            down = len(readings) - (end - self.down_command)
+            up = down + up_command - self.down_command
+        else:
+            readings = np.concatenate([self._opening, buffer.rows(up_command, end)[:, 1:]])
+            up = len(self._opening)
+            down = up - OPENING
+        return Excerpt(readings, down, up, max(down - (self.down_command - self.previous_end), 0))
+
+
+class Live:
+    """Follow the readings of a pad. Memory is bounded, however long it runs and a press is held.
+
+    Args:
+        localizers: of the pad, at least one; the one that needs the fewest readings answers first.
+        health: of the pad; None to look for no faults.
+        fibres: number of fibres that are read.
+        rate_hz: readings per second.
+
+    Attributes:
+        presses: the latest estimate of each of the last presses, oldest first.
+        faults: all faults so far, oldest first.
+
+    Raises:
+        InputError: no localizer, or a model of a pad with other fibres or of another rate.
     """
 
     def __init__(
         self, localizers: Sequence[LocalizerModel], health: HealthModel | None, fibres: int, rate_hz: float
     ) -> None:
-        """Get ready for readings of so many fibres, `rate_hz` a second.
-
-        Args:
-            localizers: of that pad, at least one; the one that needs the fewest readings answers first.
-            health: of that pad; without it no fibre is found bad.
-
-        Raises:
-            InputError: there is none, or one was learnt from other fibres, or at another rate.
-        """
-        fibres, rate_hz = (
-            check_int("fibres", fibres, 1, MAX_FIBRES),
-            check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ),
-        )
+        fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
+        rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
         if not isinstance(localizers, Sequence) or not localizers:
             raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
+        for model in localizers:
+            refuse_other_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
         self._monitor = None if health is None else FaultDetector(health)
-        models = [check_type("localizers", each, LocalizerModel) for each in localizers]
-        for model in models:
-            refuse_other_pad(model, "the localizer", fibres, rate_hz)
         if health is not None:
             refuse_other_pad(health, "health", fibres, rate_hz)
-        self._localizers = sorted(localizers, key=lambda each: NEEDS[each.features][::-1])
-        self._usual = _usual(self._localizers[-1])
-        self._finder = PressDetector(fibres)
-        self._ring = Ring(1 + fibres)
+        self._localizers = sorted(localizers, key=lambda model: READINGS_NEEDED[model.features][::-1])
+        self._response_v = _typical_response(self._localizers[-1])
+        self._detector = PressDetector(fibres)
+        self._buffer = RingBuffer(1 + fibres)  # times, then volts
         self._press: BufferedPress | None = None
-        self._count = self._free = 0
-        self.presses: deque[Estimate] = deque(maxlen=TRAIL)
-        self.findings: list[FibreFault] = []
+        self._n_presses = self._previous_end = 0
+        self.presses: deque[Estimate] = deque(maxlen=MAX_SHOWN)
+        self.faults: list[FibreFault] = []
 
     @property
     def pressed(self) -> bool:
@@ -125,42 +216,46 @@ class Live:
         return self._press is not None and self._press.up_command is None
 
     @property
-    def lost(self) -> tuple[int, ...]:
-        """Fibres that are left out, by index."""
+    def failed(self) -> tuple[int, ...]:
+        """Indices of the fibres that are masked."""
         return () if self._monitor is None else self._monitor.lost
 
     def feed(self, times_s: Array, readings: Array) -> list[Event]:
-        """Take readings; what they bring to light does not depend on how they are cut into blocks.
+        """Process readings. The events do not depend on how readings are cut into blocks.
 
         Args:
-            times_s: (n,) ascending, s. readings: (n, C) volts, NaN where missing.
+            times_s: (n,) ascending, s.
+            readings: (n, C) V, NaN where missing.
 
         Returns:
-            Estimates and findings, in the order in which they were made.
+            Estimates and faults in the order in which they were made.
 
         Raises:
-            InputError: as `limits.stream_of`, or times before those that were fed last.
+            InputError: arrays that `stream_of` refuses, or times that do not follow those of the last block.
         """
         events: list[Event] = []
-        times, rows = stream_of(times_s, readings, len(self._usual))
-        if len(times) and self._ring.end and not times[0] > self._ring.rows(self._ring.end - 1, self._ring.end)[0, 0]:
+        times, rows = stream_of(times_s, readings, len(self._response_v))
+        end = self._buffer.end
+        if len(times) and end and not times[0] > self._buffer.rows(end - 1, end)[0, 0]:
             raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
         for row in np.column_stack([times, rows]):
-            self._ring.append(row)
-            for change in self._finder.feed(row[:1], row[None, 1:]):
-                if change.down:
-                    events += self._begin(change.reading)
+            self._buffer.append(row)
+            for event in self._detector.feed(row[:1], row[None, 1:]):
+                if event.down:
+                    events += self._begin(event.reading)
                 elif self._press is not None:
-                    self._press.let_go(max(self._ring.sent(change.reading, SENT_UP_S), self._press.touched))
+                    command = self._buffer.command_index(event.reading, SENT_UP_S)
+                    self._press.release(max(command, self._press.touched))
             events += self._advance()
         return events
 
     def view(self) -> dict[str, Any]:
-        """What there is to show now, as JSON.
+        """Return the state of the pad as JSON.
 
         Returns:
-            "pressed"; "fibres", for each its "swing" (from its rest, as a share of the usual; None where there is no
-            reading) and "state"; "presses", see `Estimate.document`, "measured" and "text"; "findings", a line each.
+            "pressed"; "fibres", for each its "swing" (deviation from its rest in units of its typical response, None
+            without a reading) and "state"; "presses": `Estimate.to_dict` with "measures_text" and "text"; "faults":
+            a line each.
         """
         swings = self._swings()
         states = self._states(np.isnan(swings))
@@ -170,97 +265,100 @@ class Live:
                 {"swing": None if np.isnan(swing) else round(swing, 3), "state": state}
                 for swing, state in zip(swings.tolist(), states, strict=True)
             ],
-            "presses": [press.document | {"measured": press.measured, "text": press.text} for press in self.presses],
-            "findings": [finding.text for finding in self.findings],
+            "presses": [
+                press.to_dict() | {"measures_text": press.measures_text, "text": press.text} for press in self.presses
+            ],
+            "faults": [fault.text for fault in self.faults],
         }
 
     def _swings(self) -> Array:
-        """(C,) how far each fibre is from its rest, as a share of the usual; NaN where there is no reading."""
-        end = self._ring.end
+        end = self._buffer.end
         if end == 0:
-            return np.full(len(self._usual), np.nan)
+            return np.full(len(self._response_v), np.nan)
         rest = self._rest(end) if self._press is None else self._press.rest
-        return (self._ring.rows(end - 1, end)[0, 1:] - rest) / self._usual
+        return (self._buffer.rows(end - 1, end)[0, 1:] - rest) / self._response_v
 
     def _states(self, missing: Mask) -> list[str]:
-        kinds = {fibre: finding.kind for finding in self.findings for fibre in finding.fibres}
-        usual = "unwatched" if self._monitor is None else "sound"
+        kinds = {fibre: fault.kind for fault in self.faults for fibre in fault.fibres}
+        healthy = "unmonitored" if self._monitor is None else "sound"
         return [
-            kinds.get(fibre, "dead") if fibre in self.lost else "missing" if gone else usual
-            for fibre, gone in enumerate(missing)
+            kinds.get(fibre, "dead") if fibre in self.failed else "missing" if is_missing else healthy
+            for fibre, is_missing in enumerate(missing)
         ]
 
-    def _rest(self, at: int) -> Array:
-        """(C,) V, mean of the readings just before index `at`."""
-        return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
+    def _rest(self, index: int) -> Array:
+        """(C,) V, mean of the readings just before `index`."""
+        return bridged(self._buffer.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
 
     def _begin(self, touched: int) -> list[Event]:
-        """The pad is touched; what was still to come of the press before comes now."""
-        down_command = self._ring.sent(touched, SENT_DOWN_S)
+        """Begin a press, after the press before has given all that is still to come of it."""
+        down_command = self._buffer.command_index(touched, SENT_DOWN_S)
         events = self._advance(down_command)
-        down_command = max(down_command, self._free + 1)
-        time_s = float(self._ring.rows(touched, touched + 1)[0, 0])
-        self._press = BufferedPress(self._count, time_s, touched, down_command, self._free, self._rest(down_command))
-        self._count += 1
+        down_command = max(down_command, self._previous_end + 1)
+        time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])
+        rest = self._rest(down_command)
+        self._press = BufferedPress(self._n_presses, time_s, touched, down_command, self._previous_end, rest)
+        self._n_presses += 1
         return events
 
-    def _advance(self, over: int | None = None) -> list[Event]:
-        """Do with the press under way what the readings allow, or all there is to do if it was over at index `over`."""
-        press, now = self._press, self._ring.end
+    def _advance(self, cut: int | None = None) -> list[Event]:
+        """Return the events that the readings so far allow, or all of a press that the next one cuts off at `cut`."""
+        press, now = self._press, self._buffer.end
         if press is None:
             return []
-        if over is not None:
-            now = max(over, press.down_command + 1)
+        if cut is not None:
+            now = max(cut, press.down_command + 1)
             if press.up_command is None:
-                press.let_go(over)
-        press.keep_opening(self._ring)
+                press.release(cut)
+        press.store_opening(self._buffer)
         events: list[Event] = []
-        for localizer in self._localizers[press.told :]:
-            enough = press.enough(localizer.features)
-            if enough is None or (enough > now and over is None):
+        for localizer in self._localizers[press.n_estimates :]:
+            end = press.end_of(localizer.features)
+            if end is None or (end > now and cut is None):
                 break
-            press.told += 1
-            events.append(self._estimate(press, localizer, min(enough, now)))
-        if press.up_command is not None and (now >= press.up_command + DONE or over is not None):
-            events += self._judge(press, min(press.up_command + DONE, now))
-            self._free, self._press = press.up_command, None
+            press.n_estimates += 1
+            events.append(self._estimate(press, localizer, min(end, now)))
+        if press.up_command is not None and (now >= press.up_command + RELEASE or cut is not None):
+            events += self._check_fibres(press, min(press.up_command + RELEASE, now))
+            self._previous_end, self._press = press.up_command, None
         return events
 
     def _estimate(self, press: BufferedPress, localizer: LocalizerModel, end: int) -> Estimate:
-        readings, down_command, up_command, free = press.excerpt(self._ring, end)
-        # The press before stands in by its end alone: the rest of this one reaches back no further.
-        begins, ends = ([free - 1, down_command], [free, up_command]) if free > 0 else ([down_command], [up_command])
-        raw = press_inputs(readings, np.array(begins), np.array(ends), localizer.features)[-1:]
-        presses = localizer.scaler.inputs(raw)
-        fibre_mask = presses.fibre_mask.copy()
-        fibre_mask[:, list(self.lost)] = False
-        found = localizer.predict_features(ScaledFeatures(presses.inputs, fibre_mask))
-        numbers = np.concatenate([found.positions_mm[0], found.std_mm[0], found.r50_mm, found.r90_mm]).tolist()
-        final, lost = localizer is self._localizers[-1], tuple(np.flatnonzero(~fibre_mask[0]).tolist())
-        measured = {
+        readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)
+        downs, ups = [down_command], [up_command]
+        if previous_end > 0:  # a stand-in for the press before, so that the rest of this one reaches back no further
+            downs, ups = [previous_end - 1, *downs], [previous_end, *ups]
+        features = press_inputs(readings, np.array(downs), np.array(ups), localizer.features)[-1:]
+        scaled = localizer.scaler.inputs(features)
+        fibre_mask = scaled.fibre_mask.copy()
+        fibre_mask[:, list(self.failed)] = False
+        result = localizer.predict_features(ScaledFeatures(scaled.inputs, fibre_mask))
+        numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
+        measures = {
             column: float(values[0])
-            for name, each in found.measures.items()
-            for column, values in zip(MEASURED[name], (each.values, each.r90), strict=True)
+            for name, measure in result.measures.items()
+            for column, values in zip(MEASURED[name], (measure.values, measure.r90), strict=True)
         }
-        estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, lost=lost, **measured)
+        final, failed = localizer is self._localizers[-1], tuple(np.flatnonzero(~fibre_mask[0]).tolist())
+        estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, failed=failed, **measures)
         if self.presses and self.presses[-1].press == press.number:
             self.presses.pop()
         self.presses.append(estimate)
         return estimate
 
-    def _judge(self, press: BufferedPress, end: int) -> list[FibreFault]:
-        """What a press that is over says of the fibres."""
+    def _check_fibres(self, press: BufferedPress, end: int) -> list[FibreFault]:
+        """Return the faults that a complete press brings to light."""
         if self._monitor is None:
             return []
-        readings, down_command, up_command, free = press.excerpt(self._ring, end)
-        first = max(down_command + REST[0], free)
-        findings = self._monitor.update(readings[first:], down_command - first, up_command - first)
-        self.findings += findings
-        return findings
+        readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)
+        first = max(down_command + REST[0], previous_end)
+        faults = self._monitor.update(readings[first:], down_command - first, up_command - first)
+        self.faults += faults
+        return faults
 
 
-def _usual(localizer: LocalizerModel) -> Array:
-    """(C,) V, what a fibre's answer to a press goes up to."""
-    scaling, windows = localizer.scaler, SIZES[localizer.features]
-    usual = (np.abs(scaling.centre) + 2 * scaling.spread)[:, :windows].max(axis=1)
-    return np.where(usual > 0, usual, 1.0)
+def _typical_response(localizer: LocalizerModel) -> Array:
+    """(C,) V that the response of each fibre to a press goes up to."""
+    scaler, n_windows = localizer.scaler, SIZES[localizer.features]
+    response = (np.abs(scaler.centre) + 2 * scaler.spread)[:, :n_windows].max(axis=1)
+    return np.where(response > 0, response, 1.0)

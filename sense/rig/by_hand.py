@@ -30,7 +30,7 @@ from padforge.sense.rig.by_hand_presses import (
 )
 from padforge.sense.rig.config import RigConfig, open_recorder, read_source
 from padforge.sense.rig.devices import Board, RigFault
-from padforge.sense.rig.streams import HISTORY, SLACK, Ring, connected
+from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
 KIND = "hand"  # of the source of such a recording, whose depths are unknown
@@ -143,7 +143,7 @@ class HandSession:
         self._first = recorder.n_readings  # of this session, in the recording; other indices count from it
         self._number = max(recorder.done, default=-1) + 1
         self._sequence = PressSequence(targets_mm, hold_s, self._start_s)
-        self._ring, self._now_s = Ring(1 + n_fibres), self._start_s
+        self._ring, self._now_s = RingBuffer(1 + n_fibres), self._start_s
         self._detector: PressDetector | None = PressDetector(n_fibres)  # None while it is not to be believed
         self._detector_start, self._validator = 0, PressValidator()
         self._touched = self._down_command = self._released = 0
@@ -199,14 +199,14 @@ class HandSession:
     def _touch(self, touched: int) -> None:
         target = self._sequence.touch(self._time_s(touched))
         self._touched = touched
-        self._down_command = max(self._ring.sent(touched, SENT_DOWN_S), self._released + 1)
+        self._down_command = max(self._ring.command_index(touched, SENT_DOWN_S), self._released + 1)
         self._baseline = self._mean_before(self._down_command)
         self._rejected_mm = None
         self._recorder.begin(target or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
 
     def _release(self, released: int) -> None:
-        up_command = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
+        up_command = max(self._ring.command_index(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
         target, rejection = self._sequence.target, self._sequence.release(self._time_s(released))
         responses = self._responses(up_command)
         rejection = rejection or self._validator.rejection(responses)
@@ -348,13 +348,13 @@ def record_by_hand(
     if not resume:
         check_new_recording(config.out)
     rig = config.rig
-    source = connected(board, rig.rate_hz)
-    recorder, targets_mm, remaining_mm = open_recorder_by_hand(config, source.converter, resume)
+    stream = stream_board(board, rig.rate_hz)
+    recorder, targets_mm, remaining_mm = open_recorder_by_hand(config, stream.board, resume)
     with recorder:
-        hold_s = rig.readings_per_press / 2 / source.rate_hz
+        hold_s = rig.readings_per_press / 2 / stream.rate_hz
         n_done = len(targets_mm) - len(remaining_mm)
-        session = HandSession(recorder, source.fibres, remaining_mm, hold_s, n_done)
-        session.run(source.blocks, on_view, poll_commands)
+        session = HandSession(recorder, stream.fibres, remaining_mm, hold_s, n_done)
+        session.run(stream.blocks, on_view, poll_commands)
     return Recording.open(config.out)
 
 

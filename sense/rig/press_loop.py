@@ -225,7 +225,7 @@ class PressLoop:
         up_s = self._clock()
         self._move(above, self._rig.press_mm_s)
         self._await_reading(up_s)
-        reached["lost"] = self._averager.lost
+        reached["lost"] = self._averager.n_missing
         self._disk.submit(self._recorder.finish, self._reading_after(up_s), **reached)
         self._disk.submit(self._recorder.sync)
         self._await_still()

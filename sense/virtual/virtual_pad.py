@@ -3,15 +3,21 @@
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from padforge.design import Contact, Morphology, signals
+from padforge.design.common.files import read_json
+from padforge.design.common.settings import validate
+from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import make_plan
+from padforge.sense.recording.run_directory import FORMAT, START
 from padforge.sense.rig.devices import BoardSamples, RigFault
+from padforge.sense.rig.streams import RECORDED
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
 from padforge.sense.simulation.simulated_recording import random_places
@@ -75,3 +81,35 @@ class SimulatedConverter:
             self._press, self._place_mm = press, random_places(self._pad, 1, self._finger, self._size)[0]
         down = min((within_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - within_s) / TRAVEL_S)
         return self._place_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(down, 0.0)
+
+
+def virtual_pad_of(model: Path) -> SimulatedConverter:
+    """Return the simulated pad whose recording a model was trained on.
+
+    Args:
+        model: folder of the model.
+
+    Raises:
+        InputError: the recording is not in the folder, or not of a simulated pad.
+    """
+    path = model / RECORDED / START
+    if not path.is_file():
+        raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")
+    source = read_json(path, FORMAT).get("source")
+    if not isinstance(source, dict) or source.get("kind") != "simulated":
+        raise InputError(f"{path}: of no simulated pad, but --rig simulated needs one; --replay shows a recording")
+    if "twin" in source:
+        raise InputError(f"{path}: of a pad simulated by its twin, which is not live; --replay shows a recording")
+    try:
+        pad = Morphology.from_dict(source["morphology"])
+        contact, rig = dict(source["contact"]), dict(source["rig"])
+        rig.pop("channels", None)  # a simulated pad has no inputs of a board
+        size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
+    return SimulatedConverter(
+        pad,
+        validate(RigSettings, rig, f"{path}: rig"),
+        validate(Contact, contact, f"{path}: contact"),
+        size=validate(PadSettings, {**pad.layout.settings, **size}, f"{path}: pad"),
+    )

@@ -1,15 +1,14 @@
-// What the pages of a pad that is pressed share: presses, and the fibres' bars.
-// Earlier presses fade.
-function trailParts(view, before) {
+// Shared by the pages of a pad that is pressed: earlier presses, which fade, and the fibres' bars.
+function trailElements(view, before) {
   const {x, y} = frame(view)
   return before.map((press, index) => svgElement("circle", {
     class: "trail", cx: x(press.x_mm), cy: y(press.y_mm), r: 4, "fill-opacity": (index + 1) / (before.length + 1) * .8,
   }))
 }
 
-function tellFibres(view) {
+function showFibres(view) {
   byId("fibres").replaceChildren(...view.fibres.map((fibre, index) => {
-    const bad = !["", "sound", "unwatched"].includes(fibre.state)
+    const bad = !["", "sound", "unmonitored"].includes(fibre.state)
     const row = htmlElement("div", `fibre ${bad ? "bad" : fibre.state}`, "")
     const bar = svgElement("svg", {class: "bar", viewBox: "-1 0 2 1", preserveAspectRatio: "none", "aria-hidden": "true"})
     const swing = Math.max(-1, Math.min(1, fibre.swing ?? 0))

@@ -11,11 +11,11 @@ import pytest
 
 from padforge.sense import Recording
 from padforge.sense.cli.live import view_lines
-from padforge.sense.live import outputs as messages
+from padforge.sense.live import outputs
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.virtual import virtual_pad as live_pad
+from padforge.sense.virtual import virtual_pad
 from tests.sense.live.conftest import first_presses
 
 
@@ -41,7 +41,7 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 
 def test_a_recording_is_shown(replay, views: list[dict]) -> None:
     code, out, err = replay("--json")
-    assert code == 0
+    assert code == 0, err
     assert "http://127.0.0.1:" in err
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
@@ -51,7 +51,7 @@ def test_a_recording_is_shown(replay, views: list[dict]) -> None:
     assert {view["mirrored"] for view in views} == {True}
     assert [view["ended"] for view in views][-2:] == ["", "ended"]
     code, plain, _ = replay()
-    assert code == 0
+    assert code == 0, err
     first = told[0]
     assert plain.splitlines()[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
     assert len(plain.splitlines()) == len(told)
@@ -60,7 +60,7 @@ def test_a_recording_is_shown(replay, views: list[dict]) -> None:
 def test_other_programs_are_told_what_they_ask_for(replay) -> None:
     token = "a word of sixteen"
     code, _, err = replay("--tcp", "0", "--osc", "127.0.0.1:9", "--host", "127.0.0.1", "--token", token)
-    assert code == 0
+    assert code == 0, err
     assert re.search(r"^page: http://127\.0\.0\.1:\d+/\?token=a\+word\+of\+sixteen ", err, re.MULTILINE)
     assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)
 
@@ -80,8 +80,8 @@ def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch,
     recording = Recording.open(model / "recording")
     source = {**recording.source, "rig": {**recording.source["rig"], "mirrored": True}}
     replace(recording, source=source).save("mine/recording", {})
-    monkeypatch.setattr(live_pad, "SimulatedConverter", lambda *pad, **size: board)
-    monkeypatch.setattr(messages, "Messages", told)
+    monkeypatch.setattr(virtual_pad, "SimulatedConverter", lambda *pad, **size: board)
+    monkeypatch.setattr(outputs, "MessageBuilder", told)
     ended, out, err = padforge_sense("live", "--port", "0", "--model", "mine", "--json")
     assert (ended, out) == (code, "")
     assert said in err.splitlines()[-1]
@@ -93,7 +93,7 @@ def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch,
 def test_a_terminal_shows_fibres_by_their_numbers() -> None:
     """From 1, as the page does, and faults are told."""
     fibres = [{"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (None, "dead"))]
-    lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "findings": ["fibre 2 was dead"]})
+    lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "faults": ["fibre 2 was dead"]})
     assert lines[:2] == ["waiting for a press", "no press yet"]
     assert [line.split()[:2] for line in lines[2:4]] == [["fibre", "1"], ["fibre", "2"]]
     assert lines[4] == "fibre 2 was dead"

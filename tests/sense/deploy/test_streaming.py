@@ -1,95 +1,114 @@
-"""The twin of the C header: windows as the features have them, averages as they are defined, touches where they are."""
+"""The Python twin of the C header: features as the localizer has them, averages as defined, touches as commanded."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from padforge.sense import Recording
-from padforge.sense import arrays as limits
-from padforge.sense.deploy import streaming as press_stream
-from padforge.sense.deploy.streaming import POLES, Detector, commanded, held, owners, seen
-from padforge.sense.localizer import features
+from padforge.sense.deploy.streaming import (
+    CODE_BYTES,
+    HIDDEN_STEP,
+    MAX_PRESS,
+    N_REST,
+    PRESS,
+    TIME_CONSTANTS,
+    MemoryBudget,
+    ThresholdDetector,
+    commanded_features,
+    commanded_presses,
+    match_presses,
+    max_hidden,
+    state_bytes,
+    stream_presses,
+    table_bytes,
+)
+from padforge.sense.localizer.features import compute_features
 
 
 @pytest.fixture
-def nothing() -> Detector:
-    return Detector(np.full(4, np.inf), np.inf, 0)
+def unused() -> ThresholdDetector:
+    return ThresholdDetector(np.full(4, np.inf), np.inf, 0)
 
 
-def test_presses_are_seen_as_commanded_with_the_windows_of_the_features(recording, nothing) -> None:
-    found = seen(recording.readings, nothing, held(recording))
-    assert np.array_equal(found.down_command, recording.down_command)
-    assert np.array_equal(found.ended, recording.up_command)
-    assert np.array_equal(found.told, recording.down_command + press_stream.SEEN - 1)
-    assert found.inputs.fibre_mask.all()
-    assert (press_stream.WINDOWS, press_stream.MOST_V) == (features.DOWN, limits.MAX_VOLTS)
-    assert features.REST == (-press_stream.REST, 0)
-    expected = features.window_inputs(recording.readings, recording.down_command, recording.up_command, release=False)
-    np.testing.assert_allclose(commanded(recording).windows, expected, atol=2e-6)
+def test_stream_presses_as_commanded_gives_the_windows_of_causal_features(recording, unused) -> None:
+    presses = stream_presses(recording.readings, unused, commanded_presses(recording))
+    assert np.array_equal(presses.down_command, recording.down_command)
+    assert np.array_equal(presses.ended, recording.up_command)
+    assert np.array_equal(presses.estimated, recording.down_command + PRESS - 1)
+    assert presses.features.fibre_mask.all()
+    expected = compute_features(recording.readings, recording.down_command, recording.up_command, "causal")
+    np.testing.assert_allclose(commanded_features(recording).windows, expected.windows, atol=2e-6)
 
 
-def test_history_is_what_averages_were_when_the_press_began(recording: Recording, nothing: Detector) -> None:
-    found = seen(recording.readings, nothing, held(recording))
-    levels = np.repeat(recording.readings[:1, :, None], len(POLES), axis=2)[0]
+def test_history_is_the_averages_at_the_begin_of_the_press(recording: Recording, unused: ThresholdDetector) -> None:
+    presses = stream_presses(recording.readings, unused, commanded_presses(recording))
+    levels = np.repeat(recording.readings[:1, :, None], len(TIME_CONSTANTS), axis=2)[0]
     press = 0
     for n, row in enumerate(recording.readings[: recording.down_command[20]]):
-        if n == found.down_command[press]:
-            rest = recording.readings[n - press_stream.REST : n].mean(axis=0)
-            np.testing.assert_allclose(found.inputs.history[press], levels - rest[:, None], atol=1e-5)
+        if n == presses.down_command[press]:
+            rest = recording.readings[n - N_REST : n].mean(axis=0)
+            np.testing.assert_allclose(presses.features.history[press], levels - rest[:, None], atol=1e-5)
             press += 1
-        levels += (row[:, None] - levels) / np.array(POLES)
+        levels += (row[:, None] - levels) / np.array(TIME_CONSTANTS)
     assert press == 20
 
 
-def test_short_presses_and_such_without_a_pause_are_seen(recording: Recording, nothing: Detector) -> None:
+def test_stream_presses_handles_short_presses_without_pauses(recording: Recording, unused: ThresholdDetector) -> None:
     pressed = np.zeros(200, bool)
     for first, end in ((0, 3), (5, 6), (7, 8), (40, 90), (91, 92)):
         pressed[first:end] = True
-    found = seen(recording.readings[:200], nothing, pressed)
-    assert found.down_command.tolist() == [1, 5, 7, 40, 91]
-    assert found.ended.tolist() == [3, 6, 8, 90, 92]
-    assert found.told.tolist() == [3, 6, 8, 59, 92]
-    assert np.isfinite(found.inputs.windows).all()
+    presses = stream_presses(recording.readings[:200], unused, pressed)
+    assert presses.down_command.tolist() == [1, 5, 7, 40, 91]
+    assert presses.ended.tolist() == [3, 6, 8, 90, 92]
+    assert presses.estimated.tolist() == [3, 6, 8, 59, 92]
+    assert np.isfinite(presses.features.windows).all()
     pressed[150:] = True
-    assert seen(recording.readings[:200], nothing, pressed).ended[-1] == 200
+    assert stream_presses(recording.readings[:200], unused, pressed).ended[-1] == 200
 
 
-def test_the_detector_finds_what_it_never_training_recording_sha256(recording: Recording) -> None:
-    found = seen(recording.readings, Detector.fit(recording, np.arange(0, 200)))
-    press = owners(recording, found.down_command)
+def test_threshold_detector_detects_presses_not_fitted_to(recording: Recording) -> None:
+    presses = stream_presses(recording.readings, ThresholdDetector.fit(recording, np.arange(0, 200)))
+    press = match_presses(recording, presses.down_command)
     assert np.isin(np.arange(200, 300), press).all()
     assert (press >= 0).all()
-    assert np.abs(found.down_command - recording.down_command[press]).max() <= 2
-    assert np.abs(found.ended[:-1] - recording.up_command[press[:-1]]).max() <= 5  # the simulated pad takes its time
+    assert np.abs(presses.down_command - recording.down_command[press]).max() <= 2
+    # The simulated pad takes its time.
+    assert np.abs(presses.ended[:-1] - recording.up_command[press[:-1]]).max() <= 5
 
 
-def test_a_fibre_that_tells_nothing_is_no_noise(recording: Recording) -> None:
+def test_threshold_detector_ignores_dead_fibres(recording: Recording) -> None:
     readings = np.array(recording.readings)
     readings[:, 1], readings[:, 2] = 1.5, np.nan
-    dead = Recording(readings, recording.times_s, recording.presses_mm, recording.down_command, recording.up_command)
-    detector = Detector.fit(dead, np.arange(300))
+    detector = ThresholdDetector.fit(replace(recording, readings=readings), np.arange(300))
     assert np.isinf(detector.noise_v[[1, 2]]).all()
-    assert len(seen(readings, detector).down_command) >= 280
+    assert len(stream_presses(readings, detector).down_command) >= 280
 
 
-def test_what_lasts_too_long_is_the_new_rest(recording: Recording) -> None:
-    """A fibre breaks while the pad is free: what follows is found again after that."""
+def test_threshold_detector_takes_a_long_press_for_a_new_rest(recording: Recording) -> None:
+    """A fibre breaks while the pad is free; presses are detected again after that."""
     readings = np.array(recording.readings)
     readings[2012:, 0] = 0.0
-    found = seen(readings, Detector.fit(recording, np.arange(300)))
-    long = np.flatnonzero(found.ended - found.down_command > press_stream.LONGEST)
+    presses = stream_presses(readings, ThresholdDetector.fit(recording, np.arange(300)))
+    long = np.flatnonzero(presses.ended - presses.down_command > MAX_PRESS)
     assert len(long) == 1
-    assert found.ended[long[0]] < recording.down_command[100]
-    assert np.isin(np.arange(150, 300), owners(recording, found.down_command)).mean() > 0.9
+    assert presses.ended[long[0]] < recording.down_command[100]
+    assert np.isin(np.arange(150, 300), match_presses(recording, presses.down_command)).mean() > 0.9
 
 
-def test_the_first_of_several_in_a_press_is_it(recording: Recording) -> None:
-    first = recording.down_command[0]
-    down_command = [
-        first - 5,
-        first - 1,
-        first + 3,
-        recording.up_command[0] + 2,
-        recording.down_command[1],
-        recording.up_command[2],
-    ]
-    assert owners(recording, np.array(down_command)).tolist() == [-1, 0, -1, -1, 1, -3]
+def test_match_presses_takes_the_first_detection(recording: Recording) -> None:
+    down, up = recording.down_command, recording.up_command
+    detected = [down[0] - 5, down[0] - 1, down[0] + 3, up[0] + 2, down[1], up[2]]
+    assert match_presses(recording, np.array(detected)).tolist() == [-1, 0, -1, -1, 1, -3]
+
+
+@pytest.mark.parametrize("quantized", [False, True])
+@pytest.mark.parametrize(("flash", "ram"), [(20_000, 65_536), (262_144, 2_000), (150_000, 8_192)])
+def test_max_hidden_is_the_largest_within_the_budget(flash: int, ram: int, quantized: bool) -> None:
+    hidden = max_hidden(6, 0, 4, MemoryBudget(flash, ram, quantized))
+
+    def fits(hidden: int) -> bool:
+        return CODE_BYTES + table_bytes(6, 0, 4, hidden, quantized) <= flash and state_bytes(6, 0, hidden) <= ram
+
+    assert fits(hidden)
+    assert not fits(hidden + HIDDEN_STEP)

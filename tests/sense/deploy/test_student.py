@@ -1,4 +1,4 @@
-"""The student: nearly as good as its teacher, never taught what it is tested on, and as small as it must be."""
+"""The student is nearly as accurate as its teacher, and never trained on its test presses."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,105 +8,98 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import LocalizerSettings, Recording, calibrate
-from padforge.sense.deploy import student as students
-from padforge.sense.deploy.streaming import CODE, STEP, Budget, state_bytes, table_bytes, widest
-from padforge.sense.deploy.student import Student, as_int8, examine, split, teach
+from padforge.sense.deploy.streaming import MemoryBudget
+from padforge.sense.deploy.student import (
+    MAX_INT8,
+    StudentNetwork,
+    distill,
+    evaluate_student,
+    quantize,
+    split_student_presses,
+)
 from padforge.sense.formats.import_export import open_recording
 from padforge.sense.localizer import training as trainings
 from padforge.sense.localizer.model import LocalizerModel
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
 
-MOST_WORSE = 1.25
+MAX_RATIO = 1.25
 
 
-def test_it_is_nearly_as_good_as_its_teacher(taught: Student, recording: Recording, localizer: LocalizerModel) -> None:
-    _, test = split(recording, localizer, QUICK)
+def test_student_is_nearly_as_accurate_as_its_teacher(
+    student: StudentNetwork, recording: Recording, localizer: LocalizerModel
+) -> None:
+    _, test = split_student_presses(recording, localizer, QUICK)
     assert set(test.tolist()) == set(localizer.test)
-    found = examine(taught, [localizer], recording, test)
-    header, teacher = found["errors"]["header"], found["errors"]["press_and_release"]
-    assert header[0]["mean_mm"] < MOST_WORSE * teacher[0]["mean_mm"]
+    evaluation = evaluate_student(student, [localizer], recording, test)
+    header, teacher = evaluation["errors"]["header"], evaluation["errors"]["press_and_release"]
+    assert header[0]["mean_mm"] < MAX_RATIO * teacher[0]["mean_mm"]
     assert [row["n_failed"] for row in header] == [0, 1, 2, 3]
     assert all(0.75 < row["within_r90"] < 1 for row in header)
-    assert (found["found"], found["false"]) == (len(test), 0)
-    assert found["predicted_mm"] < MOST_WORSE * teacher[0]["mean_mm"]
+    assert (evaluation["n_detected"], evaluation["n_false"]) == (len(test), 0)
+    assert evaluation["detected_mean_mm"] < MAX_RATIO * teacher[0]["mean_mm"]
 
 
 @pytest.mark.slow
-def test_it_is_nearly_as_good_as_a_causal_localizer_on_the_published_recording(published: Path) -> None:
-    """Of 64 KiB of RAM, after a training of the same length."""
+def test_student_is_nearly_as_accurate_as_a_causal_localizer_on_the_published_recording(published: Path) -> None:
+    """With 64 KiB of RAM, after a training of the same length."""
     recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 1200)
     options = LocalizerSettings(members=1, hidden=96, layers=3, epochs=40, batch=128, features="causal", max_failures=1)
     localizer, _ = calibrate(recording, options)
-    training, test = split(recording, localizer, options)
-    student = teach(recording, localizer, training, Budget(150_000, 65_536), options)
-    found = examine(student, [localizer], recording, test)
-    assert found["errors"]["header"][0]["mean_mm"] <= MOST_WORSE * found["errors"]["causal"][0]["mean_mm"]
-    assert found["found"] >= 0.95 * len(test)
-    assert found["false"] <= 0.03 * len(test)
+    training, test = split_student_presses(recording, localizer, options)
+    student = distill(recording, localizer, training, MemoryBudget(150_000, 65_536), options)
+    evaluation = evaluate_student(student, [localizer], recording, test)
+    errors = evaluation["errors"]
+    assert errors["header"][0]["mean_mm"] <= MAX_RATIO * errors["causal"][0]["mean_mm"]
+    assert evaluation["n_detected"] >= 0.95 * len(test)
+    assert evaluation["n_false"] <= 0.03 * len(test)
 
 
-def test_no_press_of_the_test_is_training_recording_sha256(brief: Recording, localizer: LocalizerModel) -> None:
-    """Places of test presses that are nonsense change nothing but the test."""
-    training, test = split(brief, localizer, QUICK)
+def test_distill_ignores_test_presses(brief: Recording, localizer: LocalizerModel) -> None:
+    training, test = split_student_presses(brief, localizer, QUICK)
     assert (len(training), len(test)) == (34, 6)
     assert not set(training.tolist()) & set(test.tolist())
-    nonsense = np.array(brief.presses_mm)
-    nonsense[test] = 0.0
-    short, budget = QUICK.model_copy(update={"epochs": 2}), Budget(20_000, 4_000)
-    one, other = (
-        teach(each, localizer, training, budget, short) for each in (brief, replace(brief, presses_mm=nonsense))
-    )
-    for name, weight in one.localizer.weights.items():
-        assert np.array_equal(weight, other.localizer.weights[name])
-    assert np.array_equal(one.localizer.interval_factors, other.localizer.interval_factors)
+    wrong = np.array(brief.presses_mm)
+    wrong[test] = 0.0
+    options, budget = QUICK.model_copy(update={"epochs": 2}), MemoryBudget(20_000, 4_000)
+    recordings = brief, replace(brief, presses_mm=wrong)
+    one, other = (distill(each, localizer, training, budget, options) for each in recordings)
+    for name, weight in one.model.weights.items():
+        assert np.array_equal(weight, other.model.weights[name])
+    assert np.array_equal(one.model.interval_factors, other.model.interval_factors)
     assert one.detector.threshold == other.detector.threshold
 
 
-def test_presses_of_unknown_place_are_neither_learnt_from_nor_tested_on(
-    brief: Recording, localizer: LocalizerModel
-) -> None:
+def test_split_leaves_out_presses_of_unknown_position(brief: Recording, localizer: LocalizerModel) -> None:
     unknown = np.array(brief.presses_mm)
     unknown[:10] = np.nan
-    training, test = split(replace(brief, presses_mm=unknown), localizer, QUICK)
+    training, test = split_student_presses(replace(brief, presses_mm=unknown), localizer, QUICK)
     assert min(*training, *test) == 10
 
 
-def test_a_recording_that_cannot_judge_is_refused(brief: Recording, localizer: LocalizerModel) -> None:
-    seen = replace(localizer, recalibrated_by=(brief.digest,))
+def test_split_refuses_recordings_that_cannot_test(brief: Recording, localizer: LocalizerModel) -> None:
+    recalibrated = replace(localizer, recalibrated_by=(brief.digest,))
     with pytest.raises(InputError, match="the localizer was recalibrated by"):
-        split(brief, seen, QUICK)
-    with pytest.raises(InputError, match="presses of known place"):
-        split(first_presses(brief, 3), localizer, QUICK)
+        split_student_presses(brief, recalibrated, QUICK)
+    with pytest.raises(InputError, match="presses of known position"):
+        split_student_presses(first_presses(brief, 3), localizer, QUICK)
     with pytest.raises(InputError, match="readings a second"):
-        split(replace(brief, times_s=brief.times_s * 2), localizer, QUICK)
+        split_student_presses(replace(brief, times_s=brief.times_s * 2), localizer, QUICK)
 
 
-def test_a_training_that_diverges_is_one_line(brief, localizer, monkeypatch) -> None:
+def test_distill_reports_a_training_that_diverged(brief, localizer, monkeypatch) -> None:
     wild = {name: np.full((1, 1, 1), np.nan, np.float32) for name in ("first.w", "hidden.w")}
-    monkeypatch.setattr(trainings, "train_members", lambda *_: trainings.Trained(wild, None, {}))
-    with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate"):
-        teach(brief, localizer, np.arange(30), Budget(20_000, 4_000), QUICK)
+    monkeypatch.setattr(trainings, "train_members", lambda *_: trainings.TrainedNetworks(wild, None, {}))
+    with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate"):
+        distill(brief, localizer, np.arange(30), MemoryBudget(20_000, 4_000), QUICK)
 
 
-def test_int8_is_within_half_a_step(taught: Student) -> None:
-    rounded = as_int8(taught.localizer.weights)
-    for name, weight in taught.localizer.weights.items():
+def test_quantize_is_within_half_a_step(student: StudentNetwork) -> None:
+    quantized = quantize(student.model.weights)
+    for name, weight in student.model.weights.items():
         if name.endswith(".b"):
-            assert rounded[name] is weight
+            assert quantized[name] is weight
         else:
-            step = np.abs(weight).max(axis=-2, keepdims=True) / students.MOST_INT8
-            assert (np.abs(rounded[name] - weight) <= 0.501 * step).all()
-            assert (np.abs(np.rint(rounded[name] / step)) <= students.MOST_INT8).all()
-
-
-@pytest.mark.parametrize("quantized", [False, True])
-@pytest.mark.parametrize(("flash", "ram"), [(20_000, 65_536), (262_144, 2_000), (150_000, 8_192)])
-def test_the_network_is_the_widest_that_a_budget_allows(flash: int, ram: int, quantized: bool) -> None:
-    hidden = widest(6, 0, 4, Budget(flash, ram, quantized))
-
-    def fits(hidden: int) -> bool:
-        return CODE + table_bytes(6, 0, 4, hidden, quantized) <= flash and state_bytes(6, 0, hidden) <= ram
-
-    assert fits(hidden)
-    assert not fits(hidden + STEP)
+            step = np.abs(weight).max(axis=-2, keepdims=True) / MAX_INT8
+            assert (np.abs(quantized[name] - weight) <= 0.501 * step).all()
+            assert (np.abs(np.rint(quantized[name] / step)) <= MAX_INT8).all()

@@ -1,4 +1,4 @@
-"""The page of `padforge sense live`: what its server says to whom, and what a browser makes of it."""
+"""The pages of a pad that is pressed: who is served what, and what a browser makes of it."""
 
 import json
 import socket
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design.common import server as local_page
+from padforge.design.common import server as page_server
 from padforge.design.common.server import HOST
 from padforge.sense.live.outputs import LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
@@ -23,11 +23,15 @@ VIEW = {
     "half_mm": [20.0, 20.0],
     "pressed": True,
     "ended": "",
-    "fibres": [{"swing": 0.5, "state": "sound"}, {"swing": -3.0, "state": "silent"}, {"swing": None, "state": HOSTILE}],
+    "fibres": [
+        {"swing": 0.5, "state": "sound"},
+        {"swing": -3.0, "state": "no_response"},
+        {"swing": None, "state": HOSTILE},
+    ],
     "presses": [
         {"press": 7 + k, "x_mm": 1.0 + k, "y_mm": -2.0, "r50_mm": 1.5, "r90_mm": 3.0, "final": k == 0} for k in (0, 1)
     ],
-    "findings": [HOSTILE],
+    "faults": [HOSTILE],
 }
 
 
@@ -48,15 +52,15 @@ def port_of(page: LivePage) -> int:
 
 
 @contextmanager
-def told(page: LivePage) -> Iterator[Iterator[dict]]:
-    """The messages that a browser gets."""
+def events_of(page: LivePage) -> Iterator[Iterator[dict]]:
+    """The views that a browser gets."""
     with get(page, "/events") as response:
         lines = (line.decode() for line in response)
         yield (json.loads(line[6:]) for line in lines if line.startswith("data: "))
 
 
 @pytest.mark.parametrize("name", ["live.html", "hand.html"])
-def test_the_page_is_served_and_allows_its_own_script_alone(name: str) -> None:
+def test_page_allows_only_its_own_script(name: str) -> None:
     with LivePage(0, name) as page:
         response = get(page, "/")
         text = response.read().decode()
@@ -72,7 +76,7 @@ def test_the_page_is_served_and_allows_its_own_script_alone(name: str) -> None:
     assert not any(word in text for word in ("https://", "innerHTML", "outerHTML", "insertAdjacentHTML", "eval("))
 
 
-def test_nothing_else_is_served_and_only_to_who_asks_this_machine_by_its_name(page, monkeypatch) -> None:
+def test_server_refuses_other_paths_and_other_host_names(page, monkeypatch) -> None:
     for path in ("/x", "/../pyproject.toml", "/events/"):
         assert get(page, path).status == 404
     # A page of another host, whose name was made to mean this machine, gets nothing.
@@ -80,37 +84,37 @@ def test_nothing_else_is_served_and_only_to_who_asks_this_machine_by_its_name(pa
         assert get(page, path, host="elsewhere.example").status == 403
     assert get(page, "/", host=f"localhost:{port_of(page)}").status == 200
     assert get(page, "/", host="localhost").status == 403
-    monkeypatch.setattr(local_page, "HTTP_PORT", port_of(page))  # which browsers leave out
+    monkeypatch.setattr(page_server, "HTTP_PORT", port_of(page))  # which browsers leave out
     assert [get(page, "/", name).status for name in ("localhost", HOST, "elsewhere")] == [200, 200, 403]
     if sys.platform == "linux":  # where 127.0.0.2 is another address of this machine
         with pytest.raises(OSError, match="refused"):
             socket.create_connection(("127.0.0.2", port_of(page)), timeout=5)
 
 
-def test_every_browser_is_told_all_whenever_it_comes(page: LivePage) -> None:
+def test_every_browser_gets_the_latest_view(page: LivePage) -> None:
     page.show(VIEW)
     with pytest.raises(ValueError, match="JSON"):
         page.show({"swing": float("nan")})
-    with told(page) as first, told(page) as second:
+    with events_of(page) as first, events_of(page) as second:
         assert next(first) == next(second) == VIEW
         page.show(VIEW | {"pressed": False})
         assert next(first) == next(second) == VIEW | {"pressed": False}
-    with told(page) as again:
+    with events_of(page) as again:
         assert next(again) == VIEW | {"pressed": False}
 
 
-def test_a_slow_browser_is_told_the_latest_and_holds_up_nobody(page: LivePage) -> None:
+def test_slow_browser_skips_views_and_delays_nobody(page: LivePage) -> None:
     page.show({"at": 0})
-    with told(page) as messages:
+    with events_of(page) as messages:
         assert next(messages) == {"at": 0}
         for at in range(1, 2001):
             page.show({"at": at})
-        seen = [message["at"] for message in iter(lambda: next(messages), {"at": 2000})]
-    assert seen == sorted(seen)
-    assert len(seen) < 1000
+        numbers = [message["at"] for message in iter(lambda: next(messages), {"at": 2000})]
+    assert numbers == sorted(numbers)
+    assert len(numbers) < 1000
 
 
-def test_the_end_is_told() -> None:
+def test_browser_gets_the_last_view() -> None:
     with LivePage(0) as page:
         page.show({"at": 0})
         browser = get(page, "/events")
@@ -118,14 +122,14 @@ def test_the_end_is_told() -> None:
     assert browser.read().decode().endswith('data: {"ended": "ended"}\n\n')
 
 
-def test_a_browser_that_goes_away_is_forgotten(page: LivePage, capfd: pytest.CaptureFixture[str]) -> None:
+def test_server_survives_browsers_that_go_away(page: LivePage, capfd: pytest.CaptureFixture[str]) -> None:
     page.show({"at": 0})
     with socket.create_connection((HOST, port_of(page))) as browser:
         browser.sendall(f"GET /events HTTP/1.0\r\nHost: {HOST}:{port_of(page)}\r\n\r\n".encode())
         assert browser.recv(10)
     with socket.create_connection((HOST, port_of(page))) as browser:
         browser.sendall(b"\x00\xff nonsense\r\n\r\n")
-    with told(page) as messages:
+    with events_of(page) as messages:
         assert next(messages) == {"at": 0}
         page.show({"at": 1})
         assert next(messages) == {"at": 1}
@@ -133,31 +137,31 @@ def test_a_browser_that_goes_away_is_forgotten(page: LivePage, capfd: pytest.Cap
 
 
 @pytest.fixture
-def asking() -> Iterator[LivePage]:
+def hand_page() -> Iterator[LivePage]:
     with LivePage(0, "hand.html", ("back", "skip")) as page:
         yield page
 
 
-def said(page: LivePage, body: bytes, **headers: str) -> int:
-    """The status of what a page says; by default it is the one that was served."""
+def post(page: LivePage, body: bytes, **headers: str) -> int:
+    """Post a command as the page that was served does by default; return the status."""
     connection = HTTPConnection(HOST, port_of(page), timeout=10)
-    connection.request("POST", "/say", body, {"Origin": page.url.rstrip("/")} | headers)
+    connection.request("POST", "/command", body, {"Origin": page.url.rstrip("/")} | headers)
     return connection.getresponse().status
 
 
-def test_only_what_its_own_page_says_is_heard(page: LivePage, asking: LivePage) -> None:
-    assert [said(asking, word) for word in (b"skip", b"back", b"skip")] == [204, 204, 204]
-    assert asking.said() == ["skip", "back", "skip"]
+def test_commands_are_accepted_from_the_page_only(page: LivePage, hand_page: LivePage) -> None:
+    assert [post(hand_page, word) for word in (b"skip", b"back", b"skip")] == [204, 204, 204]
+    assert hand_page.read_commands() == ["skip", "back", "skip"]
     for word in (b"", b"quit", b"skip\n", b"\xff" * 4, b"back" * 1000):
-        assert said(asking, word) == 400
-    port = port_of(asking)
+        assert post(hand_page, word) == 400
+    port = port_of(hand_page)
     for origin in ("http://elsewhere.example", "null", f"https://{HOST}:{port}", f"http://{HOST}:{port + 1}"):
-        assert said(asking, b"skip", Origin=origin) == 403
-    assert said(page, b"skip") == 400  # it says nothing
-    assert asking.said() == page.said() == []
+        assert post(hand_page, b"skip", Origin=origin) == 403
+    assert post(page, b"skip") == 400  # it has no commands
+    assert hand_page.read_commands() == page.read_commands() == []
     for _ in range(20):
-        assert said(asking, b"skip", Host=f"localhost:{port}", Origin=f"http://localhost:{port}") == 204
-    assert len(asking.said()) == 16  # they do not pile up
+        assert post(hand_page, b"skip", Host=f"localhost:{port}", Origin=f"http://localhost:{port}") == 204
+    assert len(hand_page.read_commands()) == 16  # the queue is bounded
 
 
 @pytest.fixture
@@ -175,15 +179,15 @@ def box_of(browser: Chromium, part: str) -> list[float]:
 
 
 @pytest.mark.slow
-def test_a_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
+def test_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     page.show(VIEW)
     browser.open(page.url)
     browser.wait_for("document.querySelectorAll('.fibre').length == 3")
-    shown = browser.ask("document.body.innerText")
-    assert "2.0, -2.0 mm" in shown
-    assert "press 8: within 1.5 mm at 50 %, 3.0 mm at 90 %, to be refined" in shown
-    assert shown.count(HOSTILE) == 3
-    assert ("fibre 1" in shown, "fibre 3" in shown, "fibre 0" in shown) == (True, True, False)
+    text = browser.ask("document.body.innerText")
+    assert "2.0, -2.0 mm" in text
+    assert "press 8: within 1.5 mm at 50 %, 3.0 mm at 90 %, to be refined" in text
+    assert text.count(HOSTILE) == 3
+    assert ("fibre 1" in text, "fibre 3" in text, "fibre 0" in text) == (True, True, False)
     assert browser.ask("document.images.length") == 0
     count = "document.querySelectorAll('{}').length"
     assert [browser.ask(count.format(f"#pad .{name}")) for name in ("trail", "r50", "r90", "early")] == [1, 1, 1, 1]
@@ -206,11 +210,9 @@ HAND |= {"target": [1.0, -2.0], "rejected": None}
 
 
 @pytest.mark.slow
-def test_a_browser_shows_where_to_press_on_the_pad_as_it_lies_and_says_what_is_said(
-    asking: LivePage, browser: Chromium
-) -> None:
-    asking.show(HAND)
-    browser.open(asking.url)
+def test_browser_shows_where_to_press_and_sends_commands(hand_page: LivePage, browser: Chromium) -> None:
+    hand_page.show(HAND)
+    browser.open(hand_page.url)
     browser.wait_for("document.getElementById('prompt').textContent == 'press x 1, y -2 mm'")
     assert "2 of 8 presses" in browser.ask("document.body.innerText")
     assert browser.ask("document.querySelectorAll('.path').length") == 1
@@ -218,14 +220,14 @@ def test_a_browser_shows_where_to_press_on_the_pad_as_it_lies_and_says_what_is_s
     browser.press("s")
     browser.wait_for("document.getElementById('bar').value == .25")
     deadline = time.monotonic() + 10
-    heard: list[str] = []
-    while len(heard) < 2 and time.monotonic() < deadline:
-        heard += asking.said()
+    commands: list[str] = []
+    while len(commands) < 2 and time.monotonic() < deadline:
+        commands += hand_page.read_commands()
         time.sleep(0.02)
-    assert heard == ["skip", "skip"]
+    assert commands == ["skip", "skip"]
     for mirrored in (False, True):
-        asking.show(HAND | {"target": [11.0, -2.0], "mirrored": mirrored})
-        browser.open(asking.url)
+        hand_page.show(HAND | {"target": [11.0, -2.0], "mirrored": mirrored})
+        browser.open(hand_page.url)
         browser.wait_for("document.querySelector('.press .ring') != null")
         ring, edge = box_of(browser, ".press .ring"), box_of(browser, "#pad .edge")
         assert (ring[0] - edge[0]) / edge[2] == pytest.approx(-0.25 if mirrored else 0.25)
@@ -237,7 +239,7 @@ def test_a_browser_shows_where_to_press_on_the_pad_as_it_lies_and_says_what_is_s
 
 
 @pytest.mark.slow
-def test_a_browser_comes_back_to_a_page_that_was_away(browser: Chromium) -> None:
+def test_browser_reconnects_to_a_page(browser: Chromium) -> None:
     with LivePage(0) as page:
         port = port_of(page)
         page.show(VIEW | {"title": "before"})

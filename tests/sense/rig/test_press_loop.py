@@ -331,7 +331,7 @@ def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
     assert np.allclose(volts[:, 0], expected)
     assert np.allclose(volts[:, 1], -np.array(expected))
     assert np.allclose(1000 * times, expected)
-    assert averager.lost == sum(i <= last for i in lost)
+    assert averager.n_missing == sum(i <= last for i in lost)
 
 
 def test_disk_thread_makes_calls_in_order_without_blocking() -> None:

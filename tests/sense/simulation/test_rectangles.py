@@ -11,9 +11,9 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording, calibrate, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import pad_source
-from padforge.sense.rig.streams import simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.virtual.virtual_pad import virtual_pad_of
 
 HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
@@ -38,7 +38,7 @@ def test_a_recording_says_which_pad_it_is_of(recording: Recording, tmp_path: Pat
     assert Morphology.from_dict(recording.source["morphology"]) == PAD
     assert recording.source["keep_out_mm"] == [[list(corner) for corner in HOLE]]
     recording.save(tmp_path / "recording", {})
-    assert simulated(tmp_path).connect()["channels"] == 5
+    assert virtual_pad_of(tmp_path).connect()["channels"] == 5
     square = Morphology.straight(2)
     assert json.dumps(pad_source(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
 

@@ -1,0 +1,138 @@
+"""onnxruntime computes from `localizer.onnx` what the localizer predicts, with any fibres masked."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from padforge.design.common.validation import Fault, InputError
+from padforge.sense import Recording, calibrate, export_csv
+from padforge.sense.deploy import onnx_export
+from padforge.sense.deploy.onnx_export import FORMAT, MAX_DIFFERENCE_MM, OnnxReport, export_onnx
+from padforge.sense.localizer.features import interpolate_gaps
+from padforge.sense.localizer.model import Localization, LocalizerModel
+from tests.sense.conftest import QUICK
+from tests.sense.deploy.conftest import ROOT, tutorial_code
+
+DIGEST = "a" * 64
+
+
+@pytest.fixture(scope="module")
+def exported(
+    localizer: LocalizerModel, recording: Recording, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, OnnxReport]:
+    path = tmp_path_factory.mktemp("onnx") / "localizer.onnx"
+    return path, export_onnx(localizer, DIGEST, path, recording)
+
+
+def open_graph(path: Path) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture
+def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
+    return open_graph(exported[0])
+
+
+def inputs_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
+    commands = {"down_command": recording.down_command, "up_command": recording.up_command}
+    return {"readings": interpolate_gaps(recording.readings), **commands, "fibre_mask": fibre_mask}
+
+
+def check_positions(positions_mm: Any, expected: Localization) -> None:
+    assert np.shape(positions_mm) == expected.positions_mm.shape
+    assert np.hypot(*(np.asarray(positions_mm) - expected.positions_mm).T).max() < MAX_DIFFERENCE_MM
+
+
+def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, recording) -> None:
+    presses, names = localizer.scaled_features(recording), ["positions_mm", "std_mm", "r50_mm", "r90_mm"]
+    for failed in ((), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)):
+        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), failed)
+        expected = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
+        positions_mm, *others = graph.run(names, inputs_of(recording, fibre_mask))
+        check_positions(positions_mm, expected)
+        for name, values in zip(names[1:], others, strict=True):
+            np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
+
+
+def test_graph_takes_any_number_of_presses_and_readings(graph, localizer, brief) -> None:
+    presses = localizer.scaled_features(brief)
+    for count in (1, 2, 7):
+        inputs = {
+            "readings": brief.readings[: brief.down_command[count]],
+            "down_command": brief.down_command[:count],
+            "up_command": brief.up_command[:count],
+            "fibre_mask": np.ones((count, 4), bool),
+        }
+        check_positions(graph.run(["positions_mm"], inputs)[0], localizer.predict_features(presses[np.arange(count)]))
+
+
+@pytest.mark.parametrize("features", ["causal", "onset", "published"])
+def test_graph_has_all_kinds_of_features(features: str, brief: Recording, tmp_path: Path) -> None:
+    options = QUICK.model_copy(update={"features": features, "epochs": 2, "members": 1})
+    report = export_onnx(calibrate(brief, options)[0], DIGEST, tmp_path / "l.onnx", brief)
+    assert report.position_difference_mm < MAX_DIFFERENCE_MM
+    assert report.n_presses == 40
+
+
+def test_graph_gives_depth_and_force(deep_localizer, deep_recording, tmp_path) -> None:
+    export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", deep_recording)
+    presses = deep_localizer.scaled_features(deep_recording)
+    expected, graph = deep_localizer.predict_features(presses), open_graph(tmp_path / "l.onnx")
+    names = [each.name for each in graph.get_outputs()][4:]
+    assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
+    values = graph.run(names, inputs_of(deep_recording, presses.fibre_mask))
+    columns = [column for each in expected.measures.values() for column in (each.values, each.r90)]
+    np.testing.assert_allclose(np.array(values), np.array(columns), rtol=1e-4, atol=1e-4)
+
+
+def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
+    model = onnx.load(exported[0])
+    onnx.checker.check_model(model, full_check=True)
+    metadata = {each.key: each.value for each in model.metadata_props}
+    assert (metadata["format"], metadata["localizer_sha256"]) == (FORMAT, DIGEST)
+    assert json.loads(metadata["fibres"]) == ["fibre_0_v", "fibre_1_v", "fibre_2_v", "fibre_3_v"]
+    assert list(json.loads(metadata["inputs"])) == [each.name for each in model.graph.input]
+    assert list(json.loads(metadata["outputs"])) == [each.name for each in model.graph.output]
+    assert all(each.doc_string for each in (*model.graph.input, *model.graph.output))
+    assert [each.dim_param for each in model.graph.input[1].type.tensor_type.shape.dim] == ["presses"]
+    text = exported[1].text
+    assert text.startswith("1.9 MB, tested on 300 presses with up to 3 failed fibres: positions within ")
+
+
+def test_export_refuses_the_published_method_and_a_graph_that_differs(localizer, tmp_path, monkeypatch) -> None:
+    path = tmp_path / "l.onnx"
+    with pytest.raises(InputError, match="method published, expected ensemble"):
+        export_onnx(replace(localizer, method="published"), DIGEST, path)
+    monkeypatch.setattr(onnx_export, "MAX_DIFFERENCE_MM", 1e-9)
+    with pytest.raises(Fault, match="not written, positions by onnxruntime differ"):
+        export_onnx(localizer, DIGEST, path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("localizer.onnx").write_bytes(exported[0].read_bytes())
+    export_csv(brief, "presses.csv")
+    names: dict[str, np.ndarray] = {}
+    exec(tutorial_code("graph", "python"), names)
+    assert np.array_equal(names["down_command"], brief.down_command)
+    presses = localizer.scaled_features(brief)
+    without_last = localizer.predict_features(presses[np.arange(len(brief.down_command) - 1)])
+    check_positions(names["positions_mm"][:-1], without_last)
+
+
+def test_onnxruntime_sends_no_telemetry(tmp_path: Path) -> None:
+    """If it does, it leaves a file in the folder for temporary ones."""
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    command = [sys.executable, "-c", "import padforge.sense.deploy.onnx_export"]
+    subprocess.run(command, cwd=ROOT, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,78 @@
+"""The virtual pad is pressed as the simulated recording was, and is found by the model that was trained on that."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from padforge.design import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.settings import PUBLISHED_CONTACT, Contact
+from padforge.sense import Recording
+from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.streams import RECORDED
+from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.virtual.virtual_pad import SimulatedConverter, virtual_pad_of
+from tests.sense.rig.fakes import Time
+
+
+def test_virtual_pad_is_the_pad_of_the_recording() -> None:
+    pad = Morphology.random(2, knots=3, seed=5)
+    rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
+    recorded, time = simulate(pad, rig), Time(least_s=0)
+    board = SimulatedConverter(pad, rig, PUBLISHED_CONTACT, time)
+    with pytest.raises(RigFault, match="not connected"):
+        board.read()
+    assert board.connect().items() >= {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}.items()
+    samples = []
+    for pause_s in [0.0, 0.3, 0.01, 5.0] + 30 * [1.0]:
+        time.sleep(pause_s)
+        samples.append(board.read())
+    volts = np.concatenate([each.volts for each in samples])
+    times_s = np.concatenate([each.times_s for each in samples])
+    np.testing.assert_allclose(np.diff(times_s), 1 / rig.rate_hz)
+    # The same fibres at rest, and as many presses that answer as strongly.
+    np.testing.assert_array_equal(volts[:19], recorded.readings[:19])
+    swings = np.abs(volts - volts[0]).sum(axis=1)
+    assert (np.diff((swings > swings.max() / 5).astype(int)) == 1).sum() == round(len(volts) / 40)
+    assert 0.5 < np.abs(volts - volts[0]).max() / np.abs(recorded.readings - volts[0]).max() < 2
+
+
+def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
+    rig = RigSettings(presses=4, seed=4, noise_mv=0.0, drift_mv=0.0, depths_mm=(0.5, 5.0), readings_per_press=20)
+    time = Time(least_s=0)
+    board = SimulatedConverter(Morphology.straight(2), rig, Contact(), time)
+    board.connect()
+    time.sleep(4.01 * 20 / rig.rate_hz)
+    volts = board.read().volts
+    swings = [np.ptp(volts[20 * press : 20 * press + 20], axis=0).sum() for press in range(4)]
+    assert max(swings[0::2]) < 0.5 * min(swings[1::2])
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"kind": "rig"}, "of no simulated pad"),
+        ({"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
+        ({"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
+        ({"morphology": {}}, "no pad that can be simulated"),
+        ({"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "there are 1 fibres"),
+        ({"morphology": {"pitch_mm": 1, "knots": [[1, 2], [3, 4]]}}, "knots"),
+    ],
+)
+def test_virtual_pad_of_a_model_needs_its_simulated_recording(
+    brief: Recording, tmp_path: Path, change: dict, error: str
+) -> None:
+    with pytest.raises(InputError, match=r"start\.json: not there"):
+        virtual_pad_of(tmp_path)
+    brief.save(tmp_path / RECORDED, {})
+    path = tmp_path / RECORDED / START
+    source = simulate(Morphology.straight(2), RigSettings(presses=1)).source
+    path.write_text(json.dumps({"format": FORMAT, "source": source}))
+    assert virtual_pad_of(tmp_path).connect()["channels"] == 4
+    path.write_text(json.dumps({"format": FORMAT, "source": {**source, **change}}))
+    with pytest.raises(InputError, match=error):
+        virtual_pad_of(tmp_path)
