@@ -24,8 +24,8 @@ from padforge.sense.recording.run_directory import START
 from padforge.sense.rig.config import (
     RigConfig,
     RobotFrame,
-    locate_on_bed,
     load_or_make_plan,
+    locate_on_bed,
     open_recorder,
     plan_notice,
 )
