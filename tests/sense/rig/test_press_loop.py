@@ -317,11 +317,12 @@ def test_run_records_depth_and_force(tmp_path):
 @given(st.integers(1, 12), st.integers(1, 200), st.sets(st.integers(0, 199), max_size=60), st.data())
 def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
     index = np.array([i for i in range(count) if i not in lost], dtype=np.int64)
-    samples = index / 1000, np.column_stack([index, -index]).astype(float), np.diff(index, prepend=-1) - 1
+    times_s, missing = index / 1000, np.diff(index, prepend=-1) - 1
+    rows = np.column_stack([index, -index]).astype(float)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(index)), max_size=6)))
     averager = Averager(ratio, 2)
     pieces = [
-        averager.feed(BoardSamples(*(column[a:b] for column in samples)))
+        averager.feed(BoardSamples(times_s[a:b], rows[a:b], missing[a:b]))
         for a, b in zip([0, *cuts], [*cuts, len(index)], strict=True)
     ]
     times, volts = (np.concatenate(column) for column in zip(*pieces, strict=True))
