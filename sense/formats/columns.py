@@ -319,14 +319,14 @@ def _runs(values: Array, down: Mask) -> _PressColumns:
 
 def _found(readings: Array, times_s: Array, source: Mapping[str, Any]) -> _PressColumns:
     """Presses that the readings show."""
-    from padforge.sense.signals.press_detection import as_commanded, detect_presses
+    from padforge.sense.signals.press_detection import estimate_commands, detect_presses
 
     first = np.array([1])  # a press that is none: refuses what are no readings, before they are searched
     Recording(readings, times_s, np.zeros((1, 2)), first, first + 1, source)
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
         raise InputError("has no press: no place or number tells one, and none is found in the readings")
-    return _PressColumns(*as_commanded(presses, times_s), FOUND)
+    return _PressColumns(*estimate_commands(presses, times_s), FOUND)
 
 
 def _pressed(places: Array | None, presses: _PressColumns, count: int) -> Array:

@@ -30,7 +30,7 @@ from padforge.sense.arrays import (
     Indices,
     Mask,
     check_numbers,
-    stream_of,
+    check_stream,
 )
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, STEPS, FaultLikelihoods, Tail
 from padforge.sense.health.trace_model import (
@@ -224,7 +224,7 @@ def checked_presses(
     Raises:
         InputError: they are something else.
     """
-    times_s, readings = stream_of(times_s, readings)
+    times_s, readings = check_stream(times_s, readings)
     down_command, up_command = (
         check_numbers(edges, np.int64, "presses", copy=False) for edges in (down_command, up_command)
     )
@@ -264,7 +264,7 @@ def learn_health(
     Raises:
         InputError: too few presses, no living fibre, or an argument of another kind.
     """
-    from padforge.sense.signals.press_detection import as_detected
+    from padforge.sense.signals.press_detection import align_to_detected
 
     learnt = np.ones(len(check_type("recording", recording, Recording).presses_mm), dtype=bool)
     away = check_numbers(held_back, np.int64, "held_back")
@@ -274,7 +274,7 @@ def learn_health(
     seed = check_int("the seed of provenance", check_mapping("provenance", provenance).get("seed"), 0, 2**64 - 1)
     readings, times_s = recording.readings, recording.times_s
     commanded = recording.down_command, recording.up_command
-    edges = {COMMANDED: commanded, DETECTED: as_detected(readings, times_s, *commanded)}
+    edges = {COMMANDED: commanded, DETECTED: align_to_detected(readings, times_s, *commanded)}
 
     def fit(name: str) -> HealthModel:
         down_command, up_command = (edge[learnt] for edge in edges[name])

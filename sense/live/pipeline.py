@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
-from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
+from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultDetector, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.localizer.features import REST, SIZES, ScaledFeatures, bridged, press_inputs
 from padforge.sense.localizer.model import MEASURED, LocalizerModel
 from padforge.sense.localizer.model_files import refuse_other_pad
 from padforge.sense.rig.streams import DONE, NEEDS, BufferedPress, Ring
-from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
+from padforge.sense.signals.press_detection import TOUCH_DELAY_S, RELEASE_DELAY_S, PressDetector
 
 TRAIL = 12
 """Presses that are kept to be shown."""
@@ -139,19 +139,19 @@ class Live:
             Estimates and findings, in the order in which they were made.
 
         Raises:
-            InputError: as `limits.stream_of`, or times before those that were fed last.
+            InputError: as `check_stream`, or times before those that were fed last.
         """
         events: list[Event] = []
-        times, rows = stream_of(times_s, readings, len(self._usual))
+        times, rows = check_stream(times_s, readings, len(self._usual))
         if len(times) and self._ring.end and not times[0] > self._ring.rows(self._ring.end - 1, self._ring.end)[0, 0]:
             raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
         for row in np.column_stack([times, rows]):
             self._ring.append(row)
-            for change in self._finder.feed(row[:1], row[None, 1:]):
+            for change in self._finder.update(row[:1], row[None, 1:]):
                 if change.down:
                     events += self._begin(change.reading)
                 elif self._press is not None:
-                    self._press.let_go(max(self._ring.sent(change.reading, SENT_UP_S), self._press.touched))
+                    self._press.let_go(max(self._ring.sent(change.reading, RELEASE_DELAY_S), self._press.touched))
             events += self._advance()
         return events
 
@@ -196,7 +196,7 @@ class Live:
 
     def _begin(self, touched: int) -> list[Event]:
         """The pad is touched; what was still to come of the press before comes now."""
-        down_command = self._ring.sent(touched, SENT_DOWN_S)
+        down_command = self._ring.sent(touched, TOUCH_DELAY_S)
         events = self._advance(down_command)
         down_command = max(down_command, self._free + 1)
         time_s = float(self._ring.rows(touched, touched + 1)[0, 0])

@@ -27,7 +27,7 @@ from padforge.sense.rig.by_hand_presses import GONE_S, MOST, SOON_S, Judge, Phas
 from padforge.sense.rig.config import RigConfig, begun_source, require_same_devices, source_of
 from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, Ring, connected
-from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
+from padforge.sense.signals.press_detection import TOUCH_DELAY_S, RELEASE_DELAY_S, PressDetector
 
 ROUND = 25
 """Places of a uniform plan that are gone through by a short way, before the next ones. Whoever stops early has been
@@ -193,7 +193,7 @@ class HandSession:
         for row in np.column_stack([times_s, readings]):
             self._ring.append(row)
             self._now_s = float(row[0])
-            for event in self._finder.feed(row[:1], row[None, 1:]) if self._finder else ():
+            for event in self._finder.update(row[:1], row[None, 1:]) if self._finder else ():
                 reading = self._found_from + event.reading
                 self._touch(reading) if event.down else self._release(reading)
         self._doubt()
@@ -201,14 +201,14 @@ class HandSession:
     def _touch(self, touched: int) -> None:
         place = self._turns.touch(self._time_s(touched))
         self._touched = touched
-        self._down_command = max(self._ring.sent(touched, SENT_DOWN_S), self._free + 1)
+        self._down_command = max(self._ring.sent(touched, TOUCH_DELAY_S), self._free + 1)
         self._rest = self._rest_before(self._down_command)
         self._refused = None
         self._recorder.begin(place or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
 
     def _release(self, released: int) -> None:
-        up_command = max(self._ring.sent(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
+        up_command = max(self._ring.sent(released, RELEASE_DELAY_S), self._touched + 1, self._down_command + 1)
         target, fault = self._turns.target, self._turns.release(self._time_s(released))
         answered = self._answers(up_command)
         fault = fault or self._judge.fault_of(answered)

@@ -20,7 +20,7 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-TRUSTED = {"sense.HealthModel.refuse_other", "sense.PressDetector.follow"}
+TRUSTED = {"sense.HealthModel.refuse_other"}
 """They are handed what those who call them have checked."""
 CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
 """Parameters that are left alone: what is called back may raise what it likes."""

@@ -26,8 +26,8 @@ from tests.sense.live.conftest import first_presses
 def prompt() -> Iterator[None]:
     """Presses as scripted begin as they are sent."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(padforge.sense.live.pipeline, "SENT_DOWN_S", 0.0)
-        monkeypatch.setattr(padforge.sense.live.pipeline, "SENT_UP_S", 0.0)
+        monkeypatch.setattr(padforge.sense.live.pipeline, "TOUCH_DELAY_S", 0.0)
+        monkeypatch.setattr(padforge.sense.live.pipeline, "RELEASE_DELAY_S", 0.0)
         yield
 
 
@@ -43,7 +43,7 @@ class Scripted:
     def __call__(self, fibres: int) -> "Scripted":
         return self
 
-    def feed(self, times_s: np.ndarray, readings: np.ndarray) -> Iterator[PressEvent]:
+    def update(self, times_s: np.ndarray, readings: np.ndarray) -> Iterator[PressEvent]:
         self._read += len(times_s)
         while self._edges and self._edges[0][0] < self._read:
             _, down, at = self._edges.pop(0)

@@ -165,9 +165,9 @@ class Turned(PressDetector):
         super().__init__(fibres)
         self._reading, self._turned, self._touched = 0, False, list[int]()
 
-    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
+    def update(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
         """Of one reading."""
-        events = super().feed(times_s, readings)
+        events = super().update(times_s, readings)
         self._reading += 1
         self._touched += [event.reading for event in events if event.down]
         if Turned.once and len(self._touched) == 8 and self._reading == self._touched[-1] + 5:

@@ -12,11 +12,11 @@ from padforge.design import Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import Counts
 from padforge.sense import Recording, RigSettings, import_mat, simulate
-from padforge.sense.signals.press_detection import PressDetector, Presses, as_commanded, as_detected, detect_presses
+from padforge.sense.signals.press_detection import PressDetector, Presses, estimate_commands, align_to_detected, detect_presses
 from padforge.sense.simulation.pad_model import Divider
 
 RATE_HZ = 14.0
-SENT_DOWN_S, SENT_UP_S = 0.16, 0.08
+TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08
 """From a command to its first effect, as in the published recording."""
 LOOK_S = 0.03
 EARLY = 3
@@ -47,7 +47,7 @@ def test_presses_of_the_published_recording_are_found(published: Path) -> None:
     assert np.median(touches) == 2
     assert touches.std() < 1.2
     assert np.mean(np.abs(releases - 0.5) <= 1.5) > 0.995
-    down_command, up_command = as_commanded(presses, recording.times_s)
+    down_command, up_command = estimate_commands(presses, recording.times_s)
     of = np.searchsorted(recording.down_command - EARLY, presses.touched, side="right") - 1
     assert abs(np.mean(down_command - recording.down_command[of])) < 0.5
     assert abs(np.median(up_command - recording.up_command[of])) < 1
@@ -126,7 +126,7 @@ def test_any_protocol_will_do(spans: Spans, rate_hz: float, ramp_s: float) -> No
     if spans[-1][1] - spans[-1][0] >= 1:
         cut = int(np.mean(spans[-1]) * rate_hz)
         presses = detect_presses(readings[:cut], times[:cut])
-        assert presses.released[-1] == as_commanded(presses, times[:cut])[1][-1] == cut
+        assert presses.released[-1] == estimate_commands(presses, times[:cut])[1][-1] == cut
 
 
 COUNT = 3.3 / 1023
@@ -255,14 +255,14 @@ def test_presses_found_make_a_recording(gaps: list[int], after: int, rate_hz: fl
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     presses = Presses(edges[::2], edges[1::2])
     times = np.cumsum(np.random.default_rng(seed).exponential(1 / rate_hz, edges[-1] + max(after, 1)) + 1e-4)
-    down_command, up_command = as_commanded(presses, times)
+    down_command, up_command = estimate_commands(presses, times)
     Recording(np.ones((len(times), 1)), times, np.full((len(down_command), 2), np.nan), down_command, up_command)
     assert (down_command <= presses.touched).all()
     assert (up_command <= presses.released).all()
     assert (up_command > presses.touched).all()
     waited = down_command == np.concatenate([[0], up_command[:-1]]) + 1
-    assert (waited | (times[presses.touched] - times[down_command] <= SENT_DOWN_S)).all()
-    assert ((up_command == presses.touched + 1) | (times[presses.released] - times[up_command] <= SENT_UP_S)).all()
+    assert (waited | (times[presses.touched] - times[down_command] <= TOUCH_DELAY_S)).all()
+    assert ((up_command == presses.touched + 1) | (times[presses.released] - times[up_command] <= RELEASE_DELAY_S)).all()
 
 
 def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -319,7 +319,7 @@ def test_presses_of_scenes_are_found_where_they_always_were(seed: tuple[int, flo
 
 
 def test_presses_are_aligned_with_what_the_readings_show_of_them_or_stay_as_commanded(recording: Recording) -> None:
-    down_command, up_command = as_detected(
+    down_command, up_command = align_to_detected(
         recording.readings, recording.times_s, recording.down_command, recording.up_command
     )
     for found, commanded in ((down_command, recording.down_command), (up_command, recording.up_command)):
@@ -331,15 +331,15 @@ def test_presses_are_aligned_with_what_the_readings_show_of_them_or_stay_as_comm
     silent = recording.readings.copy()
     first, last = int(recording.down_command[10]) - 3, int(recording.down_command[12]) - 10
     silent[first:last] = silent[first - 1]
-    down_command, up_command = as_detected(silent, recording.times_s, recording.down_command, recording.up_command)
+    down_command, up_command = align_to_detected(silent, recording.times_s, recording.down_command, recording.up_command)
     np.testing.assert_array_equal(down_command[10:12], recording.down_command[10:12])
     np.testing.assert_array_equal(up_command[10:11], recording.up_command[10:11])
     held = recording.readings.copy()
     first, last = int(recording.up_command[20]) - 2, int(recording.down_command[21]) + 10
     held[first:last] = held[first - 1]  # two presses show as one, which is neither of them
-    down_command, up_command = as_detected(held, recording.times_s, recording.down_command, recording.up_command)
+    down_command, up_command = align_to_detected(held, recording.times_s, recording.down_command, recording.up_command)
     np.testing.assert_array_equal(
         (down_command[20], up_command[20]), (recording.down_command[20], recording.up_command[20])
     )
-    flat = as_detected(np.ones_like(silent), recording.times_s, recording.down_command, recording.up_command)
+    flat = align_to_detected(np.ones_like(silent), recording.times_s, recording.down_command, recording.up_command)
     np.testing.assert_array_equal(flat, (recording.down_command, recording.up_command))
