@@ -22,7 +22,6 @@ TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08
 0.5 readings (means of the published recording at 14.3 Hz)."""
 MAX_LEAD = 2
 """Readings before its command at which a press may show: commands are noted a little late."""
-_CHUNK = 65_536  # readings at a time, so that a long recording is not copied as a whole
 
 
 class PressEvent(NamedTuple):
@@ -85,12 +84,9 @@ class PressDetector:
         times, rows = check_stream(times_s, readings, len(self._fibres))
         if len(times) and not times[0] > self._last_s:
             raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
-        return self._detect(times, rows)
-
-    def _detect(self, times_s: Array, readings: Array) -> list[PressEvent]:
-        events = np.empty((2 * len(times_s), 2), np.int64)
-        self._last_s = times_s[-1] if len(times_s) else self._last_s
-        count = detect(self._fibres, self._pad, times_s, np.ascontiguousarray(readings), *self._limits, events)
+        self._last_s = times[-1] if len(times) else self._last_s
+        events = np.empty((2 * len(times), 2), np.int64)
+        count = detect(self._fibres, self._pad, times, np.ascontiguousarray(rows), *self._limits, events)
         return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
 
 
@@ -108,9 +104,7 @@ def detect_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
         InputError: as `check_stream`.
     """
     times_s, readings = check_stream(times_s, readings)
-    detector = PressDetector(readings.shape[1])
-    chunks = (slice(first, first + _CHUNK) for first in range(0, len(readings), _CHUNK))
-    events = [event for chunk in chunks for event in detector._detect(times_s[chunk], readings[chunk])]
+    events = PressDetector(readings.shape[1]).update(times_s, readings)
     touched = [event.reading for event in events if event.down]
     released = [event.reading for event in events if not event.down]
     released += [len(readings)] * (len(touched) - len(released))

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from padforge.benchmarks.filter import admm, fibre, linear_program
 from padforge.design.common.validation import InputError
 from padforge.sense import TotalVariation, open_recording, running_median, total_variation
-from padforge.sense.signals.filters import stretches
+from padforge.sense.signals.filters import find_segment_starts
 
 STEP_V = 3.3 / 1023
 LAMS = st.sampled_from([1e-9, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3, 4.0, np.pi, 7.7, 30.0, 1e6])
@@ -151,11 +151,11 @@ def test_a_press_is_kept_or_cut_by_its_length_and_stretches_begin_after_long_int
     below, lowest, highest, above = (objective(y, other, 2) for other in levels)
     assert below > lowest == objective(y, x, 2) == highest < above
     times = np.array([0, 0.1, 0.2, 5.2, 5.3, 99])
-    np.testing.assert_array_equal(stretches(times, 1), [3, 5])
-    np.testing.assert_array_equal(stretches(times, 1000), [])
-    np.testing.assert_array_equal(stretches([], 1), [])
+    np.testing.assert_array_equal(find_segment_starts(times, 1), [3, 5])
+    np.testing.assert_array_equal(find_segment_starts(times, 1000), [])
+    np.testing.assert_array_equal(find_segment_starts([], 1), [])
     y = np.array([0, 0, 0, 1, 1, 0.0])
-    np.testing.assert_array_equal(total_variation(y, 4, starts=stretches(times, 1)), y)
+    np.testing.assert_array_equal(total_variation(y, 4, starts=find_segment_starts(times, 1)), y)
 
 
 def hostile(count):
@@ -237,10 +237,10 @@ def test_running_median_is_numpys_of_each_window(y, width, causal):
         (lambda: running_median([1], 4), "width is 4, allowed is an odd whole number above 0"),
         (lambda: running_median([1], 3.0), "width is 3.0"),  # type: ignore[arg-type]
         (lambda: running_median([-np.inf], 3), "readings hold -inf"),
-        (lambda: stretches([0, 2, 1], 1), "times_s are .*, expected finite numbers that ascend"),
-        (lambda: stretches([[0]], 1), "shape"),
-        (lambda: stretches(np.broadcast_to(1.0, 2**40), 1), "times_s are 1099511627776 numbers, allowed are"),
-        (lambda: stretches([0], 0), "longest_s is 0, allowed is a number above 0"),
+        (lambda: find_segment_starts([0, 2, 1], 1), "times_s are .*, expected finite numbers that ascend"),
+        (lambda: find_segment_starts([[0]], 1), "shape"),
+        (lambda: find_segment_starts(np.broadcast_to(1.0, 2**40), 1), "times_s are 1099511627776 numbers, allowed are"),
+        (lambda: find_segment_starts([0], 0), "max_interval_s is 0, allowed is a number above 0"),
     ],
 )
 def test_what_cannot_be_filtered_is_refused_in_one_line(call, message):
@@ -257,6 +257,6 @@ def test_the_real_recording(published):
     for c in (0, recording.fibres - 1):
         assert excess_robust(y[:, c], x[:, c], 4) == 0
     stream = TotalVariation(recording.fibres, 4)
-    blocks = [stream.feed(block) for block in np.array_split(y, 40)]
+    blocks = [stream.update(block) for block in np.array_split(y, 40)]
     assert len(y) - sum(map(len, blocks)) < 40  # readings held back: less than a press
-    np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), x)
+    np.testing.assert_array_equal(np.concatenate([*blocks, stream.flush()]), x)

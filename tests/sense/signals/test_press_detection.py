@@ -193,7 +193,7 @@ def test_it_does_not_matter_how_readings_are_cut(recording: Recording, cuts: lis
     readings, times = recording.readings[:2000], recording.times_s[:2000]
     finder = PressDetector(recording.fibres)
     edges = [0, *sorted(cuts), 2000]
-    told = [event for first, end in pairwise(edges) for event in finder.feed(times[first:end], readings[first:end])]
+    told = [event for first, end in pairwise(edges) for event in finder.update(times[first:end], readings[first:end])]
     touched, released = detect_presses(readings, times)
     assert [event.reading for event in told if event.down] == touched.tolist()
     assert [event.reading for event in told if not event.down] == released[released < 2000].tolist()
@@ -205,26 +205,26 @@ def test_events_are_told_soon_and_what_is_no_stream_of_readings_is_refused(recor
     lags = [
         at - event.reading
         for at in range(2000)
-        for event in finder.feed(recording.times_s[at : at + 1], recording.readings[at : at + 1])
+        for event in finder.update(recording.times_s[at : at + 1], recording.readings[at : at + 1])
     ]
     assert len(lags) > 90
     assert min(lags) >= 1
     assert np.mean(np.array(lags) <= 2) > 0.95
     for times, readings in ((np.zeros(3), (3, 2)), (np.zeros(2), (3, 4)), (np.zeros((2, 2)), (2, 4))):
         with pytest.raises(InputError, match=r"times have shape .* and readings .*, expected \(n,\) and \(n, 4\)"):
-            PressDetector(4).feed(times, np.zeros(readings))
+            PressDetector(4).update(times, np.zeros(readings))
     with pytest.raises(InputError, match="fibres is 0, allowed is a whole number from 1 to 512"):
         PressDetector(0)
     for value in (np.inf, 1001.0):
         with pytest.raises(InputError, match="readings hold"):
-            PressDetector(1).feed([0.0], [[value]])
+            PressDetector(1).update([0.0], [[value]])
     finder = PressDetector(2)
-    finder.feed([0.0, 0.1], np.zeros((2, 2)))
+    finder.update([0.0, 0.1], np.zeros((2, 2)))
     for again in (0.05, 0.1):
         with pytest.raises(InputError, match=f"times begin at {again} s, expected later than the last reading, 0.1 s"):
-            finder.feed([again, 0.3], np.zeros((2, 2)))
-    finder.feed([], np.zeros((0, 2)))
-    finder.feed([0.11], np.zeros((1, 2)))
+            finder.update([again, 0.3], np.zeros((2, 2)))
+    finder.update([], np.zeros((0, 2)))
+    finder.update([0.11], np.zeros((1, 2)))
 
 
 @settings(max_examples=25)

@@ -19,7 +19,7 @@ FIDELITY = st.sampled_from(["robust", "squares"])
 
 
 def streamed(stream, readings, cuts=()):
-    return np.concatenate([*(stream.feed(block) for block in np.split(readings, cuts)), stream.finish()])
+    return np.concatenate([*(stream.update(block) for block in np.split(readings, cuts)), stream.flush()])
 
 
 @settings(max_examples=50)
@@ -36,7 +36,7 @@ def test_what_comes_of_blocks_is_that_of_the_whole(y, cuts, lam, fidelity, width
 def test_what_is_held_back_could_still_change(y, lam, fidelity):
     """Nothing waits longer than it must: of what is held, the first value does depend on what follows."""
     y = y[:, :1]
-    given = TotalVariation(1, lam, fidelity).feed(y)
+    given = TotalVariation(1, lam, fidelity).update(y)
     if len(given) < len(y):
         high, low = (np.concatenate([y, np.full((4000, 1), end)]) for end in (1e9, -1e9))
         if lam < 1e3:  # enough readings to outweigh the coupling
@@ -51,7 +51,7 @@ def test_latest_is_the_causal_value(y, lam, fidelity):
     assert np.isnan(stream.latest).all()
     causal = total_variation(y, lam, fidelity, causal=True)
     for i, reading in enumerate(y):
-        stream.feed([reading])
+        stream.update([reading])
         np.testing.assert_array_equal(stream.latest, causal[i])
 
 
@@ -60,10 +60,10 @@ def test_at_the_cap_a_channel_is_decided_as_if_it_ended():
     y = np.column_stack([np.arange(35) % 2, np.ones(35), np.full(35, np.nan)])
     expected = total_variation(y, 2, starts=[10, 20, 30])
     for size in (1, 7, 10, 35):
-        stream = TotalVariation(3, 2, most_held=10)
-        blocks = [stream.feed(y[i : i + size]) for i in range(0, 35, size)]
+        stream = TotalVariation(3, 2, max_pending=10)
+        blocks = [stream.update(y[i : i + size]) for i in range(0, 35, size)]
         assert sum(map(len, blocks)) == 30
-        np.testing.assert_array_equal(np.concatenate([*blocks, stream.finish()]), expected)
+        np.testing.assert_array_equal(np.concatenate([*blocks, stream.flush()]), expected)
 
 
 @settings(max_examples=50)
@@ -80,9 +80,9 @@ def test_a_long_recording_is_filtered_in_little_memory(fidelity):
     """20 000 readings in blocks of 1000: the stream takes little more than a block, and holds few back."""
     rng, stream = np.random.default_rng(0), TotalVariation(1, 4, fidelity)
     blocks = [np.cumsum(rng.normal(size=1000))[:, None] for _ in range(20)]
-    stream.feed(blocks[0])
+    stream.update(blocks[0])
     tracemalloc.start()
-    assert sum(len(stream.feed(block)) for block in blocks) > 19_000
+    assert sum(len(stream.update(block)) for block in blocks) > 19_000
     kept, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 60_000
@@ -96,7 +96,7 @@ def test_what_follows_the_end_begins_anew(make):
     first, second = streamed(stream, y[:20]), streamed(stream, y[20:])
     np.testing.assert_array_equal(first, streamed(make(), y[:20]))
     np.testing.assert_array_equal(second, streamed(make(), y[20:]))
-    assert stream.finish().shape == (0, 2)
+    assert stream.flush().shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -104,12 +104,12 @@ def test_what_follows_the_end_begins_anew(make):
     [
         (lambda: TotalVariation(0, 4), "channels is 0, allowed is a whole number from 1 to 512"),
         (lambda: TotalVariation(2, -1), "lam is -1"),
-        (lambda: TotalVariation(2, 4, most_held=0), "most_held is 0"),
-        (lambda: TotalVariation(2, 4).feed([1, 2]), r"shape \(2,\), expected \(n, 2\)"),
-        (lambda: TotalVariation(2, 4).feed([[1, 2, 3]]), r"shape \(1, 3\), expected \(n, 2\)"),
-        (lambda: TotalVariation(1, 4).feed([[np.inf]]), "readings hold inf"),
+        (lambda: TotalVariation(2, 4, max_pending=0), "max_pending is 0"),
+        (lambda: TotalVariation(2, 4).update([1, 2]), r"shape \(2,\), expected \(n, 2\)"),
+        (lambda: TotalVariation(2, 4).update([[1, 2, 3]]), r"shape \(1, 3\), expected \(n, 2\)"),
+        (lambda: TotalVariation(1, 4).update([[np.inf]]), "readings hold inf"),
         (lambda: RunningMedian(1, 2), "width is 2"),
-        (lambda: RunningMedian(1, 3).feed([[1, 2]]), r"expected \(n, 1\)"),
+        (lambda: RunningMedian(1, 3).update([[1, 2]]), r"expected \(n, 1\)"),
     ],
 )
 def test_what_a_stream_cannot_take_is_refused(call, message):
