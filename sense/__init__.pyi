@@ -8,11 +8,9 @@ from .formats.lerobot import export_lerobot as export_lerobot
 from .formats.ros_recording import export_bag as export_bag
 from .formats.ros_recording import import_bag as import_bag
 from .health.fault_detector import FaultDetector as FaultDetector
+from .health.fault_detector import FaultMonitor as FaultMonitor
 from .health.fault_detector import FibreFault as FibreFault
-from .health.fault_detector import examine as examine
 from .health.health_model import HealthModel as HealthModel
-from .health.health_model import fit_health_model as fit_health_model
-from .health.health_model import learn_health as learn_health
 from .live.pipeline import Live as Live
 from .localizer.calibration import calibrate as calibrate
 from .localizer.evaluation import evaluate as evaluate

@@ -187,13 +187,12 @@ def _converter(rig: str, model: Path, localizer: "LocalizerModel", spec: Path | 
 
 def _health(model: Path) -> "HealthModel | None":
     """What was learnt of a healthy pad, if it was."""
-    from padforge.sense.health.fault_detector import has_health
-    from padforge.sense.health.health_model import DETECTED, HealthModel
+    from padforge.sense.health.fault_detector import FaultDetector, has_health
 
-    if not has_health(model, DETECTED):
+    if not has_health(model):
         click.echo(f"{model}: health was not learnt, so no fibre will be found bad", err=True)
         return None
-    return HealthModel.load(model, DETECTED)
+    return FaultDetector.load(model).live_model_
 
 
 def _json(view: dict[str, Any], events: "Sequence[Event]") -> None:

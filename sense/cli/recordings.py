@@ -113,12 +113,13 @@ def _findings(model: Path, recording: "Recording") -> "ModelFindings":
     import numpy as np
 
     from padforge.sense.formats.annotations import FaultFound, ModelFindings
-    from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
+    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel
 
-    known, faults = examined(model, recording) if has_health(model) else (None, [])
+    detector = FaultDetector.load(model) if has_health(model) else None
+    faults = detector.predict(recording) if detector else []
     localizer = LocalizerModel.load(model)
-    found = localizer.predict(recording, fibre_mask=fibre_mask_of(faults, len(recording.down_command), localizer.fibres))
+    found = localizer.predict(recording, fibre_mask=mask_faults(faults, len(recording.down_command), localizer.fibres))
     depth = found.measures.get("depth_mm")
     unknown = np.full(len(found.r90_mm), np.nan)
     return ModelFindings(
@@ -127,6 +128,6 @@ def _findings(model: Path, recording: "Recording") -> "ModelFindings":
         found.r90_mm,
         unknown if depth is None else depth.values,
         unknown if depth is None else depth.r90,
-        faults=known and [FaultFound(fault.press, fault.fibres, fault.kind, fault.text) for fault in faults],
-        dead=known.dead if known else (),
+        faults=detector and [FaultFound(fault.press, fault.fibres, fault.kind, fault.text) for fault in faults],
+        dead=detector.model_.dead if detector else (),
     )

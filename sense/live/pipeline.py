@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
-from padforge.sense.health.fault_detector import FaultDetector, FibreFault
+from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.localizer.features import REST, SIZES, ScaledFeatures, bridged, press_inputs
 from padforge.sense.localizer.model import MEASURED, LocalizerModel
@@ -104,7 +104,7 @@ class Live:
         )
         if not isinstance(localizers, Sequence) or not localizers:
             raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
-        self._monitor = None if health is None else FaultDetector(health)
+        self._monitor = None if health is None else FaultMonitor(health)
         models = [check_type("localizers", each, LocalizerModel) for each in localizers]
         for model in models:
             refuse_other_pad(model, "the localizer", fibres, rate_hz)
@@ -127,7 +127,7 @@ class Live:
     @property
     def lost(self) -> tuple[int, ...]:
         """Fibres that are left out, by index."""
-        return () if self._monitor is None else self._monitor.lost
+        return () if self._monitor is None else self._monitor.failed
 
     def feed(self, times_s: Array, readings: Array) -> list[Event]:
         """Take readings; what they bring to light does not depend on how they are cut into blocks.

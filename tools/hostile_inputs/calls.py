@@ -20,7 +20,7 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-TRUSTED = {"sense.HealthModel.refuse_other"}
+TRUSTED = {"sense.HealthModel.check_pad"}
 """They are handed what those who call them have checked."""
 CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
 """Parameters that are left alone: what is called back may raise what it likes."""
@@ -130,7 +130,7 @@ def functions() -> dict[str, Callable[..., Any]]:
         "RunningMedian": lambda: sense.RunningMedian(4, 5),
         "TotalVariation": lambda: sense.TotalVariation(4, 2.0),
         "Live": lambda: sense.Live(sound()["localizers"], sound()["health"], 4, 13.3),
-        "FaultDetector": lambda: sense.FaultDetector(sound()["model"]),
+        "FaultMonitor": lambda: sense.FaultMonitor(sound()["model"]),
         "Spec": lambda: design.Spec({}),
         **{name: lambda key=key: sound()[key] for name, key in _OF_CLASS.items()},
     }

@@ -55,14 +55,14 @@ class Watching:
 
     def __init__(self, model: object) -> None:
         self.told: list[tuple[np.ndarray, int, int]] = []
-        self.lost: tuple[int, ...] = ()
+        self.failed: tuple[int, ...] = ()
 
     def update(self, readings: np.ndarray, down_command: int, up_command: int) -> list[FibreFault]:
         self.told.append((readings.copy(), down_command, up_command))
         if len(self.told) != 6:
             return []
-        self.lost = (1,)
-        return [FibreFault(5, 2, (1,), "silent", 9.0)]
+        self.failed = (1,)
+        return [FibreFault(5, 2, (1,), "no_response", 9.0)]
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt,
     down_command, up_command = part.down_command.copy(), part.up_command.copy()
     down_command[8], up_command[8] = up_command[7] + 4, up_command[7] + 20  # soon after the one before
     part = replace(part, down_command=down_command, up_command=up_command)
-    monkeypatch.setattr(padforge.sense.live.pipeline, "FaultDetector", lambda model: watching)
+    monkeypatch.setattr(padforge.sense.live.pipeline, "FaultMonitor", lambda model: watching)
     monkeypatch.setattr(padforge.sense.live.pipeline, "PressDetector", Scripted(part))
     live = Live([localizer], localizer, part.fibres, part.rate_hz)  # as alike as it looks at
     events = live.feed(part.times_s, part.readings)
@@ -175,7 +175,7 @@ def test_a_fibre_found_bad_is_left_out_from_the_next_press_on(recording, learnt,
     expected = localizer.predict(part, (1,)).positions_mm
     np.testing.assert_allclose(places(estimates)[6:], expected[6 : len(estimates)], atol=1e-3)
     view = live.view()
-    assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "silent", "sound", "sound"]
+    assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "no_response", "sound", "sound"]
     assert view["findings"] == [live.findings[0].text]
     for press, (readings, down_command, up_command) in enumerate(watching.told):  # of each press alone
         first, last = (
