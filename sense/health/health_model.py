@@ -28,7 +28,7 @@ from padforge.sense.health.trace_model import (
     predict_fibres,
     train_networks,
 )
-from padforge.sense.localizer.model_files import files_of, refuse_other_pad
+from padforge.sense.localizer.model_files import files_of
 from padforge.sense.recording.recording import rate_of
 
 FORMAT = "padforge-health/3"
@@ -111,10 +111,6 @@ class HealthModel:
     def threshold(self) -> float:
         """Least `ExceedanceModel.neg_log_p` of a fault: all hypotheses share the false alarms equally."""
         return float(np.log(len(HYPOTHESES) / self.false_alarm_rate))
-
-    def check_pad(self, fibres: int, rate_hz: float) -> None:
-        """Raise InputError if readings have another number of fibres, or another rate, than those trained on."""
-        refuse_other_pad(self, "health", fibres, rate_hz)
 
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; `load` restores every bit.

@@ -7,7 +7,7 @@ is the share.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,22 +42,20 @@ class PadModel:
     """A pad of C channels to be simulated.
 
     Attributes:
-        channels: number of channels, C.
         corners_mm: low and high corner of where it is pressed, in the frame of the arm; shape (2, 2).
         free: which positions (Q, 2) may be pressed.
         responses: maps positions (Q, 2), mm, to responses (Q, C) at full depth: relative stretches, or V.
+        source: description of the pad for the recording, JSON.
         noise_v: standard deviation of a response that no position explains; shape (C,), V; None for stretches.
         rig: measured settings of `[rig]`.
-        source: description of the pad for the recording, JSON.
     """
 
-    channels: int
     corners_mm: Array
     free: Free
     responses: Callable[[Array], Array]
-    noise_v: Array | None
-    rig: dict[str, float]
     source: dict[str, Any]
+    noise_v: Array | None = None
+    rig: dict[str, float] = field(default_factory=dict)
 
 
 def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = None) -> PadModel:
@@ -70,15 +68,11 @@ def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = Non
     keys = {"sensed_mm", "keep_out_mm"} if size.keep_out_mm else {"sensed_mm"}
     source = {"contact": contact.model_dump(mode="json"), "morphology": told_pad(pad)}
     source |= size.model_dump(mode="json", include=keys)
-    return PadModel(
-        len(pad.knots),
-        pad.to_mm(size.sensed),
-        free_of(pad, size),
-        lambda positions_mm: relative_stretch(pad, pad.to_grid(positions_mm), contact),
-        None,
-        {},
-        source,
-    )
+
+    def responses(positions_mm: Array) -> Array:
+        return relative_stretch(pad, pad.to_grid(positions_mm), contact)
+
+    return PadModel(pad.to_mm(size.sensed), free_of(pad, size), responses, source)
 
 
 def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
@@ -104,13 +98,12 @@ def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
     sides, *_ = np.linalg.lstsq(spans, np.array(twin.sensed_mm) / twin.frame.scale, rcond=MIN_SINGULAR)
     half_mm = np.maximum(sides, 0) / 2
     plan = model_plan(twin.morphology, twin.contact(), size)
-    source = plan.source | {"sensed_mm": (2 * half_mm).tolist()}
-    return PadModel(
-        len(twin.channels),
-        np.array([-half_mm, half_mm]),
-        lambda positions_mm: plan.free(twin.frame.to_plan(positions_mm)),
-        responses,
-        *_measured(twin, noise_v, source),
+    return replace(
+        plan,
+        corners_mm=np.array([-half_mm, half_mm]),
+        free=lambda positions_mm: plan.free(twin.frame.to_plan(positions_mm)),
+        responses=responses,
+        **_measured(twin, noise_v, plan.source | {"sensed_mm": (2 * half_mm).tolist()}),
     )
 
 
@@ -125,14 +118,9 @@ def model_like_twin(pad: Morphology, twin: Twin, size: PadSettings | None = None
     gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live_channels(twin)]).T
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
     plan = model_plan(pad, twin.contact(), size)
-    noise_v = np.full(plan.channels, np.median(noises_v))
-    return PadModel(
-        plan.channels,
-        plan.corners_mm,
-        plan.free,
-        lambda positions_mm: gain_v * plan.responses(positions_mm),
-        *_measured(twin, noise_v, plan.source),
-    )
+    noise_v = np.full(len(pad.knots), np.median(noises_v))
+    measured = _measured(twin, noise_v, plan.source)
+    return replace(plan, responses=lambda positions_mm: gain_v * plan.responses(positions_mm), **measured)
 
 
 def _live_channels(twin: Twin) -> list[TwinChannel]:
@@ -142,8 +130,8 @@ def _live_channels(twin: Twin) -> list[TwinChannel]:
     return live
 
 
-def _measured(twin: Twin, noise_v: Array, source: dict[str, Any]) -> tuple[Array, dict[str, float], dict[str, Any]]:
-    """Return noise, settings of `[rig]` and source of a pad that is like a twin.
+def _measured(twin: Twin, noise_v: Array, source: dict[str, Any]) -> dict[str, Any]:
+    """Return `noise_v`, `rig` and `source` of a `PadModel` that is like a twin.
 
     A simulated press deviates in all its readings by the same, so by less than a measured one while it is held: as much
     as limits the localization from all that was read of a press.
@@ -151,13 +139,10 @@ def _measured(twin: Twin, noise_v: Array, source: dict[str, Any]) -> tuple[Array
     rig = asdict(twin.readings) if twin.readings else {}
     information_gain = rig.pop("information_gain", 1.0)
     rig |= {"scatter": twin.scatter.share / np.sqrt(information_gain), "scatter_common": twin.scatter.common}
-    description = {
-        "presses": twin.presses,
-        "noise": twin.noise,
-        "information_gain": information_gain,
-        "provenance": dict(twin.provenance),
-    }
-    return twin.scatter.floor * noise_v / np.sqrt(information_gain), rig, source | {"twin": description}
+    description = {"presses": twin.presses, "noise": twin.noise, "information_gain": information_gain}
+    description |= {"provenance": dict(twin.provenance)}
+    noise_v = twin.scatter.floor * noise_v / np.sqrt(information_gain)
+    return {"noise_v": noise_v, "rig": rig, "source": source | {"twin": description}}
 
 
 def simulate(

@@ -20,8 +20,6 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-TRUSTED = {"sense.HealthModel.check_pad"}
-"""They are handed what those who call them have checked."""
 CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
 """Parameters that are left alone: what is called back may raise what it likes."""
 
@@ -146,7 +144,7 @@ def functions() -> dict[str, Callable[..., Any]]:
                 found[full] = thing
             for key, method in inspect.getmembers(thing, callable):
                 inherited = (getattr(method, "__module__", "") or "").partition(".")[0] != package.__name__
-                if key.startswith("_") or f"{full}.{key}" in TRUSTED or inherited:
+                if key.startswith("_") or inherited:
                     continue
                 if inspect.ismethod(method) or isinstance(inspect.getattr_static(thing, key), staticmethod):
                     found[f"{full}.{key}"] = method
