@@ -45,50 +45,26 @@ MEDIAN_T, FAR_T = 0.7267, 6.869
 
 @dataclass(frozen=True)
 class FaultLikelihoods:
-    """Distribution of healthy presses about the predictions of the networks.
+    """Distribution of healthy presses about the predictions of the networks."""
 
-    Attributes:
-        std_scale: calibrates a predicted deviation s to hypot(std_scale s, std_floor); shape (C, T).
-        std_floor: shape (C, T).
-        noise_floor: noise of the components of a response; shape (C, D).
-        library_mean: predictions for other presses; shape (L, C, D).
-        library_std: their standard deviations; shape (L, C, D).
-        noise_v: median noise; shape (C,), V.
-        log_noise_mean: median of the logarithm of the noise over its median; shape (C,).
-        log_noise_std: its standard deviation; shape (C,).
-        constant_share: share of presses in which the fibre is constant; shape (C,).
-        step_filters: matched filters of a step; shape (C, S, TRACE), 1/V.
-        rest_autocorr: correlation of the rest's residual with that of the press before, of all fibres; shape (1,).
-        innovation_std: standard deviation of what does not correlate; shape (1,).
-    """
-
-    std_scale: Array
+    std_scale: Array  # a predicted deviation s is calibrated to hypot(std_scale s, std_floor); shape (C, T)
     std_floor: Array
-    noise_floor: Array
-    library_mean: Array
+    noise_floor: Array  # noise of the components of a response; shape (C, D)
+    library_mean: Array  # predictions for other presses; shape (L, C, D)
     library_std: Array
-    noise_v: Array
-    log_noise_mean: Array
+    noise_v: Array  # median noise; shape (C,), V
+    log_noise_mean: Array  # median and deviation of the logarithm of the noise over its median; shape (C,)
     log_noise_std: Array
-    constant_share: Array
-    step_filters: Array
-    rest_autocorr: Array
-    innovation_std: Array
+    constant_share: Array  # share of presses in which the fibre is constant; shape (C,)
+    step_filters: Array  # matched filters of a step; shape (C, S, TRACE), 1/V
+    rest_autocorr: Array  # correlation of the rest's residual with that of the press before, of all fibres; shape (1,)
+    innovation_std: Array  # standard deviation of what does not correlate; shape (1,)
 
     @classmethod
     def fit(
         cls, traces: Array, targets: Array, mean: Array, std: Array, target_scale_v: Array, rng: np.random.Generator
     ) -> "FaultLikelihoods":
-        """Fit to healthy presses.
-
-        Args:
-            traces: shape (Q, C, TRACE), V.
-            targets: scaled; shape (Q, C, T).
-            mean: predicted by members that were not trained on the press; shape (Q, C, T).
-            std: shape (Q, C, T).
-            target_scale_v: shape (C, T), V.
-            rng: chooses the library.
-        """
+        """Fit to healthy traces, targets, and predictions (Q, C, T) by members that were not trained on the press."""
         std_scale, std_floor = _calibrate_std(targets - mean, std)
         noise_v = np.median(estimate_noise(traces), axis=0)
         noise_v = np.where(noise_v > MIN_SCALE_V, noise_v, 1e-3 * target_scale_v[:, 0])

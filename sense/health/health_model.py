@@ -225,18 +225,6 @@ def fit_health_model(
     readings show (stuck, noisy, offset); responses need two or more. A model of fewer than MIN_GAIN_PRESSES never
     reports a reduced gain.
 
-    Args:
-        readings: of a recording; shape (R, C), V.
-        times_s: shape (R,), s.
-        down_command: first reading after the probe was sent down; shape (Q,).
-        up_command: first reading after it was sent up; shape (Q,).
-        rng: of all that is random.
-        false_alarm_rate: false alarms a press.
-        provenance: origin of the model, JSON.
-
-    Returns:
-        The model.
-
     Raises:
         InputError: fewer than MIN_PRESSES complete presses, or no living fibre.
     """

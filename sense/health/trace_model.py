@@ -50,17 +50,9 @@ LOG_STD = (-4.0, 2.0)
 
 
 def extract_trace(readings: Array, down_command: int, up_command: int, first: int, end: int) -> Array:
-    """Extract the readings around a press.
+    """Extract the trace (C, TRACE) of a press from readings (R, C), filled beyond those from `first` to before `end`.
 
-    Args:
-        readings: shape (R, C), V.
-        down_command: first reading after the probe was sent down.
-        up_command: first reading after it was sent up.
-        first: first reading that belongs to the press; earlier ones are filled with it.
-        end: end of its readings; later ones are filled with the last.
-
-    Returns:
-        The trace; shape (C, TRACE), V; NaN after the release if the press has no reading from there on.
+    It has NaN after the release if the press has no reading from there on.
     """
     rest = np.arange(down_command - REST, down_command).clip(min(first, down_command - 1))
     held = np.minimum(np.arange(down_command, down_command + HELD), up_command - 1)
@@ -73,11 +65,9 @@ def extract_trace(readings: Array, down_command: int, up_command: int, first: in
 
 
 def bound_presses(readings: Array, down_command: Indices, up_command: Indices) -> tuple[Array, Indices, Indices]:
-    """Find the readings that belong to each press, between its neighbours.
+    """Find the first readings (Q,) of presses and their ends (Q,), between the neighbours.
 
-    Returns:
-        Readings, padded with NaN where the recording ends before RELEASED readings of the last release; the first
-        reading of each press; and their ends; shape (Q,).
+    Readings (R, C) are returned too, padded with NaN if they end before RELEASED readings of the last release.
     """
     # No press follows that cuts the last one short, so its remaining readings are missing, and are not filled.
     missing = max(int(up_command[-1]) + RELEASED - len(readings), 0)
@@ -94,17 +84,11 @@ def extract_traces(readings: Array, down_command: Indices, up_command: Indices) 
 
 @dataclass
 class TraceHistory:
-    """State of the fibres after earlier presses.
+    """State of the fibres after earlier presses."""
 
-    Attributes:
-        level: running level of the rest; shape (C,), V; NaN before the first press.
-        n_presses: presses in it; shape (C,).
-        residue: decaying sum of earlier responses; shape (C, D).
-    """
-
-    level: Array
-    n_presses: Indices
-    residue: Array
+    level: Array  # running level of the rest; shape (C,), V; NaN before the first press
+    n_presses: Indices  # presses in it; shape (C,)
+    residue: Array  # decaying sum of earlier responses; shape (C, D)
 
     @classmethod
     def initial(cls, fibres: int) -> "TraceHistory":
@@ -114,17 +98,11 @@ class TraceHistory:
 
 @dataclass(frozen=True)
 class TracePCA:
-    """Principal components of the responses, and the scales of inputs and targets of the network.
+    """Principal components of the responses, and the scales of inputs and targets of the network."""
 
-    Attributes:
-        components: principal directions of each fibre's responses; shape (C, TRACE, D).
-        input_scale_v: shape (C, N), V.
-        target_scale_v: shape (C, T), V.
-    """
-
-    components: Array
-    input_scale_v: Array
-    target_scale_v: Array
+    components: Array  # principal directions of each fibre's responses; shape (C, TRACE, D)
+    input_scale_v: Array  # shape (C, N)
+    target_scale_v: Array  # shape (C, T)
 
     @classmethod
     def fit_transform(cls, traces: Array) -> tuple["TracePCA", Floats, Array]:
@@ -193,17 +171,7 @@ def _silu(x: Floats) -> Floats:
 
 
 def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.random.Generator) -> dict[str, Floats]:
-    """Train one member on each set of presses.
-
-    Args:
-        inputs: scaled; shape (Q, C, N).
-        targets: scaled; shape (Q, C, T).
-        rows: indices of the presses of each member.
-        rng: source of the seed of torch's generator.
-
-    Returns:
-        Weights of an ensemble of len(rows).
-    """
+    """Train one member on each set of presses (`rows`), of scaled inputs (Q, C, N) and targets (Q, C, T)."""
     import torch
     from torch.nn.functional import silu
 

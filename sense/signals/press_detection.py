@@ -66,7 +66,8 @@ class PressDetector:
         self._fibres, self._pad = initial_state(fibres)
         self._last_s = -np.inf
         degrees = np.arange(1, fibres + 1)
-        self._limits = [np.concatenate([[0.0], chdtri(degrees, p)]) for p in (P_REJECT, P_ACCEPT)]
+        self._reject_limit = np.concatenate([[0.0], chdtri(degrees, P_REJECT)])
+        self._accept_limit = np.concatenate([[0.0], chdtri(degrees, P_ACCEPT)])
 
     def update(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
         """Process further readings.
@@ -86,7 +87,8 @@ class PressDetector:
             raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
         self._last_s = times[-1] if len(times) else self._last_s
         events = np.empty((2 * len(times), 2), np.int64)
-        count = detect(self._fibres, self._pad, times, np.ascontiguousarray(rows), *self._limits, events)
+        rows = np.ascontiguousarray(rows)
+        count = detect(self._fibres, self._pad, times, rows, self._reject_limit, self._accept_limit, events)
         return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
 
 

@@ -40,12 +40,7 @@ REST_V = (1.7, 2.1)
 
 @dataclass(frozen=True)
 class Cycle:
-    """Cycle of a press: the probe is sent down in its middle, and up at its end.
-
-    Attributes:
-        readings: readings in a cycle.
-        rate_hz: readings per second.
-    """
+    """Cycle of a press, in readings: the probe is sent down in its middle, and up at its end."""
 
     readings: int
     rate_hz: float
@@ -174,18 +169,10 @@ def simulate_readings(
     rng: np.random.Generator,
     noise_v: Array | None = None,
 ) -> Array:
-    """Simulate the readings of a plan of presses; strain is proportional to the depth.
+    """Simulate the readings (Q readings, C), V, of presses; strain is proportional to the depth (Q,).
 
-    Args:
-        responses: relative stretches at full depth; or V, as measured (a held press minus the rest); shape (Q, C).
-        depths_mm: depths of the presses; shape (Q,), mm.
-        cycle: cycle of the presses.
-        rig: settings of scatter, creep, hysteresis, drift and noise.
-        rng: of all that is random.
-        noise_v: standard deviation of responses in V that does not depend on them; shape (C,); None for stretches.
-
-    Returns:
-        Readings; shape (Q readings, C), V.
+    Responses (Q, C) are relative stretches at full depth; or V, as measured (a held press minus the rest), with the
+    standard deviation `noise_v` (C,) that does not depend on them.
     """
     presses, channels = responses.shape
     # The divider draws first, as in `LivePad`: with the same seed fibres have the same rests there.

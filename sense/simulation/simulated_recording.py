@@ -39,23 +39,14 @@ DECAY_S = np.geomspace(1.0, 100.0, 41)
 
 @dataclass(frozen=True)
 class PadModel:
-    """A pad of C channels to be simulated.
+    """A pad of C channels to be simulated."""
 
-    Attributes:
-        corners_mm: low and high corner of where it is pressed, in the frame of the arm; shape (2, 2).
-        free: which positions (Q, 2) may be pressed.
-        responses: maps positions (Q, 2), mm, to responses (Q, C) at full depth: relative stretches, or V.
-        source: description of the pad for the recording, JSON.
-        noise_v: standard deviation of a response that no position explains; shape (C,), V; None for stretches.
-        rig: measured settings of `[rig]`.
-    """
-
-    corners_mm: Array
-    free: Free
-    responses: Callable[[Array], Array]
-    source: dict[str, Any]
-    noise_v: Array | None = None
-    rig: dict[str, float] = field(default_factory=dict)
+    corners_mm: Array  # low and high corner of where it is pressed, in the frame of the arm; shape (2, 2)
+    free: Free  # which positions (Q, 2) may be pressed
+    responses: Callable[[Array], Array]  # of positions (Q, 2), mm, at full depth: relative stretches, or V; (Q, C)
+    source: dict[str, Any]  # description of the pad for the recording, JSON
+    noise_v: Array | None = None  # deviation of responses that no position explains, shape (C,); None for stretches
+    rig: dict[str, float] = field(default_factory=dict)  # measured settings of `[rig]`
 
 
 def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = None) -> PadModel:

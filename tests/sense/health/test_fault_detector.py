@@ -182,11 +182,11 @@ def test_fit_trains_on_commanded_and_on_detected_presses(pad: Recording, monkeyp
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda pad: FaultDetector().fit(3), "recording is 3, expected a Recording"),
+        (lambda pad: FaultDetector().fit(3), "recording is 3, expected a Recording"),  # type: ignore[arg-type]
         (lambda pad: FaultDetector().fit(pad, [0, 10**6]), "held_back is .*, allowed are presses from 0 to"),
         (lambda pad: FaultDetector().fit(pad, [-1]), "held_back is .*, allowed are presses from 0 to"),
         (lambda pad: FaultDetector().fit(pad, "ab"), "held_back"),
-        (lambda pad: FaultDetector(seed="a"), "seed is 'a'"),
+        (lambda pad: FaultDetector(seed="a"), "seed is 'a'"),  # type: ignore[arg-type]
         (lambda pad: FaultDetector(0.0), "false_alarm_rate is 0"),
         (lambda pad: FaultDetector(0.2), "false_alarm_rate is 0.2"),
     ],
