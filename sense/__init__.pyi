@@ -8,11 +8,9 @@ from .formats.lerobot import export_lerobot as export_lerobot
 from .formats.ros_recording import export_bag as export_bag
 from .formats.ros_recording import import_bag as import_bag
 from .health.fault_detector import FaultDetector as FaultDetector
+from .health.fault_detector import FaultMonitor as FaultMonitor
 from .health.fault_detector import FibreFault as FibreFault
-from .health.fault_detector import examine as examine
 from .health.health_model import HealthModel as HealthModel
-from .health.health_model import fit_health_model as fit_health_model
-from .health.health_model import learn_health as learn_health
 from .live.pipeline import Live as Live
 from .localizer.calibration import calibrate as calibrate
 from .localizer.evaluation import evaluate as evaluate
@@ -25,8 +23,8 @@ from .settings import LocalizerSettings as LocalizerSettings
 from .settings import RigSettings as RigSettings
 from .signals.filters import RunningMedian as RunningMedian
 from .signals.filters import TotalVariation as TotalVariation
+from .signals.filters import find_segment_starts as find_segment_starts
 from .signals.filters import running_median as running_median
-from .signals.filters import stretches as stretches
 from .signals.filters import total_variation as total_variation
 from .signals.press_detection import PressDetector as PressDetector
 from .signals.press_detection import detect_presses as detect_presses

@@ -1,4 +1,7 @@
-"""What a recording may hold: beyond these limits lies no pad, probe or clock, but a file of another kind."""
+"""Arrays that a recording consists of: their types, limits, and the checks of what comes from outside.
+
+Values beyond the limits are of no pad, probe or clock: the file is of another kind.
+"""
 
 from typing import Any
 
@@ -7,51 +10,50 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.design.common.validation import MAX_VALUES, InputError, short_repr
 
-MAX_FIBRES = 512
-MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
-"""Greatest reading, place, time and force, by amount (seconds since 1970 are 2e9)."""
-MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
-MAX_BYTES = 2**33
-"""Size of the largest file of a recording."""
-MAX_INDEX = 2**53
-"""Greatest index that float64 holds exactly."""
-MIN_SCALE_V = 1e-9
-"""Least spread that an input is divided by: what varies less never varied."""
-
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-"""Kinds of arrays that all rooms of sense speak of."""
+
+MAX_FIBRES = 512
+MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
+"""Largest absolute reading, position, time and force (seconds since 1970 are 2e9)."""
+MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
+MAX_BYTES = 2**33
+"""Size of the largest file of a recording."""
+MAX_INDEX = 2**53
+"""Largest index that float64 holds exactly."""
+MIN_SCALE_V = 1e-9
+"""Least standard deviation that an input is divided by: what varies less is constant."""
 
 
 def check_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
-    """`values`, or a copy of them, as an array of float64, or of int64 where all are whole numbers.
+    """Convert values to an array of float64, or of int64 if all are whole numbers.
 
     Raises:
-        InputError: anything else.
+        InputError: they are anything else, or too many.
     """
-    what = "real numbers" if kind is np.float64 else f"whole numbers up to {MAX_INDEX}"
+    allowed = "real numbers" if kind is np.float64 else f"whole numbers up to {MAX_INDEX}"
     try:
         array = np.asarray(values)
-    except Exception as error:  # numpy lets pass whatever an object raises that poses as an array
-        raise InputError(f"{name} are {short_repr(values)}, expected an array of {what} ({error})") from error
+    except Exception as error:  # numpy passes on whatever an object raises that poses as an array
+        raise InputError(f"{name} are {short_repr(values)}, expected an array of {allowed} ({error})") from error
     if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} are {short_repr(values)} ({array.dtype}), expected an array of {what}")
+        raise InputError(f"{name} are {short_repr(values)} ({array.dtype}), expected an array of {allowed}")
     if array.size > MAX_VALUES:
         raise InputError(f"{name} are {array.size} numbers, allowed are {MAX_VALUES}")
-    with np.errstate(over="ignore"):  # of longer floats, which become infinity
+    with np.errstate(over="ignore"):  # longer floats become infinity
         array = array.astype(np.float64, copy=copy) if array.dtype.kind == "f" else array
     if kind is np.int64 and not ((array >= -MAX_INDEX) & (array <= MAX_INDEX) & (array == np.trunc(array))).all():
-        raise InputError(f"{name} are {short_repr(values)}, expected an array of {what}")
+        raise InputError(f"{name} are {short_repr(values)}, expected an array of {allowed}")
     return array.astype(kind, copy=copy)
 
 
-def check_magnitude(name: str, values: NDArray[np.float64], limit: float, unit: str, missing: bool = False) -> None:
-    """Raise InputError if an entry of (N, M) values is not finite, or beyond `limit`; NaN is allowed if `missing`."""
-    sound = ~np.isinf(values) if missing else np.isfinite(values)
-    if not sound.all():
-        row = int(np.argmin(sound.all(axis=1)))
+def check_magnitude(name: str, values: Array, limit: float, unit: str, missing: bool = False) -> None:
+    """Raise InputError if a value (N, M) is not finite, or beyond the limit; NaN is allowed if `missing`."""
+    valid = ~np.isinf(values) if missing else np.isfinite(values)
+    if not valid.all():
+        row = int(np.argmin(valid.all(axis=1)))
         kind = "infinity" if missing else "NaN or infinity"
         raise InputError(f"{name} hold {kind} (first in row {row}), expected finite numbers")
     beyond = np.abs(values) > limit
@@ -62,11 +64,27 @@ def check_magnitude(name: str, values: NDArray[np.float64], limit: float, unit: 
         )
 
 
-def stream_of(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Times (n,) and readings (n, C), NaN where missing, as float64; C is `fibres`, where that is given.
+def check_ascending(times_s: Array) -> None:
+    """Raise InputError unless each time (n,) is later than the one before."""
+    is_later = np.diff(times_s) > 0
+    if not is_later.all():
+        row = int(np.argmin(is_later)) + 1
+        raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
+
+
+def check_stream(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None) -> tuple[Array, Array]:
+    """Check readings and their times, and convert them to float64.
+
+    Args:
+        times_s: ascending; shape (n,), s.
+        readings: NaN where missing; shape (n, C), V.
+        fibres: required number of fibres C; None allows any.
+
+    Returns:
+        Times and readings.
 
     Raises:
-        InputError: shapes that do not fit together, what is beyond the limits above, or times that do not ascend.
+        InputError: shapes that do not fit together, values beyond the limits, or times that do not ascend.
     """
     times = check_numbers(times_s, np.float64, "times", copy=False)
     rows = check_numbers(readings, np.float64, "readings", copy=False)
@@ -80,11 +98,3 @@ def stream_of(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None
     check_magnitude("times", times[:, None], MAX_S, "s")
     check_ascending(times)
     return times, rows
-
-
-def check_ascending(times_s: NDArray[np.float64]) -> None:
-    """Raise InputError unless each of (n,) times is later than the one before."""
-    late = np.diff(times_s) > 0
-    if not late.all():
-        row = int(np.argmin(late)) + 1
-        raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")

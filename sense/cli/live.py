@@ -186,13 +186,12 @@ def _make_board(rig: str, model: Path, localizer: "LocalizerModel", options: Any
 
 def _load_health(model: Path) -> "HealthModel | None":
     """Load the health model in the folder of a model, if there is one."""
-    from padforge.sense.health.fault_detector import has_health
-    from padforge.sense.health.health_model import DETECTED, HealthModel
+    from padforge.sense.health.fault_detector import FaultDetector, has_health
 
-    if not has_health(model, DETECTED):
+    if not has_health(model):
         click.echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
         return None
-    return HealthModel.load(model, DETECTED)
+    return FaultDetector.load(model).live_model_
 
 
 def _show_json(view: dict[str, Any], events: "Sequence[Event]") -> None:

@@ -137,17 +137,17 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
     deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
     of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
-    from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
+    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel, write_localization
 
     file = out or pad_folder(recording) / "places.csv"
     localizer = LocalizerModel.load(model)
     failed = fibre_indices(exclude_fibres, localizer.fibres)
     opened = read_recording(recording)
-    findings = examined(model, opened)[1] if has_health(model) else []
+    findings = FaultDetector.load(model).predict(opened) if has_health(model) else []
     for finding in findings:
         click.echo(f"{finding.text}; left out from there on", err=True)
-    fibre_mask = fibre_mask_of(findings, len(opened.down_command), localizer.fibres)
+    fibre_mask = mask_faults(findings, len(opened.down_command), localizer.fibres)
     localization = localizer.predict(opened, failed, fibre_mask)
     write_localization(localization, file)
     click.echo(f"{len(localization.r50_mm)} positions -> {file}")
@@ -168,17 +168,18 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     """
     from dataclasses import asdict
 
-    from padforge.sense.health.fault_detector import examined, fault_lines
+    from padforge.sense.health.fault_detector import FaultDetector, fault_lines
 
     opened = read_recording(recording)
-    known, findings = examined(model, opened)
+    detector = FaultDetector.load(model)
+    findings = detector.predict(opened)
     document = {
-        "format": "padforge-findings/2",
+        "format": "padforge-findings/3",
         "presses": len(opened.down_command),
-        "dead": list(known.dead),
+        "dead": list(detector.model_.dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
     }
-    show_result(document, fault_lines(findings, opened.fibres, known.dead), as_json)
+    show_result(document, fault_lines(findings, opened.fibres, detector.model_.dead), as_json)
     context.exit(int(bool(findings)))
 
 
@@ -270,7 +271,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     """
     from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.formats.import_export import open_recording
-    from padforge.sense.health.fault_detector import health_files, health_in
+    from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector, has_health
     from padforge.sense.localizer import recalibration
     from padforge.sense.localizer.model import LocalizerModel
 
@@ -278,16 +279,17 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
     check_writable(target)
-    old, health, opened = LocalizerModel.load(model), health_in(model), open_recording(recording)
+    old, opened = LocalizerModel.load(model), open_recording(recording)
+    detector = FaultDetector.load(model) if has_health(model) else None
     with reported("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
-    with atomic_files(target, without=health_files()) as folder:
+    with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"
-        check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *health_files()], force)
+        check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *HEALTH_FILES], force)
         write_json(folder / "recalibration.json", document)
-        for name, known in health.items():  # it was learnt without places
-            known.save(folder, name)
+        if detector:  # it does not depend on positions
+            detector.save(folder)
     common.show_result(document, recalibration.recalibration_lines(document), as_json)
 
 

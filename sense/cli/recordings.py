@@ -116,12 +116,13 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
     import numpy as np
 
     from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
-    from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
+    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel
 
-    health_model, faults = examined(model, recording) if has_health(model) else (None, [])
+    detector = FaultDetector.load(model) if has_health(model) else None
+    faults = [] if detector is None else detector.predict(recording)
     localizer = LocalizerModel.load(model)
-    fibre_mask = fibre_mask_of(faults, len(recording.down_command), localizer.fibres)
+    fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
     prediction = localizer.predict(recording, fibre_mask=fibre_mask)
     depth = prediction.measures.get("depth_mm")
     unknown = np.full(len(prediction.r90_mm), np.nan)
@@ -132,7 +133,7 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
         depths_mm=unknown if depth is None else depth.values,
         depths_r90_mm=unknown if depth is None else depth.r90,
         faults=None
-        if health_model is None
+        if detector is None
         else [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in faults],
-        dead=() if health_model is None else health_model.dead,
+        dead=() if detector is None else detector.model_.dead,
     )

@@ -316,12 +316,12 @@ def _find_runs(values: Array, pressed: Mask) -> tuple[Indices, Indices]:
 
 def _detect(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
     """Return the down and up commands of presses that are detected in the readings."""
-    from padforge.sense.signals.press_detection import as_commanded, detect_presses
+    from padforge.sense.signals.press_detection import detect_presses, estimate_commands
 
     placeholder = np.array([1])
     Recording(readings, times_s, np.zeros((1, 2)), placeholder, placeholder + 1, source)  # checks the readings first
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
         raise InputError("has no press: no position or number tells of one, and none is detected in the readings")
-    down, up = as_commanded(presses, times_s)
+    down, up = estimate_commands(presses, times_s)
     return down, up

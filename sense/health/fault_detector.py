@@ -1,63 +1,79 @@
-"""Following the health of a pad press by press, and naming the fibre at fault.
-
-Health in the folder of a model, as `calibrate` leaves it there: what is known of a recording's fibres by it.
-"""
+"""Detection of faulty fibres: press by press (`FaultMonitor`), and in a recording (`FaultDetector`, an estimator)."""
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from padforge.design.common.files import resolve_exchange
-from padforge.design.common.validation import InputError, check_int, check_type
-from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Indices, Mask, check_magnitude, check_numbers
+from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
+from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Mask, check_magnitude, check_numbers
 from padforge.sense.formats.columns import PRESSES_DETECTED
-from padforge.sense.health.fault_likelihoods import HYPOTHESES, MOST, climb, noise_of
-from padforge.sense.health.health_model import COMMANDED, DETECTED, SETTLED, HealthModel, checked_presses
-from padforge.sense.health.trace_model import RELEASED, REST, History, expected, press_ranges, press_trace
-from padforge.sense.localizer.model_files import files_of
+from padforge.sense.health.fault_likelihoods import HYPOTHESES, MAX_LLR, cusum_update, estimate_noise
+from padforge.sense.health.health_model import (
+    COMMANDED,
+    DETECTED,
+    FALSE_ALARM_RATE,
+    MAX_FALSE_ALARM_RATE,
+    WARM_UP,
+    HealthModel,
+    fit_health_model,
+)
+from padforge.sense.health.trace_model import (
+    RELEASED,
+    REST,
+    TraceHistory,
+    bound_presses,
+    extract_trace,
+    predict_fibres,
+)
+from padforge.sense.localizer.model_files import files_of, refuse_other_pad
 from padforge.sense.recording.recording import Recording
+from padforge.sense.signals.press_detection import align_to_detected
 
-MISSING = 20
-"""Presses on end without a reading after which a fibre is missing."""
+MAX_MISSING = 20
+"""Successive presses without a reading after which a fibre is missing."""
 WINDOW = 64
-"""Presses that are gone through again when a fibre is to be named."""
-SUSPECTS = 4
-"""Most fibres that are weighed against each other then."""
-MOST_SCORE = 99.0
-"""What is certain."""
+"""Presses that are evaluated again to identify a faulty fibre."""
+MAX_SUSPECTS = 4
+"""Fibres that are compared then."""
+MAX_SCORE = 99.0
+"""Score of what is certain."""
 FLOATING = 30.0
-"""Noise, as a multiple of the usual, that no fibre makes: an open input picks it up."""
+"""Noise, as a multiple of the median, that only an open input picks up."""
 
 TEXTS = {
     "stuck": "reads one value",
-    "open": "is open: it reads what its rest never was, or noise alone",
-    "silent": "answers no press",
-    "weak": "answers by about half",
-    "odd": "answers as if another place were pressed",
-    "swapped": "have changed places",
+    "open": "is open: it reads a level that it never rests at, or noise alone",
+    "no_response": "responds to no press",
+    "reduced_gain": "responds with about half its gain",
+    "inconsistent": "responds as if another position were pressed",
+    "swapped": "are swapped",
     "noisy": "is noisy",
     "offset": "rests at another level",
     "drifting": "rests ever further from its level",
     "missing": "gives no readings",
 }
-"""The kinds of findings, in words."""
+"""Kinds of faults, in words."""
 
 
 @dataclass(frozen=True)
 class FibreFault:
-    """A fibre at fault.
+    """A faulty fibre.
 
     Attributes:
-        press: index of the press at which it was named, counted from the first that was seen.
-        since: estimate of the first bad press.
-        fibres: by index; two if they were swapped.
+        press: index of the press at which the fault was detected.
+        since: estimated index of the first bad press.
+        fibres: indices of the fibres; two if they are swapped.
         kind: a key of `TEXTS`.
-        score: a healthy pad looks like this once in 10 ** score presses; at most 99, which is certainty.
+        score: a healthy pad looks like this once in 10 ** score presses; at most 99, which is certain.
     """
 
     press: int
@@ -68,60 +84,63 @@ class FibreFault:
 
     @property
     def text(self) -> str:
-        """One line; fibres by number, the first is 1."""
-        who = " and ".join(str(fibre + 1) for fibre in self.fibres)
+        """One line; fibres are numbered from 1."""
+        numbers = " and ".join(str(fibre + 1) for fibre in self.fibres)
         return (
-            f"fibre{'s' * (len(self.fibres) > 1)} {who} {TEXTS[self.kind]} ({self.kind}) since press {self.since}, "
+            f"fibre{'s' * (len(self.fibres) > 1)} {numbers} {TEXTS[self.kind]} ({self.kind}) since press {self.since}, "
             f"found at press {self.press}; by chance once in 1e{self.score:.0f} presses"
         )
 
 
-class _Press(NamedTuple):
-    """What is kept of a press; `level` (L,) of the rests before it, and where that had settled."""
-
-    traces: Array
-    inputs: Floats
-    targets: Array
-    level: Array
-    settled: Mask
+class _PressRecord(NamedTuple):
+    trace: Array  # (L, TRACE)
+    inputs: Floats  # (L, N)
+    targets: Array  # (L, T)
+    level: Array  # (L,) of the rests before it
+    is_warm: Mask  # (L,) whether that level is reliable
 
 
-class FaultDetector:
-    """Follows presses and names fibres; a fibre that was named is left out from then on.
+class FaultMonitor:
+    """Detect faulty fibres press by press; a faulty fibre is masked from then on.
+
+    Args:
+        model: of the healthy pad.
 
     Attributes:
-        presses: seen so far.
+        model: the model.
+        n_presses: presses processed so far.
     """
 
     def __init__(self, model: HealthModel) -> None:
         self.model = check_type("model", model, HealthModel)
-        self.presses = 0
+        self.n_presses = 0
         fibres = len(model.living)
-        self._lost = np.zeros(fibres, dtype=bool)
-        self._missing = np.zeros(fibres, dtype=np.int64)
-        self._history = History.none(fibres)
-        self._recent: deque[_Press] = deque(maxlen=WINDOW)
+        self._failed = np.zeros(fibres, dtype=bool)
+        self._n_missing = np.zeros(fibres, dtype=np.int64)
+        self._history = TraceHistory.initial(fibres)
+        self._recent: deque[_PressRecord] = deque(maxlen=WINDOW)
         self._height = np.zeros((fibres, len(HYPOTHESES)))
-        self._start = np.zeros((fibres, len(HYPOTHESES)), dtype=np.int64)
+        self._onset = np.zeros((fibres, len(HYPOTHESES)), dtype=np.int64)
 
     @property
-    def lost(self) -> tuple[int, ...]:
-        """Fibres that are not to be relied on, by index: dead from the first, or named since."""
-        return tuple(sorted((*self.model.dead, *self.model.living[self._lost].tolist())))
+    def failed(self) -> tuple[int, ...]:
+        """Indices of the fibres that are dead, or were found faulty."""
+        return tuple(sorted((*self.model.dead, *self.model.living[self._failed].tolist())))
 
     def update(self, readings: Array, down_command: int, up_command: int) -> list[FibreFault]:
-        """Take in the next press.
+        """Process the next press.
 
         Args:
-            readings: (R, C) volts, NaN where missing: of this press alone, best from 10 readings before the probe was
-                sent down to 20 after it was sent up; fewer after it only where the next press begins.
-            down_command, up_command: first of them after the probe was sent down, and up; 1 <= begun < lifted <= R.
+            readings: of this press alone, best from 10 readings before the probe was sent down to 20 after it was sent
+                up (fewer only if the next press begins), NaN where missing; shape (R, C), V.
+            down_command: first of them after the probe was sent down, 1 or more.
+            up_command: first of them after it was sent up, above `down_command`, R at most.
 
         Returns:
-            What this press brought to light, mostly nothing.
+            Faults detected by this press; mostly none.
 
         Raises:
-            InputError: other fibres than health was learnt from, or indices out of range.
+            InputError: another number of fibres than the model's, or indices out of range.
         """
         readings = check_numbers(readings, np.float64, "readings", copy=False)
         if readings.ndim != 2 or readings.shape[1] != self.model.fibres:
@@ -129,174 +148,263 @@ class FaultDetector:
         check_magnitude("readings", readings, MAX_VOLTS, "V", missing=True)
         down_command = check_int("down_command", down_command, 1, len(readings) - 1)
         up_command = check_int("up_command", up_command, down_command + 1, len(readings))
-        traces = press_trace(readings[:, self.model.living], down_command, up_command, 0, len(readings))
-        level, settled = self._history.level, self._history.seen >= SETTLED
-        inputs, targets = self.model.shapes.scaled(*self.model.shapes.advance(traces, self._history))
-        self._recent.append(_Press(traces, inputs, targets, level, settled))
-        stay, begin = self._ratios(list(self._recent)[-2:], self._lost)
-        self._climb(stay[-1], begin[-1], self.presses)
-        findings = self._absent(traces)
-        while (self._rarity(self._height, self._lost) > self.model.threshold).any():
-            findings.append(self._name())
-        self.presses += 1
-        return findings
+        trace = extract_trace(readings[:, self.model.living], down_command, up_command, 0, len(readings))
+        level, is_warm = self._history.level, self._history.n_presses >= WARM_UP
+        inputs, targets = self.model.pca.scale(*self.model.pca.project(trace, self._history))
+        self._recent.append(_PressRecord(trace, inputs, targets, level, is_warm))
+        llr_continuing, llr_onset = self._llrs(list(self._recent)[-2:], self._failed)
+        self._update_sums(llr_continuing[-1], llr_onset[-1], self.n_presses)
+        faults = self._find_missing(trace)
+        while (self._neg_log_p(self._failed) > self.model.threshold).any():
+            faults.append(self._identify())
+        self.n_presses += 1
+        return faults
 
-    def _absent(self, traces: Array) -> list[FibreFault]:
-        self._missing = np.where(np.isfinite(traces).all(axis=1), 0, self._missing + 1)
-        gone = ~self._lost & (self._missing == MISSING)
-        self._lost |= gone
-        since = self.presses - MISSING + 1
-        return [FibreFault(self.presses, since, (int(c),), "missing", MOST_SCORE) for c in self.model.living[gone]]
+    def _find_missing(self, trace: Array) -> list[FibreFault]:
+        self._n_missing = np.where(np.isfinite(trace).all(axis=1), 0, self._n_missing + 1)
+        missing = ~self._failed & (self._n_missing == MAX_MISSING)
+        self._failed |= missing
+        since = self.n_presses - MAX_MISSING + 1
+        fibres = self.model.living[missing].tolist()
+        return [FibreFault(self.n_presses, since, (fibre,), "missing", MAX_SCORE) for fibre in fibres]
 
-    def _rarity(self, height: Array, lost: Mask) -> Array:
-        """(L, H); of lost fibres minus infinity."""
-        return np.where(lost[:, None], -np.inf, self.model.tail.rarity(height, int(lost.sum())))
+    def _neg_log_p(self, failed: Mask) -> Array:
+        """(L, H) of the present sums; minus infinity for failed fibres."""
+        neg_log_p = self.model.exceedance.neg_log_p(self._height, int(failed.sum()))
+        return np.where(failed[:, None], -np.inf, neg_log_p)
 
-    def _climb(self, stay: Array, begin: Array, press: int) -> None:
-        begins = (self._height <= 0) | (begin >= self._height + stay)
-        self._start = np.where(begins, press, self._start)
-        self._height = climb(self._height, stay, begin)
+    def _update_sums(self, llr_continuing: Array, llr_onset: Array, press: int) -> None:
+        begins = (self._height <= 0) | (llr_onset >= self._height + llr_continuing)
+        self._onset = np.where(begins, press, self._onset)
+        self._height = cusum_update(self._height, llr_continuing, llr_onset)
 
-    def _predicted(self, presses: Sequence[_Press], lost: Mask) -> tuple[Array, Array, Array, Array]:
-        """Traces, targets, and the means and spreads predicted without the fibres `lost`, (Q, L, ...) each."""
-        traces, inputs, targets, _, settled = (np.stack(part) for part in zip(*presses, strict=True))
-        fibre_mask = ~lost & np.isfinite(traces).all(axis=2)
-        mean, spread = expected(self.model.weights, inputs, fibre_mask)
-        # A rest has no level to be compared with before some presses have made one.
-        targets[:, :, -1] = np.where(settled, targets[:, :, -1], np.nan)
-        return traces, targets, mean, spread
+    def _predict(self, records: Sequence[_PressRecord], failed: Mask) -> tuple[Array, Array, Array, Array]:
+        """Traces, targets, and means and deviations predicted without the failed fibres; shape (Q, L, ...) each."""
+        traces, inputs, targets, _, is_warm = (np.stack(part) for part in zip(*records, strict=True))
+        mean, std = predict_fibres(self.model.weights, inputs, ~failed & np.isfinite(traces).all(axis=2))
+        # A rest has no level to be compared with before some presses have defined one.
+        targets[:, :, -1] = np.where(is_warm, targets[:, :, -1], np.nan)
+        return traces, targets, mean, std
 
-    def _ratios(self, presses: Sequence[_Press], lost: Mask) -> tuple[Array, Array]:
-        return self.model.evidence.ratios(*self._predicted(presses, lost))
+    def _llrs(self, records: Sequence[_PressRecord], failed: Mask) -> tuple[Array, Array]:
+        return self.model.likelihoods.log_likelihood_ratios(*self._predict(records, failed))
 
-    def _replay(self, first: int, lost: Mask) -> None:
-        """Climb again through the recent presses from index `first` on, without the fibres `lost`."""
-        self._height, self._start = np.zeros_like(self._height), np.zeros_like(self._start)
-        stay, begin = self._ratios(self._since(first), lost)
-        for index in range(len(stay)):
-            self._climb(stay[index], begin[index], first + index)
+    def _replay(self, first: int, failed: Mask) -> None:
+        """Compute the sums again over the recent presses from index `first` on, without the failed fibres."""
+        self._height, self._onset = np.zeros_like(self._height), np.zeros_like(self._onset)
+        for press, llrs in enumerate(zip(*self._llrs(self._records_since(first), failed), strict=True), first):
+            self._update_sums(*llrs, press)
 
-    def _since(self, first: int) -> list[_Press]:
-        """Kept presses from index `first` on."""
-        return list(self._recent)[first - self.presses - 1 :]
+    def _records_since(self, first: int) -> list[_PressRecord]:
+        return list(self._recent)[first - self.n_presses - 1 :]
 
-    def _name(self) -> FibreFault:
-        """The fibre at fault, now that one is: it is lost from here on, and the climbs are as if it always had been.
+    def _first_record(self) -> int:
+        """Index of the oldest press in the window."""
+        return self.n_presses + 1 - len(self._recent)
 
-        A bad fibre spoils what is expected of the others. So every suspect is judged anew by the fibres that are
-        not suspected; the culprit stands out even then.
+    def _identify(self) -> FibreFault:
+        """Identify the faulty fibre, mask it, and compute the sums as if it always had been masked.
+
+        A faulty fibre disturbs the predictions for the others. So every suspect is tested again by the fibres that are
+        not suspected; the faulty one still stands out.
         """
-        rarity = self._rarity(self._height, self._lost)
-        worst = rarity.max(axis=1)
-        order = np.argsort(-worst, kind="stable")[: min(SUSPECTS, int((~self._lost).sum()))]
+        neg_log_p = self._neg_log_p(self._failed)
+        worst = neg_log_p.max(axis=1)
+        order = np.argsort(-worst, kind="stable")[: min(MAX_SUSPECTS, int((~self._failed).sum()))]
         suspects = order[worst[order] > self.model.threshold / 2]
-        starts = self._start[suspects, rarity[suspects].argmax(axis=1)]
-        first = max(int(starts.min()), self._kept())
-        alarmed = worst > self.model.threshold
-        pairs = [pair for pair in combinations(sorted(order.tolist()), 2) if alarmed[list(pair)].any()]
-        pair = self._swapped(pairs, first)
-        start = self._start
-        alone = []
+        onset = self._onset
+        first = max(int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min()), self._first_record())
+        is_alarm = worst > self.model.threshold
+        pairs = [pair for pair in combinations(sorted(order.tolist()), 2) if is_alarm[list(pair)].any()]
+        pair = self._find_swapped(pairs, first)
+        scores = []
         for fibre in suspects:
-            lost = self._lost.copy()
-            lost[suspects] = True
-            lost[fibre] = False
-            self._replay(first, lost)
-            alone.append(self._rarity(self._height, lost)[fibre].max())
-        fibres = pair or (int(suspects[np.argmax(alone)]),)
+            failed = self._failed.copy()
+            failed[suspects] = True
+            failed[fibre] = False
+            self._replay(first, failed)
+            scores.append(self._neg_log_p(failed)[fibre].max())
+        fibres = pair or (int(suspects[np.argmax(scores)]),)
         fibre = max(fibres, key=lambda c: worst[c])
-        hypothesis = int(rarity[fibre].argmax())
-        since = int(start[fibre, hypothesis])
-        kind = "swapped" if pair else self._kind(fibre, hypothesis, since)
-        score = min(float(worst[fibre] / np.log(10)), MOST_SCORE)
-        self._lost[list(fibres)] = True
-        self._replay(first, self._lost)
-        return FibreFault(self.presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
+        hypothesis = int(neg_log_p[fibre].argmax())
+        since = int(onset[fibre, hypothesis])
+        kind = "swapped" if pair else self._classify(fibre, hypothesis, since)
+        score = min(float(worst[fibre] / np.log(10)), MAX_SCORE)
+        self._failed[list(fibres)] = True
+        self._replay(first, self._failed)
+        return FibreFault(self.n_presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
 
-    def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> tuple[int, int] | None:
-        """The one of `pairs` whose readings since `first` fit far better if exchanged, if there is one."""
-        presses = self._since(first)
-        shapes, evidence = self.model.shapes, self.model.evidence
-        found, most = None, self.model.threshold
+    def _find_swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> tuple[int, int] | None:
+        """Find the pair whose readings since press `first` are far more likely if they are swapped."""
+        records = self._records_since(first)
+        pca, likelihoods = self.model.pca, self.model.likelihoods
+        best, best_llr = None, self.model.threshold
         for pair in pairs:
-            own, other = list(pair), list(reversed(pair))
-            lost = self._lost.copy()
-            lost[own] = True
-            traces, targets, mean, spread = self._predicted(presses, lost)
+            this, other = list(pair), list(reversed(pair))
+            failed = self._failed.copy()
+            failed[this] = True
+            traces, targets, mean, std = self._predict(records, failed)
             rests = traces[:, :, :REST].mean(axis=2)
-            answers = traces[:, other] - rests[:, other, None]
-            exchanged = targets.copy()
-            exchanged[:, own, :-1] = np.einsum("qcw,cwd->qcd", answers, shapes.basis[own]) / shapes.targets[own, :-1]
-            better = evidence.answer_fit(exchanged, mean, spread) - evidence.answer_fit(targets, mean, spread)
-            gain = np.nan_to_num(np.clip(better, -MOST, MOST)).sum()
-            # Rests of successive presses hang together: they count once.
-            spread_v, level = shapes.targets[own, -1], presses[0].level[own]
-            away, back = ((rests[:, source].mean(axis=0) - level) / spread_v for source in (own, other))
-            gain += np.nan_to_num(np.clip(away**2 - back**2, -2 * MOST, 2 * MOST)).sum() / 2
-            if gain > most:
-                found, most = pair, gain
-        return found
+            responses = traces[:, other] - rests[:, other, None]
+            swapped = targets.copy()
+            swapped[:, this, :-1] = np.einsum("qcw,cwd->qcd", responses, pca.components[this])
+            swapped[:, this, :-1] /= pca.target_scale_v[this, :-1]
+            log_likelihoods = (likelihoods.log_likelihood_healthy(each, mean, std) for each in (swapped, targets))
+            difference = np.subtract(*log_likelihoods)
+            llr = np.nan_to_num(np.clip(difference, -MAX_LLR, MAX_LLR)).sum()
+            # Rests of successive presses correlate: they count once.
+            scale_v, level = pca.target_scale_v[this, -1], records[0].level[this]
+            as_is, if_swapped = ((rests[:, source].mean(axis=0) - level) / scale_v for source in (this, other))
+            llr += np.nan_to_num(np.clip(as_is**2 - if_swapped**2, -2 * MAX_LLR, 2 * MAX_LLR)).sum() / 2
+            if llr > best_llr:
+                best, best_llr = pair, llr
+        return best
 
-    def _kind(self, fibre: int, hypothesis: int, since: int) -> str:
-        """What is wrong, by the last presses of the fibre named."""
-        presses = self._since(max(since, self._kept()))
-        rests = np.array([press.traces[fibre, :REST].mean() for press in presses])
-        last = self._recent[-1].traces[fibre]
-        low, high = self.model.rests[:, fibre]
-        outside = not 2 * low - high <= last[:REST].mean() <= 2 * high - low
+    def _classify(self, fibre: int, hypothesis: int, since: int) -> str:
+        """Return the kind of fault, by the last presses of the fibre."""
+        records = self._records_since(max(since, self._first_record()))
+        rests = np.array([record.trace[fibre, :REST].mean() for record in records])
+        last = self._recent[-1].trace[fibre]
+        low, high = self.model.rest_range_v[:, fibre]
+        is_outside = not 2 * low - high <= last[:REST].mean() <= 2 * high - low
         if np.ptp(last) == 0:
-            return "open" if outside else "stuck"
-        if outside and noise_of(last) > FLOATING * self.model.evidence.noise[fibre]:
+            return "open" if is_outside else "stuck"
+        if is_outside and estimate_noise(last) > FLOATING * self.model.likelihoods.noise_v[fibre]:
             return "open"
         name = HYPOTHESES[hypothesis]
         if not name.startswith("offset"):
             return name
-        moved = rests - presses[0].level[fibre]
-        ramp = np.arange(1.0, len(moved) + 1)
-        ramp *= (ramp @ moved) / (ramp @ ramp)
-        return "drifting" if ((moved - ramp) ** 2).sum() < ((moved - moved.mean()) ** 2).sum() else "offset"
-
-    def _kept(self) -> int:
-        """Index of the oldest press that is kept."""
-        return self.presses + 1 - len(self._recent)
+        offsets = rests - records[0].level[fibre]
+        ramp = np.arange(1.0, len(offsets) + 1)
+        ramp *= (ramp @ offsets) / (ramp @ ramp)
+        return "drifting" if ((offsets - ramp) ** 2).sum() < ((offsets - offsets.mean()) ** 2).sum() else "offset"
 
 
-def examine(
-    model: HealthModel, readings: Array, times_s: Array, down_command: Indices, up_command: Indices
-) -> list[FibreFault]:
-    """Follow a whole recording.
+class FaultDetector:
+    """Detect faulty fibres in recordings of a pad, from the readings alone.
 
     Args:
-        model: of the same pad. readings: (R, C) volts, NaN where missing. times_s: (R,) s.
-        down_command, up_command: (Q,) first reading after the probe was sent down, and up.
+        false_alarm_rate: false alarms a press, all fibres and kinds of fault together; above 0, up to 0.1.
+        seed: of all that is random in `fit`.
 
-    Returns:
-        Findings in the order in which they were made. Presses are counted from the recording's first.
+    Attributes:
+        model_: fitted model, for presses as they were commanded.
+        live_model_: the same for presses as they are detected in the readings, which a `FaultMonitor` takes live.
 
     Raises:
-        InputError: other fibres or another rate than health was learnt from, or presses out of order.
+        InputError: an argument out of range.
     """
-    readings, times_s, down_command, up_command = checked_presses(readings, times_s, down_command, up_command)
-    check_type("model", model, HealthModel).refuse_other(readings, times_s)
-    monitor = FaultDetector(model)
-    readings, lows, highs = press_ranges(readings, down_command, up_command)
-    findings: list[FibreFault] = []
-    for down, up, low, high in zip(down_command, up_command, lows, highs, strict=True):
-        first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
-        findings += monitor.update(readings[first:last], int(down - first), int(up - first))
-    return findings
+
+    def __init__(self, false_alarm_rate: float = FALSE_ALARM_RATE, seed: int = 0) -> None:
+        self.false_alarm_rate = check_float("false_alarm_rate", false_alarm_rate, 0.0, MAX_FALSE_ALARM_RATE)
+        if not self.false_alarm_rate > 0:
+            raise InputError(f"false_alarm_rate is {false_alarm_rate}, allowed is above 0 to {MAX_FALSE_ALARM_RATE}")
+        self.seed = check_int("seed", seed, 0, 2**64 - 1)
+        self.model_: HealthModel
+        self.live_model_: HealthModel
+
+    def fit(
+        self, recording: Recording, held_back: ArrayLike = (), provenance: Mapping[str, Any] | None = None
+    ) -> "FaultDetector":
+        """Train on a recording of the healthy pad; positions of presses are not needed.
+
+        Args:
+            recording: of the healthy pad.
+            held_back: indices of presses that are left out.
+            provenance: origin of the model, JSON.
+
+        Returns:
+            The detector.
+
+        Raises:
+            InputError: fewer than 300 complete presses, no living fibre, or indices out of range.
+        """
+        mask = np.ones(len(check_type("recording", recording, Recording).presses_mm), dtype=bool)
+        indices = check_numbers(held_back, np.int64, "held_back")
+        if indices.ndim != 1 or not ((indices >= 0) & (indices < len(mask))).all():
+            raise InputError(f"held_back is {short_repr(held_back)}, allowed are presses from 0 to {len(mask) - 1}")
+        mask[indices] = False
+        readings, times_s = recording.readings, recording.times_s
+        commanded = recording.down_command, recording.up_command
+        presses = {COMMANDED: commanded, DETECTED: align_to_detected(readings, times_s, *commanded)}
+        options = {"false_alarm_rate": self.false_alarm_rate, "provenance": dict(provenance or {})}
+
+        def fit(name: str) -> HealthModel:
+            down_command, up_command = (command[mask] for command in presses[name])
+            rng = np.random.default_rng(self.seed)
+            return fit_health_model(readings, times_s, down_command, up_command, rng=rng, **options)
+
+        with one_torch_thread():
+            models = dict(run_tasks((name, partial(fit, name)) for name in presses))
+        self.model_, self.live_model_ = models[COMMANDED], models[DETECTED]
+        return self
+
+    def predict(self, recording: Recording) -> list[FibreFault]:
+        """Detect faults in a recording.
+
+        Args:
+            recording: of the same pad.
+
+        Returns:
+            Faults in the order of their detection.
+
+        Raises:
+            InputError: another number of fibres, or another rate, than trained on; or `fit` or `load` was not called.
+        """
+        if not hasattr(self, "model_"):
+            raise InputError("fault detector: not fitted, expected fit or load before predict")
+        check_type("recording", recording, Recording)
+        is_detected = PRESSES_DETECTED.items() <= recording.source.items()
+        monitor = FaultMonitor(self.live_model_ if is_detected else self.model_)
+        refuse_other_pad(monitor.model, "health", recording.fibres, recording.rate_hz)
+        readings, firsts, ends = bound_presses(recording.readings, recording.down_command, recording.up_command)
+        faults: list[FibreFault] = []
+        for down, up, low, high in zip(recording.down_command, recording.up_command, firsts, ends, strict=True):
+            first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
+            faults += monitor.update(readings[first:last], int(down - first), int(up - first))
+        return faults
+
+    def save(self, folder: str | Path) -> None:
+        """Write both models to a folder.
+
+        Raises:
+            InputError: as `HealthModel.save`.
+        """
+        self.model_.save(folder, COMMANDED)
+        self.live_model_.save(folder, DETECTED)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "FaultDetector":
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: as `HealthModel.load`.
+        """
+        model, live_model = HealthModel.load(folder, COMMANDED), HealthModel.load(folder, DETECTED)
+        detector = cls(model.false_alarm_rate)
+        detector.model_, detector.live_model_ = model, live_model
+        return detector
 
 
-def fibre_mask_of(faults: Sequence[FibreFault], presses: int, fibres: int) -> Mask:
-    """Return which fibres of each press no fault has reached.
+def has_health(folder: Path) -> bool:
+    """Return whether the folder of a model has a fault detector."""
+    return any(resolve_exchange(files_of(folder, name).document).exists() for name in (COMMANDED, DETECTED))
+
+
+HEALTH_FILES = frozenset(file.name for name in (COMMANDED, DETECTED) for file in files_of(Path(), name))
+"""Names of the files of a fault detector."""
+
+
+def mask_faults(faults: Sequence[FibreFault], presses: int, fibres: int) -> Mask:
+    """Mask faulty fibres from the first bad press on.
 
     Args:
-        faults: of a recording; a faulty fibre is left out from the press on since which it is.
-        presses: Q of the recording.
-        fibres: C of the pad.
+        faults: of a recording.
+        presses: number of its presses, Q.
+        fibres: number of fibres of the pad, C.
 
     Returns:
-        (Q, C), false where a fibre is at fault.
+        Valid fibres of each press; shape (Q, C).
 
     Raises:
         InputError: a fault of a fibre that the pad does not have.
@@ -304,46 +412,14 @@ def fibre_mask_of(faults: Sequence[FibreFault], presses: int, fibres: int) -> Ma
     mask = np.ones((presses, fibres), dtype=bool)
     for fault in faults:
         if max(fault.fibres, default=0) >= fibres:
-            raise InputError(f"findings name fibre {max(fault.fibres) + 1}, allowed are 1 to {fibres}")
+            raise InputError(f"faults name fibre {max(fault.fibres) + 1}, allowed are 1 to {fibres}")
         mask[fault.since :, list(fault.fibres)] = False
     return mask
 
 
-def fault_lines(findings: Sequence[FibreFault], fibres: int, dead: Sequence[int] = ()) -> list[str]:
-    """What to tell of a pad of so many fibres, of which `dead` never lived: a line each finding, and what is left.
-
-    Fibres are counted from 1 in the lines, from 0 in `dead` and the findings.
-    """
-    bad = {fibre for finding in findings for fibre in finding.fibres} | set(dead)
+def fault_lines(faults: Sequence[FibreFault], fibres: int, dead: Sequence[int] = ()) -> list[str]:
+    """Return lines for people: dead fibres, faults, and the sound fibres that remain, numbered from 1."""
+    bad = {fibre for fault in faults for fibre in fault.fibres} | set(dead)
     sound = [str(fibre + 1) for fibre in range(fibres) if fibre not in bad]
-    told = [f"fibre {fibre + 1} was dead in the recording that health was learnt from" for fibre in dead]
-    return [*told, *(finding.text for finding in findings), f"sound fibres: {', '.join(sound) or 'none'}"]
-
-
-def has_health(model: Path, name: str = COMMANDED) -> bool:
-    """Whether health was learnt into a folder."""
-    return resolve_exchange(files_of(model, name).document).exists()
-
-
-def examined(model: Path, recording: Recording) -> tuple[HealthModel, list[FibreFault]]:
-    """What health is told by, presses that were found by what was learnt from such, and what is wrong.
-
-    Raises:
-        InputError: health was not learnt into this folder, or does not suit the recording.
-    """
-    known = HealthModel.load(model, DETECTED if PRESSES_DETECTED.items() <= recording.source.items() else COMMANDED)
-    return known, examine(known, recording.readings, recording.times_s, recording.down_command, recording.up_command)
-
-
-def health_files(names: Collection[str] = (COMMANDED, DETECTED)) -> set[str]:
-    """Names of the files in a folder by which it tells health, for those of its models that are named."""
-    return {file.name for name in names for file in files_of(Path(), name)}
-
-
-def health_in(model: Path) -> dict[str, HealthModel]:
-    """What the folder of a model tells health by, by the names of its files; nothing where none was learnt.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    return {name: HealthModel.load(model, name) for name in (COMMANDED, DETECTED) if has_health(model, name)}
+    lines = [f"fibre {fibre + 1} was dead in the recording that health was learnt from" for fibre in dead]
+    return [*lines, *(fault.text for fault in faults), f"sound fibres: {', '.join(sound) or 'none'}"]

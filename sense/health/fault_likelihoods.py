@@ -1,11 +1,10 @@
-"""How much likelier a press makes each fault of each fibre, and how much of that healthy presses bring together.
-A fault hypothesis says what a fibre's readings would look like; a press gives the logarithm of how much likelier they
-are under it than under health. Sums of these over presses that begin whenever they are worth it (CUSUM: E. S. Page,
-"Continuous inspection schemes", Biometrika 41, 1954) rise steadily under the fault. How high they climb by chance is
-measured on presses that the prediction was not fitted on: the heights of healthy climbs have an exponential tail
-(D. Siegmund, "Sequential Analysis", 1985, chapter X), which leads from a rate of false alarms to a threshold.
+"""Log-likelihood ratios of every fault of every fibre, their cumulative sums, and how high these rise by chance.
 
-How high likelihood ratios climb on healthy presses by chance, and so what height names a fibre.
+A fault hypothesis says what a fibre's readings would look like; a press gives the log-likelihood ratio (llr) of the
+hypothesis against health. Their cumulative sums (CUSUM: E. S. Page, "Continuous inspection schemes", Biometrika 41,
+1954) rise steadily under the fault. How high they rise by chance is measured on presses that the prediction was not
+trained on: the peaks of healthy sums have an exponential tail (D. Siegmund, "Sequential Analysis", 1985, chapter X),
+which converts a rate of false alarms into a threshold.
 """
 
 from collections.abc import Sequence
@@ -14,288 +13,274 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
-from padforge.sense.health.trace_model import COMPONENTS, FREEDOM, RELEASED, REST, SUNK, TRACE
+from padforge.sense.health.trace_model import COMPONENTS, HELD, RELEASED, REST, T_DEGREES, TRACE
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
-"""Offsets of the rest that are looked for, in spreads of the residual of the rest."""
-HYPOTHESES = ("stuck", "silent", "weak", "odd", "noisy", *(f"offset {size:+g}" for size in OFFSETS))
-"""Reads one value; answers nothing; answers by half; answers as to another press; is five times as noisy; and has a
-rest that was moved by one of `OFFSETS`."""
+"""Offsets of the rest that are tested, in standard deviations of its residual."""
+HYPOTHESES = ("stuck", "no_response", "reduced_gain", "inconsistent", "noisy", *(f"offset {o:+g}" for o in OFFSETS))
+"""Constant readings; a gain of 0; a gain of one half; the response to another press; five times the noise; and a rest
+that has shifted by one of `OFFSETS`."""
 GAINS = (0.0, 0.5)
-NOISIER = 5.0
-WIDER = 4.0
-"""What is odd is either as another press would be, or off by this many times what is usual."""
-MOST, MOST_OF_STEP = 6.0, 12.0
-"""Most that one press adds, either way: no mishap in a single press names a fibre. A step within a trace may add more
-where an offset begins, yet is worth less than the threshold until the rest has moved as well."""
+NOISE_FACTOR = 5.0
+STD_FACTOR = 4.0
+"""An inconsistent response is either that to another press, or wrong by so many times the predicted deviation."""
+MAX_LLR, MAX_STEP_LLR = 6.0, 12.0
+"""Largest contribution of one press: no mishap in a single press is a fault. A step within a trace may add more at the
+onset of an offset, yet is below the threshold until the rest has shifted as well."""
 STEPS = np.arange(3, TRACE - 2)
-"""Readings of a trace at which a step is looked for; one nearer to an end could as well be a spike."""
+"""Readings of a trace at which a step is tested; one nearer to an end could as well be a spike."""
 LIBRARY = 64
-"""Other presses that an odd answer is held against."""
-SCALES = np.geomspace(0.5, 2.0, 9)
-EXTRAS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
-"""Factors on predicted spreads, and what is added to them, among which the likeliest is chosen."""
-LEAST_SCALE = 1e-3
-"""Least spread of what is new in a rest: where nothing is, nothing is divided by it."""
-MEDIAN_T = 0.7267
-_FAR_T = 6.869
-"""Median, and what one in a thousand lies beyond, of the absolute value of Student's t with `FREEDOM` degrees."""
+"""Other presses that an inconsistent response is compared with."""
+STD_SCALES = np.geomspace(0.5, 2.0, 9)
+STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
+"""Calibrations of predicted deviations that are tried."""
+MIN_INNOVATION = 1e-3
+"""Least standard deviation of the innovation of a rest, since it is divided by."""
+MAX_HEIGHT = 1e5
+"""A height that no sum reaches."""
+MIN_PEAKS = 30
+MEDIAN_T, FAR_T = 0.7267, 6.869
+"""Median and 0.999 quantile of the absolute value of Student's t with `T_DEGREES` degrees of freedom."""
 
 
 @dataclass(frozen=True)
 class FaultLikelihoods:
-    """What healthy presses look like, beside what the network predicts.
+    """Distribution of healthy presses about the predictions of the networks."""
 
-    Attributes:
-        scale, extra: (C, T) a predicted spread s means hypot(scale s, extra).
-        floor: (C, D) noise of an answer's components.
-        other_mean, other_spread: (L, C, D) predictions for other presses, to tell an answer to one of them.
-        noise: (C,) usual noise, V. noise_centre, noise_spread: (C,) of the logarithm of the noise over the usual.
-        constant: (C,) share of presses in which the fibre reads one value throughout.
-        filters: (C, S, TRACE) matched filters of a step, 1/V.
-        persistence: (1,) correlation of the rest's residual with that of the press before, of all fibres together.
-            innovation: (1,) spread of what is new in it.
-    """
-
-    scale: Array
-    extra: Array
-    floor: Array
-    other_mean: Array
-    other_spread: Array
-    noise: Array
-    noise_centre: Array
-    noise_spread: Array
-    constant: Array
-    filters: Array
-    persistence: Array
-    innovation: Array
+    std_scale: Array  # a predicted deviation s is calibrated to hypot(std_scale s, std_floor); shape (C, T)
+    std_floor: Array
+    noise_floor: Array  # noise of the components of a response; shape (C, D)
+    library_mean: Array  # predictions for other presses; shape (L, C, D)
+    library_std: Array
+    noise_v: Array  # median noise; shape (C,), V
+    log_noise_mean: Array  # median and deviation of the logarithm of the noise over its median; shape (C,)
+    log_noise_std: Array
+    constant_share: Array  # share of presses in which the fibre is constant; shape (C,)
+    step_filters: Array  # matched filters of a step; shape (C, S, TRACE), 1/V
+    rest_autocorr: Array  # correlation of the rest's residual with that of the press before, of all fibres; shape (1,)
+    innovation_std: Array  # standard deviation of what does not correlate; shape (1,)
 
     @classmethod
     def fit(
-        cls, traces: Array, targets: Array, mean: Array, spread: Array, size: Array, rng: np.random.Generator
+        cls, traces: Array, targets: Array, mean: Array, std: Array, target_scale_v: Array, rng: np.random.Generator
     ) -> "FaultLikelihoods":
-        """From (Q, C, TRACE) healthy traces, their targets and predictions (Q, C, T) by members that did not learn
-        from them, and `size` (C, T), V, of a target of 1."""
-        scale, extra = _calibrated(targets - mean, spread)
-        usual = np.median(noise_of(traces), axis=0)
-        usual = np.where(usual > MIN_SCALE_V, usual, 1e-3 * size[:, 0])
-        logs = _log_noise(traces, usual)
-        centre = np.median(logs, axis=0)
-        honest = np.hypot(spread * scale, extra)
-        rest = ((targets - mean) / honest)[:, :, -1]
-        persistence = np.clip([(rest[1:] * rest[:-1]).mean() / (rest**2).mean()], 0.0, 0.95)
-        new = np.array([np.median(np.abs(rest[1:] - persistence * rest[:-1])) / MEDIAN_T])
+        """Fit to healthy traces, targets, and predictions (Q, C, T) by members that were not trained on the press."""
+        std_scale, std_floor = _calibrate_std(targets - mean, std)
+        noise_v = np.median(estimate_noise(traces), axis=0)
+        noise_v = np.where(noise_v > MIN_SCALE_V, noise_v, 1e-3 * target_scale_v[:, 0])
+        log_noise = _log_noise(traces, noise_v)
+        log_noise_mean = np.median(log_noise, axis=0)
+        calibrated = np.hypot(std * std_scale, std_floor)
+        rest = ((targets - mean) / calibrated)[:, :, -1]
+        autocorr = np.clip([(rest[1:] * rest[:-1]).mean() / (rest**2).mean()], 0.0, 0.95)
+        innovation_std = np.array([np.median(np.abs(rest[1:] - autocorr * rest[:-1])) / MEDIAN_T])
         library = rng.choice(len(traces), LIBRARY)
         return cls(
-            scale=scale,
-            extra=extra,
-            floor=usual[:, None] / size[:, :COMPONENTS],
-            other_mean=mean[library, :, :COMPONENTS],
-            other_spread=honest[library, :, :COMPONENTS],
-            noise=usual,
-            noise_centre=centre,
-            noise_spread=np.maximum(np.median(np.abs(logs - centre), axis=0) / 0.6745, 0.1),
-            constant=(_constant(traces).sum(axis=0) + 1) / (len(traces) + 2),
-            filters=step_filters(traces, usual),
-            persistence=persistence,
-            innovation=np.maximum(new, LEAST_SCALE),
+            std_scale=std_scale,
+            std_floor=std_floor,
+            noise_floor=noise_v[:, None] / target_scale_v[:, :COMPONENTS],
+            library_mean=mean[library, :, :COMPONENTS],
+            library_std=calibrated[library, :, :COMPONENTS],
+            noise_v=noise_v,
+            log_noise_mean=log_noise_mean,
+            log_noise_std=np.maximum(np.median(np.abs(log_noise - log_noise_mean), axis=0) / 0.6745, 0.1),
+            constant_share=(_is_constant(traces).sum(axis=0) + 1) / (len(traces) + 2),
+            step_filters=fit_step_filters(traces, noise_v),
+            rest_autocorr=autocorr,
+            innovation_std=np.maximum(innovation_std, MIN_INNOVATION),
         )
 
-    def answer_fit(self, targets: Array, mean: Array, spread: Array) -> Array:
-        """(..., C, T) each to (..., C): log-likelihood of the answers of healthy fibres, up to a constant."""
-        own = slice(0, COMPONENTS)
-        return _log_t(targets[..., own], mean[..., own], self._honest(spread)[..., own]).sum(axis=-1)
+    def log_likelihood_healthy(self, targets: Array, mean: Array, std: Array) -> Array:
+        """Compute the log-likelihood (..., C) of the responses (..., C, T) of healthy fibres, up to a constant."""
+        part = slice(0, COMPONENTS)
+        return _log_t(targets[..., part], mean[..., part], self._calibrated(std)[..., part]).sum(axis=-1)
 
-    def _honest(self, spread: Array) -> Array:
-        """Predicted spreads as they turned out on presses never seen."""
-        return np.hypot(spread * self.scale, self.extra)
+    def largest_step(self, traces: Array) -> Array:
+        """Compute the likeliest step (Q, C) within traces (Q, C, TRACE), signed, in deviations of healthy ones."""
+        responses = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
+        steps = np.einsum("csw,qcw->qcs", self.step_filters, responses)
+        return np.take_along_axis(steps, np.abs(steps).argmax(axis=-1)[..., None], axis=-1)[..., 0]
 
-    def steps(self, traces: Array) -> Array:
-        """(Q, C, TRACE) to (Q, C): the likeliest step within the trace, signed, in spreads of a healthy one."""
-        answers = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
-        found = np.einsum("csw,qcw->qcs", self.filters, answers)
-        return np.take_along_axis(found, np.abs(found).argmax(axis=-1)[..., None], axis=-1)[..., 0]
-
-    def ratios(self, traces: Array, targets: Array, mean: Array, spread: Array) -> tuple[Array, Array]:
-        """Log-likelihood ratios of all hypotheses against health, for presses that followed one another.
+    def log_likelihood_ratios(self, traces: Array, targets: Array, mean: Array, std: Array) -> tuple[Array, Array]:
+        """Compute the log-likelihood ratios of all hypotheses against health, for successive presses.
 
         Args:
-            traces: (Q, C, TRACE) V. targets, mean, spread: (Q, C, T) what was measured and predicted. The first press
-                counts as one that followed its like.
+            traces: shape (Q, C, TRACE), V. The first press counts as preceded by itself.
+            targets: measured; shape (Q, C, T).
+            mean: predicted; shape (Q, C, T).
+            std: shape (Q, C, T).
 
         Returns:
-            (Q, C, H) if the fault was there at the press before, and (Q, C, H) if it began since. What is missing
-            (NaN) speaks neither for nor against.
+            `llr_continuing` if the fault was present at the press before, and `llr_onset` if it has begun since; shape
+            (Q, C, H) each; 0 for a fibre that misses readings.
         """
-        constant = np.where(_constant(traces), -np.log(self.constant), -MOST)
-        silent, weak, odd = self._answers(targets, mean, spread)
-        loud = np.log(NOISIER) / self.noise_spread
-        noisy = _shift_ratio((_log_noise(traces, self.noise) - self.noise_centre) / self.noise_spread, loud)
-        common = [constant, silent, weak, odd, noisy]
-        # The residual of the rest fades slowly by itself: what a press tells of an offset is only what is new in it.
-        rest = ((targets - mean) / self._honest(spread))[..., -1]
-        new = (rest - self.persistence * _before(rest)) / self.innovation
-        step = self.steps(traces)
-        step = np.stack([step, _before(step)])
-        staying, beginning = list(common), list(common)
+        constant = np.where(_is_constant(traces), -np.log(self.constant_share), -MAX_LLR)
+        noise_shift = np.log(NOISE_FACTOR) / self.log_noise_std
+        log_noise = (_log_noise(traces, self.noise_v) - self.log_noise_mean) / self.log_noise_std
+        common = [constant, *self._response_llrs(targets, mean, std), _shift_llr(log_noise, noise_shift)]
+        # The residual of the rest decays slowly by itself: only its innovation is evidence of an offset.
+        rest = ((targets - mean) / self._calibrated(std))[..., -1]
+        innovation = (rest - self.rest_autocorr * _previous(rest)) / self.innovation_std
+        step = self.largest_step(traces)
+        step = np.stack([step, _previous(step)])
+        continuing, onset = list(common), [_clip(llr) for llr in common]
         for offset in OFFSETS:
-            sign, size = np.sign(offset), abs(offset) / self.innovation
-            staying.append(_shift_ratio(sign * new, (1 - self.persistence) * size))
+            sign, size = np.sign(offset), abs(offset) / self.innovation_std
+            continuing.append(_shift_llr(sign * innovation, (1 - self.rest_autocorr) * size))
             jump = np.maximum(sign * step, 0.0).max(axis=0)
-            # A step may have any size up to some hundred spreads: the logarithm of its density is about -4.
-            stepped = np.clip(-_log_t(jump, 0.0, 1.0) - 4.0, 0.0, MOST_OF_STEP)
-            beginning.append(_capped(_shift_ratio(sign * new, size)) + stepped)
-        present = np.isfinite(traces).all(axis=-1, keepdims=True)
-        stay, begin = np.stack(staying, axis=-1), np.stack(beginning, axis=-1)
-        begin[..., : len(common)] = _capped(begin[..., : len(common)])
-        return np.where(present, np.nan_to_num(_capped(stay)), 0.0), np.where(present, np.nan_to_num(begin), 0.0)
+            # A step may have any size up to some hundred deviations: the logarithm of its density is about -4.
+            step_llr = np.clip(-_log_t(jump, 0.0, 1.0) - 4.0, 0.0, MAX_STEP_LLR)
+            onset.append(_clip(_shift_llr(sign * innovation, size)) + step_llr)
+        valid = np.isfinite(traces).all(axis=-1, keepdims=True)
+        llrs = _clip(np.stack(continuing, axis=-1)), np.stack(onset, axis=-1)
+        llr_continuing, llr_onset = (np.where(valid, np.nan_to_num(llr), 0.0) for llr in llrs)
+        return llr_continuing, llr_onset
 
-    def _answers(self, targets: Array, mean: Array, spread: Array) -> list[Array]:
-        """Ratios (Q, C) of silent, weak and odd."""
+    def _response_llrs(self, targets: Array, mean: Array, std: Array) -> list[Array]:
+        """Ratios (Q, C) of no_response, reduced_gain and inconsistent."""
         targets = np.nan_to_num(targets)
-        healthy = self.answer_fit(targets, mean, spread)
-        answer, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
-        spread = self._honest(spread)[..., :COMPONENTS]
-        gains = [_log_t(answer, gain * mean, np.hypot(gain * spread, self.floor)).sum(axis=-1) for gain in GAINS]
-        others = _log_t(answer[..., None, :, :], self.other_mean, self.other_spread).sum(axis=-1)
+        healthy = self.log_likelihood_healthy(targets, mean, std)
+        response, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
+        std = self._calibrated(std)[..., :COMPONENTS]
+        gains = [_log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1) for gain in GAINS]
+        others = _log_t(response[..., None, :, :], self.library_mean, self.library_std).sum(axis=-1)
         other = np.logaddexp.reduce(others, axis=-2) - np.log(LIBRARY)
-        odd = np.logaddexp(other, _log_t(answer, mean, WIDER * spread).sum(axis=-1)) - np.log(2)
-        return [hypothesis - healthy for hypothesis in (*gains, odd)]
+        inconsistent = np.logaddexp(other, _log_t(response, mean, STD_FACTOR * std).sum(axis=-1)) - np.log(2)
+        return [hypothesis - healthy for hypothesis in (*gains, inconsistent)]
+
+    def _calibrated(self, std: Array) -> Array:
+        return np.hypot(std * self.std_scale, self.std_floor)
 
 
-def _capped(ratios: Array) -> Array:
-    return np.clip(ratios, -MOST, MOST)
+def _clip(llr: Array) -> Array:
+    return np.clip(llr, -MAX_LLR, MAX_LLR)
 
 
-def _calibrated(error: Array, spread: Array) -> tuple[Array, Array]:
-    """Scale and extra (C, T) that make the errors (Q, C, T) of predictions most likely.
+def _calibrate_std(residual: Array, std: Array) -> tuple[Array, Array]:
+    """Choose the scale and floor (C, T) that make residuals (Q, C, T) of predictions most likely.
 
-    A network that learnt from few presses is too sure where it should be least in doubt; `extra` takes that back.
+    A network trained on few presses is overconfident where it should be least certain; the floor corrects that.
     """
-    choices = [(scale, extra) for scale in SCALES for extra in EXTRAS]
-    fits = np.stack([_log_t(error, 0.0, np.hypot(scale * spread, extra)).sum(axis=0) for scale, extra in choices])
+    choices = [(scale, floor) for scale in STD_SCALES for floor in STD_FLOORS]
+    fits = np.stack([_log_t(residual, 0.0, np.hypot(scale * std, floor)).sum(axis=0) for scale, floor in choices])
     best = np.array(choices)[fits.argmax(axis=0)]
     return best[..., 0], best[..., 1]
 
 
-def _before(values: Array) -> Array:
-    """(Q, ...) values of the press before each; the first has none, and stands for it."""
+def _previous(values: Array) -> Array:
+    """(Q, ...) values of the press before each; the first stands for its own."""
     return np.concatenate([values[:1], values[:-1]])
 
 
-def noise_of(traces: Array) -> Array:
-    """(..., TRACE) to (...): mean difference of successive readings in the quiet thirds, V.
+def estimate_noise(traces: Array) -> Array:
+    """Estimate the noise (...) of traces (..., TRACE): mean difference of successive readings in quiet parts, V.
 
-    The greatest quarter of the differences is left out: a spike is a spike, not noise.
+    The largest quarter of the differences is ignored: a spike is no noise.
     """
-    quiet = (slice(0, REST), slice(REST + SUNK - 10, REST + SUNK), slice(TRACE - RELEASED + 10, TRACE))
+    quiet = (slice(0, REST), slice(REST + HELD - 10, REST + HELD), slice(TRACE - RELEASED + 10, TRACE))
     steps = np.sort(np.concatenate([np.abs(np.diff(traces[..., part], axis=-1)) for part in quiet], axis=-1), axis=-1)
     return steps[..., : steps.shape[-1] * 3 // 4].mean(axis=-1)
 
 
-def _log_noise(traces: Array, usual: Array) -> Array:
-    # A quarter keeps a press that happens to be without noise from standing out.
-    return np.log(noise_of(traces) / usual + 0.25)
+def _log_noise(traces: Array, noise_v: Array) -> Array:
+    # A quarter keeps a press that happens to be without noise from being an outlier.
+    return np.log(estimate_noise(traces) / noise_v + 0.25)
 
 
-def _constant(traces: Array) -> Mask:
+def _is_constant(traces: Array) -> Mask:
     return np.ptp(traces, axis=-1) == 0
 
 
-def step_filters(traces: Array, noise: Array) -> Array:
-    """Filters that answer 1 to the spread of a healthy trace and most to a step: step' S^-1 / sqrt(step' S^-1 step).
+def fit_step_filters(traces: Array, noise_v: Array) -> Array:
+    """Fit matched filters of steps: step' S^-1 / sqrt(step' S^-1 step), 1 for a standard deviation of healthy traces.
 
-    S is the second moment of healthy answers (D. O. North, 1943). What lies out further, where the probe touches, is
-    scaled down until its far quantile is that of Student's t.
+    S is the second moment of healthy responses (D. O. North, 1943). Filters with heavier tails, where the probe
+    touches, are scaled down until their far quantile is that of Student's t.
     """
     step = (np.arange(TRACE) >= STEPS[:, None]).astype(float)
     step -= step[:, :REST].mean(axis=1, keepdims=True)
-    answers = traces - traces[:, :, :REST].mean(axis=2, keepdims=True)
+    responses = traces - traces[:, :, :REST].mean(axis=2, keepdims=True)
     filters = np.empty((traces.shape[1], len(STEPS), TRACE))
-    for fibre, own in enumerate(np.moveaxis(answers, 1, 0)):
-        filters[fibre] = np.linalg.solve(own.T @ own / len(own) + noise[fibre] ** 2 * np.eye(TRACE), step.T).T
+    for fibre, response in enumerate(np.moveaxis(responses, 1, 0)):
+        covariance = response.T @ response / len(response) + noise_v[fibre] ** 2 * np.eye(TRACE)
+        filters[fibre] = np.linalg.solve(covariance, step.T).T
         filters[fibre] /= np.sqrt((filters[fibre] * step).sum(axis=1, keepdims=True))
-        far = np.quantile(np.abs(own @ filters[fibre].T), 0.999, axis=0)
-        filters[fibre] /= np.maximum(far / _FAR_T, 1.0)[:, None]
+        far = np.quantile(np.abs(response @ filters[fibre].T), 0.999, axis=0)
+        filters[fibre] /= np.maximum(far / FAR_T, 1.0)[:, None]
     return filters
 
 
-def _log_t(value: Array, mean: Array | float, spread: Array | float) -> Array:
+def _log_t(value: Array, mean: Array | float, std: Array | float) -> Array:
     """Logarithm of the density of Student's t, up to a constant."""
-    return -(FREEDOM + 1) / 2 * np.log1p(((value - mean) / spread) ** 2 / FREEDOM) - np.log(spread)
+    return -(T_DEGREES + 1) / 2 * np.log1p(((value - mean) / std) ** 2 / T_DEGREES) - np.log(std)
 
 
-def _shift_ratio(value: Array, shift: Array | float) -> Array:
+def _shift_llr(value: Array, shift: Array | float) -> Array:
     """Log-likelihood ratio of a mean of at least `shift` > 0 against 0."""
     value = np.minimum(value, shift)
     return _log_t(value, shift, 1.0) - _log_t(value, 0.0, 1.0)
 
 
-NEVER = 1e5
-"""A height that no climb reaches."""
-_LEAST_PEAKS = 30
-
-
-def climb(height: Array, stay: Array, begin: Array) -> Array:
-    """One press of CUSUM: the fault was there before, or begins now, or there is none (0)."""
-    return np.maximum(np.maximum(height + stay, begin), 0.0)
+def cusum_update(height: Array, llr_continuing: Array, llr_onset: Array) -> Array:
+    """Update cumulative sums by a press: the fault was present before, or begins now, or there is none (0)."""
+    return np.maximum(np.maximum(height + llr_continuing, llr_onset), 0.0)
 
 
 @dataclass(frozen=True)
-class Tail:
-    """How rarely healthy presses climb high, by how many fibres are left out: the fewer tell, the more is chance.
+class ExceedanceModel:
+    """Exponential tail of the peaks of healthy sums, by the number of failed fibres: with fewer, more is chance.
 
     Attributes:
-        level, slope: (K, H) a height h is passed exp(-(h - level) / slope) times a press, all fibres together, with
-            0 .. K - 1 fibres left out.
+        level: a height h is exceeded exp(-(h - level) / slope) times a press, by all fibres together; shape (K, H) for
+            0 .. K - 1 failed fibres.
+        slope: shape (K, H).
     """
 
     level: Array
     slope: Array
 
     @classmethod
-    def fit(cls, ratios: Sequence[tuple[Array, Array]]) -> "Tail":
-        """From the ratios (Q, C, H) of healthy presses in their order, for each number of fibres left out.
+    def fit(cls, llrs: Sequence[tuple[Array, Array]]) -> "ExceedanceModel":
+        """Fit to the ratios (Q, C, H), continuing and onset, of successive healthy presses, by the number of failures.
 
-        The slope is the mean excess of the highest tenth of the climbs. The level makes the highest climb of all no
-        rarer than once in these Q presses. No slope is below 1, which exact likelihoods have (A. Wald).
+        The slope is the mean excess of the highest tenth of the peaks. By the level the highest of all occurs at least
+        once in these Q presses. No slope is below 1, that of exact likelihoods (A. Wald).
         """
-        rows = [_tail(stay, begin) for stay, begin in ratios]
-        return cls(np.stack([level for level, _ in rows]), np.stack([slope for _, slope in rows]))
+        levels, slopes = zip(*[_fit_tail(*each) for each in llrs], strict=True)
+        return cls(np.stack(levels), np.stack(slopes))
 
-    def without(self, hypothesis: str) -> "Tail":
-        """One by which no height of a hypothesis is rare."""
+    def without(self, hypothesis: str) -> "ExceedanceModel":
+        """Return a model by which no height of a hypothesis is rare."""
         level = self.level.copy()
-        level[:, HYPOTHESES.index(hypothesis)] = NEVER
+        level[:, HYPOTHESES.index(hypothesis)] = MAX_HEIGHT
         return replace(self, level=level)
 
-    def rarity(self, heights: Array, lost: int) -> Array:
-        """(..., H) heights to minus the logarithm of how often a healthy pad passes them, a press, without `lost`
-        fibres."""
-        row = min(lost, len(self.level) - 1)
+    def neg_log_p(self, heights: Array, n_failed: int) -> Array:
+        """Return minus the logarithm of how often a press of a healthy pad exceeds heights (..., H)."""
+        row = min(n_failed, len(self.level) - 1)
         return (heights - self.level[row]) / self.slope[row]
 
 
-def _tail(stay: Array, begin: Array) -> tuple[Array, Array]:
-    heights = np.empty_like(stay)
-    height = np.zeros(stay.shape[1:])
-    for press in range(len(stay)):
-        height = heights[press] = climb(height, stay[press], begin[press])
-    level, slope = np.empty(stay.shape[2]), np.empty(stay.shape[2])
-    for hypothesis in range(stay.shape[2]):
+def _fit_tail(llr_continuing: Array, llr_onset: Array) -> tuple[Array, Array]:
+    heights = np.empty_like(llr_continuing)
+    height = np.zeros(llr_continuing.shape[1:])
+    for press in range(len(heights)):
+        height = heights[press] = cusum_update(height, llr_continuing[press], llr_onset[press])
+    level, slope = np.empty(heights.shape[2]), np.empty(heights.shape[2])
+    for hypothesis in range(heights.shape[2]):
         peaks = np.sort(np.concatenate([_peaks(series) for series in heights[:, :, hypothesis].T]))
-        # Few climbs are a tail by themselves; zeros stand for the ones that were not worth beginning.
-        peaks = np.concatenate([np.zeros(max(_LEAST_PEAKS + 1 - len(peaks), 0)), peaks])
-        top = int(np.clip(len(peaks) // 10, _LEAST_PEAKS, 300))
+        # Few peaks are a tail by themselves; zeros stand for sums that never left 0.
+        peaks = np.concatenate([np.zeros(max(MIN_PEAKS + 1 - len(peaks), 0)), peaks])
+        top = int(np.clip(len(peaks) // 10, MIN_PEAKS, 300))
         base = peaks[-top - 1]
         slope[hypothesis] = max((peaks[-top:] - base).mean(), 1.0)
-        rates = np.log([top / len(stay), 1 / len(stay)])
+        rates = np.log([top / len(heights), 1 / len(heights)])
         level[hypothesis] = (np.array([base, peaks[-1]]) + slope[hypothesis] * rates).max()
     return level, slope
 
 
 def _peaks(heights: Array) -> Array:
-    """Greatest height of every climb from 0."""
-    up = heights > 0
-    begins = np.flatnonzero(up & ~np.concatenate([[False], up[:-1]]))
-    return np.maximum.reduceat(heights, begins) if len(begins) else np.empty(0)
+    """Largest height of every excursion from 0."""
+    above = heights > 0
+    starts = np.flatnonzero(above & ~np.concatenate([[False], above[:-1]]))
+    return np.maximum.reduceat(heights, starts) if len(starts) else np.empty(0)

@@ -60,7 +60,13 @@ class Message:
     def to_json(self, number: int) -> str:
         """Return the message as a line of JSON, the `number`-th of its stream, from 0."""
         pad = {"format": FORMAT, "number": number, **self.pad}
-        operation = {"op": "publish", "topic": self.topic, "type": TOPICS[self.topic].msgtype, "msg": self.msg, "pad": pad}
+        operation = {
+            "op": "publish",
+            "topic": self.topic,
+            "type": TOPICS[self.topic].msgtype,
+            "msg": self.msg,
+            "pad": pad,
+        }
         return json.dumps(operation, allow_nan=False)
 
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
-from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
-from padforge.sense.health.fault_detector import FaultDetector, FibreFault
+from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
+from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
 from padforge.sense.localizer.features import (
@@ -30,7 +30,7 @@ from padforge.sense.localizer.features import (
 from padforge.sense.localizer.model import MEASURED, LocalizerModel
 from padforge.sense.localizer.model_files import refuse_other_pad
 from padforge.sense.rig.streams import HISTORY, RingBuffer
-from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
+from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
 MAX_SHOWN = 12
 """Latest presses that are shown."""
@@ -198,7 +198,7 @@ class Live:
             raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
         for model in localizers:
             refuse_other_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
-        self._monitor = None if health is None else FaultDetector(health)
+        self._monitor = None if health is None else FaultMonitor(health)
         if health is not None:
             refuse_other_pad(health, "health", fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda model: READINGS_NEEDED[model.features][::-1])
@@ -218,7 +218,7 @@ class Live:
     @property
     def failed(self) -> tuple[int, ...]:
         """Indices of the fibres that are masked."""
-        return () if self._monitor is None else self._monitor.lost
+        return () if self._monitor is None else self._monitor.failed
 
     def feed(self, times_s: Array, readings: Array) -> list[Event]:
         """Process readings. The events do not depend on how readings are cut into blocks.
@@ -231,20 +231,20 @@ class Live:
             Estimates and faults in the order in which they were made.
 
         Raises:
-            InputError: arrays that `stream_of` refuses, or times that do not follow those of the last block.
+            InputError: arrays that `check_stream` refuses, or times that do not follow those of the last block.
         """
         events: list[Event] = []
-        times, rows = stream_of(times_s, readings, len(self._response_v))
+        times, rows = check_stream(times_s, readings, len(self._response_v))
         end = self._buffer.end
         if len(times) and end and not times[0] > self._buffer.rows(end - 1, end)[0, 0]:
             raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
         for row in np.column_stack([times, rows]):
             self._buffer.append(row)
-            for event in self._detector.feed(row[:1], row[None, 1:]):
+            for event in self._detector.update(row[:1], row[None, 1:]):
                 if event.down:
                     events += self._begin(event.reading)
                 elif self._press is not None:
-                    command = self._buffer.command_index(event.reading, SENT_UP_S)
+                    command = self._buffer.command_index(event.reading, RELEASE_DELAY_S)
                     self._press.release(max(command, self._press.touched))
             events += self._advance()
         return events
@@ -292,7 +292,7 @@ class Live:
 
     def _begin(self, touched: int) -> list[Event]:
         """Begin a press, after the press before has given all that is still to come of it."""
-        down_command = self._buffer.command_index(touched, SENT_DOWN_S)
+        down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
         events = self._advance(down_command)
         down_command = max(down_command, self._previous_end + 1)
         time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])

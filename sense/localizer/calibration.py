@@ -114,9 +114,9 @@ def learn(
     measures = learnable(recording, training) if masked else {}
     shown_raw, rows = raw[taught], taught
     if masked:
-        from padforge.sense.signals.press_detection import as_detected
+        from padforge.sense.signals.press_detection import align_to_detected
 
-        again = as_detected(recording.readings, recording.times_s, recording.down_command, recording.up_command)
+        again = align_to_detected(recording.readings, recording.times_s, recording.down_command, recording.up_command)
         shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
         rows = np.concatenate([taught, taught])
     shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)

@@ -307,7 +307,7 @@ class LocalizerModel:
         Args:
             recording: of a pad with the fibres and the rate that were trained on.
             failed: indices of fibres to leave out of every press.
-            fibre_mask: (Q, C), false where a fibre is left out of a press; see `health.fault_detector.fibre_mask_of`.
+            fibre_mask: (Q, C), false where a fibre is left out of a press; see `health.fault_detector.mask_faults`.
 
         Returns:
             Positions and their uncertainty, Q presses.

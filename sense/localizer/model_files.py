@@ -2,12 +2,11 @@
 
 import hashlib
 import json
-import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +17,8 @@ from padforge.design.common.files import atomic_files, read_bytes
 from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.design.common.validation import check_path as as_path
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-
 RATE_TOLERANCE = 0.25
 """Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
-WARM_UP = 0.2
-"""Share of the steps of a training in which the rate of learning rises."""
-AVERAGE = 0.998
-"""Share of the running average of the weights that a step of training leaves as it was."""
 
 
 class ModelFiles(NamedTuple):
@@ -102,20 +93,3 @@ def refuse_other_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float
             f"there are {rate_hz:.3g} readings a second, allowed is {model.rate_hz:.3g}, at which {what} was learnt, "
             f"within {RATE_TOLERANCE:.0%}"
         )
-
-
-def one_cycle(share: float) -> float:
-    """Rate of learning after `share` of the steps: up along a line to 1, then down along a cosine to 0."""
-    if share < WARM_UP:
-        return share / WARM_UP
-    return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
-
-
-def average_in(average: "Iterable[Tensor]", weights: "Iterable[Tensor]", number: int) -> None:
-    """Move the running average by step `number`, counted from 1, of a training.
-
-    It forgets the first steps sooner than the later ones, or it would start from the initial draw.
-    """
-    keep = min(AVERAGE, number / (number + 9))
-    for kept, weight in zip(average, weights, strict=True):
-        kept.lerp_(weight.detach(), 1 - keep)

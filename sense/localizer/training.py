@@ -25,7 +25,7 @@ without forgetting). The more presses there are, the more the first count. Expec
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from threading import Event, Lock
@@ -42,8 +42,95 @@ from padforge.sense import settings
 from padforge.sense.arrays import Floats
 from padforge.sense.localizer.bayes import TOLD, BayesianLocalizer
 from padforge.sense.localizer.features import TrainingPresses, as_unseen, looked_up
-from padforge.sense.localizer.model_files import average_in, one_cycle
 from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Weights
+
+WARM_UP = 0.2
+"""Share of the steps in which the learning rate rises."""
+AVERAGE_DECAY = 0.998
+"""Decay of the exponential moving average of the weights."""
+REPORTS = 40
+"""Calls of `on_progress` in a training."""
+
+
+def one_cycle(share: float) -> float:
+    """Return the learning rate, relative to its maximum, after `share` of the steps: linear up, cosine down to 0."""
+    if share < WARM_UP:
+        return share / WARM_UP
+    return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
+
+
+@dataclass
+class TrainingLength:
+    """Length of a training, in steps or in seconds.
+
+    Attributes:
+        steps: number of steps, where there is no time budget.
+        seconds: time budget; None for none. The clock starts when this is made.
+    """
+
+    steps: int
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        self._begin = time.monotonic()
+
+    @property
+    def total(self) -> int:
+        """Steps, or seconds, of the whole training."""
+        return self.steps if self.seconds is None else max(1, round(self.seconds))
+
+    def share(self, step: int) -> float:
+        """Return the share of the training, above 0 and up to 1, that is done with a step, counted from 1."""
+        if self.seconds is None:
+            return step / self.steps
+        elapsed = time.monotonic() - self._begin
+        return min(elapsed / self.seconds, 1.0) if self.seconds > 0 else 1.0
+
+
+def fit_network(
+    parameters: Mapping[str, Tensor],
+    loss_of_batch: Callable[[], Tensor],
+    length: TrainingLength | int,
+    learning_rate: float,
+    *,
+    weight_decay: float = 1e-2,
+    averaged: bool = True,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> dict[str, Floats]:
+    """Minimize a loss by AdamW with a one-cycle learning rate and averaged weights.
+
+    Args:
+        parameters: weights by name, which require gradients; they are changed in place.
+        loss_of_batch: draws a batch and returns its loss, a scalar; called once a step.
+        length: number of steps, or a `TrainingLength`.
+        learning_rate: maximum of the schedule.
+        weight_decay: of AdamW.
+        averaged: whether the moving average of the weights is returned, or the last ones.
+        on_progress: called up to `REPORTS` times with the steps (or seconds, in a time budget) done.
+
+    Returns:
+        The weights by the same names, as NumPy arrays.
+    """
+    length = TrainingLength(length) if isinstance(length, int) else length
+    average = [weight.detach().clone() for weight in parameters.values()]
+    optimizer = torch.optim.AdamW(parameters.values(), lr=learning_rate, weight_decay=weight_decay, fused=True)
+    share, step, reports = 0.0, 0, 0
+    while share < 1:
+        step += 1
+        share = length.share(step)
+        optimizer.param_groups[0]["lr"] = learning_rate * one_cycle(share)
+        optimizer.zero_grad()
+        loss_of_batch().backward()
+        optimizer.step()
+        # The first steps are forgotten sooner than the later ones, or the average would begin at the initial draw.
+        decay = min(AVERAGE_DECAY, step / (step + 9)) if averaged else 0.0
+        for mean, weight in zip(average, parameters.values(), strict=True):
+            mean.lerp_(weight.detach(), 1 - decay)
+        if share * REPORTS >= reports + 1:
+            reports = int(share * REPORTS)
+            on_progress(round(share * length.total))
+    return {name: mean.cpu().numpy() for name, mean in zip(parameters, average, strict=True)}
+
 
 WHOLE = 0.25
 """Share of training presses that keep all fibres; the others lose 1 .. `lost`, each as often."""
@@ -182,8 +269,6 @@ EXPECTING = 0.1
 """Weight of learning the expected error, beside the distance."""
 CORRECTOR = {"hidden": 128, "layers": 3}
 """Size of the network that corrects what the observer finds, at most: larger ones gain nothing."""
-REPORTS = 40
-"""How often a training tells how far it is."""
 TRIED, LENGTHENED, MOST_MEMBERS = 12, 5, 64
 """Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
 
@@ -216,33 +301,6 @@ class JointProgress:
 
     def __exit__(self, *error: object) -> None:
         self._over.set()
-
-
-@dataclass
-class TrainingLength:
-    """How long a member is trained.
-
-    Attributes:
-        steps: how many, where there is no time budget. seconds: the time budget; None for none.
-    """
-
-    steps: int
-    seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        self._begin = time.monotonic()
-
-    @property
-    def total(self) -> int:
-        """What is told as the whole: steps, or seconds."""
-        return self.steps if self.seconds is None else max(1, round(self.seconds))
-
-    def share(self, number: int) -> float:
-        """Share of the training, above 0 and up to 1, that is over with step `number`, counted from 1."""
-        if self.seconds is None:
-            return number / self.steps
-        spent = time.monotonic() - self._begin
-        return min(spent / self.seconds, 1.0) if self.seconds > 0 else 1.0
 
 
 class Trained(NamedTuple):
@@ -359,22 +417,7 @@ class _Training:
         return float(np.median(took))
 
     def run(self, length: TrainingLength, tell: Callable[[int], None]) -> Weights:
-        weights, rate = self._weights, self._options.learning_rate
-        average = {name: w.detach().clone() for name, w in weights.items()}
-        optimizer = torch.optim.AdamW(weights.values(), lr=rate, weight_decay=WEIGHT_DECAY, fused=True)
-        told, share, number = 0, 0.0, 0
-        while share < 1:
-            number += 1
-            share = length.share(number)
-            optimizer.param_groups[0]["lr"] = rate * one_cycle(share)
-            optimizer.zero_grad()
-            self._loss().backward()
-            optimizer.step()
-            average_in(average.values(), weights.values(), number)
-            if share * REPORTS >= told + 1:
-                told = int(share * REPORTS)
-                tell(round(share * length.total))
-        return {name: w.cpu().numpy() for name, w in average.items()}
+        return fit_network(self._weights, self._loss, length, self._options.learning_rate, on_progress=tell)
 
     def _loss(self) -> Tensor:
         batch = min(self._options.batch, len(self._x))
@@ -421,7 +464,6 @@ def adapt(
     table: Floats,
     lost: int,
     rng: np.random.Generator,
-    progress: Callable[[int], None] = lambda steps: None,
     bayes: BayesianLocalizer | None = None,
 ) -> Weights:
     """Adapt the members of a network of method "ensemble", or the network that corrects an observer.
@@ -432,7 +474,6 @@ def adapt(
         table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
         lost: fibres that are lost at once, at most, while adapting.
         rng: source of the seed of torch's generator, which draws all that is random here.
-        progress: called with the steps done since it was last called.
         bayes: what they correct, if anything; it stays as it is.
 
     Returns:
@@ -444,22 +485,18 @@ def adapt(
     presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator, bayes)
     members = len(now["first.w"])
     trust = len(samples.inputs) / (len(samples.inputs) + OLD_PRESSES)
-    optimizer = torch.optim.Adam(now.values(), lr=RATE)
+
+    def loss() -> Tensor:
+        known, left = presses.nearby()
+        off = forward(now, known.expand(members, -1, -1))[..., : left.shape[1]] - left
+        near = trust * misses(off).mean(dim=1).sum()
+        known = presses.anywhere().expand(members, -1, -1)
+        with torch.no_grad():
+            found = forward(before, known)
+        return near + (1 - trust) * _change(forward(now, known), found)
+
     with one_torch_thread():
-        for number in range(1, STEPS + 1):
-            optimizer.param_groups[0]["lr"] = RATE * one_cycle(number / STEPS)
-            optimizer.zero_grad()
-            known, left = presses.nearby()
-            off = forward(now, known.expand(members, -1, -1))[..., : left.shape[1]] - left
-            loss = trust * misses(off).mean(dim=1).sum()
-            known = presses.anywhere().expand(members, -1, -1)
-            with torch.no_grad():
-                found = forward(before, known)
-            loss = loss + (1 - trust) * _change(forward(now, known), found)
-            loss.backward()
-            optimizer.step()
-            progress(1)
-    return {name: weight.detach().numpy() for name, weight in now.items()}
+        return fit_network(now, loss, STEPS, RATE, weight_decay=0.0, averaged=False)
 
 
 class _Presses:

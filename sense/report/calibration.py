@@ -14,8 +14,7 @@ from padforge.design.common.files import atomic_files, check_replaceable, check_
 from padforge.design.common.plotting import ALARM, INK, add_caption, new_figure, save_figure
 from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
-from padforge.sense.health.fault_detector import health_files
-from padforge.sense.health.health_model import learn_health
+from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import calibrate, left_out
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
@@ -68,7 +67,7 @@ def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
 
 FILES = (
     *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
-    *sorted(health_files()),
+    *sorted(HEALTH_FILES),
 )
 """Names of all that a calibration writes; of health, what can be learnt."""
 
@@ -105,17 +104,15 @@ def calibrate_into(
     progress(0, 0)
     with stage("health"):
         try:
-            health = learn_health(recording, localizer.test, localizer.provenance)
+            detector = FaultDetector(seed=options.seed).fit(recording, localizer.test, localizer.provenance)
         except InputError as error:
-            health = {}
+            detector = None
             warn(f"no watch is kept on the fibres' health: {error}")
-    with atomic_files(
-        out, without=health_files() - health_files(health)
-    ) as folder:  # it must not speak for another model
+    with atomic_files(out, without=HEALTH_FILES) as folder:  # those of another model must not stay
         localizer.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings may be told by the result alone
-        for name, model in health.items():
-            model.save(folder, name)
+        if detector:
+            detector.save(folder)
         write_json(folder / "calibration.json", document)
         with stage("figures"):
             draw_error_map(document, folder / "error_map.png")

@@ -31,7 +31,7 @@ from padforge.sense.rig.by_hand_presses import (
 from padforge.sense.rig.config import RigConfig, open_recorder, read_source
 from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
-from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
+from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
 KIND = "hand"  # of the source of such a recording, whose depths are unknown
 # Targets of a uniform plan that are ordered by a short way before the next ones: a session that ends early has covered
@@ -191,7 +191,7 @@ class HandSession:
         for row in np.column_stack([times_s, readings]):
             self._ring.append(row)
             self._now_s = float(row[0])
-            for event in self._detector.feed(row[:1], row[None, 1:]) if self._detector else ():
+            for event in self._detector.update(row[:1], row[None, 1:]) if self._detector else ():
                 reading = self._detector_start + event.reading
                 self._touch(reading) if event.down else self._release(reading)
         self._check_detector()
@@ -199,14 +199,14 @@ class HandSession:
     def _touch(self, touched: int) -> None:
         target = self._sequence.touch(self._time_s(touched))
         self._touched = touched
-        self._down_command = max(self._ring.command_index(touched, SENT_DOWN_S), self._released + 1)
+        self._down_command = max(self._ring.command_index(touched, TOUCH_DELAY_S), self._released + 1)
         self._baseline = self._mean_before(self._down_command)
         self._rejected_mm = None
         self._recorder.begin(target or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
 
     def _release(self, released: int) -> None:
-        up_command = max(self._ring.command_index(released, SENT_UP_S), self._touched + 1, self._down_command + 1)
+        up_command = max(self._ring.command_index(released, RELEASE_DELAY_S), self._touched + 1, self._down_command + 1)
         target, rejection = self._sequence.target, self._sequence.release(self._time_s(released))
         responses = self._responses(up_command)
         rejection = rejection or self._validator.rejection(responses)

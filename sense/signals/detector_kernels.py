@@ -1,23 +1,19 @@
-"""
+"""Press detection as readings come: a Kalman filter for each fibre, a test for changes, and a state machine.
 
-Levels that fibres keep between presses: followed reading by reading, and told when they change.
-At rest a fibre keeps a level that drifts, under a press another that creeps. Each is followed by a Kalman filter of
-level and slope (the local linear trend of A. C. Harvey, "Forecasting, Structural Time Series Models and the Kalman
-Filter", Cambridge 1989), whose slope fades as silicone settles. A change is a run of looks that leave what the filters
-predict and agree with each other; one that agrees with no other is a spike. How far a level wanders beyond its slope is
-learnt from looks in a row that are off the same way.
-A look is a reading, or the mean of as many as come in `LOOK_S`: slow converters are looked at reading by reading, of
-fast ones the noise is averaged out.
+1. Readings are averaged over blocks of BLOCK_S: slow converters are followed reading by reading.
+2. Each fibre's level, at rest or under a press, is tracked by a Kalman filter of level and slope (local linear trend;
+   A. C. Harvey, "Forecasting, Structural Time Series Models and the Kalman Filter", Cambridge 1989), whose slope fades
+   as silicone settles. Noise and the random walk of the level are learnt from the innovations.
+3. A change is a run of blocks that leave the prediction and agree with each other (chi-square tests with
+   `reject_limit` and `accept_limit`); a block that agrees with no other is a spike.
+4. A change is classified as touch or release. A release takes back the step of its touch and goes against the
+   direction of touches, since fibres that a press stretches drive their dividers all one way.
 
-Which changes of level are touches and which are releases.
-A release takes back the step that its touch made, and goes against the way of touches: fibres that a press stretches
-drive their dividers all one way. Where a change fits neither, the next one decides. A pad whose rests differ from
-press to press, as only levels under presses do, has been taken the wrong way round and is set right.
-Steps are compared fibre by fibre in spreads (see `level_tracking`). The size of a step is the sum of their squares;
-counted, no fibre enters it with more than `STRONGEST`.
+Steps are whitened: divided by `scale`, the noise of the fibre. The size of a step is the sum of the squares.
 """
 
 import math
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -25,562 +21,544 @@ from numba import njit
 
 FIBRE = np.dtype(
     [
-        ("level", "f8"),  # as predicted for now, V,
-        ("slope", "f8"),  # and how fast it changes, V/s
-        ("level_var", "f8"),  # their covariance, in squares of `spread`
+        ("level", "f8"),  # predicted for now, V
+        ("slope", "f8"),  # V/s
+        ("level_var", "f8"),  # covariance of level and slope, in units of scale^2
         ("cross_var", "f8"),
         ("slope_var", "f8"),
-        ("noise", "f8"),  # standard deviation of a look, V;
-        ("spread", "f8"),  # the same, widened to what counts as noise
-        ("off", "f8"),  # deviation of the look last followed, V,
-        ("common", "f8"),  # mean product of two such in a row, V^2,
-        ("wander", "f8"),  # and the variance of the level's own wandering that it speaks of, V^2
-        ("seen_s", "f8"),  # when the fibre was last seen at its level
+        ("noise", "f8"),  # standard deviation of a block mean, V
+        ("scale", "f8"),  # the same, but not below what counts as noise, V
+        ("innovation", "f8"),  # of the last update, V
+        ("autocov", "f8"),  # mean product of successive innovations, V^2
+        ("random_walk_var", "f8"),  # variance of the level's own random walk, by `autocov`, V^2
+        ("updated_s", "f8"),  # time of the last update
         ("reading", "f8"),  # the last one, V
-        ("count", "f8"),  # readings in the present look,
-        ("low", "f8"),  # and the extremes among them
-        ("high", "f8"),
-        ("look", "f8"),  # the present look, V,
-        ("before", "f8"),  # and the one before
-        ("deviation", "f8"),  # of the look from the level, or from where a change began
-        ("run", "f8"),  # sum of the deviations of a run,
-        ("run_square", "f8"),  # and of their squares
-        ("origin", "f8"),  # level at which a change began, V,
-        ("farthest", "f8"),  # and how far it went at its farthest
-        ("press", "f8"),  # step that the press made, V
-        ("way", "f8"),  # mean step of touches, in spreads
-        ("rest", "f8"),  # last level without a press, V,
-        ("held", "f8"),  # and under one
+        ("count", "f8"),  # readings in the present block, and their extremes
+        ("lowest", "f8"),
+        ("highest", "f8"),
+        ("mean", "f8"),  # of the present block, V
+        ("previous_mean", "f8"),  # of the block before
+        ("residual", "f8"),  # of the block mean from the level, or from where a change began, V
+        ("run_sum", "f8"),  # of the residuals of a run, and of their squares
+        ("run_square_sum", "f8"),
+        ("start_level", "f8"),  # where a change began, V
+        ("peak_step", "f8"),  # of a change at its farthest, V
+        ("press_step", "f8"),  # that the press made, V
+        ("direction", "f8"),  # mean whitened step of touches
+        ("rest_level", "f8"),  # the last at rest, V
+        ("press_level", "f8"),  # the last under a press, V
     ]
 )
-"""What is known of a fibre; NaN where nothing is."""
+"""State of a fibre; NaN is unknown."""
 
 PAD = np.dtype(
     [
-        ("reading", "i8"),  # readings taken so far
-        ("reading_s", "f8"),  # time of the last one
-        ("look_first", "i8"),  # first reading of the present look,
-        ("look_from_s", "f8"),  # its time,
-        ("look_readings", "i8"),  # and how many there are
-        ("look_s", "f8"),  # time of the last look
-        ("looks", "i8"),  # from which noise was learnt
-        ("step_v", "f8"),  # of the converter: least difference of two readings
-        ("run", "i8"),  # looks in a row that leave the levels,
-        ("run_first", "i8"),  # first reading of the first,
-        ("run_s", "f8"),  # and its time
-        ("changing", "?"),  # whether a change is under way,
-        ("told", "i8"),  # what it was told to be, see `press_detection`,
-        ("farthest", "f8"),  # its size at its farthest,
-        ("farthest_s", "f8"),  # when that was,
-        ("after_farthest", "i8"),  # and the first reading after it; -1 before
-        ("state", "i8"),  # see `press_detection`
-        ("released_s", "f8"),  # when a press was last let go
-        ("odd_first", "i8"),  # where a change began that is not yet understood
-        ("presses", "i8"),  # learnt from
-        ("typical_v", "f8"),  # step that a press makes, all fibres together, V
-        ("typical_size", "f8"),  # the same as a counted size, see `press_detection`
-        ("agreement", "f8"),  # how far touches go the same way, -1 to 1
-        ("rest_spread", "f8"),  # mean counted size of the way from one rest to the next,
-        ("held_spread", "f8"),  # and from one level under a press to the next
+        ("n_readings", "i8"),
+        ("reading_s", "f8"),  # time of the last reading
+        ("block_first", "i8"),  # first reading of the present block, its time, and how many there are
+        ("block_start_s", "f8"),
+        ("block_count", "i8"),
+        ("block_s", "f8"),  # time of the last block
+        ("n_blocks", "i8"),  # that the noise was learnt from
+        ("resolution_v", "f8"),  # of the converter: least difference of two readings
+        ("run", "i8"),  # blocks in a row that leave the levels; first reading and time of the first
+        ("run_first", "i8"),
+        ("run_s", "f8"),
+        ("in_change", "?"),
+        ("change", "i8"),  # a `Change`
+        ("peak_size", "f8"),  # size of the change at its farthest, the time, and the first reading after it (or -1)
+        ("peak_s", "f8"),
+        ("after_peak", "i8"),
+        ("state", "i8"),  # a `State`
+        ("released_s", "f8"),  # time of the last release
+        ("unclear_first", "i8"),  # first reading of the change that led to `UNCLEAR`
+        ("n_presses", "i8"),  # learnt from
+        ("typical_v", "f8"),  # root of the summed squares of a press's steps, V
+        ("typical_size", "f8"),  # size of a press, clipped
+        ("agreement", "f8"),  # of touches with the direction of earlier ones, -1 to 1
+        ("rest_scatter", "f8"),  # mean clipped size of the step from one rest level to the next
+        ("press_scatter", "f8"),  # and from one level under a press to the next
     ]
 )
-"""What is known of the pad as a whole."""
+"""State of the pad."""
+
+BLOCK_S = 0.03
+"""Length of a block; a probe takes a tenth of a second to sink in."""
+FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0
+"""Times in which a slope fades (an overshoot comes back within seconds), is learnt, and the noise is learnt."""
+GAP_S, GIVE_UP_S = 1.0, 1.0
+"""A fibre missing for longer starts anew; a run that lasts longer without agreement is grown noise, and no change."""
+WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8
+"""Blocks before the first change; after n blocks the noise is widened by the share ROUGH_BLOCKS / n."""
+LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4
+"""Shares of a step by which the level after it, and its slope per s, may be wrong: silicone has not settled then."""
+MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0
+"""Standard deviations beyond which a block moves the level, and the noise, no further."""
+MIN_SHARE, MIN_V = 0.01, 1e-7
+"""Least noise, as a share of a typical press and in V; differences of readings below MIN_V are rounding."""
+MIN_CORRELATION = 0.25
+"""Correlation of successive innovations from which on a level is taken to walk."""
+MEAN_TO_STD = math.sqrt(math.pi / 2)
+"""Standard deviation over mean absolute value of a normal distribution."""
+STALL_S, SETTLED = 0.5, 0.1
+"""A change has ended when it goes no farther for STALL_S, or when two blocks differ by less than this share of it."""
+RELEASE_S = 1.0
+"""A step in the direction of a release so soon after one belongs to it."""
+MAX_STEP, CLEAR_STEP = 20.0, 5.0
+"""Whitened steps: beyond MAX_STEP a fibre counts no more (a broken one would drown the others); from CLEAR_STEP on it
+adds to the typical press in V."""
+MIN_PRESSES, MIN_AGREEMENT = 3, 0.5
+"""Touches, and their agreement, from which on their direction is used."""
+TOUCH_RATE, LEVEL_RATE = 0.05, 0.15
+"""Weights of the newest touch and level in their running means."""
+INVERTED, MIN_INVERTED = 1.2, 0.4
+"""Rests are presses, and presses rests, where rest levels scatter more than this share of the levels under presses,
+and of a typical press: only levels under presses differ from press to press."""
 
 
-def unknown(fibres: int) -> tuple[Any, Any]:
-    """What is known before the first reading: (C,) `FIBRE` and a `PAD`, overwritten as readings come."""
-    known = np.zeros(fibres, FIBRE)
-    for name in ("level", "reading", "look", "before", "deviation", "origin", "rest", "held"):
-        known[name] = np.nan
-    known["seen_s"] = -np.inf
-    pad = np.zeros(1, PAD)
-    pad["step_v"] = np.inf
-    pad["reading_s"] = pad["look_s"] = pad["released_s"] = -np.inf
-    return known, pad[0]
+class State(IntEnum):
+    """States of the pad; `classify` and `commit` hold the transitions.
 
-
-LOOK_S = 0.03
-"""Length of a look; a probe takes a tenth of a second to sink in."""
-
-FADE_S = 2.5
-"""Time in which a slope fades: the overshoot after a release comes back within seconds."""
-
-MEMORY_S = 1.0
-"""Time over which a slope is learnt."""
-
-NOISE_S = 10.0
-"""Time over which the noise is learnt."""
-
-GAP_S = 1.0
-"""A fibre that was missing for longer is taken as it comes back."""
-
-GIVE_UP_S = 1.0
-"""Looks that leave the levels for longer without agreeing are no change: the noise has grown."""
-
-FIRST_LOOKS = 8
-"""Looks that the noise is learnt from before any change is told."""
-
-ROUGH_LOOKS = 8
-"""How rough the first estimates of the noise are: of n looks it is widened by the share ROUGH_LOOKS / n."""
-
-OFF, OFF_PER_S = 0.05, 0.4
-"""Shares of a step by which the level after it, and its slope, may still be off: silicone has not settled then."""
-
-OUTLIER, GROWTH = 2.5, 3.0
-"""Standard deviations beyond which a look moves a level (OUTLIER) and the noise (GROWTH) no further."""
-
-LEAST_SHARE = 0.01
-"""Least noise, share of a typical press: less means nothing, however quiet the converter."""
-
-LEAST_V = 1e-7
-"""Least noise, and least difference of two readings that is no rounding, V."""
-
-TOLERATED = 0.25
-"""Share of the noise's variance that two looks in a row may have in common before a level is taken to wander."""
-
-MEAN_TO_SD = math.sqrt(math.pi / 2)
-"""Standard deviation over mean amount of what is normally distributed."""
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def take(fibres: Any, pad: Any, row: Any, time_s: float) -> bool:
-    """Take a reading (C,) in V, NaN where missing; True if it completes a look.
-
-    A look without any fibre is none. Of three readings or more, the lowest and the highest of each fibre are left out
-    of a look, since they may be spikes.
+    state      change                                           events            next state
+    REST       in the direction of touches                      touch             PRESSED
+    REST       the same, but gone when it settles (a tap)       touch, release    REST
+    REST       takes back a step, soon after a release          -                 REST
+    REST       against the direction of touches                 -                 UNCLEAR
+    PRESSED    takes back the step of the touch                 release           REST
+    PRESSED    any other (pressed deeper or elsewhere)          -                 PRESSED
+    UNCLEAR    takes back the unclear step: that was a touch    touch, release    REST
+    UNCLEAR    any other: that was a missed press's release     touch             PRESSED
+    PRESSED    rest levels scatter as only presses do           release           REST
     """
-    if pad.look_readings == 0:
-        pad.look_first, pad.look_from_s = pad.reading, time_s
+
+    REST = 0
+    PRESSED = 1
+    UNCLEAR = 2
+
+
+class Change(IntEnum):
+    """Classes of a change; SETTLING is a later part of a release."""
+
+    UNKNOWN = 0
+    TOUCH = 1
+    RELEASE = 2
+    SETTLING = 3
+
+
+kernel = njit(cache=True, error_model="numpy", nogil=True)
+
+
+def initial_state(n_fibres: int) -> tuple[Any, Any]:
+    """Return the state before the first reading, to be overwritten: `FIBRE` of shape (C,), and a `PAD`."""
+    fibres = np.zeros(n_fibres, FIBRE)
+    for name in ("level", "reading", "mean", "previous_mean", "residual", "start_level", "rest_level", "press_level"):
+        fibres[name] = np.nan
+    fibres["updated_s"] = -np.inf
+    pad = np.zeros(1, PAD)
+    pad["resolution_v"] = np.inf
+    pad["reading_s"] = pad["block_s"] = pad["released_s"] = -np.inf
+    return fibres, pad[0]
+
+
+@kernel
+def ingest(fibres: Any, pad: Any, row: Any, time_s: float) -> bool:
+    """Add a reading (C,) to the present block; return whether that completes it with some fibre in it."""
+    if pad.block_count == 0:
+        pad.block_first, pad.block_start_s = pad.n_readings, time_s
         for fibre in fibres:
-            fibre.look, fibre.count, fibre.low, fibre.high = 0.0, 0.0, np.inf, -np.inf
+            fibre.mean, fibre.count, fibre.lowest, fibre.highest = 0.0, 0.0, np.inf, -np.inf
     for f in range(len(fibres)):
         fibre, volts = fibres[f], row[f]
         if np.isnan(volts):
             continue
-        step = abs(volts - fibre.reading)
-        if LEAST_V < step < pad.step_v:
-            pad.step_v = step
+        if MIN_V < abs(volts - fibre.reading) < pad.resolution_v:
+            pad.resolution_v = abs(volts - fibre.reading)
         fibre.reading = volts
-        fibre.look += volts
+        fibre.mean += volts
         fibre.count += 1
-        fibre.low, fibre.high = min(fibre.low, volts), max(fibre.high, volts)
-    pad.look_readings += 1
-    complete = time_s - pad.look_from_s + (time_s - pad.reading_s) >= LOOK_S  # the next reading would be too late
-    seen = False
+        fibre.lowest, fibre.highest = min(fibre.lowest, volts), max(fibre.highest, volts)
+    pad.block_count += 1
+    complete = time_s - pad.block_start_s + (time_s - pad.reading_s) >= BLOCK_S  # the next reading would be too late
+    present = False
     if complete:
-        pad.look_readings = 0
+        pad.block_count = 0
         for fibre in fibres:
-            seen |= fibre.count > 0
-            if fibre.count >= 3:
-                fibre.look = (fibre.look - fibre.low - fibre.high) / (fibre.count - 2)
+            present |= fibre.count > 0
+            if fibre.count >= 3:  # the lowest and the highest may be spikes
+                fibre.mean = (fibre.mean - fibre.lowest - fibre.highest) / (fibre.count - 2)
             else:
-                fibre.look /= fibre.count  # NaN where there was none
-    pad.reading += 1
+                fibre.mean /= fibre.count  # NaN without a reading
+    pad.n_readings += 1
     pad.reading_s = time_s
-    return complete and seen
+    return complete and present
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def advance(fibres: Any, pad: Any, time_s: float) -> None:
-    """Predict all levels for `time_s`, and how far looks may be from them; forget fibres not seen for long."""
-    least = max(LEAST_SHARE * pad.typical_v, LEAST_V, pad.step_v / 2 if pad.step_v < np.inf else 0.0)
-    rough = 1 + ROUGH_LOOKS / max(pad.looks, 1)
-    dt = min(max(time_s - pad.look_s, 0.0), GAP_S)
+@kernel
+def kalman_predict(fibres: Any, pad: Any, time_s: float) -> None:
+    """Predict all levels for `time_s`; forget fibres that were missing for long."""
+    floor = max(MIN_SHARE * pad.typical_v, MIN_V, pad.resolution_v / 2 if pad.resolution_v < np.inf else 0.0)
+    widening = 1 + ROUGH_BLOCKS / max(pad.n_blocks, 1)
+    dt = min(max(time_s - pad.block_s, 0.0), GAP_S)
     fade = math.exp(-dt / FADE_S)
-    reach = FADE_S * (1 - fade)
+    gain = FADE_S * (1 - fade)  # integral of the fading slope
     for fibre in fibres:
-        fibre.spread = rough * max(fibre.noise, least)
-        fibre.wander = max(fibre.common - TOLERATED * fibre.noise**2, 0.0)
-        if time_s - fibre.seen_s > GAP_S:
+        fibre.scale = widening * max(fibre.noise, floor)
+        fibre.random_walk_var = max(fibre.autocov - MIN_CORRELATION * fibre.noise**2, 0.0)
+        if time_s - fibre.updated_s > GAP_S:
             fibre.level = np.nan
-        fibre.level += reach * fibre.slope
+        fibre.level += gain * fibre.slope
         fibre.slope *= fade
-        fibre.level_var += reach * (2 * fibre.cross_var + reach * fibre.slope_var)
-        fibre.cross_var = fade * (fibre.cross_var + reach * fibre.slope_var)
-        fibre.slope_var = fade**2 * fibre.slope_var + dt**2 / MEMORY_S**4
+        fibre.level_var += gain * (2 * fibre.cross_var + gain * fibre.slope_var)
+        fibre.cross_var = fade * (fibre.cross_var + gain * fibre.slope_var)
+        fibre.slope_var = fade**2 * fibre.slope_var + dt**2 / SLOPE_S**4
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _begin(fibre: Any, time_s: float, step: float) -> None:
-    """Follow a fibre from its present look on, after a step of so many spreads."""
-    fibre.level, fibre.slope, fibre.off, fibre.seen_s = fibre.look, 0.0, 0.0, time_s
-    fibre.level_var = 1 + (OFF * step) ** 2
+@kernel
+def _start_track(fibre: Any, time_s: float, step: float) -> None:
+    """Start the filter of a fibre at the present block, after a whitened step."""
+    fibre.level, fibre.slope, fibre.innovation, fibre.updated_s = fibre.mean, 0.0, 0.0, time_s
+    fibre.level_var = 1 + (LEVEL_ERROR * step) ** 2
     fibre.cross_var = 0.0
-    fibre.slope_var = 1 + (OFF_PER_S * step) ** 2
+    fibre.slope_var = 1 + (SLOPE_ERROR * step) ** 2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def restart(fibres: Any, pad: Any, time_s: float) -> None:
-    """Follow all fibres from the present look on, their deviations being steps."""
+@kernel
+def _restart(fibres: Any, pad: Any, time_s: float) -> None:
+    """Start all filters at the present block; residuals are steps."""
     for fibre in fibres:
-        _begin(fibre, time_s, 0.0 if np.isnan(fibre.deviation) else fibre.deviation / fibre.spread)
+        _start_track(fibre, time_s, 0.0 if np.isnan(fibre.residual) else fibre.residual / fibre.scale)
     pad.run = 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def follow(fibres: Any, pad: Any, time_s: float) -> None:
-    """Correct levels, slopes and noise by the present look."""
-    share = max(1 / (pad.looks + 1), 1 - math.exp(-min(time_s - pad.look_s, GAP_S) / NOISE_S))
+@kernel
+def kalman_update(fibres: Any, pad: Any, time_s: float) -> None:
+    """Correct levels, slopes and noise by the present block, robustly."""
+    share = max(1 / (pad.n_blocks + 1), 1 - math.exp(-min(time_s - pad.block_s, GAP_S) / NOISE_S))
     for fibre in fibres:
-        if np.isnan(fibre.look):
+        if np.isnan(fibre.mean):
             continue
         if np.isnan(fibre.level):
-            _begin(fibre, time_s, 0.0)
+            _start_track(fibre, time_s, 0.0)
             continue
-        off, total = fibre.look - fibre.level, fibre.level_var + 1
-        amount = MEAN_TO_SD * abs(off) / math.sqrt(total)
-        if pad.looks >= FIRST_LOOKS:
-            amount = min(amount, GROWTH * fibre.spread)
-            limit = OUTLIER * fibre.spread * math.sqrt(total)
-            off = min(max(off, -limit), limit)
-        fibre.noise += share * (amount - fibre.noise)
-        fibre.common += share * (off * fibre.off - fibre.common)
-        fibre.off = off
-        gain, slope_gain = fibre.level_var / total, fibre.cross_var / total
-        fibre.level += gain * off
-        fibre.slope += slope_gain * off
+        innovation, total_var = fibre.mean - fibre.level, fibre.level_var + 1
+        std = MEAN_TO_STD * abs(innovation) / math.sqrt(total_var)
+        if pad.n_blocks >= WARM_UP_BLOCKS:
+            std = min(std, MAX_GROWTH * fibre.scale)
+            limit = MAX_INNOVATION * fibre.scale * math.sqrt(total_var)
+            innovation = min(max(innovation, -limit), limit)
+        fibre.noise += share * (std - fibre.noise)
+        fibre.autocov += share * (innovation * fibre.innovation - fibre.autocov)
+        fibre.innovation = innovation
+        gain, slope_gain = fibre.level_var / total_var, fibre.cross_var / total_var
+        fibre.level += gain * innovation
+        fibre.slope += slope_gain * innovation
         fibre.slope_var -= slope_gain * fibre.cross_var
         fibre.cross_var *= 1 - gain
         fibre.level_var *= 1 - gain
-        fibre.seen_s = time_s
-    pad.looks += 1
+        fibre.updated_s = time_s
+    pad.n_blocks += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def learn_run(fibres: Any, pad: Any, time_s: float) -> None:
+@kernel
+def _learn_run_noise(fibres: Any, pad: Any, time_s: float) -> None:
     """Learn the noise of a run that was no change."""
     if pad.run > 0:
         share = 1 - math.exp(-(time_s - pad.run_s) / NOISE_S)
         for fibre in fibres:
-            amount = min(math.sqrt(fibre.run_square / pad.run), GROWTH * fibre.spread)
-            fibre.noise += share * (amount - fibre.noise)
+            std = min(math.sqrt(fibre.run_square_sum / pad.run), MAX_GROWTH * fibre.scale)
+            fibre.noise += share * (std - fibre.noise)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def learn_unrest(fibres: Any) -> None:
-    """Learn the noise of a change that does not settle: half of it, since it may have been a slow press after all."""
+@kernel
+def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
+    """Start a run at the present block, or, since a touch may have two paces, at the one block before it."""
+    if pad.run != 2:
+        pad.run_first, pad.run_s = pad.block_first, time_s
+    pad.run = 1
     for fibre in fibres:
-        amount = MEAN_TO_SD * abs(fibre.look - fibre.before) / math.sqrt(2)
-        if amount > fibre.noise:
-            fibre.noise += (amount - fibre.noise) / 2
+        fibre.run_sum = 0.0 if np.isnan(fibre.residual) else fibre.residual
+        fibre.run_square_sum = fibre.run_sum**2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def changes(fibres: Any, pad: Any, time_s: float, doubt: Any, sure: Any) -> bool:
-    """Take the present look; True if the levels have changed, since reading `pad.run_first`.
+@kernel
+def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
+    """Add the present block to the run; return the common signal of its blocks, and the distance of the last one.
 
-    Args:
-        doubt, sure: (C + 1,) by the number of fibres seen, sums of squared deviations, in spreads, that chance exceeds
-            rarely, and hardly ever.
+    Both are sums of whitened squares. The common signal is the mean product of two different blocks, to which spikes
+    add nothing.
     """
-    seen, total = 0, 0.0
+    common, distance = 0.0, 0.0
+    n_before, pad.run = pad.run, pad.run + 1
     for fibre in fibres:
-        fibre.deviation = fibre.look - fibre.level
-        if not np.isnan(fibre.deviation):
-            seen += 1
-            total += fibre.deviation**2 / (fibre.spread**2 * (1 + fibre.level_var) + fibre.wander)
-    if total <= doubt[seen]:
-        learn_run(fibres, pad, time_s)
+        if np.isnan(fibre.residual):  # as the blocks before, so that they keep their weight
+            fibre.run_sum += fibre.run_sum / n_before
+            fibre.run_square_sum += fibre.run_square_sum / n_before
+            continue
+        distance += ((fibre.residual - fibre.run_sum / n_before) / fibre.scale) ** 2 / (1 + 1 / n_before)
+        fibre.run_sum += fibre.residual
+        fibre.run_square_sum += fibre.residual**2
+        product = (fibre.run_sum**2 - fibre.run_square_sum) / (pad.run * n_before)
+        common += product / (fibre.scale**2 * (1 / pad.run + fibre.level_var) + fibre.random_walk_var)
+    return common, distance
+
+
+@kernel
+def has_changed(fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_limit: Any) -> bool:
+    """Test the present block; return whether the levels have changed since reading `pad.run_first`."""
+    n_present, chi_square = 0, 0.0
+    for fibre in fibres:
+        fibre.residual = fibre.mean - fibre.level
+        if not np.isnan(fibre.residual):
+            n_present += 1
+            chi_square += fibre.residual**2 / (fibre.scale**2 * (1 + fibre.level_var) + fibre.random_walk_var)
+    if chi_square <= reject_limit[n_present]:
+        _learn_run_noise(fibres, pad, time_s)
         pad.run = 0
-        follow(fibres, pad, time_s)
+        kalman_update(fibres, pad, time_s)
         return False
     if pad.run == 0:
-        _run_anew(fibres, pad, time_s)
+        _start_run(fibres, pad, time_s)
         return False
-    agreeing, apart = _run_on(fibres, pad)
-    if agreeing > sure[seen]:
+    common, distance = _extend_run(fibres, pad)
+    if common > accept_limit[n_present]:
         return True
-    if apart > sure[seen]:  # the looks before this one were of something else
-        _run_anew(fibres, pad, time_s)
+    if distance > accept_limit[n_present]:  # the blocks before belonged to something else
+        _start_run(fibres, pad, time_s)
     elif time_s - pad.run_s > GIVE_UP_S:
-        learn_run(fibres, pad, time_s)
+        _learn_run_noise(fibres, pad, time_s)
         for fibre in fibres:
-            fibre.deviation = 0.0
-        restart(fibres, pad, time_s)
+            fibre.residual = 0.0
+        _restart(fibres, pad, time_s)
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _run_anew(fibres: Any, pad: Any, time_s: float) -> None:
-    """Begin a run with the present look, or, since a touch may have two paces, with the one look before it."""
-    if pad.run != 2:
-        pad.run_first, pad.run_s = pad.look_first, time_s
-    pad.run = 1
-    for fibre in fibres:
-        fibre.run = 0.0 if np.isnan(fibre.deviation) else fibre.deviation
-        fibre.run_square = fibre.run**2
+@kernel
+def _whiten(fibres: Any, f: int, volts: float, limit: float) -> float:
+    """Whiten a step of fibre f, clipped to the limit; 0 if the largest of as many fibres has it by chance, or NaN."""
+    z = volts / fibres[f].scale
+    return min(max(z, -limit), limit) if abs(z) > math.sqrt(2 * math.log(len(fibres))) else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _run_on(fibres: Any, pad: Any) -> tuple[float, float]:
-    """Add the present look to the run.
-
-    Returns:
-        What its looks have in common, and how far the present one is from those before, both as sums of squares in
-        spreads. Common is the mean product of two different looks: spikes, being apart from each other, add nothing.
-    """
-    agreeing, apart = 0.0, 0.0
-    before, pad.run = pad.run, pad.run + 1
-    for fibre in fibres:
-        if np.isnan(fibre.deviation):  # as the looks before, so that they count no less
-            fibre.run += fibre.run / before
-            fibre.run_square += fibre.run_square / before
-            continue
-        apart += ((fibre.deviation - fibre.run / before) / fibre.spread) ** 2 / (1 + 1 / before)
-        fibre.run += fibre.deviation
-        fibre.run_square += fibre.deviation**2
-        common = (fibre.run**2 - fibre.run_square) / (pad.run * before)
-        agreeing += common / (fibre.spread**2 * (1 / pad.run + fibre.level_var) + fibre.wander)
-    return agreeing, apart
-
-
-STALL_S = 0.5
-"""A change that goes no farther for so long has ended."""
-SETTLED = 0.1
-"""A change has settled when two looks differ by no more than this share of it."""
-RELEASE_S = 1.0
-"""What goes on the way of a release for so long belongs to it."""
-STRONGEST = 20.0
-"""Spreads beyond which a fibre counts no more: a broken one would drown the others."""
-CLEAR = 5.0
-"""Spreads from which on a fibre's step adds to the typical press in volts."""
-LEARNT, AGREEING = 3, 0.5
-"""Touches, and their agreement, from which on their way tells anything."""
-RECENT = 0.05
-"""Share of the newest touch in what is known of touches."""
-RECENT_LEVELS, INVERTED, LEAST_INVERTED = 0.15, 1.2, 0.4
-"""Share of the newest level in the spreads of levels; the spread of rests that says that presses are taken for rests:
-over that of levels under presses, and over the size of a typical press."""
-
-NOTHING, TOUCH, RELEASE, MORE = 0, 1, 2, 3
-"""What a change is told to be: nothing yet, or more of the release before."""
-FREE, PRESSED, ODD = 0, 1, 2
-"""States of a pad: at rest, under a press, and after a change against the way of touches, which was the release of a
-press that was missed, or a touch of a rare kind."""
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _spreads(fibres: Any, f: int, volts: float) -> float:
-    """A step of fibre f in spreads; 0 if the largest of as many fibres has it by chance, or it is not known."""
-    z = volts / fibres[f].spread
-    return z if abs(z) > math.sqrt(2 * math.log(len(fibres))) else 0.0
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _counted(fibres: Any, f: int, volts: float) -> float:
-    """The same, counted."""
-    return min(max(_spreads(fibres, f, volts), -STRONGEST), STRONGEST)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _size(fibres: Any, step: Any) -> float:
+@kernel
+def _size(fibres: Any, steps: Any, limit: float) -> float:
+    """Return the sum of squares of whitened steps (C,), each clipped to the limit."""
     total = 0.0
     for f in range(len(fibres)):
-        total += _spreads(fibres, f, step[f]) ** 2
+        total += _whiten(fibres, f, steps[f], limit) ** 2
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _counted_size(fibres: Any, step: Any) -> float:
-    total = 0.0
+@kernel
+def _projection(fibres: Any, steps: Any) -> float:
+    """Project the residual on steps (C,), as a share of them; 0 if they are none."""
+    product, total = 0.0, 0.0
     for f in range(len(fibres)):
-        total += _counted(fibres, f, step[f]) ** 2
-    return total
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _share(fibres: Any, step: Any) -> float:
-    """How far the present deviation goes along `step`, as a share of it; 0 where that is none."""
-    along, total = 0.0, 0.0
-    for f in range(len(fibres)):
-        z = _counted(fibres, f, step[f])
-        along += z * _counted(fibres, f, fibres[f].deviation)
+        z = _whiten(fibres, f, steps[f], MAX_STEP)
+        product += z * _whiten(fibres, f, fibres[f].residual, MAX_STEP)
         total += z**2
-    return along / total if total > 0 else 0.0
+    return product / total if total > 0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _agreement(fibres: Any) -> float:
-    """How far the present deviation goes the way of touches: 1 if all of it does, -1 if all goes against it."""
-    along, total = 0.0, 0.0
+    """Return how far the residual has the direction of touches: 1 if all of it does, -1 if it is opposite."""
+    product, total = 0.0, 0.0
     for f in range(len(fibres)):
-        z = _counted(fibres, f, fibres[f].deviation)
-        along += z * abs(z) * fibres[f].way
-        total += z**2 * abs(fibres[f].way)
-    return along / total if total > 0 else 0.0
+        z = _whiten(fibres, f, fibres[f].residual, MAX_STEP)
+        product += z * abs(z) * fibres[f].direction
+        total += z**2 * abs(fibres[f].direction)
+    return product / total if total > 0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _common(fibre: Any) -> float:
-    """What the deviations of the present look and the one before have in common, V."""
-    one, other = fibre.deviation, fibre.before - fibre.origin
-    return min(one, other) if one > 0 and other > 0 else max(one, other) if one < 0 and other < 0 else 0.0
+@kernel
+def _confirmed_step(fibre: Any) -> float:
+    """Return the part of the step, V, that the present block and the one before have in common."""
+    now, before = fibre.residual, fibre.previous_mean - fibre.start_level
+    if now > 0 and before > 0:
+        return min(now, before)
+    return max(now, before) if now < 0 and before < 0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _go_far(fibres: Any, pad: Any, time_s: float) -> None:
-    """Remember where a change has gone farthest, as two looks in a row have it: one alone may be a spike."""
+@kernel
+def track_peak(fibres: Any, pad: Any, time_s: float) -> None:
+    """Store where a change is farthest in two blocks in a row: a single one may be a spike."""
     size = 0.0
     for f in range(len(fibres)):
-        size += _spreads(fibres, f, _common(fibres[f])) ** 2
-    if size > pad.farthest:
-        pad.farthest, pad.farthest_s, pad.after_farthest = size, time_s, -1
+        size += _whiten(fibres, f, _confirmed_step(fibres[f]), np.inf) ** 2
+    if size > pad.peak_size:
+        pad.peak_size, pad.peak_s, pad.after_peak = size, time_s, -1
         for fibre in fibres:
-            fibre.farthest = _common(fibre)
-    elif pad.after_farthest < 0:
-        pad.after_farthest = pad.look_first
+            fibre.peak_step = _confirmed_step(fibre)
+    elif pad.after_peak < 0:
+        pad.after_peak = pad.block_first
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _settled(fibres: Any, doubt: Any) -> bool:
-    """Whether the present look is as the one before."""
-    seen, total = 0, 0.0
+@kernel
+def _has_settled(fibres: Any, pad: Any, time_s: float, reject_limit: Any) -> bool:
+    """Return whether a change has ended."""
+    n_present, chi_square = 0, 0.0
     for fibre in fibres:
-        off = fibre.look - fibre.before
-        if not np.isnan(off):
-            seen += 1
-            total += (off / fibre.spread) ** 2 / 2
-    return total <= max(doubt[seen], SETTLED**2 / 2 * _size(fibres, fibres.deviation))
+        difference = fibre.mean - fibre.previous_mean
+        if not np.isnan(difference):
+            n_present += 1
+            chi_square += (difference / fibre.scale) ** 2 / 2
+    if chi_square <= max(reject_limit[n_present], SETTLED**2 / 2 * _size(fibres, fibres.residual, np.inf)):
+        return True
+    if time_s - pad.peak_s <= STALL_S:
+        return False
+    for fibre in fibres:  # it stalls unsettled: noise has grown; half of it, since it may be a slow press after all
+        std = MEAN_TO_STD * abs(fibre.mean - fibre.previous_mean) / math.sqrt(2)
+        if std > fibre.noise:
+            fibre.noise += (std - fibre.noise) / 2
+    return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _learn(fibres: Any, pad: Any) -> None:
-    """Learn from a touch that has settled."""
-    pad.presses += 1
-    share = max(1 / pad.presses, RECENT)
-    if pad.presses > 1:
-        pad.agreement += max(1 / (pad.presses - 1), RECENT) * (_agreement(fibres) - pad.agreement)
+@kernel
+def _learn_touch(fibres: Any, pad: Any) -> None:
+    """Learn direction and size from a touch that has settled."""
+    pad.n_presses += 1
+    share = max(1 / pad.n_presses, TOUCH_RATE)
+    if pad.n_presses > 1:
+        pad.agreement += max(1 / (pad.n_presses - 1), TOUCH_RATE) * (_agreement(fibres) - pad.agreement)
     square = 0.0
     for f in range(len(fibres)):
         fibre = fibres[f]
-        fibre.way += share * (_counted(fibres, f, fibre.deviation) - fibre.way)
-        if abs(_spreads(fibres, f, fibre.deviation)) > CLEAR:
-            square += fibre.deviation**2
+        fibre.direction += share * (_whiten(fibres, f, fibre.residual, MAX_STEP) - fibre.direction)
+        if abs(_whiten(fibres, f, fibre.residual, np.inf)) > CLEAR_STEP:
+            square += fibre.residual**2
     pad.typical_v += share * (math.sqrt(square) - pad.typical_v)
-    pad.typical_size += share * (_counted_size(fibres, fibres.deviation) - pad.typical_size)
+    pad.typical_size += share * (_size(fibres, fibres.residual, MAX_STEP) - pad.typical_size)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _way_from(fibres: Any, last: Any) -> float:
-    """Counted size of the way from the last level of a kind to the present look, which then is the last."""
+@kernel
+def _replace_levels(fibres: Any, levels: Any) -> float:
+    """Set the last levels (C,) of a kind to the present block; return the clipped size of that step."""
     total = 0.0
     for f in range(len(fibres)):
-        total += _counted(fibres, f, fibres[f].look - last[f]) ** 2
-        if not np.isnan(fibres[f].look):
-            last[f] = fibres[f].look
+        total += _whiten(fibres, f, fibres[f].mean - levels[f], MAX_STEP) ** 2
+        if not np.isnan(fibres[f].mean):
+            levels[f] = fibres[f].mean
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _tell(events: Any, count: Any, down: bool, reading: int) -> int:
+@kernel
+def emit(events: Any, count: Any, down: bool, reading: int) -> int:
+    """Append an event; return their number."""
     events[count, 0], events[count, 1] = down, reading
     return count + 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _judge(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
-    """Tell a change that is under way, as soon as it is clear what it is; the new count of events."""
-    known = pad.presses >= LEARNT and pad.agreement > AGREEING
-    along = _agreement(fibres) if known else 1.0
-    back = _share(fibres, fibres.press)
-    ratio = _counted_size(fibres, fibres.deviation) / _counted_size(fibres, fibres.press)
-    if pad.state == FREE and time_s - pad.released_s < RELEASE_S and back < -0.5 * math.sqrt(ratio):
-        pad.told = MORE
-    elif pad.state == FREE and along >= 0:
-        pad.told = TOUCH
-        count = _tell(events, count, True, pad.run_first)
-    elif pad.state == PRESSED and (back < -0.5 or (along < 0 and ratio > 0.25)):
-        pad.told = RELEASE
-        count = _tell(events, count, False, pad.run_first)
-    elif pad.state == ODD and settled:
-        odd_was_touch = along < 0 or (-2 < back < -0.5 and ratio < 4)
-        count = _tell(events, count, True, pad.odd_first if odd_was_touch else pad.run_first)
-        if odd_was_touch:
-            count = _tell(events, count, False, pad.run_first)
-        pad.told = RELEASE if odd_was_touch else TOUCH
+@kernel
+def classify(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
+    """Classify a change under way, as soon as it is clear what it is; return the number of events."""
+    has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
+    agreement = _agreement(fibres) if has_direction else 1.0
+    projection = _projection(fibres, fibres.press_step)  # -1: takes the step of the press back
+    ratio = _size(fibres, fibres.residual, MAX_STEP) / _size(fibres, fibres.press_step, MAX_STEP)
+    if pad.state == State.REST and time_s - pad.released_s < RELEASE_S and projection < -0.5 * math.sqrt(ratio):
+        pad.change = Change.SETTLING
+    elif pad.state == State.REST and agreement >= 0:
+        pad.change = Change.TOUCH
+        count = emit(events, count, True, pad.run_first)
+    elif pad.state == State.PRESSED and (projection < -0.5 or (agreement < 0 and ratio > 0.25)):
+        pad.change = Change.RELEASE
+        count = emit(events, count, False, pad.run_first)
+    elif pad.state == State.UNCLEAR and settled:
+        was_touch = agreement < 0 or (-2 < projection < -0.5 and ratio < 4)
+        count = emit(events, count, True, pad.unclear_first if was_touch else pad.run_first)
+        if was_touch:
+            count = emit(events, count, False, pad.run_first)
+        pad.change = Change.RELEASE if was_touch else Change.TOUCH
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _press(fibres: Any, kept: float) -> None:
-    """Take the present deviation for the step of the press, besides a share of what it was."""
+@kernel
+def _set_press_step(fibres: Any, keep: float) -> None:
+    """Add the residual to a share of the step of the press."""
     for fibre in fibres:
-        fibre.press = kept * fibre.press + (0.0 if np.isnan(fibre.deviation) else fibre.deviation)
+        fibre.press_step = keep * fibre.press_step + (0.0 if np.isnan(fibre.residual) else fibre.residual)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _conclude(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
-    """Take a change that has settled as what it was told to be; the new count of events."""
-    if pad.told == TOUCH and _share(fibres, fibres.farthest) < 0.5:  # a tap: it was released meanwhile
-        pad.state = FREE
-        return _tell(events, count, False, pad.after_farthest if pad.after_farthest >= 0 else pad.look_first)
-    if pad.told == TOUCH:
-        pad.state = PRESSED
-        _press(fibres, 0.0)
-        _learn(fibres, pad)
-        pad.held_spread += RECENT_LEVELS * (_way_from(fibres, fibres.held) - pad.held_spread)
-        bound = max(INVERTED * pad.held_spread, LEAST_INVERTED * pad.typical_size)
-        if pad.presses >= LEARNT and pad.rest_spread > bound:
-            pad.state, pad.presses, pad.rest_spread, pad.held_spread = FREE, 0, 0.0, 0.0
-            count = _tell(events, count, False, pad.look_first)
-    elif pad.told == RELEASE:
-        pad.state, pad.released_s = FREE, time_s
-        pad.rest_spread += RECENT_LEVELS * (_way_from(fibres, fibres.rest) - pad.rest_spread)
-    elif pad.told == NOTHING and pad.state == FREE:
-        pad.state, pad.odd_first = ODD, pad.run_first
-        _press(fibres, 0.0)
-    elif pad.told == NOTHING:  # pressed deeper or elsewhere
-        _press(fibres, 0.0 if _size(fibres, fibres.deviation) > _size(fibres, fibres.press) else 1.0)
+@kernel
+def commit(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
+    """Change the state by a change that has settled; return the number of events."""
+    if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, released meanwhile
+        pad.state = State.REST
+        return emit(events, count, False, pad.after_peak if pad.after_peak >= 0 else pad.block_first)
+    if pad.change == Change.TOUCH:
+        pad.state = State.PRESSED
+        _set_press_step(fibres, 0.0)
+        _learn_touch(fibres, pad)
+        pad.press_scatter += LEVEL_RATE * (_replace_levels(fibres, fibres.press_level) - pad.press_scatter)
+        bound = max(INVERTED * pad.press_scatter, MIN_INVERTED * pad.typical_size)
+        if pad.n_presses >= MIN_PRESSES and pad.rest_scatter > bound:
+            pad.state, pad.n_presses, pad.rest_scatter, pad.press_scatter = State.REST, 0, 0.0, 0.0
+            count = emit(events, count, False, pad.block_first)
+    elif pad.change == Change.RELEASE:
+        pad.state, pad.released_s = State.REST, time_s
+        pad.rest_scatter += LEVEL_RATE * (_replace_levels(fibres, fibres.rest_level) - pad.rest_scatter)
+    elif pad.change == Change.UNKNOWN and pad.state == State.REST:
+        pad.state, pad.unclear_first = State.UNCLEAR, pad.run_first
+        _set_press_step(fibres, 0.0)
+    elif pad.change == Change.UNKNOWN:  # pressed deeper or elsewhere
+        larger = _size(fibres, fibres.residual, np.inf) > _size(fibres, fibres.press_step, np.inf)
+        _set_press_step(fibres, 0.0 if larger else 1.0)
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _look(fibres: Any, pad: Any, time_s: float, doubt: Any, sure: Any, events: Any, count: Any) -> int:
-    """Take a look that is complete; the new count of events."""
-    if not pad.changing:
-        advance(fibres, pad, time_s)
-        if pad.looks < FIRST_LOOKS:
-            follow(fibres, pad, time_s)
-        elif changes(fibres, pad, time_s, doubt, sure):
-            pad.changing, pad.told = True, NOTHING
-            pad.farthest, pad.farthest_s, pad.after_farthest = 0.0, time_s, -1
-            for fibre in fibres:  # one by one: assigning slices compiles what words an error about their shapes
-                fibre.origin = fibre.level
-    if pad.changing:
+@kernel
+def _process_block(
+    fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_limit: Any, events: Any, count: Any
+) -> int:
+    """Process a complete block; return the number of events."""
+    if not pad.in_change:
+        kalman_predict(fibres, pad, time_s)
+        if pad.n_blocks < WARM_UP_BLOCKS:
+            kalman_update(fibres, pad, time_s)
+        elif has_changed(fibres, pad, time_s, reject_limit, accept_limit):
+            pad.in_change, pad.change = True, Change.UNKNOWN
+            pad.peak_size, pad.peak_s, pad.after_peak = 0.0, time_s, -1
+            for fibre in fibres:  # one by one: assigning slices compiles the wording of an error about their shapes
+                fibre.start_level = fibre.level
+    if pad.in_change:
         for fibre in fibres:
-            if np.isnan(fibre.look):  # missing now: as it was last seen in this change
-                fibre.look = fibre.origin + fibre.deviation
-            fibre.deviation = fibre.look - fibre.origin
-        _go_far(fibres, pad, time_s)
-        settled = _settled(fibres, doubt)
-        if not settled and time_s - pad.farthest_s > STALL_S:
-            settled = True
-            learn_unrest(fibres)
-        if pad.told == NOTHING:
-            count = _judge(fibres, pad, time_s, settled, events, count)
+            if np.isnan(fibre.mean):  # missing now: as last read in this change
+                fibre.mean = fibre.start_level + fibre.residual
+            fibre.residual = fibre.mean - fibre.start_level
+        track_peak(fibres, pad, time_s)
+        settled = _has_settled(fibres, pad, time_s, reject_limit)
+        if pad.change == Change.UNKNOWN:
+            count = classify(fibres, pad, time_s, settled, events, count)
         if settled:
-            count = _conclude(fibres, pad, time_s, events, count)
-            restart(fibres, pad, time_s)
-            pad.changing = False
+            count = commit(fibres, pad, time_s, events, count)
+            _restart(fibres, pad, time_s)
+            pad.in_change = False
     for fibre in fibres:
-        fibre.before = fibre.look
-    pad.look_s = time_s
+        fibre.previous_mean = fibre.mean
+    pad.block_s = time_s
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def find(fibres: Any, pad: Any, times_s: Any, readings: Any, doubt: Any, sure: Any, events: Any) -> Any:
-    """Take (n,) times and (n, C) readings in V, NaN where missing, going on from those before.
+@kernel
+def detect(
+    fibres: Any, pad: Any, times_s: Any, readings: Any, reject_limit: Any, accept_limit: Any, events: Any
+) -> Any:
+    """Detect presses in further readings.
 
     Args:
-        fibres, pad: what is known, see `pad_state`; overwritten. doubt, sure: as in `level_tracking.changes`.
-        events: (2 n, 2) overwritten with whether the pad was touched (1) or let go (0), and the reading from which on.
+        fibres: state of the fibres, as `initial_state` makes it; overwritten.
+        pad: state of the pad; overwritten.
+        times_s: (n,) s, ascending.
+        readings: (n, C) V, NaN where missing.
+        reject_limit: (C + 1,) by the number of fibres present, chi-square that noise exceeds rarely.
+        accept_limit: (C + 1,) the same, hardly ever.
+        events: (2 n, 2) overwritten with rows of 1 (touch) or 0 (release), and the first reading that shows it.
 
     Returns:
-        How many events there are.
+        The number of events.
     """
     count = np.int64(0)
     for r in range(len(times_s)):
-        if take(fibres, pad, readings[r], times_s[r]):
-            count = _look(fibres, pad, times_s[r], doubt, sure, events, count)
+        if ingest(fibres, pad, readings[r], times_s[r]):
+            count = _process_block(fibres, pad, times_s[r], reject_limit, accept_limit, events, count)
     return count

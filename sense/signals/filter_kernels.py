@@ -1,27 +1,18 @@
-"""Backward pass of total-variation denoising: from the last value back, each is the next one clipped.
+"""Compiled passes of total variation denoising, and the running median.
 
-The running median, of a sorted window that readings enter and leave.
+Total variation denoising minimises fidelity + lam sum |x_{i+1} - x_i| by dynamic programming (N. Johnson, "A dynamic
+programming algorithm for the fused lasso and L0 segmentation", J. Comput. Graph. Stat. 22, 2013; V. Kolmogorov, T.
+Pock, M. Rolinek, "Total variation on a tree", SIAM J. Imaging Sci. 9, 2016). The message of reading i is the least
+cost of all readings up to it as a function of x_i. A reading adds its fidelity; the coupling to the next clips the
+derivative of the message to +-lam, and where it does so are the bounds that x_i is clipped to, given the next value.
+The backward pass clips from the last value on.
 
-A double-ended priority queue in two flat arrays: smallest and greatest at hand, insertion and removal in log time.
-Node k holds entries 2k and 2k + 1, the low and the high end of an interval that lies within its parent's; so the low
-ends are a heap with the smallest at 0, the high ends one with the greatest at 1. A last node may hold one entry, which
-is both its ends. Each entry is a key with a value that travels along (J. van Leeuwen, D. Wood, "Interval heaps", The
-Computer Journal 36, 1993). All is inlined where it is used: a call takes longer than the work on a short queue.
-
-Forward pass of robust total-variation denoising: min sum |y_i - x_i| + lam sum |x_{i+1} - x_i|.
-The message of reading i is the least cost of all up to it as a function of x_i. Its derivative is a rising staircase;
-a reading adds a stair of height 2 where it lies, the coupling to the next cuts all beyond +-lam off, and where it does
-so are the places x_i is clipped to (N. Johnson, "A dynamic programming algorithm for the fused lasso and L0
-segmentation", J. Comput. Graph. Stat. 22, 2013; V. Kolmogorov, T. Pock, M. Rolinek, "Total variation on a tree", SIAM
-J. Imaging Sci. 9, 2016). The stairs lie in two double-ended queues, below and above the message's minimum, so a
-reading costs O(log min(R, lam)) and the minimum is at hand.
-
-Forward pass of total-variation denoising by squares: min 1/2 sum (y_i - x_i)^2 + lam sum |x_{i+1} - x_i|.
-The message of reading i is the least cost of all up to it as a function of x_i. Its derivative is piecewise linear
-and rising; a reading adds x - y_i, the coupling to the next cuts all beyond +-lam off, and where it does so are the
-places x_i is clipped to (N. Johnson, J. Comput. Graph. Stat. 22, 2013; L. Condat, IEEE Signal Process. Lett. 20, 2013,
-has the same geometry as a taut string). Each cut leaves a knot; knots beyond the next cut never matter again, so
-finding a cut pools them with the new reading as pooled adjacent violators are, O(1) a reading on average.
+- Fidelity by absolute values (`forward_pass_l1`): the derivative is a rising staircase, to which a reading adds a step
+  of height 2. The steps are in two double-ended queues, below and above the minimum of the message: O(log min(R, lam))
+  a reading.
+- Fidelity by squares (`forward_pass_l2`): the derivative is piecewise linear, to which a reading adds x - y_i. Knots
+  beyond a cut never matter again, so they are pooled with the new reading like adjacent violators: O(1) a reading on
+  average. The taut string has the same geometry (L. Condat, IEEE Signal Process. Lett. 20, 2013).
 """
 
 from typing import Any
@@ -29,52 +20,44 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+kernel = njit(cache=True, error_model="numpy", nogil=True)
+inlined = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
+"""For operations of queues, which are short: a call takes longer than the work."""
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def clip_back(low: Any, high: Any, last: float, out: Any) -> int:
-    """The minimiser of the readings so far, and how many of its values no later reading can change.
 
-    A chain of clips is a clip. Once its bounds have met, what comes in no longer matters: from there on back all is
-    decided.
+@kernel
+def backward_pass(low: Any, high: Any, last: float, out: Any) -> int:
+    """Compute the minimiser by clipping from the last value back.
+
+    A chain of clips is a clip. Where its bounds have met, what comes later does not matter: all before is final.
 
     Args:
-        low, high: (R,) from a forward pass. last: the last value of the minimiser.
-        out: (R,) overwritten with the minimiser; NaN where there is no reading at all.
+        low: lower bounds from a forward pass; shape (R,).
+        high: upper bounds; shape (R,).
+        last: last value of the minimiser.
+        out: overwritten with the minimiser, NaN if there is no reading at all; shape (R,).
 
     Returns:
-        The number of decided values.
+        The number of values that no later reading can change.
     """
-    value, least, greatest = last, -np.inf, np.inf
-    decided = 0
+    value, lowest, highest = last, -np.inf, np.inf
+    n_final = 0
     for i in range(len(low) - 1, -1, -1):
         value = min(max(value, low[i]), high[i])  # NaN, no reading so far, stays: no comparison with it holds
         out[i] = value
-        if decided == 0:
-            least, greatest = min(max(least, low[i]), high[i]), min(max(greatest, low[i]), high[i])
-            if least == greatest:
-                decided = i + 1
-    return decided
+        if n_final == 0:
+            lowest, highest = min(max(lowest, low[i]), high[i]), min(max(highest, low[i]), high[i])
+            if lowest == highest:
+                n_final = i + 1
+    return n_final
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _place(window: Any, count: int, value: float) -> int:
-    """The number of the `count` sorted values of the window that are below `value`."""
-    low, high = 0, count
-    while low < high:
-        middle = (low + high) // 2
-        if window[middle] < value:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def running_median(readings: Any, before: int, after: int, out: Any) -> None:
-    """Median of the readings i - before .. i + after that there are, NaN (missing) left out, into out (R,).
+    """Compute the medians of the readings i - before .. i + after into out (R,), ignoring NaN.
 
-    Of an even number it is the mean of the two in the middle; of none, NaN. O(before + after) a reading, most of it
-    one short move of memory.
+    An even number has the mean of the two in the middle; none has NaN. The window is a sorted array: O(before + after)
+    a reading, most of it one short move of memory.
     """
     width = before + 1 + after
     window, count = np.empty(min(width, len(readings))), 0
@@ -82,13 +65,13 @@ def running_median(readings: Any, before: int, after: int, out: Any) -> None:
         leaving, i = entering - width, entering - after
         if leaving >= 0 and not np.isnan(readings[leaving]):
             count -= 1
-            for k in range(_place(window, count + 1, readings[leaving]), count):
+            for k in range(np.searchsorted(window[: count + 1], readings[leaving]), count):
                 window[k] = window[k + 1]
         if entering < len(readings) and not np.isnan(readings[entering]):
-            at = _place(window, count, readings[entering])
-            for k in range(count, at, -1):
+            index = np.searchsorted(window[:count], readings[entering])
+            for k in range(count, index, -1):
                 window[k] = window[k - 1]
-            window[at] = readings[entering]
+            window[index] = readings[entering]
             count += 1
         if i >= 0:
             half = count // 2
@@ -96,24 +79,28 @@ def running_median(readings: Any, before: int, after: int, out: Any) -> None:
             out[i] = middle
 
 
+# An interval heap: a double-ended priority queue in a flat array (J. van Leeuwen, D. Wood, The Computer Journal 36,
+# 1993). Node k holds entries 2k and 2k + 1, the low and the high end of an interval within its parent's; so the low
+# ends are a heap with the smallest at 0, the high ends one with the greatest at 1. A last node may hold one entry,
+# which is both its ends. Each entry is a key with a value that travels along.
 LOW, HIGH = 0, 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def end_slot(size: int, end: int) -> int:
-    """Where the smallest (LOW) or greatest (HIGH) of `size` > 0 entries is."""
+@inlined
+def _end_slot(size: int, end: int) -> int:
+    """Return where the smallest (LOW) or greatest (HIGH) of `size` > 0 entries is."""
     return end if size > 1 else 0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _beyond(key: float, other: float, end: int) -> bool:
-    """Whether `key` is nearer to the end than `other`: strictly, so that equal keys stay where they are."""
+@inlined
+def _is_beyond(key: float, other: float, end: int) -> bool:
+    """Return whether `key` is nearer to the end: strictly, so that equal keys stay where they are."""
     return key < other if end == LOW else key > other
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def push(keys: Any, values: Any, size: int, key: float, value: float) -> None:
-    """Add an entry to the `size` that are there; the arrays hold more than that."""
+@inlined
+def _push(keys: Any, values: Any, size: int, key: float, value: float) -> None:
+    """Add an entry to `size` others; the arrays are longer than that."""
     slot, end = size, size % 2
     if end == HIGH and key < keys[slot - 1]:  # the node's other entry becomes its high end
         keys[slot], values[slot] = keys[slot - 1], values[slot - 1]
@@ -122,18 +109,18 @@ def push(keys: Any, values: Any, size: int, key: float, value: float) -> None:
         end = HIGH
     while slot > 1:
         parent = 2 * ((slot // 2 - 1) // 2) + end
-        if not _beyond(key, keys[parent], end):
+        if not _is_beyond(key, keys[parent], end):
             break
         keys[slot], values[slot] = keys[parent], values[parent]
         slot = parent
     keys[slot], values[slot] = key, value
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def pop(keys: Any, values: Any, size: int, end: int) -> None:
+@inlined
+def _pop(keys: Any, values: Any, size: int, end: int) -> None:
     """Remove the smallest (LOW) or greatest (HIGH) of `size` > 0 entries."""
     size -= 1
-    key, value = keys[size], values[size]  # the last entry looks for a place along the gap that opens at the end
+    key, value = keys[size], values[size]  # the last entry sinks along the gap that opens at the end
     slot = end
     if slot >= size:
         return
@@ -141,198 +128,207 @@ def pop(keys: Any, values: Any, size: int, end: int) -> None:
         nearest = -1
         for node in (slot // 2 * 2 + 1, slot // 2 * 2 + 2):
             child = 2 * node + end  # a node of one entry has lost the last as its high end, which is not below it
-            if child < size and (nearest < 0 or _beyond(keys[child], keys[nearest], end)):
+            if child < size and (nearest < 0 or _is_beyond(keys[child], keys[nearest], end)):
                 nearest = child
-        if nearest < 0 or not _beyond(keys[nearest], key, end):
+        if nearest < 0 or not _is_beyond(keys[nearest], key, end):
             break
         keys[slot], values[slot] = keys[nearest], values[nearest]
         slot = nearest
         other = slot ^ 1
-        if other < size and _beyond(keys[other], key, end):
+        if other < size and _is_beyond(keys[other], key, end):
             keys[other], key = key, keys[other]
             values[other], value = value, values[other]
     keys[slot], values[slot] = key, value
 
 
-Message = tuple[Any, Any, Any]
-"""(2,) the derivative's greatest value, which negated is its least, and its level between the queues, the least that is
-not negative. (2, a) and (2, b) place and height of the stairs below that level, and above, as interval heaps."""
-
 GRAIN = 2.0**40
 """Heights are whole multiples of 1 / GRAIN: their sums are exact, and nothing drifts however long a recording is."""
 
 
-def silent_l1() -> Message:
-    """The message before any reading."""
+def initial_message_l1() -> tuple[Any, Any, Any]:
+    """Return the message before any reading.
+
+    It is (2,) the greatest value of the derivative (negated, its least) and its level between the queues, the least
+    that is not negative; and (2, a), (2, b) positions and heights of the steps below and above it, as interval heaps.
+    """
     return np.zeros(2), np.empty((2, 0)), np.empty((2, 0))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _halfway(place: float, other: float) -> float:
-    """The middle of two places: of one stair where a cut ends within it, else of the tread that is left bare."""
-    return 0.5 * place + 0.5 * other
+@inlined
+def _halfway(position: float, other: float) -> float:
+    """Return the middle of two positions, without overflow."""
+    return 0.5 * position + 0.5 * other
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _cut_l1(places: Any, heights: Any, size: int, end: int, excess: float) -> tuple[int, float, float]:
-    """Take `excess` height off one end of a queue; return its size, where the cut ends, and what it had too little."""
-    place = np.nan
+@inlined
+def _cut_l1(positions: Any, heights: Any, size: int, end: int, excess: float) -> tuple[int, float, float]:
+    """Cut the height `excess` off one end of a queue; return its size, where the cut ends, and the excess left."""
+    position = np.nan
     while excess > 0 and size > 0:
-        slot = end_slot(size, end)
-        place = places[slot]
-        taken = min(excess, heights[slot])
-        heights[slot] -= taken
-        excess -= taken
+        slot = _end_slot(size, end)
+        position = positions[slot]
+        cut = min(excess, heights[slot])
+        heights[slot] -= cut
+        excess -= cut
         if heights[slot] == 0:
-            pop(places, heights, size, end)
+            _pop(positions, heights, size, end)
             size -= 1
-    return size, place, excess
+    return size, position, excess
 
 
-@njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-def _minimum_l1(level: float, lower: Any, lowers: int, upper: Any, uppers: int) -> float:
-    """Where the message is least, halfway where it is so on an interval; NaN before any reading."""
-    if lowers == 0:
+@inlined
+def _minimum_l1(level: float, lower: Any, n_lower: int, upper: Any, n_upper: int) -> float:
+    """Return where the message is least, the middle if that is an interval; NaN before any reading."""
+    if n_lower == 0:
         return np.nan
-    place = lower[end_slot(lowers, HIGH)]
-    return place if level > 0 else _halfway(place, upper[end_slot(uppers, LOW)])
+    position = lower[_end_slot(n_lower, HIGH)]
+    return position if level > 0 else _halfway(position, upper[_end_slot(n_upper, LOW)])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def forward_sweep_l1(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
-    """Carry a message on over readings (R,).
+@kernel
+def forward_pass_l1(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
+    """Carry a message on over readings, with fidelity |y_i - x_i|.
 
     Args:
-        readings: any unit; NaN is missing and changes nothing.
-        lam: above 0; taken to 1 / GRAIN, which moves no minimum by more than that (below 1/2 no reading changes).
-        low, high: (R,) overwritten with the places x_i is clipped to, given the next: x_i = clip(x_{i+1}, low, high).
-            Where the minimum allows an interval for either, it is the middle.
-        ends: (R,) overwritten with the last value of the minimiser of each reading and those before it, or (0,).
+        readings: any unit, NaN where missing, which changes nothing; shape (R,).
+        lam: above 0; rounded to 1 / GRAIN, which moves no minimum by more than that (below 1/2 no reading changes).
+        message: of the readings before.
+        low: overwritten with the bounds of x_i given the next, x_i = clip(x_{i+1}, low, high); shape (R,). Where the
+            minimum allows an interval for either bound, it is the middle.
+        high: the upper bounds; shape (R,).
+        ends: overwritten with the last value of the minimiser up to each reading; shape (R,), or (0,) if not needed.
 
     Returns:
-        The last value of the minimiser of all, NaN if there was no reading, and the message.
+        The last value of the minimiser, NaN without any reading, and the message.
     """
     lam = max(np.rint(lam * GRAIN), 1.0) / GRAIN
-    reach, level = message[0]
-    lowers, uppers = message[1].shape[1], message[2].shape[1]
-    room = lowers + uppers + len(readings)
+    greatest, level = message[0]
+    n_lower, n_upper = message[1].shape[1], message[2].shape[1]
+    room = n_lower + n_upper + len(readings)
     lower, lower_heights = np.empty(room), np.empty(room)
     upper, upper_heights = np.empty(room), np.empty(room)
-    lower[:lowers], lower_heights[:lowers] = message[1]
-    upper[:uppers], upper_heights[:uppers] = message[2]
+    lower[:n_lower], lower_heights[:n_lower] = message[1]
+    upper[:n_upper], upper_heights[:n_upper] = message[2]
     for i in range(len(readings)):
         low[i], high[i] = -np.inf, np.inf
         reading = readings[i]
         if not np.isnan(reading):
-            if lowers > 0 and reading <= lower[end_slot(lowers, HIGH)]:
-                push(lower, lower_heights, lowers, reading, 2.0)
-                lowers, level = lowers + 1, level + 1.0
+            # 1. Add a step of height 2 at the reading.
+            if n_lower > 0 and reading <= lower[_end_slot(n_lower, HIGH)]:
+                _push(lower, lower_heights, n_lower, reading, 2.0)
+                n_lower, level = n_lower + 1, level + 1.0
             else:
-                push(upper, upper_heights, uppers, reading, 2.0)
-                uppers, level = uppers + 1, level - 1.0
-            while level < 0:  # the stairs next to the level change queues
-                place, height = upper[LOW], upper_heights[LOW]
-                pop(upper, upper_heights, uppers, LOW)
-                push(lower, lower_heights, lowers, place, height)
-                lowers, uppers, level = lowers + 1, uppers - 1, level + height
-            while level >= lower_heights[end_slot(lowers, HIGH)]:
-                place, height = lower[end_slot(lowers, HIGH)], lower_heights[end_slot(lowers, HIGH)]
-                pop(lower, lower_heights, lowers, HIGH)
-                push(upper, upper_heights, uppers, place, height)
-                lowers, uppers, level = lowers - 1, uppers + 1, level - height
-            excess = reach + 1.0 - lam
-            reach = min(reach + 1.0, lam)
-            if excess > 0:  # the lower queue always has enough: level + reach, which is not below the excess
-                lowers, place, _ = _cut_l1(lower, lower_heights, lowers, LOW, excess)
-                low[i] = _halfway(place, lower[LOW])
-                uppers, place, lacking = _cut_l1(upper, upper_heights, uppers, HIGH, excess)
-                if lacking > 0:
-                    lowers, place, _ = _cut_l1(lower, lower_heights, lowers, HIGH, lacking)
-                    level -= lacking
-                inner = upper[end_slot(uppers, HIGH)] if uppers > 0 else lower[end_slot(lowers, HIGH)]
-                high[i] = _halfway(place, inner)
+                _push(upper, upper_heights, n_upper, reading, 2.0)
+                n_upper, level = n_upper + 1, level - 1.0
+            # 2. Move the steps next to the minimum to the queue that they belong to now.
+            while level < 0:
+                position, height = upper[LOW], upper_heights[LOW]
+                _pop(upper, upper_heights, n_upper, LOW)
+                _push(lower, lower_heights, n_lower, position, height)
+                n_lower, n_upper, level = n_lower + 1, n_upper - 1, level + height
+            while level >= lower_heights[_end_slot(n_lower, HIGH)]:
+                position, height = lower[_end_slot(n_lower, HIGH)], lower_heights[_end_slot(n_lower, HIGH)]
+                _pop(lower, lower_heights, n_lower, HIGH)
+                _push(upper, upper_heights, n_upper, position, height)
+                n_lower, n_upper, level = n_lower - 1, n_upper + 1, level - height
+            # 3. Cut the derivative at -lam and lam.
+            excess = greatest + 1.0 - lam
+            greatest = min(greatest + 1.0, lam)
+            if excess > 0:  # the lower queue always has enough: level + greatest, which is not below the excess
+                n_lower, position, _ = _cut_l1(lower, lower_heights, n_lower, LOW, excess)
+                low[i] = _halfway(position, lower[LOW])
+                n_upper, position, remaining = _cut_l1(upper, upper_heights, n_upper, HIGH, excess)
+                if remaining > 0:
+                    n_lower, position, _ = _cut_l1(lower, lower_heights, n_lower, HIGH, remaining)
+                    level -= remaining
+                inner = upper[_end_slot(n_upper, HIGH)] if n_upper > 0 else lower[_end_slot(n_lower, HIGH)]
+                high[i] = _halfway(position, inner)
         if len(ends):
-            ends[i] = _minimum_l1(level, lower, lowers, upper, uppers)
-    below, above = np.empty((2, lowers)), np.empty((2, uppers))
-    below[0], below[1] = lower[:lowers], lower_heights[:lowers]
-    above[0], above[1] = upper[:uppers], upper_heights[:uppers]
-    return _minimum_l1(level, lower, lowers, upper, uppers), (np.array([reach, level]), below, above)
+            ends[i] = _minimum_l1(level, lower, n_lower, upper, n_upper)
+    below, above = np.empty((2, n_lower)), np.empty((2, n_upper))
+    below[0], below[1] = lower[:n_lower], lower_heights[:n_lower]
+    above[0], above[1] = upper[:n_upper], upper_heights[:n_upper]
+    return _minimum_l1(level, lower, n_lower, upper, n_upper), (np.array([greatest, level]), below, above)
 
 
-PLACE, SUM, LAMS, COUNT = range(4)
-
-MessageL2 = tuple[Any, Any]
-"""(1,) the first reading, NaN before any; (4, K) knots by place. All places are counted from that reading.
-
-Beyond its PLACE a knot adds COUNT x - SUM - LAMS lam to the derivative. Sums of readings and multiples of lam are kept
-apart, and readings counted from the first, so that neither a great lam nor a great offset costs digits."""
+# Rows of knots. Beyond its POSITION, counted from the first reading, a knot adds COUNT x - SUM - LAMS lam to the
+# derivative. Sums of readings and multiples of lam are separate, and readings counted from the first, so that neither a
+# great lam nor a great offset costs digits.
+POSITION, SUM, LAMS, COUNT = range(4)
 
 
-def silent_l2() -> MessageL2:
-    """The message before any reading."""
+def initial_message_l2() -> tuple[Any, Any]:
+    """Return the message before any reading: (1,) the first reading, NaN before any, and (4, K) knots by position."""
     return np.full(1, np.nan), np.empty((4, 0))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _cut_l2(step: int, reading: float, lams: float, lam: float, knots: Any, k: int, stop: int) -> int:
-    """Cut the derivative, a reading added, at -lam (step 1, from the left) or at lam (-1): a knot where it is cut.
+    """Cut the derivative, with a reading added, at -lam (step 1, from the left) or at lam (-1).
 
     Args:
-        reading: counted from the first.
-        lams: multiple of lam by which the derivative stood away from the cut before the reading.
-        k: the outermost knot. stop: the first, on the way in, that stays; those before it make way if beyond the cut.
+        step: direction inwards.
+        reading: counted from the first one.
+        lams: multiple of lam by which the derivative differed from the cut before the reading.
+        lam: weight of the variation.
+        knots: overwritten.
+        k: the outermost knot.
+        stop: the first knot, on the way in, that stays; those before it are pooled if they lie beyond the cut.
 
     Returns:
-        Where the new knot is.
+        The index of the new knot.
     """
     total, count = step * reading, float(step)
-    place = (total + lams * lam) / count
-    while k != stop and step * (place - knots[PLACE, k]) >= 0:
+    position = (total + lams * lam) / count
+    while k != stop and step * (position - knots[POSITION, k]) >= 0:
         total += knots[SUM, k]
         lams += knots[LAMS, k]
         count += knots[COUNT, k]
-        place = (total + lams * lam) / count
+        position = (total + lams * lam) / count
         k += step
     k -= step
-    knots[PLACE, k], knots[SUM, k], knots[LAMS, k], knots[COUNT, k] = place, total, lams, count
+    knots[POSITION, k], knots[SUM, k], knots[LAMS, k], knots[COUNT, k] = position, total, lams, count
     return k
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _minimum_l2(lam: float, knots: Any, first: int, last: int) -> float:
-    """Where the message is least: its derivative, -lam before the first knot, is followed until it is 0."""
+    """Return where the message is least: its derivative, -lam before the first knot, is followed until it is 0."""
     total, lams, count = 0.0, 1.0, 0.0
     for k in range(first, last):
         total += knots[SUM, k]
         lams += knots[LAMS, k]
         count += knots[COUNT, k]
-        place = (total + lams * lam) / count
-        if place <= knots[PLACE, k + 1]:
-            return place
-    return knots[PLACE, last]
+        position = (total + lams * lam) / count
+        if position <= knots[POSITION, k + 1]:
+            return position
+    return knots[POSITION, last]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def forward_sweep_l2(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
-    """Carry a message on over readings (R,): as `total_variation_l1.forward_sweep`; `ends` costs O(knots) a reading."""
-    origin, kept = message[0][0], message[1]
+@kernel
+def forward_pass_l2(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
+    """Carry a message on over readings, with fidelity (y_i - x_i)^2 / 2; as `forward_pass_l1`.
+
+    `ends` costs O(knots) a reading.
+    """
+    origin, old_knots = message[0][0], message[1]
     room = len(readings)
-    knots = np.empty((4, kept.shape[1] + 2 * room))
-    knots[:, room : room + kept.shape[1]] = kept
-    first, last = room, room + kept.shape[1] - 1
+    knots = np.empty((4, old_knots.shape[1] + 2 * room))
+    knots[:, room : room + old_knots.shape[1]] = old_knots
+    first, last = room, room + old_knots.shape[1] - 1
     for i in range(len(readings)):
         low[i], high[i] = -np.inf, np.inf
         if not np.isnan(readings[i]):
-            fresh = last < first
-            if fresh:
+            is_first = last < first
+            if is_first:
                 origin = readings[i]
-            reading, lams = readings[i] - origin, -1.0 if fresh else 0.0
+            reading, lams = readings[i] - origin, -1.0 if is_first else 0.0
             first = _cut_l2(1, reading, lams, lam, knots, first, last + 1)
-            if fresh:
+            if is_first:
                 last = first
             last = _cut_l2(-1, reading, lams, lam, knots, last, first)
-            low[i] = origin + knots[PLACE, first]
-            high[i] = origin + knots[PLACE, last]
+            low[i] = origin + knots[POSITION, first]
+            high[i] = origin + knots[POSITION, last]
         if len(ends):
             ends[i] = origin + _minimum_l2(lam, knots, first, last) if last > first else np.nan
     latest = origin + _minimum_l2(lam, knots, first, last) if last > first else np.nan

@@ -1,12 +1,11 @@
-"""Filters of readings: total-variation denoising, exact, and the running median (`stream_filters` has both of streams).
-Total-variation denoising keeps the steps that presses make and flattens what lies between. A missing reading is NaN:
-it counts for nothing and is bridged at its neighbours' level. Channels are filtered each by itself.
-References: the published filter is the robust one with lam = 4, or a median of 15 (T. G. Thuruthel, J. Hughes, F. Iida,
-IEEE Sensors J. 2020); the algorithms are those of `kernels.total_variation_l1` and `kernels.total_variation_l2`.
+"""Filters of readings: total variation denoising, exact, and the running median; of recordings and of streams.
 
-Filters of streams: they take readings in blocks of any size and give what `filters` gives of the whole, as it comes.
-A total variation is decided from the past on: each value is the next one clipped, and where a chain of clips has become
-a constant no later reading matters any more. So a recording too long for memory is filtered exactly, a block at a time.
+Total variation denoising keeps the steps that presses make and flattens what lies between. A missing reading is NaN:
+it has no weight and takes the level of its neighbours. Channels are filtered independently. The published filter is
+the robust one with lam = 4, or a median of 15 (T. G. Thuruthel, J. Hughes, F. Iida, IEEE Sensors J. 2020).
+
+The filters of streams take readings in blocks of any size and return what the filters of recordings do: each value of
+the minimiser is the next one clipped, so where a chain of clips has become a constant, no later reading matters.
 """
 
 from collections.abc import Callable
@@ -23,31 +22,32 @@ from padforge.sense.signals import filter_kernels
 
 Fidelity = Literal["robust", "squares"]
 
-KERNELS = {
-    "robust": (filter_kernels.forward_sweep_l1, filter_kernels.silent_l1),
-    "squares": (filter_kernels.forward_sweep_l2, filter_kernels.silent_l2),
+_PASSES = {
+    "robust": (filter_kernels.forward_pass_l1, filter_kernels.initial_message_l1),
+    "squares": (filter_kernels.forward_pass_l2, filter_kernels.initial_message_l2),
 }
-GREATEST = 1e100
-"""Greatest amount of a reading and of lam: beyond, sums may overflow."""
-WIDEST = 2**31 - 1
-"""Greatest width of a running median: no recording is longer."""
-NOBODY = np.empty(0)
-"""In place of the causal values of a forward pass where nobody asks for them."""
-
+MAX_VALUE = 1e100
+"""Largest absolute reading, and lam: beyond, sums may overflow."""
+MAX_WIDTH = 2**31 - 1
+"""Largest width of a running median: no recording is longer."""
+MAX_PENDING = 100_000
+"""Readings of a channel that are held back: two hours at 13 Hz."""
+_NOT_NEEDED = np.empty(0)  # in place of the causal values of a forward pass
 _GRAIN = 20_000  # readings below which a thread costs more than it saves
 
 
-def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
-    """Where a recording with gaps begins anew: indices of the readings that follow a longer interval than `longest_s`.
+def find_segment_starts(times_s: ArrayLike, max_interval_s: float) -> Indices:
+    """Find where a recording with gaps starts anew, for `starts` of the filters.
 
     Args:
-        times_s: (R,) ascending, s. longest_s: above 0.
+        times_s: ascending; shape (R,), s.
+        max_interval_s: longest interval between two readings of a segment, above 0.
 
     Returns:
-        (K,) ascending, for `starts` of the filters.
+        Indices of the readings that follow a longer interval; shape (K,).
 
     Raises:
-        InputError: times that are not finite, beyond 1e10 s or do not ascend, or an interval that is not above 0.
+        InputError: times that are not finite, are beyond 1e10 s or do not ascend, or an interval that is not above 0.
     """
     times = check_numbers(times_s, np.float64, "times_s")
     if times.ndim != 1:
@@ -55,274 +55,255 @@ def stretches(times_s: ArrayLike, longest_s: float) -> Indices:
     check_magnitude("times_s", times[:, None], MAX_S, "s")
     if (np.diff(times) < 0).any():
         raise InputError(f"times_s are {short_repr(times_s)}, expected finite numbers that ascend")
-    if not (longest := check_float("longest_s", longest_s, 0.0, 1e300)):
-        raise InputError(f"longest_s is {longest_s!r}, allowed is a number above 0")
-    return np.flatnonzero(np.diff(times) > longest) + 1
+    if not (interval := check_float("max_interval_s", max_interval_s, 0.0, 1e300)):
+        raise InputError(f"max_interval_s is {max_interval_s!r}, allowed is a number above 0")
+    return np.flatnonzero(np.diff(times) > interval) + 1
 
 
 def total_variation(
     readings: ArrayLike, lam: float, fidelity: Fidelity = "robust", starts: ArrayLike = (), causal: bool = False
 ) -> Array:
-    """The exact minimiser x of fidelity + lam * sum |x_{i+1} - x_i|.
+    """Minimise fidelity + lam * sum |x_{i+1} - x_i| exactly (total variation denoising, fused lasso).
 
-    The fidelity "robust" is sum |y_i - x_i|: outliers do not count by how far they are off, and lam counts readings,
-    whatever the unit of y: a bump of fewer than 2 lam readings is cut. "squares" is 1/2 sum (y_i - x_i)^2: lam has the
-    unit of y, and a bump of n readings is lowered by 2 lam / n. The robust minimum is often not one point alone: going
-    back from the last reading, each choice between places is for the middle of them.
-
-    Takes O(R log min(R, lam)) for "robust" and O(R) for "squares".
+    The fidelity "robust" is sum |y_i - x_i|: outliers do not count by their distance, and lam counts readings, whatever
+    the unit of y: a bump of fewer than 2 lam readings is removed. "squares" is 1/2 sum (y_i - x_i)^2: lam has the unit
+    of y, and a bump of n readings is lowered by 2 lam / n. The robust minimiser is often not unique: from the last
+    reading back, the middle of the choices is taken. Cost: O(R log min(R, lam)) for "robust", O(R) for "squares".
 
     Args:
-        readings: (R,) or (R, C) of any real type, NaN where one is missing: there x has the value of the next present
-            reading, else of the last. A channel without any stays NaN.
-        lam: above 0.
-        starts: (K,) ascending indices at which a new stretch begins: nothing is coupled across (see `stretches`).
-        causal: give at each reading the last value of the minimiser of its stretch up to there, what a live filter
-            knows. For "squares" this takes O(R K) for K knots: a dozen on noise, up to 2 R.
+        readings: any real type, NaN where missing (x then has the value of the next reading, else of the last; a
+            channel without any stays NaN); shape (R,) or (R, C).
+        lam: weight of the variation, above 0.
+        fidelity: "robust" or "squares".
+        starts: ascending indices of readings at which a new segment starts, independent of the one before; shape (K,).
+        causal: return at each reading the last value of the minimiser up to there, as a live filter does; for
+            "squares" in O(R K) with K knots, a dozen on noise, up to 2 R.
 
     Returns:
-        float64 of the shape of `readings`.
+        The minimiser, float64 of the shape of `readings`.
 
     Raises:
         InputError: readings that are no numbers of such a shape, or beyond 1e100; lam, fidelity or starts that are not
             as above.
     """
-    check_variation(lam, fidelity)
+    _check_variation(lam, fidelity)
     check_type("causal", causal, bool)
-    forward_sweep, silent = KERNELS[fidelity]
+    forward_pass, initial_message = _PASSES[fidelity]
 
-    def denoise(stretch: Array) -> Array:
-        low, high, out = np.empty((3, len(stretch)))
-        latest, _ = forward_sweep(stretch, float(lam), silent(), low, high, out if causal else NOBODY)
+    def denoise(segment: Array) -> Array:
+        low, high, out = np.empty((3, len(segment)))
+        ends = out if causal else _NOT_NEEDED
+        latest, _ = forward_pass(segment, float(lam), initial_message(), low, high, ends)
         if not causal:
-            filter_kernels.clip_back(low, high, latest, out)
+            filter_kernels.backward_pass(low, high, latest, out)
         return out
 
-    return _by_channel(readings, starts, denoise)
+    return _filter_channels(readings, starts, denoise)
 
 
 def running_median(readings: ArrayLike, width: int, starts: ArrayLike = (), causal: bool = False) -> Array:
-    """The median of the `width` readings around each, or up to each; windows shrink at the ends of a stretch.
+    """Compute the median of the readings around each; windows shrink at the ends of a segment. O(R width).
 
-    NaN are left out of their windows; where the number left is even it is the mean of the two in the middle, where
-    none is left NaN. Takes O(R width), most of it short moves of memory.
+    NaN are ignored; an even number of readings has the mean of the two in the middle, none has NaN.
 
     Args:
-        readings: (R,) or (R, C) of any real type. width: odd. starts: as `total_variation`.
+        readings: any real type; shape (R,) or (R, C).
+        width: readings in a window, odd.
+        starts: as in `total_variation`.
         causal: the window ends at the reading, instead of having it in its middle.
 
     Returns:
-        float64 of the shape of `readings`.
+        The medians, float64 of the shape of `readings`.
 
     Raises:
-        InputError: readings or starts as `total_variation`, or a width that is no odd whole number above 0.
+        InputError: readings or starts as in `total_variation`, or a width that is no odd whole number above 0.
     """
-    before, after = window_reach(width, causal)
-    return _by_channel(readings, starts, lambda stretch: median_of(stretch, before, after))
+    before, after = _window(width, causal)
+    return _filter_channels(readings, starts, lambda segment: _median(segment, before, after))
 
 
-def median_of(stretch: Array, before: int, after: int) -> Array:
-    """(R,) medians of the readings i - before .. i + after that there are in a stretch (R,)."""
-    out = np.empty(len(stretch))
-    filter_kernels.running_median(stretch, min(before, len(stretch)), min(after, len(stretch)), out)
-    return out
+class TotalVariation:
+    """Total variation denoising of a stream: the values of `total_variation`, as soon as they are final.
+
+    A channel of which `max_pending` readings are not final is finished as if the recording ended there and started anew
+    with the next reading. So memory is bounded, by some 200 bytes for each of `max_pending` and channel.
+
+    Args:
+        channels: number of channels, C.
+        lam: as in `total_variation`.
+        fidelity: as in `total_variation`.
+        max_pending: readings of a channel that are held back at most.
+
+    Raises:
+        InputError: an argument out of range.
+    """
+
+    def __init__(
+        self, channels: int, lam: float, fidelity: Fidelity = "robust", max_pending: int = MAX_PENDING
+    ) -> None:
+        _check_variation(lam, fidelity)
+        channels = check_int("channels", channels, 1, MAX_FIBRES)
+        max_pending = check_int("max_pending", max_pending, 1, 2**31)
+        self._channels = [_TvChannel(float(lam), fidelity, max_pending) for _ in range(channels)]
+
+    @property
+    def latest(self) -> Array:
+        """(C,) the last value of the minimiser so far, as `total_variation` with `causal`; NaN before a reading."""
+        return np.array([channel.latest for channel in self._channels])
+
+    def update(self, readings: ArrayLike) -> Array:
+        """Process readings (n, C); return the (m, C) values that have become final, in order.
+
+        Raises:
+            InputError: readings as in `total_variation`, or another number of channels.
+        """
+        for channel, column in zip(self._channels, _check_block(readings, len(self._channels)), strict=True):
+            channel.update(column)
+        return self._pop_final()
+
+    def flush(self) -> Array:
+        """End a segment; return the (m, C) values that were pending."""
+        for channel in self._channels:
+            channel.finalise(is_end=True)
+        return self._pop_final()
+
+    def _pop_final(self) -> Array:
+        count = min(len(channel.final) for channel in self._channels)
+        values = np.column_stack([channel.final[:count] for channel in self._channels])
+        for channel in self._channels:
+            channel.final = channel.final[count:]
+        return values
 
 
-def _by_channel(readings: ArrayLike, starts: ArrayLike, work: Callable[[Array], Array]) -> Array:
-    """What `work` makes of every stretch (r,) of every channel, in the shape of the readings."""
-    array = checked_readings(readings)
+class _TvChannel:
+    """A channel: the message to the next reading, bounds of the pending values, and final ones not yet returned."""
+
+    def __init__(self, lam: float, fidelity: Fidelity, max_pending: int) -> None:
+        self._lam, self._max_pending = lam, max_pending
+        self._forward_pass, self._initial_message = _PASSES[fidelity]
+        self._message: Any = self._initial_message()
+        self._low, self._high = np.empty((2, 0))
+        self.final = np.empty(0)
+        self.latest = np.nan
+
+    def update(self, readings: Array) -> None:
+        while len(readings):  # never more than may be pending, so that the result does not depend on the size of blocks
+            room = self._max_pending - len(self._low)
+            piece, readings = readings[:room], readings[room:]
+            low, high = np.empty((2, len(piece)))
+            self.latest, self._message = self._forward_pass(piece, self._lam, self._message, low, high, _NOT_NEEDED)
+            self._low, self._high = np.concatenate([self._low, low]), np.concatenate([self._high, high])
+            self.finalise(is_end=False)
+
+    def finalise(self, is_end: bool) -> None:
+        """Compute the values that no later reading can change, or all at an end or if too many are pending."""
+        values = np.empty(len(self._low))
+        count = filter_kernels.backward_pass(self._low, self._high, self.latest, values)
+        if is_end or (count == 0 and len(values) == self._max_pending):
+            count, self._message = len(values), self._initial_message()
+        self._low, self._high = self._low[count:].copy(), self._high[count:].copy()
+        self.final = np.concatenate([self.final, values[:count]])
+
+
+class RunningMedian:
+    """Running median of a stream: the values of `running_median`, half a width later, or at once if `causal`.
+
+    Args:
+        channels: number of channels, C.
+        width: as in `running_median`.
+        causal: as in `running_median`.
+
+    Raises:
+        InputError: an argument out of range.
+    """
+
+    def __init__(self, channels: int, width: int, causal: bool = False) -> None:
+        channels = check_int("channels", channels, 1, MAX_FIBRES)
+        self._before, self._after = _window(width, causal)
+        self._readings = np.empty((channels, 0))  # up to width - 1 are kept
+        self._n_returned = 0  # of these, whose median has been returned
+
+    def update(self, readings: ArrayLike) -> Array:
+        """Process readings (n, C); return the (m, C) medians that have become known, in order.
+
+        Raises:
+            InputError: readings as in `running_median`, or another number of channels.
+        """
+        self._readings = np.concatenate([self._readings, _check_block(readings, len(self._readings))], axis=1)
+        return self._pop_medians(max(self._readings.shape[1] - self._after, 0))
+
+    def flush(self) -> Array:
+        """End a segment; return the (m, C) medians that were pending."""
+        medians = self._pop_medians(self._readings.shape[1])
+        self._readings, self._n_returned = self._readings[:, :0], 0
+        return medians
+
+    def _pop_medians(self, end: int) -> Array:
+        """Return medians up to reading `end`, and drop the readings that no later window has."""
+        medians = np.stack([_median(column, self._before, self._after) for column in self._readings], axis=1)
+        new = medians[self._n_returned : end]
+        n_dropped = max(end - self._before, 0)
+        self._readings, self._n_returned = self._readings[:, n_dropped:].copy(), end - n_dropped
+        return new
+
+
+def _filter_channels(readings: ArrayLike, starts: ArrayLike, apply: Callable[[Array], Array]) -> Array:
+    """Apply a filter of segments (r,) to every segment of every channel."""
+    array = _check_readings(readings)
     if array.ndim not in (1, 2):
         raise InputError(f"readings have shape {array.shape}, expected (R,) or (R, C)")
     count = len(array)
+    first = check_numbers(starts, np.int64, "starts")
+    if first.ndim != 1 or (np.diff(first) <= 0).any() or (len(first) and not 0 <= first[0] <= first[-1] < count):
+        raise InputError(f"starts are {short_repr(starts)}, allowed are ascending indices of {count} readings")
+    edges = [0, *first.tolist(), count]
     columns = np.ascontiguousarray(np.atleast_2d(array.T))
-    edges = [0, *_checked_starts(starts, count), count]
     out = np.empty_like(columns)
 
-    def filter_channels(begin: int, end: int) -> None:
+    def filter_chunk(begin: int, end: int) -> None:
         for c in range(begin, end):
-            for first, last in pairwise(edges):
-                out[c, first:last] = work(columns[c, first:last])
+            for start, stop in pairwise(edges):
+                out[c, start:stop] = apply(columns[c, start:stop])
 
-    map_chunks(filter_channels, len(columns), 1 + _GRAIN // max(count, 1))
+    map_chunks(filter_chunk, len(columns), 1 + _GRAIN // max(count, 1))
     return np.ascontiguousarray(out.T).reshape(array.shape)
 
 
-def checked_readings(readings: ArrayLike) -> Array:
-    """Readings as float64, of any shape.
+def _median(segment: Array, before: int, after: int) -> Array:
+    out = np.empty(len(segment))
+    filter_kernels.running_median(segment, min(before, len(segment)), min(after, len(segment)), out)
+    return out
 
-    Raises:
-        InputError: they are no real numbers, or beyond GREATEST.
-    """
+
+def _window(width: int, causal: bool) -> tuple[int, int]:
+    """Return how many readings before and after each are in its window."""
+    if (width := check_int("width", width, 1, MAX_WIDTH)) % 2 != 1:
+        raise InputError(f"width is {width!r}, allowed is an odd whole number above 0")
+    return (width - 1, 0) if check_type("causal", causal, bool) else (width // 2, width // 2)
+
+
+def _check_variation(lam: float, fidelity: str) -> None:
+    if not isinstance(fidelity, str) or fidelity not in _PASSES:
+        raise InputError(f"fidelity is {short_repr(fidelity)}, allowed is {' or '.join(_PASSES)}")
+    if not check_float("lam", lam, 0.0, MAX_VALUE):
+        raise InputError(f"lam is {lam!r}, allowed is a number above 0, up to {MAX_VALUE:g}")
+
+
+def _check_readings(readings: ArrayLike) -> Array:
     array = check_numbers(readings, np.float64, "readings")
-    beyond = np.abs(array) > GREATEST
+    beyond = np.abs(array) > MAX_VALUE
     if beyond.any():
         first = np.argwhere(beyond)[0].tolist()
         raise InputError(
-            f"readings hold {array[beyond][0]:g} (first at {first}), allowed is {-GREATEST:g} to {GREATEST:g}, "
+            f"readings hold {array[beyond][0]:g} (first at {first}), allowed is {-MAX_VALUE:g} to {MAX_VALUE:g}, "
             "or NaN for one that is missing"
         )
     return array
 
 
-def _checked_starts(starts: ArrayLike, readings: int) -> list[int]:
-    array = check_numbers(starts, np.int64, "starts")
-    if array.ndim != 1 or (np.diff(array) <= 0).any() or (len(array) and not 0 <= array[0] <= array[-1] < readings):
-        raise InputError(f"starts are {short_repr(starts)}, allowed are ascending indices of {readings} readings")
-    return array.tolist()
-
-
-def check_variation(lam: float, fidelity: str) -> None:
-    """Raise InputError unless `total_variation` takes these."""
-    if not isinstance(fidelity, str) or fidelity not in KERNELS:
-        raise InputError(f"fidelity is {short_repr(fidelity)}, allowed is {' or '.join(KERNELS)}")
-    if not check_float("lam", lam, 0.0, GREATEST):
-        raise InputError(f"lam is {lam!r}, allowed is a number above 0, up to {GREATEST:g}")
-
-
-def window_reach(width: int, causal: bool) -> tuple[int, int]:
-    """How many readings before and after each are in the window of a running median.
-
-    Raises:
-        InputError: a width that is no odd whole number above 0.
-    """
-    if (width := check_int("width", width, 1, WIDEST)) % 2 != 1:
-        raise InputError(f"width is {width!r}, allowed is an odd whole number above 0")
-    return (width - 1, 0) if check_type("causal", causal, bool) else (width // 2, width // 2)
-
-
-MOST_HELD = 100_000
-"""Readings of a channel that are held back undecided, at most: two hours at 13 Hz."""
-
-
-class TotalVariation:
-    """`filters.total_variation` of a stream: the same values, as soon as no later reading can change them.
-
-    A channel of which `most_held` readings are undecided is decided as if the recording ended there and began anew
-    with the next reading. So memory is bounded: by some 200 bytes for each of `most_held`, a channel, while a block is
-    taken. What is fed takes time in proportion to itself and to what is held.
-    """
-
-    def __init__(self, channels: int, lam: float, fidelity: Fidelity = "robust", most_held: int = MOST_HELD) -> None:
-        """A stream of (n, `channels`) readings; `lam` and `fidelity` as `filters.total_variation`.
-
-        Raises:
-            InputError: an argument out of range.
-        """
-        check_variation(lam, fidelity)
-        channels, most_held = (
-            check_int("channels", channels, 1, MAX_FIBRES),
-            check_int("most_held", most_held, 1, 2**31),
-        )
-        self._channels = [_Channel(float(lam), fidelity, most_held) for _ in range(channels)]
-
-    @property
-    def latest(self) -> Array:
-        """(C,) the last value of the minimiser of the stretch so far, what a live filter knows; NaN before a reading.
-
-        It is what `total_variation` with `causal` gives.
-        """
-        return np.array([channel.latest for channel in self._channels])
-
-    def feed(self, readings: ArrayLike) -> Array:
-        """Take (n, C) readings; return the (m, C) values decided since the last call, in order.
-
-        Raises:
-            InputError: readings as `filters.total_variation`, or another number of channels.
-        """
-        for channel, column in zip(self._channels, _block(readings, len(self._channels)), strict=True):
-            channel.feed(column)
-        return self._decided()
-
-    def finish(self) -> Array:
-        """End the recording, or a stretch of it: return the (m, C) values left. What is fed next begins anew."""
-        for channel in self._channels:
-            channel.settle(ended=True)
-        return self._decided()
-
-    def _decided(self) -> Array:
-        count = min(len(channel.decided) for channel in self._channels)
-        return np.column_stack([channel.take(count) for channel in self._channels])
-
-
-class _Channel:
-    """One channel: the message that the next reading meets, the clips of values not decided, and values that wait."""
-
-    def __init__(self, lam: float, fidelity: Fidelity, most_held: int) -> None:
-        self._lam, self._most_held = lam, most_held
-        self._forward_sweep, self._silent = KERNELS[fidelity]
-        self._message: Any = self._silent()
-        self._low, self._high = np.empty((2, 0))
-        self.decided = np.empty(0)
-        self.latest = np.nan
-
-    def feed(self, readings: Array) -> None:
-        while len(readings):  # never more than may be held, so that it does not depend on the size of blocks
-            room = self._most_held - len(self._low)
-            piece, readings = readings[:room], readings[room:]
-            low, high = np.empty((2, len(piece)))
-            self.latest, self._message = self._forward_sweep(piece, self._lam, self._message, low, high, NOBODY)
-            self._low, self._high = np.concatenate([self._low, low]), np.concatenate([self._high, high])
-            self.settle(ended=False)
-
-    def settle(self, ended: bool) -> None:
-        """Decide what no later reading can change: all, if the stretch has ended or no more may be held."""
-        values = np.empty(len(self._low))
-        count = filter_kernels.clip_back(self._low, self._high, self.latest, values)
-        if ended or (count == 0 and len(values) == self._most_held):
-            count, self._message = len(values), self._silent()
-        self._low, self._high = self._low[count:].copy(), self._high[count:].copy()
-        self.decided = np.concatenate([self.decided, values[:count]])
-
-    def take(self, count: int) -> Array:
-        """Hand over the first of the decided values."""
-        taken, self.decided = self.decided[:count], self.decided[count:]
-        return taken
-
-
-class RunningMedian:
-    """`filters.running_median` of a stream: the same values, half a width later, or at once if `causal`.
-
-    It holds `width` - 1 readings; what is fed takes time in proportion to `width` times itself and those.
-    """
-
-    def __init__(self, channels: int, width: int, causal: bool = False) -> None:
-        """A stream of (n, `channels`) readings; `width` and `causal` as `filters.running_median`.
-
-        Raises:
-            InputError: an argument out of range.
-        """
-        channels = check_int("channels", channels, 1, MAX_FIBRES)
-        self._before, self._after = window_reach(width, causal)
-        self._held = np.empty((channels, 0))
-        self._given = 0  # of the readings held, those whose median has been given
-
-    def feed(self, readings: ArrayLike) -> Array:
-        """Take (n, C) readings; return the (m, C) medians known since the last call, in order.
-
-        Raises:
-            InputError: readings as `filters.running_median`, or another number of channels.
-        """
-        self._held = np.concatenate([self._held, _block(readings, len(self._held))], axis=1)
-        return self._known(max(self._held.shape[1] - self._after, 0))
-
-    def finish(self) -> Array:
-        """End the recording, or a stretch of it: return the (m, C) medians left. What is fed next begins anew."""
-        left = self._known(self._held.shape[1])
-        self._held, self._given = self._held[:, :0], 0
-        return left
-
-    def _known(self, end: int) -> Array:
-        """Medians up to reading `end` of those held; readings that no later window has go."""
-        medians = np.stack([median_of(column, self._before, self._after) for column in self._held], axis=1)
-        known = medians[self._given : end]
-        gone = max(end - self._before, 0)
-        self._held, self._given = self._held[:, gone:].copy(), end - gone
-        return known
-
-
-def _block(readings: ArrayLike, channels: int) -> Array:
-    """(C, n) of readings (n, C)."""
-    array = checked_readings(readings)
+def _check_block(readings: ArrayLike, channels: int) -> Array:
+    """Check readings (n, C) of a stream, and transpose them to (C, n)."""
+    array = _check_readings(readings)
     if array.ndim != 2 or array.shape[1] != channels:
         raise InputError(f"readings have shape {array.shape}, expected (n, {channels})")
     return np.ascontiguousarray(array.T)

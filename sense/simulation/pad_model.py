@@ -1,13 +1,14 @@
-"""The simulated pad: what an ADC reads from each fibre while a probe presses.
+"""Physical model of a simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The strain of a fibre is its relative stretch by the contact model times how far the probe is down. Four things the
-published recording shows come on top: every press is answered a little more or less strongly than the last one at the
-same position, the answer creeps (part of it follows slowly), unloading is not the reverse of loading (the fibre
-overshoots beyond its rest and comes back within seconds), and the rest itself wanders over minutes. A fibre is a
-resistor in a potential divider with a fixed one; an ADC with white noise reads their middle.
+The strain of a fibre is its relative stretch by the contact model, times the relative depth of the probe. Four effects
+of the published recording are added: the response to a press scatters about that of the position; it creeps (part of it
+follows slowly); it has hysteresis (when unloaded, a fibre overshoots its rest and comes back within seconds); and the
+rest drifts over minutes. A fibre is a resistor in a potential divider with a fixed one; an ADC with white noise reads
+their middle.
 
-Strengths are of the order of that recording: answers up to some 0.2 V on a rest near 2 V that scatter by a sixth of
-themselves, overshoot of a fifth, rest wandering by 0.04 V, noise of 1.6 mV."""
+The defaults of `[rig]` have the size of that recording: responses up to some 0.2 V on a rest near 2 V that scatter by a
+sixth, an overshoot of a fifth, drift of 0.04 V and noise of 1.6 mV.
+"""
 
 import math
 from dataclasses import dataclass
@@ -22,214 +23,195 @@ from padforge.sense.settings import RigSettings
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095
-GAUGE = 0.4
-"""Relative change of a fibre's resistance for its relative stretch at full depth, 5 mm."""
+GAUGE_FACTOR = 0.4
+"""Relative change of a fibre's resistance per relative stretch at FULL_DEPTH_MM."""
 FULL_DEPTH_MM = 5.0
 TRAVEL_S = 0.15
-"""Time the probe takes from the surface to its depth, and back."""
+"""Time that the probe takes from the surface to its depth, and back."""
 DELAY_S = (0.08, 0.2)
 """Range of the time from the command to the touch, and to the start of the release."""
 CREEP_S = (0.4, 6.0)
-"""Time constants of the creeping part of an answer, in equal shares."""
+"""Time constants of creep, in equal shares."""
 DRIFT_S = 600.0
-"""Correlation time of the rest."""
+"""Correlation time of the drift."""
 REST_V = (1.7, 2.1)
 """Range of the voltages at rest; the divider is matched to half the supply only roughly."""
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """When, within a cycle of `readings` readings at `rate_hz`, the probe is sent down; up it goes at the end."""
+    """Cycle of a press, in readings: the probe is sent down in its middle, and up at its end."""
 
     readings: int
     rate_hz: float
 
     @property
-    def down_at(self) -> int:
+    def down_index(self) -> int:
         """Reading of the cycle at which the probe is sent down."""
         return self.readings // 2
 
     @property
-    def held_at(self) -> int:
-        """Reading of the cycle from which on the probe is held down, at the latest its last one."""
-        arriving = math.ceil((DELAY_S[1] + TRAVEL_S) * self.rate_hz)
-        return min(self.down_at + arriving, self.readings - 1)
+    def held_index(self) -> int:
+        """Reading of the cycle from which on the probe is at its depth, at the latest the last one."""
+        return min(self.down_index + math.ceil((DELAY_S[1] + TRAVEL_S) * self.rate_hz), self.readings - 1)
 
 
-def indentation(cycle: Cycle, delays_s: Array) -> Array:
-    """How far the probe is down, 0 to 1, in the cycle of each press and the one after, in which it leaves.
+def relative_depths(cycle: Cycle, delays_s: Array) -> Array:
+    """Compute the relative depth (Q, 2 readings), 0 to 1, in the cycle of each press and the next, in which it leaves.
 
-    Args:
-        delays_s: (Q, 2) from the command to the touch, and from the command to the start of the release.
-
-    Returns:
-        (Q, 2 readings).
+    Its delays (Q, 2), s, are from the command to the touch, and to the start of the release.
     """
-    times = np.arange(2 * cycle.readings) / cycle.rate_hz
-    touch = cycle.down_at / cycle.rate_hz + delays_s[:, :1]
-    leave = cycle.readings / cycle.rate_hz + delays_s[:, 1:]
-    return np.clip((times - touch) / TRAVEL_S, 0, 1) - np.clip((times - leave) / TRAVEL_S, 0, 1)
+    times_s = np.arange(2 * cycle.readings) / cycle.rate_hz
+    touch_s = cycle.down_index / cycle.rate_hz + delays_s[:, :1]
+    release_s = cycle.readings / cycle.rate_hz + delays_s[:, 1:]
+    return np.clip((times_s - touch_s) / TRAVEL_S, 0, 1) - np.clip((times_s - release_s) / TRAVEL_S, 0, 1)
 
 
-def strain(signals: Array, indented: Array) -> Array:
-    """(Q, C) signals and (Q, 2 readings) indentation to (Q readings, C) strain; neighbouring cycles add up."""
-    readings = indented.shape[1] // 2
-    own = signals[:, None, :] * indented[:, :readings, None]
-    own[1:] += signals[:-1, None, :] * indented[:-1, readings:, None]
-    return own.reshape(-1, signals.shape[1])
+def superpose_strain(responses: Array, depths: Array) -> Array:
+    """Superpose the strain (Q readings, C) of presses by their responses (Q, C) and relative depths (Q, 2 readings)."""
+    readings = depths.shape[1] // 2
+    strain = responses[:, None, :] * depths[:, :readings, None]
+    strain[1:] += responses[:-1, None, :] * depths[:-1, readings:, None]
+    return strain.reshape(-1, responses.shape[1])
 
 
-class Answer:
-    """The part of the strain that shows: creeping, and overshooting as it goes down; may be asked bit by bit.
+class FirstOrderLag:
+    """First-order lag with a time constant in rows, settled at the first of its values (R, C)."""
 
-    Args:
-        rate_hz: readings a second. creep: share that follows by `CREEP_S`. hysteresis: overshoot as a share of the
-            strain lost. hysteresis_s: time constant of the return from it.
-    """
-
-    def __init__(self, rate_hz: float, creep: float, hysteresis: float, hysteresis_s: float) -> None:
-        self._creep, self._hysteresis = creep, hysteresis
-        self._lags = [Lag(rate_hz * time_constant) for time_constant in CREEP_S]
-        self._stay = np.exp(-1 / (rate_hz * hysteresis_s))
-        self._last: Array | None = None
-        self._overshoot: Array | None = None
-
-    def __call__(self, strained: Array) -> Array:
-        """(R, C) strain, going on from what was asked before, to (R, C), settling at it where it stays as it is."""
-        shown = (1 - self._creep) * strained
-        for lag in self._lags:
-            shown = shown + self._creep / len(self._lags) * lag(strained)
-        last = strained[:1] if self._last is None else self._last
-        earlier = np.concatenate([last, strained[:-1]])
-        unloading = np.sign(earlier) * np.maximum(np.abs(earlier) - np.abs(strained), 0)
-        before = np.zeros_like(last) if self._overshoot is None else self._overshoot
-        over, self._overshoot = lfilter([1.0], [1.0, -self._stay], unloading, axis=0, zi=before)
-        self._last = strained[-1:].copy()
-        return shown - self._hysteresis * over
-
-
-class Lag:
-    """A first-order lag with a time constant of `steps` rows, starting settled at the first of (R, C) values."""
-
-    def __init__(self, steps: float) -> None:
-        self._stay = np.exp(-1 / steps)
+    def __init__(self, rows: float) -> None:
+        self._decay = np.exp(-1 / rows)
         self._state: Array | None = None
 
     def __call__(self, values: Array) -> Array:
-        before = self._stay * values[:1] if self._state is None else self._state
-        lagged, self._state = lfilter([1 - self._stay], [1.0, -self._stay], values, axis=0, zi=before)
+        """Filter further values (R, C)."""
+        state = self._decay * values[:1] if self._state is None else self._state
+        lagged, self._state = lfilter([1 - self._decay], [1.0, -self._decay], values, axis=0, zi=state)
         return lagged
 
 
-class Wander:
-    """Rests of unit variance, correlated over `DRIFT_S`: an Ornstein-Uhlenbeck process from its own equilibrium."""
+class CreepHysteresis:
+    """Creep of a share of the response, and hysteresis: an overshoot by a share of the strain lost, which decays."""
+
+    def __init__(self, rate_hz: float, rig: RigSettings) -> None:
+        self._creep, self._hysteresis = rig.creep, rig.hysteresis
+        self._lags = [FirstOrderLag(rate_hz * time_constant) for time_constant in CREEP_S]
+        self._decay = np.exp(-1 / (rate_hz * rig.hysteresis_s))
+        self._last: Array | None = None
+        self._overshoot: Array | None = None
+
+    def __call__(self, strain: Array) -> Array:
+        """Compute the visible part of further strain (R, C), which settles at the strain."""
+        visible = (1 - self._creep) * strain
+        for lag in self._lags:
+            visible = visible + self._creep / len(self._lags) * lag(strain)
+        last = strain[:1] if self._last is None else self._last
+        previous = np.concatenate([last, strain[:-1]])
+        unloading = np.sign(previous) * np.maximum(np.abs(previous) - np.abs(strain), 0)
+        state = np.zeros_like(last) if self._overshoot is None else self._overshoot
+        overshoot, self._overshoot = lfilter([1.0], [1.0, -self._decay], unloading, axis=0, zi=state)
+        self._last = strain[-1:].copy()
+        return visible - self._hysteresis * overshoot
+
+
+class Drift:
+    """Drift of unit variance with correlation time `DRIFT_S`: a stationary Ornstein-Uhlenbeck process."""
 
     def __init__(self, fibres: int, rate_hz: float, rng: np.random.Generator) -> None:
-        self._stay = np.exp(-1 / (rate_hz * DRIFT_S))
+        self._decay = np.exp(-1 / (rate_hz * DRIFT_S))
         self._rng = rng
-        self._state = self._stay * rng.standard_normal((1, fibres))
+        self._state = self._decay * rng.standard_normal((1, fibres))
 
     def __call__(self, readings: int) -> Array:
-        """The next (R, C)."""
-        kicks = self._rng.standard_normal((readings, self._state.shape[1])) * np.sqrt(1 - self._stay**2)
-        wandered, self._state = lfilter([1.0], [1.0, -self._stay], kicks, axis=0, zi=self._state)
-        return wandered
+        """Sample the next values; shape (R, C)."""
+        steps = self._rng.standard_normal((readings, self._state.shape[1])) * np.sqrt(1 - self._decay**2)
+        drift, self._state = lfilter([1.0], [1.0, -self._decay], steps, axis=0, zi=self._state)
+        return drift
 
 
-def divider(rest_v: Array, change: Array) -> Array:
-    """Voltage over the fixed resistor as the fibre's resistance grows by the share `change`, from `rest_v`."""
+def divider_voltage(rest_v: Array, change: Array) -> Array:
+    """Compute the voltage over the fixed resistor when the fibre's resistance has grown by the share `change`."""
     ratio = SUPPLY_V / rest_v - 1  # fibre at rest over fixed resistor
     return SUPPLY_V / (1 + ratio * (1 + change))
 
 
-def digitised(volts: Array) -> Array:
-    """What a 12-bit ADC makes of `volts`: a whole number of steps within its range, in volts."""
+def quantize(volts: Array) -> Array:
+    """Quantize voltages as a 12-bit ADC does: whole steps within its range, V."""
     return np.clip(np.rint(volts / SUPPLY_V * ADC_STEPS), 0, ADC_STEPS) * (SUPPLY_V / ADC_STEPS)
 
 
-def read_pad(
-    answers: Array,
+class Divider:
+    """Fibres in their dividers, read by an ADC; strain is relative, or in V if `linear`."""
+
+    def __init__(
+        self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator, linear: bool = False
+    ) -> None:
+        self._rest_v = rng.uniform(*REST_V, fibres)
+        self._creep_hysteresis = CreepHysteresis(rate_hz, rig)
+        self._drift = Drift(fibres, rate_hz, rng)
+        self._rig, self._rng, self._linear = rig, rng, linear
+
+    def __call__(self, strain: Array) -> Array:
+        """Read the voltages of further strain (R, C)."""
+        if not len(strain):
+            return strain
+        visible = self._creep_hysteresis(strain)
+        volts = self._rest_v + visible if self._linear else divider_voltage(self._rest_v, GAUGE_FACTOR * visible)
+        volts += self._rig.drift_mv * 1e-3 * self._drift(len(volts))
+        volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
+        return quantize(volts)
+
+
+def simulate_readings(
+    responses: Array,
     depths_mm: Array,
     cycle: Cycle,
     rig: RigSettings,
     rng: np.random.Generator,
     noise_v: Array | None = None,
 ) -> Array:
-    """What the ADC gives of a plan of presses; as in `LivePad`, a press of half the depth gives half the strain.
+    """Simulate the readings (Q readings, C), V, of presses; strain is proportional to the depth (Q,).
 
-    Args:
-        answers: (Q, C) relative stretches at full depth; or V, as measured, which is how a held press differs from
-            the rest.
-        depths_mm: (Q,) how deep the presses are.
-        noise_v: (C,) by how much answers in V scatter whatever they are, standard deviation; None for stretches.
-
-    Returns:
-        (Q readings, C) V.
+    Responses (Q, C) are relative stretches at full depth; or V, as measured (a held press minus the rest), with the
+    standard deviation `noise_v` (C,) that does not depend on them.
     """
-    presses, channels = answers.shape
-    # the divider draws first, as in `LivePad`: with the same seed fibres rest where they do there
-    model = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
-    answers = answers * rig.response_scatter.sample_gains((presses, channels), rng)
+    presses, channels = responses.shape
+    # The divider draws first, as in `LivePad`: with the same seed fibres have the same rests there.
+    divider = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
+    responses = responses * rig.response_scatter.sample_gains((presses, channels), rng)
     if noise_v is not None:
-        own_v = np.sqrt(np.maximum(noise_v**2 - reading_noise_v(cycle, rig) ** 2, 0))
-        answers = (answers + own_v * rng.standard_normal(answers.shape)) / held_share(cycle, rig)
-    indented = indentation(cycle, rng.uniform(*DELAY_S, (presses, 2)))
-    return model(strain(depths_mm[:, None] / FULL_DEPTH_MM * answers, indented))
+        press_noise_v = np.sqrt(np.maximum(noise_v**2 - _reading_noise_v(cycle, rig) ** 2, 0))
+        responses = (responses + press_noise_v * rng.standard_normal(responses.shape)) / _held_share(cycle, rig)
+    depths = relative_depths(cycle, rng.uniform(*DELAY_S, (presses, 2)))
+    return divider(superpose_strain(depths_mm[:, None] / FULL_DEPTH_MM * responses, depths))
 
 
-def held_share(cycle: Cycle, rig: RigSettings) -> float:
-    """What a press shows while it is held, on average, as a share of what it would settle at."""
+def _held_share(cycle: Cycle, rig: RigSettings) -> float:
+    """Return the mean response while a press is held, as a share of what it would settle at."""
     pressed = np.zeros((cycle.readings, 1))
-    pressed[cycle.down_at :] = 1.0
-    return float(_answer(cycle.rate_hz, rig)(pressed)[cycle.held_at :].mean())
+    pressed[cycle.down_index :] = 1.0
+    return float(CreepHysteresis(cycle.rate_hz, rig)(pressed)[cycle.held_index :].mean())
 
 
-def reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
-    """Standard deviation of a held press minus the rest before it by white noise and drift alone, V."""
-    held, rest = np.arange(cycle.held_at, cycle.readings), np.arange(cycle.down_at // 2, cycle.down_at)
+def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
+    """Return the standard deviation of a held press minus the rest before it, by white noise and drift alone, V."""
+    held = np.arange(cycle.held_index, cycle.readings)
+    rest = np.arange(cycle.down_index // 2, cycle.down_index)
     times_s = np.append(held, rest) / cycle.rate_hz
     weights = np.append(np.full(len(held), 1 / len(held)), np.full(len(rest), -1 / len(rest)))
-    alike = np.exp(-np.abs(times_s[:, None] - times_s) / DRIFT_S)
-    drift, white = weights @ alike @ weights, weights @ weights
+    correlation = np.exp(-np.abs(times_s[:, None] - times_s) / DRIFT_S)
+    drift, white = weights @ correlation @ weights, weights @ weights
     return float(1e-3 * np.sqrt(rig.drift_mv**2 * drift + rig.noise_mv**2 * white))
 
 
-def _answer(rate_hz: float, rig: RigSettings) -> Answer:
-    return Answer(rate_hz, rig.creep, rig.hysteresis, rig.hysteresis_s)
-
-
-class Divider:
-    """The fibres of a simulated pad in their dividers, read by an ADC; may be asked bit by bit.
-
-    Args:
-        linear: whether strains are what voltages change by, V, as measured ones are, and not relative to a fibre.
-    """
-
-    def __init__(
-        self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator, linear: bool = False
-    ) -> None:
-        self._rest_v = rng.uniform(*REST_V, fibres)
-        self._answer = _answer(rate_hz, rig)
-        self._wander = Wander(fibres, rate_hz, rng)
-        self._rig, self._rng, self._linear = rig, rng, linear
-
-    def __call__(self, strained: Array) -> Array:
-        """(R, C) strain, relative stretch or V, going on from what was asked before, to (R, C) volts."""
-        if not len(strained):
-            return strained
-        shown = self._answer(strained)
-        volts = self._rest_v + shown if self._linear else divider(self._rest_v, GAUGE * shown)
-        volts += self._rig.drift_mv * 1e-3 * self._wander(len(volts))
-        volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
-        return digitised(volts)
-
-
 class LivePad:
-    """A simulated pad that is asked what it gives for where the tip is; one physical model for every simulated rig.
+    """A simulated pad under a moving tip; one physical model for every virtual rig.
 
     Args:
-        pad: course of the fibres. contact: what a press deforms. rig: strengths of creep, noise and drift.
-        rate_hz: at which it is asked. rng: of rests, drift and noise.
+        pad: paths of the fibres.
+        contact: contact model.
+        rig: settings of scatter, creep, hysteresis, drift and noise.
+        rate_hz: readings per second.
+        rng: of rests, scatter, drift and noise.
     """
 
     def __init__(
@@ -238,24 +220,32 @@ class LivePad:
         self._pad, self._contact = pad, contact
         self._divider = Divider(len(pad.knots), rate_hz, rig, rng)
         self._rig, self._rng = rig, rng
-        self._known: dict[tuple[float, float], Array] = {}
+        self._cache: dict[tuple[float, float], Array] = {}
         self._gains = np.ones(len(pad.knots))
-        self._touched = False
+        self._is_touched = False
 
     def volts(self, positions_mm: Array, depths_mm: Array) -> Array:
-        """(R, C) volts for tips at (R, 2) mm from the pad's centre, (R,) mm below its surface (above: less than 0)."""
-        strained = np.zeros((len(positions_mm), len(self._pad.knots)))
-        for row, touched in enumerate(depths_mm > 0):
-            if touched and not self._touched:
-                self._gains = self._rig.response_scatter.sample_gains((1, len(self._gains)), self._rng)[0]
-            self._touched = bool(touched)
-            if touched:
-                strained[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(positions_mm[row])
-        return self._divider(strained)
+        """Read the fibres for further positions of the tip.
 
-    def _stretch(self, place_mm: Array) -> Array:
+        Args:
+            positions_mm: from the pad's centre; shape (R, 2), mm.
+            depths_mm: below its surface, negative above; shape (R,), mm.
+
+        Returns:
+            Readings; shape (R, C), V.
+        """
+        strain = np.zeros((len(positions_mm), len(self._pad.knots)))
+        for row, is_touched in enumerate(depths_mm > 0):
+            if is_touched and not self._is_touched:
+                self._gains = self._rig.response_scatter.sample_gains((1, len(self._gains)), self._rng)[0]
+            self._is_touched = bool(is_touched)
+            if is_touched:
+                strain[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(positions_mm[row])
+        return self._divider(strain)
+
+    def _stretch(self, position_mm: Array) -> Array:
         """(C,) of a press at full depth; the tip of an arm at rest stays within hundredths of a millimetre."""
-        x, y = np.round(place_mm, 2).tolist()
-        if (x, y) not in self._known:
-            self._known = {(x, y): relative_stretch(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
-        return self._known[x, y]
+        x, y = np.round(position_mm, 2).tolist()
+        if (x, y) not in self._cache:
+            self._cache = {(x, y): relative_stretch(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
+        return self._cache[x, y]

@@ -261,7 +261,10 @@ def drift_study(
     sources |= {label: (lambda own=recording: own) for label, recording in recordings.items()}
     simulated = {*pads, *(label for label, own in recordings.items() if own.source.get("kind") == SIMULATED)}
     kinds = {label: SIMULATED if label in simulated else "recorded" for label in sources}
-    known = {**dict.fromkeys(pads, presses), **{label: int(own.has_position.sum()) for label, own in recordings.items()}}
+    known = {
+        **dict.fromkeys(pads, presses),
+        **{label: int(own.has_position.sum()) for label, own in recordings.items()},
+    }
     for label, count in known.items():
         try:
             _split(np.arange(count), test_share, seed)

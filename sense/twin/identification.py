@@ -17,7 +17,7 @@ from padforge.design.settings import sensed_rectangle
 from padforge.design.twin import MAX_INFORMATION_GAIN, Twin, TwinChannel, TwinReadings, TwinScatter
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.recording import Recording
-from padforge.sense.simulation.simulated_recording import strengths
+from padforge.sense.simulation.simulated_recording import measure_rig_settings
 from padforge.sense.twin.as_built import LaidPad, PadPlan, Responses, information, of_one_depth, responses
 from padforge.sense.twin.fitting import Fit, Freedom, Wiring, fit, response_scatter, smooth_function, wirings
 
@@ -307,7 +307,7 @@ def _readings(
     recording: Recording, live: Indices, pad: LaidPad, noise_v: Array, positions_mm: Array
 ) -> TwinReadings | None:
     """How readings run beside what presses answer, if that can be told."""
-    found = strengths(recording)
+    found = measure_rig_settings(recording)
     if not found:
         return None
     told = information(recording, live).sum() / (pad.steepness(positions_mm) / noise_v[live] ** 2).sum()

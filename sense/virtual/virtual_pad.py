@@ -20,7 +20,7 @@ from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.streams import RECORDED
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
-from padforge.sense.simulation.simulated_recording import random_places
+from padforge.sense.simulation.simulated_recording import sample_positions
 
 
 class SimulatedConverter:
@@ -78,7 +78,7 @@ class SimulatedConverter:
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
         press, within_s = divmod(at_s, cycle_s)
         if press > self._press:
-            self._press, self._place_mm = press, random_places(self._pad, 1, self._finger, self._size)[0]
+            self._press, self._place_mm = press, sample_positions(self._pad, 1, self._finger, self._size)[0]
         down = min((within_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - within_s) / TRAVEL_S)
         return self._place_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(down, 0.0)
 

@@ -21,7 +21,7 @@ from unittest.mock import patch
 
 import pytest
 
-from padforge.sense.health import trace_model as fibre_prediction
+from padforge.sense.health import trace_model
 from tests.docs.pages import BLOCK, ROOT, relative
 from tests.helpers.door import call
 from tests.helpers.once import Once
@@ -162,7 +162,7 @@ def answer(counter: Path) -> None:
         return
     here, *words = (counter / "asked").read_text(encoding="utf-8").splitlines()
     (counter / "asked").unlink()
-    with chdir(here), patch.object(fibre_prediction, "MOST_STEPS", fibre_prediction.MOST_STEPS // SHORTER):
+    with chdir(here), patch.object(trace_model, "MAX_STEPS", trace_model.MAX_STEPS // SHORTER):
         ended = call(*words)
     (counter / "err").write_text(ended.err, encoding="utf-8")
     (counter / "out").write_text(ended.out, encoding="utf-8")

@@ -20,8 +20,6 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-TRUSTED = {"sense.HealthModel.refuse_other", "sense.PressDetector.follow"}
-"""They are handed what those who call them have checked."""
 CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
 """Parameters that are left alone: what is called back may raise what it likes."""
 
@@ -130,7 +128,7 @@ def functions() -> dict[str, Callable[..., Any]]:
         "RunningMedian": lambda: sense.RunningMedian(4, 5),
         "TotalVariation": lambda: sense.TotalVariation(4, 2.0),
         "Live": lambda: sense.Live(sound()["localizers"], sound()["health"], 4, 13.3),
-        "FaultDetector": lambda: sense.FaultDetector(sound()["model"]),
+        "FaultMonitor": lambda: sense.FaultMonitor(sound()["model"]),
         "Spec": lambda: design.Spec({}),
         **{name: lambda key=key: sound()[key] for name, key in _OF_CLASS.items()},
     }
@@ -146,7 +144,7 @@ def functions() -> dict[str, Callable[..., Any]]:
                 found[full] = thing
             for key, method in inspect.getmembers(thing, callable):
                 inherited = (getattr(method, "__module__", "") or "").partition(".")[0] != package.__name__
-                if key.startswith("_") or f"{full}.{key}" in TRUSTED or inherited:
+                if key.startswith("_") or inherited:
                     continue
                 if inspect.ismethod(method) or isinstance(inspect.getattr_static(thing, key), staticmethod):
                     found[f"{full}.{key}"] = method

@@ -11,7 +11,7 @@ import pytest
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.settings import Spec
-from padforge.sense.health import trace_model as fibre_prediction
+from padforge.sense.health import trace_model
 from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
 from padforge.sense.settings import LocalizerSettings
@@ -43,7 +43,7 @@ def made(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(fibre_prediction, "MOST_STEPS", 80):
+    with mock.patch.object(trace_model, "MAX_STEPS", 80):
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 

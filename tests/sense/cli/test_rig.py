@@ -79,9 +79,7 @@ def test_record_checks_the_tcp_before_anything_moves(
     """The controller has the tip 150 mm from the flange; an unwatched force is announced."""
     arm, session = FakeArm(Time()), Mock()
     monkeypatch.setattr(arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
-    monkeypatch.setattr(
-        operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeBoard(arm), setup.rig))
-    )
+    monkeypatch.setattr(operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeBoard(arm), setup.rig)))
     monkeypatch.setattr(operation, "PressLoop", session)
     rig = RIG.model_copy(update={"tcp_mm": tcp_mm, "max_force_n": max_force_n})
     tables = {"pad": PadSettings(grid=PAD.grid), "rig": rig}

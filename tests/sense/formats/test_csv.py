@@ -111,7 +111,10 @@ def test_a_mapping_tells_what_other_columns_hold_in_any_unit_and_by_names_with_s
     ("mapping", "message"),
     [
         ("time=note,fibres=ch*", "line 3 holds no numbers .could not convert string to float: 'begin'"),
-        ("time=t_ms,fibres=ch*,down_command=px,up_command=py", "mapping has 'down_command=px'.* one of time, fibres, x, y, depth"),
+        (
+            "time=t_ms,fibres=ch*,down_command=px,up_command=py",
+            "mapping has 'down_command=px'.* one of time, fibres, x, y, depth",
+        ),
         ("time=px,fibres=ch*:mV", "times do not ascend"),
         ("time=t_ms,fibres=c*:mV,press=ch2", "press is nowhere 0"),
     ],

@@ -1,4 +1,4 @@
-"""A simulated pad, health learnt of it in a moment, and the ways in which its fibres fail."""
+"""A simulated pad, a model of it that is trained in a moment, and the ways in which its fibres fail."""
 
 from collections.abc import Callable
 from unittest import mock
@@ -6,58 +6,70 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.sense import Recording
-from padforge.sense.health import health_model as learning
-from padforge.sense.health import trace_model as fibre_prediction
-from padforge.sense.health.fault_detector import FibreFault, examine
-from padforge.sense.health.health_model import HealthModel, fit_health_model
+from padforge.sense import FaultDetector, FibreFault, HealthModel, Recording
+from padforge.sense.health import health_model, trace_model
 
 Array = NDArray[np.float64]
-LEARNT, PRESSES, BAD_FROM = 600, 760, 660
+TRAINED, PRESSES, BAD_FROM = 600, 760, 660
 
 
-def learn(readings: Array, pad: Recording, presses: int = LEARNT) -> HealthModel:
-    """Health by a quick training on the first presses, of which, on this pad, LEARNT suffice to call a fibre weak."""
+def fit(readings: Array, pad: Recording, presses: int = TRAINED) -> HealthModel:
+    """A quick training on the first presses, of which, on this pad, TRAINED suffice to detect a reduced gain."""
     end = pad.down_command[presses]
-    with mock.patch.object(fibre_prediction, "MOST_STEPS", 250), mock.patch.object(learning, "WEAK_PRESSES", LEARNT):
-        return fit_health_model(
+    with mock.patch.object(trace_model, "MAX_STEPS", 250), mock.patch.object(health_model, "MIN_GAIN_PRESSES", TRAINED):
+        return health_model.fit_health_model(
             readings[:end],
             pad.times_s[:end],
             pad.down_command[:presses],
             pad.up_command[:presses],
             rng=np.random.default_rng(0),
+            provenance={},
         )
 
 
-def later(model: HealthModel, readings: Array, pad: Recording, first: int = LEARNT) -> list[FibreFault]:
-    """Findings on the presses that health was not learnt from; press 0 is the first of them."""
-    start = pad.up_command[first - 1]
-    return examine(
-        model, readings[start:], pad.times_s[start:], pad.down_command[first:] - start, pad.up_command[first:] - start
-    )
+def part_of(pad: Recording, first: int, stop: int, end: int, readings: Array | None = None) -> Recording:
+    """Presses first .. stop - 1 with the readings from the release before them to `end`."""
+    start = int(pad.up_command[first - 1]) if first else 0
+    readings = pad.readings if readings is None else readings
+    commands = pad.down_command[first:stop] - start, pad.up_command[first:stop] - start
+    return Recording(readings[start:end], pad.times_s[start:end], pad.presses_mm[first:stop], *commands)
+
+
+def detect(model: HealthModel, recording: Recording) -> list[FibreFault]:
+    """Faults in a recording."""
+    detector = FaultDetector()
+    detector.model_ = model
+    return detector.predict(recording)
+
+
+def detect_later(model: HealthModel, readings: Array, pad: Recording, first: int = TRAINED) -> list[FibreFault]:
+    """Faults in the presses that the model was not trained on; press 0 is the first of them."""
+    return detect(model, part_of(pad, first, len(pad.down_command), len(readings), readings))
 
 
 Fault = Callable[[Array, Array, np.random.Generator], Array]
 FAULTS: dict[str, Fault] = {
-    "stuck": lambda own, before, rng: np.full_like(own, own[0]),
-    "open": lambda own, before, rng: np.zeros_like(own),
-    "floating": lambda own, before, rng: rng.uniform(0, 3.3, len(own)),
-    "noisy": lambda own, before, rng: own + 0.016 * rng.standard_normal(len(own)),
-    "offset": lambda own, before, rng: own + 0.1,
-    "drifting": lambda own, before, rng: own - 5e-5 * np.arange(len(own)),
-    "weak": lambda own, before, rng: (own + np.median(before)) / 2,
+    "stuck": lambda values, before, rng: np.full_like(values, values[0]),
+    "open": lambda values, before, rng: np.zeros_like(values),
+    "floating": lambda values, before, rng: rng.uniform(0, 3.3, len(values)),
+    "noisy": lambda values, before, rng: values + 0.016 * rng.standard_normal(len(values)),
+    "offset": lambda values, before, rng: values + 0.1,
+    "drifting": lambda values, before, rng: values - 5e-5 * np.arange(len(values)),
+    "reduced_gain": lambda values, before, rng: (values + np.median(before)) / 2,
 }
-"""What fibre 1 reads instead of its own readings, of those before, or "swapped" with fibre 4."""
+"""Readings of a faulty fibre 1, from its own and those before; "swapped" is with fibre 4."""
 
 
-def spoilt(pad: Recording, fault: str, press: int = BAD_FROM, readings: Array | None = None) -> Array:
+def plant(pad: Recording, fault: str, press: int = BAD_FROM, readings: Array | None = None) -> Array:
     """Readings in which a fibre fails from a press on."""
-    found, at = (pad.readings if readings is None else readings).copy(), int(pad.down_command[press])
+    readings = (pad.readings if readings is None else readings).copy()
+    start = int(pad.down_command[press])
     if fault == "swapped":
-        found[at:, [1, 4]] = found[at:, [4, 1]]
+        readings[start:, [1, 4]] = readings[start:, [4, 1]]
     else:
-        found[at:, 1] = FAULTS[fault](found[at:, 1], found[at - 400 : at, 1], np.random.default_rng(2))
-    return found
+        before = readings[start - 400 : start, 1]
+        readings[start:, 1] = FAULTS[fault](readings[start:, 1], before, np.random.default_rng(2))
+    return readings
 
 
 def faulty(rng: np.random.Generator, readings: Array) -> Array:

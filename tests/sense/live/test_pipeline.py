@@ -26,8 +26,8 @@ from tests.sense.live.conftest import first_presses
 def no_delays() -> Iterator[None]:
     """Scripted presses begin as they are commanded."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(padforge.sense.live.pipeline, "SENT_DOWN_S", 0.0)
-        monkeypatch.setattr(padforge.sense.live.pipeline, "SENT_UP_S", 0.0)
+        monkeypatch.setattr(padforge.sense.live.pipeline, "TOUCH_DELAY_S", 0.0)
+        monkeypatch.setattr(padforge.sense.live.pipeline, "RELEASE_DELAY_S", 0.0)
         yield
 
 
@@ -43,7 +43,7 @@ class ScriptedDetector:
     def __call__(self, fibres: int) -> "ScriptedDetector":
         return self
 
-    def feed(self, times_s: np.ndarray, readings: np.ndarray) -> Iterator[PressEvent]:
+    def update(self, times_s: np.ndarray, readings: np.ndarray) -> Iterator[PressEvent]:
         self._n_readings += len(times_s)
         while self._events and self._events[0][0] < self._n_readings:
             _, down, index = self._events.pop(0)
@@ -55,14 +55,14 @@ class ScriptedMonitor:
 
     def __init__(self) -> None:
         self.updates: list[tuple[np.ndarray, int, int]] = []
-        self.lost: tuple[int, ...] = ()
+        self.failed: tuple[int, ...] = ()
 
     def update(self, readings: np.ndarray, down_command: int, up_command: int) -> list[FibreFault]:
         self.updates.append((readings.copy(), down_command, up_command))
         if len(self.updates) != 6:
             return []
-        self.lost = (1,)
-        return [FibreFault(5, 2, (1,), "silent", 9.0)]
+        self.failed = (1,)
+        return [FibreFault(5, 2, (1,), "no_response", 9.0)]
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, trained, mo
     down_command, up_command = part.down_command.copy(), part.up_command.copy()
     down_command[8], up_command[8] = up_command[7] + 4, up_command[7] + 20  # soon after the one before
     part = replace(part, down_command=down_command, up_command=up_command)
-    monkeypatch.setattr(padforge.sense.live.pipeline, "FaultDetector", lambda model: monitor)
+    monkeypatch.setattr(padforge.sense.live.pipeline, "FaultMonitor", lambda model: monitor)
     monkeypatch.setattr(padforge.sense.live.pipeline, "PressDetector", ScriptedDetector(part))
     live = Live([localizer], localizer, part.fibres, part.rate_hz)  # a stand-in for health, of the same pad
     events = live.feed(part.times_s, part.readings)
@@ -169,7 +169,7 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, trained, mo
     expected = localizer.predict(part, (1,)).positions_mm
     np.testing.assert_allclose(positions(estimates)[6:], expected[6 : len(estimates)], atol=1e-3)
     view = live.view()
-    assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "silent", "sound", "sound"]
+    assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "no_response", "sound", "sound"]
     assert view["faults"] == [live.faults[0].text]
     for press, (readings, down, up) in enumerate(monitor.updates):  # of each press alone
         first = part.down_command[press] - (4 if press == 8 else 10)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, import_mat
-from padforge.sense.health.fault_detector import FibreFault, fibre_mask_of
+from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer.calibration import learnable, left_out, proven, split_presses
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.network import learnt
@@ -196,7 +196,7 @@ def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(
 ) -> None:
     whole, without = (localizer.predict(recording, lost).positions_mm for lost in ((), (1,)))
     found = localizer.predict(
-        recording, fibre_mask=fibre_mask_of([FibreFault(9, 5, (1,), "weak", 6.0)], len(recording.down_command), 4)
+        recording, fibre_mask=mask_faults([FibreFault(9, 5, (1,), "reduced_gain", 6.0)], len(recording.down_command), 4)
     ).positions_mm
     assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
     np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)

@@ -1,4 +1,4 @@
-"""Pads of any rectangle, from the recording of presses to the places found: in mm, and never in a hole."""
+"""Rectangular pads with keep-outs, from the simulated recording to the localization, in mm."""
 
 import json
 from pathlib import Path
@@ -15,15 +15,15 @@ from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.virtual.virtual_pad import virtual_pad_of
 
-HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
-SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
+SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
 PAD = Morphology.random(SIZE.layout, knots=3, seed=2)
 QUICK = LocalizerSettings(members=1, hidden=32, layers=2, epochs=20, batch=64, max_failures=1)
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """250 presses, as they are read back."""
+    """250 presses, saved and read."""
     path = tmp_path_factory.mktemp("rectangle") / "recording"
     simulate(PAD, RigSettings(presses=250, seed=1), size=SIZE).save(path, {})
     return Recording.open(path)
@@ -34,37 +34,39 @@ def calibrated(recording: Recording) -> tuple[LocalizerModel, dict]:
     return calibrate(recording, QUICK)
 
 
-def test_a_recording_says_which_pad_it_is_of(recording: Recording, tmp_path: Path) -> None:
+def test_recording_describes_its_pad(recording: Recording, tmp_path: Path) -> None:
     assert Morphology.from_dict(recording.source["morphology"]) == PAD
-    assert recording.source["keep_out_mm"] == [[list(corner) for corner in HOLE]]
+    assert recording.source["keep_out_mm"] == [[list(corner) for corner in KEEP_OUT]]
     recording.save(tmp_path / "recording", {})
     assert virtual_pad_of(tmp_path).connect()["channels"] == 5
     square = Morphology.straight(2)
     assert json.dumps(pad_source(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
 
 
-def test_places_are_found_in_mm(recording: Recording, calibrated: tuple[LocalizerModel, dict]) -> None:
+def test_localization_of_a_rectangular_pad_is_in_mm(
+    recording: Recording, calibrated: tuple[LocalizerModel, dict]
+) -> None:
     localizer, document = calibrated
-    found = localizer.predict(recording)
-    off = np.linalg.norm(found.positions_mm - recording.presses_mm, axis=1)
-    assert off.mean() < 3.0  # of a pad of 24 by 60 mm
+    localization = localizer.predict(recording)
+    errors = np.linalg.norm(localization.positions_mm - recording.presses_mm, axis=1)
+    assert errors.mean() < 3.0  # of a pad of 24 by 60 mm
     test = np.array(document["test"]["pressed_mm"]) - document["test"]["predicted_mm"]
     assert document["errors"][0]["mean_mm"] == pytest.approx(np.linalg.norm(test, axis=1).mean(), rel=1e-6)
     rows = evaluate(localizer, recording, levels=(0, 1))["errors"]
     assert [row["n_failed"] for row in rows] == [0, 1]
-    within = [np.mean(off <= radius) for radius in (found.r50_mm, found.r90_mm)]
+    within = [np.mean(errors <= radius) for radius in (localization.r50_mm, localization.r90_mm)]
     assert within == pytest.approx([0.5, 0.9], abs=0.2)
 
 
 @pytest.mark.parametrize("counts", [(0, 3), (3, 0), pytest.param((1, 0), marks=pytest.mark.slow)])
-def test_a_strip_finds_what_its_fibres_tell(counts: tuple[int, int]) -> None:
-    """Straight parallel fibres tell nothing of the place along them; across, they tell it where two are felt."""
+def test_localization_on_strips_of_parallel_fibres(counts: tuple[int, int]) -> None:
+    """Straight parallel fibres give no position along them; across, they do where two respond."""
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 8.0))
     recording = simulate(Morphology.straight(size.layout), RigSettings(presses=200, seed=1), size=size)
     localizer, document = calibrate(recording, QUICK)
-    off = np.abs(localizer.predict(recording).positions_mm - recording.presses_mm).mean(axis=0) / 4.0
-    along, across = off if counts[0] else off[::-1]
+    errors = np.abs(localizer.predict(recording).positions_mm - recording.presses_mm).mean(axis=0) / 4.0
+    along, across = errors if counts[0] else errors[::-1]
     assert along > 0.15  # 4 mm are pressed, whose middle is off by a quarter of them
     assert sum(counts) == 1 or across < 0.25
-    # nothing is left to locate by where all fibres are lost
+    # a single fibre cannot fail
     assert [row["n_failed"] for row in document["errors"]] == ([0, 1] if sum(counts) > 1 else [0])

@@ -1,0 +1,196 @@
+"""Planted faults are detected with their kind, healthy pads give no alarm; the estimator and the monitor."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from padforge.design import Morphology
+from padforge.design.common.validation import InputError
+from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.sense import (
+    FaultDetector,
+    FaultMonitor,
+    FibreFault,
+    HealthModel,
+    Recording,
+    RigSettings,
+    open_recording,
+    simulate,
+)
+from padforge.sense.health import fault_detector
+from padforge.sense.health.fault_detector import TEXTS, fault_lines
+from padforge.sense.health.fault_likelihoods import HYPOTHESES
+from tests.sense.health.pads import BAD_FROM, PRESSES, TRAINED, detect, detect_later, faulty, fit, part_of, plant
+
+
+@pytest.mark.parametrize(
+    ("fault", "kinds", "within"),
+    [
+        *(("stuck", {"stuck"}, 20), ("open", {"open"}, 20), ("floating", {"open"}, 20), ("noisy", {"noisy"}, 20)),
+        *(("swapped", {"swapped", "offset"}, 20), ("offset", {"offset"}, 20)),
+        *(("drifting", {"drifting"}, 60), ("reduced_gain", {"reduced_gain"}, 60)),
+    ],
+)
+def test_planted_faults_are_detected(
+    pad: Recording, model: HealthModel, fault: str, kinds: set[str], within: int
+) -> None:
+    faults = detect_later(model, plant(pad, fault), pad)
+    first, bad_from = faults[0], BAD_FROM - TRAINED
+    assert first.kind in kinds
+    # Where rests differ, a swap shows as two offsets before the responses show what it is.
+    bad = [1, 4] if fault == "swapped" else [1]
+    assert bad_from <= first.press <= bad_from + within
+    assert first.since <= first.press
+    assert first.score >= 5
+    # No fibre is reported twice, and no sound one with it.
+    assert sorted(fibre for each in faults for fibre in each.fibres) == bad
+
+
+@pytest.mark.parametrize(("distance", "kind"), [(-1.01, "open"), (-0.99, "stuck"), (0.99, "stuck"), (1.01, "open")])
+def test_constant_beyond_the_rests_is_open(pad: Recording, model: HealthModel, distance: float, kind: str) -> None:
+    low, high = model.rest_range_v[:, 1]
+    readings = pad.readings.copy()
+    readings[pad.down_command[BAD_FROM] :, 1] = (high if distance > 0 else low) + distance * (high - low)
+    (fault,) = detect_later(model, readings, pad)
+    assert (fault.fibres, fault.kind) == ((1,), kind)
+
+
+def test_healthy_pad_gives_no_alarm(pad: Recording, model: HealthModel) -> None:
+    assert detect_later(model, pad.readings, pad) == []
+
+
+@pytest.mark.parametrize("after", [0, 3])
+def test_unrecorded_last_release_gives_no_alarm(model: HealthModel, after: int) -> None:
+    """A simulated recording ends when the probe is sent up; others some readings later."""
+    for seed in range(9, 12):
+        pad = simulate(
+            Morphology.random(3, knots=3, seed=5), RigSettings(presses=31, seed=seed, drift_mv=10), PUBLISHED_CONTACT
+        )
+        assert detect(model, part_of(pad, 0, 30, int(pad.up_command[29]) + after)) == [], seed
+
+
+def test_monitor_detects_the_same_press_by_press(pad: Recording, model: HealthModel) -> None:
+    readings = plant(pad, "noisy")
+    monitor = FaultMonitor(model)
+    faults: list[FibreFault] = []
+    for press in range(TRAINED, PRESSES):
+        first = pad.down_command[press] - 10
+        last = pad.down_command[press + 1] if press + 1 < PRESSES else len(readings)
+        faults += monitor.update(readings[first:last], 10, int(pad.up_command[press] - first))
+    assert faults == detect_later(model, readings, pad)
+    assert monitor.failed == (1,)
+    assert monitor.n_presses == PRESSES - TRAINED
+
+
+def test_fibre_is_missing_after_twenty_successive_presses(pad: Recording, model: HealthModel) -> None:
+    def without(*presses: range) -> list[tuple[int, int, str]]:
+        readings = pad.readings.copy()
+        for each in presses:
+            readings[pad.down_command[BAD_FROM + each.start] : pad.up_command[BAD_FROM + each.stop - 1], 2] = np.nan
+        return [(fault.press, fault.since, fault.kind) for fault in detect_later(model, readings, pad)]
+
+    first = BAD_FROM - TRAINED
+    assert without(range(19)) == []
+    assert without(range(19), range(20, 39)) == []  # the press between restarts the count
+    assert without(range(20)) == [(first + 19, first, "missing")]
+    assert without(range(45)) == [(first + 19, first, "missing")]
+
+
+def test_predict_and_update_refuse_other_pads(pad: Recording, model: HealthModel) -> None:
+    presses = pad.presses_mm, pad.down_command, pad.up_command
+    with pytest.raises(InputError, match="readings are of 5 fibres, health was learnt from 6"):
+        detect(model, Recording(pad.readings[:, :5], pad.times_s, *presses))
+    with pytest.raises(InputError, match="readings a second"):
+        detect(model, Recording(pad.readings, 2 * pad.times_s, *presses))
+    with pytest.raises(InputError, match=r"expected \(R, 6\)"):
+        FaultMonitor(model).update(pad.readings[:60, :5], 10, 30)
+    for down_command, up_command in ((0, 30), (30, 30), (10, 61)):
+        with pytest.raises(InputError, match="allowed is a whole number from"):
+            FaultMonitor(model).update(pad.readings[:60], down_command, up_command)
+    with pytest.raises(InputError, match="not fitted"):
+        FaultDetector().predict(pad)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_readings_are_processed(pad: Recording, model: HealthModel, seed: int) -> None:
+    end = int(pad.down_command[60])
+    readings = faulty(np.random.default_rng(seed), pad.readings[:end])
+    for fault in detect(model, part_of(pad, 0, 60, end, readings)):
+        assert 0 <= fault.since <= fault.press < 60
+        assert fault.score >= 5
+
+
+def test_fault_lines() -> None:
+    faults = [FibreFault(30, 21, (1, 4), "swapped", 7.2), FibreFault(50, 41, (0,), "reduced_gain", 6.0)]
+    assert fault_lines(faults, 6, dead=(5,)) == [
+        "fibre 6 was dead in the recording that health was learnt from",
+        "fibres 2 and 5 are swapped (swapped) since press 21, found at press 30; by chance once in 1e7 presses",
+        "fibre 1 responds with about half its gain (reduced_gain) since press 41, found at press 50; "
+        "by chance once in 1e6 presses",
+        "sound fibres: 3, 4",
+    ]
+    # Every hypothesis has a text.
+    assert {name for name in HYPOTHESES if not name.startswith("offset")} <= set(TEXTS)
+
+
+@pytest.mark.slow
+def test_published_recording_with_and_without_planted_faults(published: Path) -> None:
+    pad = open_recording(published / "para5_long_first4500.mat")
+    model = fit(pad.readings, pad, presses=1000)
+    short = part_of(pad, 0, 1362, int(pad.down_command[1362]))
+    assert detect_later(model, short.readings, short, first=1000) == []
+    for fault, within in (("stuck", 20), ("swapped", 20), ("offset", 20), ("reduced_gain", 60)):
+        first = detect_later(model, plant(short, fault, 1300), short, first=1280)[0]
+        assert set(first.fibres) <= ({1, 4} if fault == "swapped" else {1})
+        assert 20 <= first.press <= 20 + within
+
+
+def test_dead_channels_are_ignored(pad: Recording) -> None:
+    readings = pad.readings.copy()
+    readings[:, 0] = 3.3
+    readings[:, 3] = np.minimum(readings[:, 3], np.quantile(readings[:, 3], 0.2))
+    model = fit(readings, pad)
+    assert model.dead == FaultMonitor(model).failed == (0, 3)
+    assert detect_later(model, readings, pad) == []
+    assert detect_later(model, plant(pad, "noisy", readings=readings), pad)[0].fibres == (1,)
+
+
+def test_single_fibre_detects_faults_of_its_own_readings(pad: Recording) -> None:
+    readings = pad.readings[:, 1:2].copy()
+    model = fit(readings, pad)
+    readings[pad.down_command[BAD_FROM] :] = readings[pad.down_command[BAD_FROM]]
+    assert [fault.kind for fault in detect_later(model, readings, pad)] == ["stuck"]
+
+
+def test_fit_trains_on_commanded_and_on_detected_presses(pad: Recording, monkeypatch) -> None:
+    monkeypatch.setattr(
+        fault_detector, "fit_health_model", lambda readings, times_s, *presses, **options: (presses, options)
+    )
+    held_back = np.arange(5, 700, 7)
+    trained = np.setdiff1d(np.arange(PRESSES), held_back)
+    detector: Any = FaultDetector(1e-4, seed=7).fit(pad, held_back, {"command": "test"})
+    commanded, options = detector.model_
+    np.testing.assert_array_equal(commanded, (pad.down_command[trained], pad.up_command[trained]))
+    assert (options["false_alarm_rate"], options["provenance"]) == (1e-4, {"command": "test"})
+    detected, _ = detector.live_model_
+    assert len(detected[0]) == len(detected[1]) == len(trained)
+    assert (detected[0] != commanded[0]).any()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda pad: FaultDetector().fit(3), "recording is 3, expected a Recording"),  # type: ignore[arg-type]
+        (lambda pad: FaultDetector().fit(pad, [0, 10**6]), "held_back is .*, allowed are presses from 0 to"),
+        (lambda pad: FaultDetector().fit(pad, [-1]), "held_back is .*, allowed are presses from 0 to"),
+        (lambda pad: FaultDetector().fit(pad, "ab"), "held_back"),
+        (lambda pad: FaultDetector(seed="a"), "seed is 'a'"),  # type: ignore[arg-type]
+        (lambda pad: FaultDetector(0.0), "false_alarm_rate is 0"),
+        (lambda pad: FaultDetector(0.2), "false_alarm_rate is 0.2"),
+    ],
+)
+def test_detector_refuses_wrong_arguments(pad: Recording, call: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call(pad)

@@ -1,0 +1,186 @@
+"""The model of a healthy pad: what it is trained on, and its files, which are read exactly, or refused if damaged."""
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from padforge.design.common.files import read_json
+from padforge.design.common.validation import InputError
+from padforge.sense import FaultDetector, HealthModel, Recording
+from padforge.sense.arrays import MIN_SCALE_V
+from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
+from padforge.sense.health.fault_likelihoods import HYPOTHESES
+from padforge.sense.health.health_model import COMMANDED, MIN_PRESSES, find_dead_fibres
+from padforge.sense.localizer.model_files import ModelFiles, files_of
+from padforge.sense.localizer.training import one_cycle
+from tests.sense.health.pads import TRAINED, detect_later, fit, part_of, plant
+from tools.kills import killed
+
+DOCUMENT, WEIGHTS = (path.name for path in files_of(Path(), COMMANDED))
+FEW = 320
+"""Presses that a model can be trained on, but not enough to detect a reduced gain."""
+
+
+def detector_of(model: HealthModel) -> FaultDetector:
+    detector = FaultDetector()
+    detector.model_ = detector.live_model_ = model
+    return detector
+
+
+def test_detector_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path) -> None:
+    assert not has_health(tmp_path)
+    detector_of(replace(model, provenance={"command": "test"})).save(tmp_path / "old")
+    assert {file.name for file in (tmp_path / "old").iterdir()} == HEALTH_FILES
+    FaultDetector.load(tmp_path / "old").save(tmp_path / "new")
+    for name in HEALTH_FILES:
+        assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
+    loaded = HealthModel.load(tmp_path / "new")
+    assert loaded.provenance == {"command": "test"}
+    readings = plant(pad, "reduced_gain")
+    assert detect_later(loaded, readings, pad) == detect_later(model, readings, pad)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"false_alarm_rate": 0.0}, "false_alarm_rate: got 0.0"),
+        ({"rate_hz": "fast"}, "rate_hz: got 'fast'"),
+        ({"dead": [6]}, "dead is \\[6\\]"),
+        ({"dead": [2]}, "is .*, expected"),
+        ({"format": "padforge-localizer/1"}, "format is 'padforge-localizer/1'"),
+        ({"weights_sha256": "0" * 64}, "not the weights"),
+        ({"more": 1}, "more: no such key"),
+    ],
+)
+def test_load_refuses_a_changed_document(model: HealthModel, tmp_path: Path, change: dict, message: str) -> None:
+    model.save(tmp_path)
+    document = json.loads((tmp_path / DOCUMENT).read_text())
+    (tmp_path / DOCUMENT).write_text(json.dumps(document | change))
+    with pytest.raises(InputError, match=message):
+        HealthModel.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"),
+    [
+        ("exceedance", "slope", 0.0),
+        ("likelihoods", "noise_v", np.nan),
+        ("pca", "components", np.inf),
+        ("likelihoods", "std_scale", -1.0),
+    ],
+)
+def test_load_refuses_entries_out_of_range(
+    model: HealthModel, tmp_path: Path, part: str, key: str, value: float
+) -> None:
+    array = getattr(getattr(model, part), key).copy()
+    array.flat[0] = value
+    replace(model, **{part: replace(getattr(model, part), **{key: array})}).save(tmp_path)
+    with pytest.raises(InputError, match=f"{part}.{key}"):
+        HealthModel.load(tmp_path)
+
+
+DAMAGES = [(name, damage) for name in sorted(HEALTH_FILES) for damage in (b"{", b"", "torn", "endless")]
+
+
+@pytest.mark.parametrize(("name", "damage"), [*DAMAGES, (WEIGHTS, "missing")])
+def test_load_refuses_damaged_files(model: HealthModel, tmp_path: Path, name: str, damage: str | bytes) -> None:
+    detector_of(model).save(tmp_path)
+    torn = (tmp_path / name).read_bytes()[:-9]
+    (tmp_path / name).unlink()
+    if damage == "endless":
+        (tmp_path / name).symlink_to("/dev/zero")
+    elif damage != "missing":
+        (tmp_path / name).write_bytes(torn if isinstance(damage, str) else damage)
+    with pytest.raises(InputError, match=r"not the weights|cannot be read|JSON|a file"):
+        FaultDetector.load(tmp_path)
+
+
+@pytest.mark.parametrize("name", [None, 3, "", "a/b", "..", "x" * 300, "a\nb"])
+def test_save_refuses_a_wrong_name_and_writes_nothing(model: HealthModel, tmp_path: Path, name: Any) -> None:
+    with pytest.raises(InputError, match="name is"):
+        model.save(tmp_path / "new", name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("share", "rate"), [(0.05, 0.25), (0.1, 0.5), (0.2, 1.0), (0.4, 0.8535533906), (1.0, 0.0)])
+def test_one_cycle_rises_linearly_and_falls_as_a_cosine(share: float, rate: float) -> None:
+    assert one_cycle(share) == pytest.approx(rate)
+
+
+def written(folder: Path, value: float) -> ModelFiles:
+    files = files_of(folder, "model")
+    files.write({"format": "model/1", "value": value}, {"weights": np.full(3, value)}, "the model")
+    return files
+
+
+def read(files: ModelFiles) -> tuple[float, float]:
+    """Values of document and weights."""
+    document = read_json(files.document, "model/1")
+    with files.arrays(document["weights_sha256"], "the model") as arrays:
+        return document["value"], float(arrays["weights"][0])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
+def test_kill_while_writing_leaves_the_old_or_the_new_model(tmp_path: Path) -> None:
+    results = []
+    for number in count():
+        folder = tmp_path / str(number)
+        files = written(folder, 1.0)
+        ended = not killed(lambda folder=folder: written(folder, 2.0), number, folder)
+        results.append(read(files))
+        assert results[-1] in ((1.0, 1.0), (2.0, 2.0))
+        assert read(written(folder, 3.0)) == (3.0, 3.0)
+        assert sorted(path.name for path in folder.iterdir()) == ["model.json", "model.safetensors"]
+        shutil.rmtree(folder)
+        if ended:
+            break
+    assert (results[0], results[-1]) == ((1.0, 1.0), (2.0, 2.0))
+
+
+def test_threshold_shares_false_alarms_among_hypotheses(model: HealthModel) -> None:
+    for rate in (1e-3, 1e-5):
+        threshold = replace(model, false_alarm_rate=rate).threshold
+        assert np.exp(-threshold) == pytest.approx(rate / len(HYPOTHESES))
+
+
+def test_find_dead_fibres() -> None:
+    """Constant, missing, or at an end of the range for more than half of the time, which most fibres are not."""
+    rng = np.random.default_rng(0)
+    readings = 1.5 + 0.01 * rng.standard_normal((1000, 9))
+    readings[:, 1] = 1.5
+    readings[:510, 2] = readings[:, 2].max()
+    readings[:490, 3] = readings[:, 3].max()
+    readings[:510, 4] = readings[:, 4].min()
+    readings[:510, 5] = np.nan
+    readings[:490, 6] = np.nan
+    for fibre, size in ((7, 0.99), (8, 1.01)):
+        readings[:, fibre] = 1.5 + size * MIN_SCALE_V * rng.permutation(np.linspace(0, 1, 1000))
+    assert find_dead_fibres(readings).tolist() == [1, 2, 4, 5, 7]
+
+
+@pytest.mark.parametrize(
+    ("scale", "presses", "message"),
+    [
+        (1, MIN_PRESSES - 1, f"299 complete presses, health is learnt from {MIN_PRESSES}"),
+        (0, TRAINED, "all 6 fibres are dead"),
+    ],
+)
+def test_fit_refuses_few_presses_and_dead_pads(pad: Recording, scale: float, presses: int, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        fit(scale * pad.readings, pad, presses)
+
+
+@pytest.mark.slow
+def test_few_presses_never_detect_a_reduced_gain(pad: Recording) -> None:
+    model = fit(pad.readings, pad, FEW)
+    start = part_of(pad, 0, FEW, int(pad.down_command[FEW]))
+    assert not detector_of(model).predict(start)
+    faults = detect_later(model, plant(pad, "reduced_gain"), pad, FEW)
+    assert "reduced_gain" not in {fault.kind for fault in faults}

@@ -1,0 +1,146 @@
+"""Traces, their principal components and scales, and the prediction of each fibre from the others."""
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from padforge.sense.health.trace_model import (
+    COMPONENTS,
+    INPUTS,
+    LOG_STD,
+    MEMBERS,
+    RELEASED,
+    REST,
+    TARGETS,
+    TRACE,
+    TraceHistory,
+    TracePCA,
+    extract_trace,
+    extract_traces,
+    predict_fibres,
+)
+
+FIBRES = 2
+
+
+def test_project_follows_response_rest_and_history() -> None:
+    rng = np.random.default_rng(0)
+    traces = rng.normal(0, 1, (120, FIBRES, TRACE)) + np.linspace(0, 3, 120)[:, None, None]
+    traces[5, 1, 3] = np.nan
+    components = rng.normal(0, 1, (FIBRES, TRACE, COMPONENTS))
+    pca = TracePCA(components, np.ones((FIBRES, INPUTS)), np.ones((FIBRES, TARGETS)))
+    history = TraceHistory.initial(FIBRES)
+    levels, residue, count = [math.nan] * FIBRES, np.zeros((FIBRES, COMPONENTS)), [0] * FIBRES
+    for trace in traces:
+        inputs, targets = pca.project(trace, history)
+        for fibre in range(FIBRES):
+            if np.isnan(trace[fibre]).any():
+                assert np.isnan(inputs[fibre, : COMPONENTS + 1]).all()
+                assert np.isnan(targets[fibre]).all()
+                continue
+            rest = trace[fibre, :REST].mean()
+            response = (trace[fibre] - rest) @ components[fibre]
+            level = rest if math.isnan(levels[fibre]) else levels[fibre]
+            np.testing.assert_allclose(inputs[fibre], [*response, rest - level, *residue[fibre]], atol=1e-9)
+            np.testing.assert_allclose(targets[fibre], [*response, rest - level], atol=1e-9)
+            count[fibre] += 1
+            levels[fibre] = level + max(1 / 50, 1 / count[fibre]) * (rest - level)
+            residue[fibre] = 0.7 * (residue[fibre] + response)
+        np.testing.assert_allclose(history.level, levels, atol=1e-9)
+        np.testing.assert_array_equal(history.n_presses, count)
+
+
+def test_scale_clips_inputs_and_zeroes_missing_fibres() -> None:
+    pca = TracePCA(np.empty(0), np.full((FIBRES, INPUTS), 2.0), np.full((FIBRES, TARGETS), 4.0))
+    inputs = np.array([[3.0] * INPUTS, [np.nan] * INPUTS])
+    inputs[0, :2] = 100, -100
+    scaled, targets = pca.scale(inputs, np.full((FIBRES, TARGETS), 6.0))
+    assert scaled[0, :3].tolist() == [8, -8, 1.5]
+    assert not scaled[1].any()
+    assert (targets == 1.5).all()
+
+
+def test_fit_transform_finds_principal_directions_and_scales() -> None:
+    rng = np.random.default_rng(1)
+    patterns = np.linalg.qr(rng.normal(0, 1, (TRACE - REST, 3)))[0].T
+    amplitudes = np.array([5.0, 2.0, 0.5]) * rng.normal(0, 1, (400, FIBRES, 3))
+    traces = np.zeros((400, FIBRES, TRACE))
+    traces[:, :, REST:] = np.einsum("qck,kw->qcw", amplitudes, patterns)
+    pca, inputs, targets = TracePCA.fit_transform(traces)
+    for fibre in range(FIBRES):
+        for component, pattern in enumerate(patterns):
+            assert abs(pca.components[fibre, REST:, component] @ pattern) > 0.98
+        rms = np.sqrt(((traces[:, fibre] @ pca.components[fibre]) ** 2).mean(axis=0))
+        largest = max(rms.max(), pca.input_scale_v[fibre].max())
+        np.testing.assert_allclose(pca.input_scale_v[fibre, :3], np.sqrt(rms[:3] * largest), rtol=1e-6)
+        np.testing.assert_allclose(pca.target_scale_v[fibre, :3], rms[:3])
+    assert inputs.shape == (400, FIBRES, INPUTS)
+    np.testing.assert_allclose(np.sqrt((targets[:, :, :3] ** 2).mean(axis=0)), 1)
+
+
+def random_weights(fibres: int, rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
+    hidden, outputs = 7, 2 * TARGETS
+    shapes = {
+        "first.w": (MEMBERS, fibres, INPUTS, hidden),
+        "first.mask": (MEMBERS, fibres, hidden),
+        "first.b": (MEMBERS, hidden),
+        "hidden.w": (MEMBERS, hidden, hidden),
+        "hidden.b": (MEMBERS, hidden),
+        "last.w": (MEMBERS, fibres, hidden, outputs),
+        "last.b": (MEMBERS, fibres, outputs),
+    }
+    return {name: (0.5 * rng.standard_normal(shape)).astype(np.float32) for name, shape in shapes.items()}
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**32 - 1), fibres=st.integers(1, 5))
+def test_predict_fibres_ignores_the_fibre_itself_and_masked_ones(seed: int, fibres: int) -> None:
+    rng = np.random.default_rng(seed)
+    weights = random_weights(fibres, rng)
+    inputs = rng.standard_normal((3, fibres, INPUTS)).astype(np.float32)
+    fibre_mask = rng.random((3, fibres)) < 0.7
+    mean, std = predict_fibres(weights, inputs, fibre_mask)
+    for press, fibre in np.ndindex(3, fibres):
+        means, variances = [], []
+        for e in range(MEMBERS):
+            h = weights["first.b"][e].astype(float)
+            for c in range(fibres):
+                if c != fibre and fibre_mask[press, c]:
+                    h = h + inputs[press, c] @ weights["first.w"][e, c] + weights["first.mask"][e, c]
+            h = h / (1 + np.exp(-h))
+            h = h @ weights["hidden.w"][e] + weights["hidden.b"][e]
+            h = h / (1 + np.exp(-h))
+            out = h @ weights["last.w"][e, fibre] + weights["last.b"][e, fibre]
+            means.append(out[:TARGETS])
+            variances.append(np.exp(2 * np.clip(out[TARGETS:], *LOG_STD)))
+        assert np.allclose(mean[press, fibre], np.mean(means, axis=0), atol=1e-4)
+        total = np.mean(variances, axis=0) + np.var(means, axis=0)
+        assert np.allclose(std[press, fibre], np.sqrt(total), rtol=1e-3, atol=1e-4)
+
+
+def test_extract_trace_fills_within_the_press() -> None:
+    readings = np.arange(100.0)[:, None] * [1.0, 2.0]
+    complete = extract_trace(readings, down_command=30, up_command=55, first=0, end=100)
+    assert complete.shape == (2, TRACE)
+    assert complete[0].tolist() == [*range(20, 50), *range(55, 75)]
+    short = extract_trace(readings, down_command=30, up_command=34, first=28, end=36)
+    assert short[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
+    # The next press begins before a reading of the release was taken.
+    unreleased = extract_trace(readings, down_command=30, up_command=55, first=0, end=55)
+    assert unreleased[0, :-RELEASED].tolist() == [*range(20, 50)]
+    assert np.isnan(unreleased[:, -RELEASED:]).all()
+
+
+def test_extract_traces_has_nan_where_the_recording_ends() -> None:
+    readings = np.arange(100.0)[:, None] * [1.0, 2.0]
+    down_command, up_command = np.array([10, 50]), np.array([30, 70])
+    for end in (70, 74, 90):
+        first, last = extract_traces(readings[:end], down_command, up_command)[:, 0]
+        assert first[-RELEASED:].tolist() == [*range(30, 50)]
+        assert np.array_equal(last, [*range(40, 70), *range(70, end), *[np.nan] * (90 - end)], equal_nan=True)
+    # One that the next press cuts short is filled.
+    first, _ = extract_traces(readings, down_command, np.array([45, 70]))[:, 0]
+    assert first[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]

@@ -1,0 +1,157 @@
+"""Simulated recordings: their form, the responses of plans and twins, and settings that are measured in them."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from padforge.design import InputError, Morphology, Twin
+from padforge.design.contact import relative_stretch
+from padforge.design.settings import PadSettings
+from padforge.design.twin import PlanTransform, TwinChannel, TwinReadings
+from padforge.sense import Recording, RigSettings, simulate
+from padforge.sense.simulation.simulated_recording import measure_rig_settings, model_twin
+
+GRID = Morphology.straight(4)
+PAD = Morphology.straight(2)
+GAINS = (-0.06, -0.04, -0.05)
+IDEAL: dict[str, Any] = {"noise_mv": 0.0, "drift_mv": 0.0}
+DISTANCE_MM, WEIGHT = 11.25 * np.linspace(0, 1.2, 9), np.append(np.exp(-0.5 * (np.linspace(0, 1.05, 8) / 0.5) ** 2), 0)
+
+
+def twin_of(frame: PlanTransform | None = None, noise_v: float = 0.0, readings: TwinReadings | None = None) -> Twin:
+    """Channel 1 is dead; 0, 2 and 3 read the fibres 3, 0 and 1 of a straight pad."""
+    wired = [(3, GAINS[0]), (None, 0.0), (0, GAINS[1]), (1, GAINS[2])]
+    channels = tuple(TwinChannel(c, fibre, gain, noise_v, 0.9) for c, (fibre, gain) in enumerate(wired))
+    as_built = *(PAD.to_mm(line) for line in PAD.knots[[0, 1]]), None, PAD.to_mm(PAD.knots[3])
+    profile = DISTANCE_MM, WEIGHT
+    return Twin(PAD, channels, frame or PlanTransform(), *profile, as_built, 0.02, (22.5, 22.5), 900, readings=readings)
+
+
+def responses(recording: Recording) -> np.ndarray:
+    """(Q, C) V, means while held minus the rest before."""
+    cycles = recording.readings.reshape(len(recording.presses_mm), 40, -1)
+    return cycles[:, 25:40].mean(axis=1) - cycles[:, 8:20].mean(axis=1)
+
+
+def test_simulate_has_the_published_protocol() -> None:
+    recording = simulate(GRID, RigSettings(presses=400))
+    assert recording.readings.shape == (16_000, 8)
+    assert np.array_equal(recording.down_command, 40 * np.arange(400) + 20)
+    assert np.array_equal(recording.up_command, recording.down_command + 20)
+    assert np.abs(recording.presses_mm).max() <= 22.5
+    assert np.abs(recording.presses_mm).max(axis=0).min() > 21
+    assert recording.rate_hz == pytest.approx(13.3, rel=0.02)
+    assert simulate(GRID, RigSettings(presses=1)).source["sensed_mm"] == "beyond"
+
+
+def test_simulate_presses_within_the_sensed_rectangle() -> None:
+    strip = simulate(GRID, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8)))
+    assert strip.source["sensed_mm"] == [50, 8]
+    np.testing.assert_allclose(np.abs(strip.presses_mm).max(axis=0), [25, 4], rtol=0.02)
+    with pytest.raises(InputError, match=r"sensed_mm: got .*the pad itself is 56\.25 mm"):
+        simulate(GRID, RigSettings(presses=1), size=PadSettings(sensed_mm=(57, 8)))
+
+
+def test_simulate_responds_in_proportion_to_depth() -> None:
+    ideal = {**IDEAL, "creep": 0.0, "hysteresis": 0.0}
+    depths = ((1.0,), (4.0,), (1.0, 4.0))
+    light, deep, mixed = (simulate(GRID, RigSettings(presses=40, depths_mm=each, **ideal)) for each in depths)
+    assert mixed.depths_mm.tolist() == [1.0, 4.0] * 20
+    assert np.array_equal(mixed.presses_mm, deep.presses_mm)
+    cycles = [each.readings.reshape(40, 40, 8) for each in (light, deep, mixed)]
+    assert np.array_equal(cycles[2][0::2, 20:], cycles[0][0::2, 20:])
+    assert np.array_equal(cycles[2][1::2, 20:], cycles[1][1::2, 20:])
+    swing = [np.abs(each[:, 39] - each[:, 15]).sum() for each in cycles[:2]]
+    assert swing[1] / swing[0] == pytest.approx(4, rel=0.05)
+
+
+def test_simulate_twin_has_its_wiring_and_gains() -> None:
+    twin = twin_of(PlanTransform(turn_deg=5, shift_mm=(2, -1), scale=0.9))
+    recording = simulate(twin, RigSettings(presses=200, hysteresis=0, **IDEAL))
+    expected = np.zeros((200, 4))
+    expected[:, [0, 2, 3]] = GAINS * twin.as_built_stretch(recording.presses_mm)[:, [3, 0, 1]]
+    result = responses(recording)
+    assert result == pytest.approx(expected, abs=4e-3)  # creep of the press before, and steps of the converter
+    assert np.corrcoef(result[:, 0], expected[:, 0])[0, 1] > 0.999
+    assert result[:, [0, 2, 3]].min(axis=0) == pytest.approx(expected[:, [0, 2, 3]].min(axis=0), rel=0.05)
+
+
+def test_simulate_twin_is_reproducible_and_its_dead_channel_has_noise_alone() -> None:
+    twin, rig = twin_of(noise_v=0.02), RigSettings(presses=200, drift_mv=0, noise_mv=2)
+    recording = simulate(twin, rig)
+    assert recording == simulate(twin, rig) != simulate(twin, rig.model_copy(update={"seed": 4}))
+    dead, live = recording.readings[:, 1], recording.readings[:, 0]
+    assert dead.std() == pytest.approx(2e-3, rel=0.05)
+    assert live.std() > 5 * dead.std()
+
+
+def test_model_twin_follows_the_plan_transform() -> None:
+    positions = np.array([[4.0, 3.0], [-7.0, 1.0], [2.0, -9.0]])
+    plain, mirrored = (model_twin(twin_of(PlanTransform(mirrored=mirrored))) for mirrored in (False, True))
+    assert mirrored.responses(positions * [-1, 1]) == pytest.approx(plain.responses(positions))
+    assert np.abs(mirrored.responses(positions) - plain.responses(positions)).max() > 0.01
+    twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
+    for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
+        recording = simulate(replace(twin, frame=PlanTransform(turn_deg=turn_deg)), RigSettings(presses=400))
+        assert np.ptp(recording.presses_mm, axis=0) == pytest.approx(sides, rel=0.02)
+    turned = replace(twin, frame=PlanTransform(turn_deg=10, scale=0.8))
+    half = np.array(model_twin(turned).corners_mm[1])
+    spans = np.ptp(turned.frame.to_plan(half * [[-1, -1], [-1, 1], [1, 1], [1, -1]]), axis=0)
+    assert spans == pytest.approx((20, 10))
+
+
+@pytest.mark.parametrize(
+    ("information_gain", "rig"), [(1.0, {}), (4.0, {}), (1.0, {"drift_mv": 100.0, "noise_mv": 5.0})]
+)
+def test_simulate_twin_scatters_by_its_noise(information_gain: float, rig: dict) -> None:
+    """With an information gain of 4 by half of it; what was measured takes precedence."""
+    measured = {"noise_mv": 1.6, "drift_mv": 10.0, "hysteresis": 0.0, "hysteresis_s": 12.0} | rig
+    twin = twin_of(noise_v=0.012, readings=TwinReadings(**measured, information_gain=information_gain))
+    recording = simulate(twin, RigSettings(presses=1500, creep=0))
+    assert recording.source["rig"].items() >= (measured | {"creep": 0}).items()
+    scatter = responses(recording) - model_twin(twin).responses(recording.presses_mm)
+    assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / information_gain**0.5, rel=0.08)
+
+
+def test_simulate_like_twin_has_its_profile_and_median_gain() -> None:
+    twin = twin_of(PlanTransform(mirrored=True, shift_mm=(3, 3)))
+    other = Morphology.random(3, knots=2, seed=1, pitch_mm=9)
+    recording = simulate(other, RigSettings(presses=100, hysteresis=0, creep=0, **IDEAL), like=twin)
+    expected = -0.05 * relative_stretch(other, other.to_grid(recording.presses_mm), twin.contact())
+    assert responses(recording) == pytest.approx(expected, abs=1e-3)
+    assert recording.source["contact"] == twin.contact().model_dump(mode="json")
+    assert recording.source["twin"]["presses"] == 900
+    assert np.abs(recording.presses_mm).max() == pytest.approx(13.5, rel=0.02)
+
+
+def test_simulate_refuses_wrong_arguments() -> None:
+    dead = replace(twin_of(), channels=tuple(TwinChannel(c, None, 0.0, 0.0, 0.0) for c in range(2)))
+    for pad, like in ((dead, None), (PAD, dead)):
+        with pytest.raises(InputError, match="twin: none of its channels reads a fibre"):
+            simulate(pad, RigSettings(presses=3), like=like)
+    with pytest.raises(InputError, match="fibres of the pad is 600, allowed is a whole number from 1 to 512"):
+        simulate(Morphology.straight(300), RigSettings(presses=3), like=twin_of())
+    with pytest.raises(InputError, match="plan is adaptive"):
+        simulate(PAD, RigSettings(plan="adaptive"))
+
+
+@pytest.mark.parametrize("values", [(1.8, 12.0, 0.4, 15.0), (3.0, 25.0, 0.3, 6.0)])
+def test_measure_rig_settings_recovers_those_of_a_simulation(values: tuple[float, ...]) -> None:
+    names = ("noise_mv", "drift_mv", "hysteresis", "hysteresis_s")
+    rig: dict[str, Any] = dict(zip(names, values, strict=True))
+    measured = measure_rig_settings(simulate(PAD, RigSettings(presses=1500, **rig)))
+    for name, value, rel in zip(names, values, (0.05, 0.3, 0.2, 0.35), strict=True):
+        assert measured[name] == pytest.approx(value, rel=rel), name
+
+
+def test_measure_rig_settings_ignores_incomplete_channels_and_few_presses() -> None:
+    assert measure_rig_settings(simulate(PAD, RigSettings(presses=90))) == {}
+    recording = simulate(PAD, RigSettings(presses=200))
+    readings = np.column_stack([recording.readings, np.full(len(recording.readings), 1.5), recording.readings[:, 0]])
+    readings[1000, 5] = np.nan
+    presses = {name: getattr(recording, name) for name in ("presses_mm", "down_command", "up_command")}
+    with_bad = Recording(readings, recording.times_s, **presses)
+    assert measure_rig_settings(with_bad) == measure_rig_settings(recording)
+    assert measure_rig_settings(Recording(readings[:, 4:], recording.times_s, **presses)) == {}
