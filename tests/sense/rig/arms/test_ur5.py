@@ -168,7 +168,7 @@ def test_connect_refuses_arm_in_use_on_this_computer(robot: EmulatedUR5, arm: UR
     arm.move(LOW, 50, 500)
     (diagnosis,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
     assert diagnosis.status == "fail"
-    assert "another program on this computer uses the arm" in diagnosis.found
+    assert "another program on this computer uses the arm" in diagnosis.message
     assert arm.state().moving
     arm.stop()
 
