@@ -34,10 +34,10 @@ def test_finger_presses_where_asked_lifts_and_errs() -> None:
     assert (late > [REACTION_S[0], 0]).all()
     assert (late < np.array([REACTION_S[1], REACTION_S[1] / 2]) + 0.04).all()
     assert min(stroke.depth_mm for stroke in finger.strokes) >= 3.5
-    assert finger.said() == []
+    assert finger.commands() == []
     finger.look({"phase": "lift", "target": (5.0, -5.0)})  # it touches nothing where it is told to lift
     finger.volts(150.0 + np.arange(1, 201) / RATE_HZ)
-    assert finger.said() == ["free"]
+    assert finger.commands() == ["free"]
     strokes = pressed(1.0, 40).strokes
     assert {stroke.kind for stroke in strokes} == {*MISHAPS, "echo"}
     for before, stroke in pairwise(strokes):
