@@ -186,7 +186,7 @@ class RigConfig:
     folder: Path = Path()
 
 
-def make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
+def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
     """Return the stored plan of a resumed recording, otherwise the one that `rig` asks for."""
     if resume and (config.out / START).exists():
         plan = PressPlan.of(read_source(config, rig, KIND)["plan"]["presses"])

@@ -25,7 +25,7 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import Free, PressPlan, free_of, size_of, uniform
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import refuse_begun, refuse_existing
-from padforge.sense.rig.config import RigConfig, locate_on_bed, make_plan, open_recorder, plan_notice
+from padforge.sense.rig.config import RigConfig, locate_on_bed, load_or_make_plan, open_recorder, plan_notice
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
 from padforge.sense.rig.press_loop import Interrupts, OnProgress, PressLoop, check_plan
@@ -177,7 +177,7 @@ def record(
     """
     with opened as (arm, board, rig):
         with Interrupts() as interrupts:
-            plan = make_plan(config, rig, resume)
+            plan = load_or_make_plan(config, rig, resume)
             planner = _make_planner(config, rig, model)
             check_plan(plan, rig)
             if resume and (notice := plan_notice(config)):

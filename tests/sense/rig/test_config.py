@@ -21,7 +21,14 @@ from padforge.design.twin import PlanTransform
 from padforge.fabricate import build
 from padforge.sense.recording.press_plan import PressPlan, planned
 from padforge.sense.recording.run_directory import START
-from padforge.sense.rig.config import RigConfig, RobotFrame, locate_on_bed, make_plan, open_recorder, plan_notice
+from padforge.sense.rig.config import (
+    RigConfig,
+    RobotFrame,
+    locate_on_bed,
+    load_or_make_plan,
+    open_recorder,
+    plan_notice,
+)
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.press_loop import check_plan
 from padforge.sense.settings import RigSettings
@@ -159,7 +166,7 @@ def config_of(out: Path, pad: Morphology = PAD) -> RigConfig:
 
 
 def resumed_plan(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
-    return make_plan(config_of(out, pad), RIG.model_copy(update=settings), resume=True).document()
+    return load_or_make_plan(config_of(out, pad), RIG.model_copy(update=settings), resume=True).document()
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +182,7 @@ def test_make_plan_reads_a_file(tmp_path):
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
     rig = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
     assert rig.plan_file == tmp_path / "places.csv"
-    assert make_plan(config_of(tmp_path / "run"), rig, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
+    assert load_or_make_plan(config_of(tmp_path / "run"), rig, resume=False).document() == [[1, 2, 3], [-3.5, 4, 3]]
     assert RigSettings(plan="grid").plan_file is None
 
 
@@ -196,7 +203,7 @@ def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
     hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
     config = replace(config_of(tmp_path, pad), pad_settings=PadSettings(keep_out_mm=(hole,)))
     with pytest.raises(InputError, match=r"press 2, at .* lies in a keep-out"):
-        make_plan(config, RIG, resume=True)
+        load_or_make_plan(config, RIG, resume=True)
 
 
 CHANGES: dict[str, Any] = {
@@ -211,7 +218,7 @@ CHANGES: dict[str, Any] = {
 def test_resume_refuses_settings_that_change_a_press(run):
     for key, value in CHANGES.items():
         with pytest.raises(InputError, match=re.escape(f"[rig] {key}: got {value}, the recording")):
-            make_plan(config_of(run), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
+            load_or_make_plan(config_of(run), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
 
 
 def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
