@@ -27,14 +27,14 @@ _MAX_BUCKETS = 60
 _MIN_STEP, _MAX_STEP = 0.5, 1.5  # between two returned times, in periods, while a changed line is caught up with
 
 
-class Block(Protocol):
+class SampleBlock(Protocol):
     """Samples that came together, (n, C) of them."""
 
     @property
     def counts(self) -> Any: ...
 
 
-B = TypeVar("B", bound=Block)
+B = TypeVar("B", bound=SampleBlock)
 
 
 class BlockReader(threading.Thread, Generic[B]):
