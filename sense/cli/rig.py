@@ -204,7 +204,7 @@ def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -
 
         def poll_commands() -> list[str]:
             by_key = (commands[key] for key in typed() if key in commands)
-            return [*page.read_commands(), *by_key, *(finger.said() if finger is not None else ())]
+            return [*page.read_commands(), *by_key, *(finger.commands() if finger is not None else ())]
 
         return record_by_hand(config, board, show, poll_commands, resume)
 

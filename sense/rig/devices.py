@@ -12,7 +12,9 @@ import os
 import platform
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -206,17 +208,53 @@ def host_ports() -> list[Any]:
     return list(comports())
 
 
-def open_port(port: str, baud: int, timeout_s: float) -> Any:
-    """Open a serial port exclusively, as a `serial.Serial` whose reads wait for at most `timeout_s`.
+class SerialStream:
+    """An open serial port. Any method but `close` raises RigFault("lost") once the device is gone."""
 
-    Raises:
-        RigFault: "refused" if it cannot be opened, and why.
-    """
-    serial = _import_pyserial()
-    try:
-        return serial.Serial(port, baud, timeout=timeout_s, write_timeout=1, exclusive=True)
-    except Exception as error:  # pyserial lets termios.error through, which is no OSError
-        raise port_fault(port, error) from error
+    def __init__(self, port: str, baud: int, timeout_s: float, device: str = "board") -> None:
+        """Open a port for this process alone.
+
+        Args:
+            port: its name.
+            baud: of the device.
+            timeout_s: longest wait of `receive`.
+            device: what is there, for messages.
+
+        Raises:
+            RigFault: "refused" if it cannot be opened, and why.
+        """
+        serial = _import_pyserial()
+        self.port, self._device = port, device
+        try:
+            self.serial: Any = serial.Serial(port, baud, timeout=timeout_s, write_timeout=1, exclusive=True)
+        except Exception as error:  # pyserial lets termios.error through, which is no OSError
+            raise port_fault(port, error) from error
+
+    def receive(self) -> tuple[float, bytes]:
+        """Wait for bytes; return the host time and all that have come, possibly none."""
+        try:
+            data = self.serial.read(1)
+            if data:
+                data += self.serial.read(self.serial.in_waiting)
+        except OSError as error:
+            raise self._lost(error) from error
+        return time.monotonic(), data
+
+    def send(self, data: bytes) -> None:
+        """Send all of `data`."""
+        try:
+            self.serial.write(data)
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        with suppress(OSError):
+            self.serial.close()
+
+    def _lost(self, error: OSError) -> RigFault:
+        message = f"{self.port}: the {self._device} is gone ({error})"
+        return RigFault("lost", message, "check its cable and connect again")
 
 
 def port_fault(port: str, error: Exception) -> RigFault:

@@ -96,7 +96,7 @@ class Finger:
         """See what is displayed: its "phase" and "target", [x, y] mm."""
         self._view = view
 
-    def said(self) -> list[str]:
+    def commands(self) -> list[str]:
         """Return its commands: that the pad is free, if it has long been asked to lift."""
         waits = self._view["phase"] == "lift" and bool(self.strokes)
         return ["free"] if waits and self._now_s > self.strokes[-1].up_s + PATIENCE_S else []

@@ -1,4 +1,4 @@
-"""A simulated pad that a finger presses at random, in real time: a converter to watch where there is no hardware."""
+"""A simulated pad that a finger presses at random, in real time: a board to watch without hardware."""
 
 import math
 import time
@@ -23,11 +23,12 @@ from padforge.sense.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
 from padforge.sense.simulation.simulated_recording import sample_positions
 
 
-class SimulatedConverter:
-    """The converter of the simulated rig, `rate_hz` of which is its own; implements `Board`.
+class VirtualPad:
+    """A board that samples a simulated pad at `[rig] rate_hz`; implements `Board`.
 
-    The pad is the one that `simulate` records with the same arguments, down to the rests of its fibres. Presses come
-    as often and are held as long as there, at other places, and as deep as `[rig]` says, its depths in turn.
+    The pad is the one that `simulate` records with the same arguments, down to the readings of its fibres at rest.
+    Presses come as often and are held as long as there, at other positions, and as deep as `[rig]` says, its depths in
+    turn.
     """
 
     def __init__(
@@ -38,52 +39,61 @@ class SimulatedConverter:
         clock: Callable[[], float] = time.monotonic,
         size: PadSettings | None = None,
     ) -> None:
+        """Make the pad; sampling starts with `connect`.
+
+        Args:
+            pad: what is pressed.
+            rig: rate, presses, noise of the pad, seed.
+            contact: what a press deforms.
+            clock: time in s.
+            size: sensed area and keep-outs; those of the pad if None.
+        """
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
-            make_plan(pad, rig, rng, size)  # the presses of the recording, drawn before the pad is
+            make_plan(pad, rig, rng, size)  # the presses of the recording are drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig, self._clock = pad, contact, rig, clock
         self._depths_mm = rig.depths_mm or (rig.depth_mm,)
         self._size = size
-        self._finger = rng.spawn(1)[0]
-        self._started_s: float | None = None
-        self._count = 0
-        self._press, self._place_mm = -1, np.zeros(2)
+        self._position_rng = rng.spawn(1)[0]
+        self._start_s: float | None = None
+        self._n_samples = 0
+        self._press, self._position_mm = -1, np.zeros(2)
 
     def connect(self) -> Mapping[str, Any]:
-        """Begin; see `Board`."""
+        """Start sampling; see `Board`."""
         signals(self._pad, self._pad.to_grid([[0.0, 0.0]]), self._contact)  # compiled before it has to keep up
-        self._started_s, self._count = self._clock(), 0
+        self._start_s, self._n_samples = self._clock(), 0
         fibres = len(self._pad.knots)
-        named = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
-        return {**named, "rate_hz": self._rig.rate_hz, "supply_v": SUPPLY_V}
+        identity = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
+        return {**identity, "rate_hz": self._rig.rate_hz, "supply_v": SUPPLY_V}
 
     def read(self) -> BoardSamples:
-        """All samples since the last call; see `Board`. Raises RigFault("refused") before `connect`."""
-        if self._started_s is None:
+        """Return all samples since the last call; see `Board`. Raises RigFault("refused") before `connect`."""
+        if self._start_s is None:
             raise RigFault("refused", "the simulated rig is not connected")
-        count = math.floor((self._clock() - self._started_s) * self._rig.rate_hz)
-        elapsed_s = np.arange(self._count + 1, count + 1) / self._rig.rate_hz
-        self._count = count
-        touches = [self._touch(at_s) for at_s in elapsed_s.tolist()]
-        positions_mm = np.array([place for place, _ in touches]).reshape(-1, 2)
+        count = math.floor((self._clock() - self._start_s) * self._rig.rate_hz)
+        elapsed_s = np.arange(self._n_samples + 1, count + 1) / self._rig.rate_hz
+        self._n_samples = count
+        touches = [self._touch(time_s) for time_s in elapsed_s.tolist()]
+        positions_mm = np.array([position for position, _ in touches]).reshape(-1, 2)
         volts = self._model.volts(positions_mm, np.array([depth for _, depth in touches]))
-        return BoardSamples(self._started_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
+        return BoardSamples(self._start_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
 
     def close(self) -> None:
-        """Nothing is open; see `Board`."""
+        """Do nothing, for nothing is open; see `Board`."""
 
-    def _touch(self, at_s: float) -> tuple[Array, float]:
-        """Where the finger is, and how deep, mm: it comes down in the middle of a cycle and goes up at its end."""
+    def _touch(self, time_s: float) -> tuple[Array, float]:
+        """Return the finger's position and depth, mm: it is down in the second half of every cycle."""
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
-        press, within_s = divmod(at_s, cycle_s)
+        press, elapsed_s = divmod(time_s, cycle_s)
         if press > self._press:
-            self._press, self._place_mm = press, sample_positions(self._pad, 1, self._finger, self._size)[0]
-        down = min((within_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - within_s) / TRAVEL_S)
-        return self._place_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(down, 0.0)
+            self._press, self._position_mm = press, sample_positions(self._pad, 1, self._position_rng, self._size)[0]
+        share = min((elapsed_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - elapsed_s) / TRAVEL_S)
+        return self._position_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(share, 0.0)
 
 
-def virtual_pad_of(model: Path) -> SimulatedConverter:
+def virtual_pad_of(model: Path) -> VirtualPad:
     """Return the simulated pad whose recording a model was trained on.
 
     Args:
@@ -107,7 +117,7 @@ def virtual_pad_of(model: Path) -> SimulatedConverter:
         size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
-    return SimulatedConverter(
+    return VirtualPad(
         pad,
         validate(RigSettings, rig, f"{path}: rig"),
         validate(Contact, contact, f"{path}: contact"),

@@ -1,1 +1,1 @@
-"""Arms that press: one folder for each kind."""
+"""Arms that press: drivers of a UR5 and of a 3D printer."""

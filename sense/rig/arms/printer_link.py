@@ -11,7 +11,7 @@ from operator import xor
 from typing import Any
 
 from padforge.sense.rig.arms.motion import Position
-from padforge.sense.rig.devices import Cause, RigFault, open_port
+from padforge.sense.rig.devices import Cause, RigFault, SerialStream
 
 FIRMWARE = "Marlin"
 HALTED = ("halted", "kill()", "STOP called", "stopped")
@@ -124,8 +124,8 @@ class MarlinLink:
     def __init__(self, port: str, baud: int) -> None:
         """Open `port` exclusively; raises RigFault("refused") where that fails."""
         self._port = port
-        self._serial = open_port(port, baud, _READ_S)
-        _keep_running(self._serial)
+        self._stream = SerialStream(port, baud, _READ_S, "printer")
+        _keep_running(self._stream.serial)
         self._text = b""
         self._number = 0
         self._history: deque[bytes] = deque(maxlen=_MAX_HISTORY)
@@ -139,7 +139,7 @@ class MarlinLink:
         """
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
-            self._write(b"\n" + number_line(0, "M110 N0"))
+            self._stream.send(b"\n" + number_line(0, "M110 N0"))
             if any(map(_is_confirmation, list(self._read_until_silent()))):
                 self._connected = True
                 return
@@ -166,7 +166,7 @@ class MarlinLink:
         n_sent = n_bad_resends = requested = 0
         while (now := time.monotonic()) < deadline:
             if now >= resend_s:
-                self._write(self._history[-1])
+                self._stream.send(self._history[-1])
                 answer, resend_s, n_sent = [], now + _RESEND_S, n_sent + 1
             for line in self._receive():
                 resend_s = time.monotonic() + _RESEND_S
@@ -195,12 +195,11 @@ class MarlinLink:
     def send_unnumbered(self, command: str) -> None:
         """Send a command ahead of all others, from any thread; never raises."""
         with suppress(RigFault):
-            self._write(b"\n" + command.encode("ascii") + b"\n")
+            self._stream.send(b"\n" + command.encode("ascii") + b"\n")
 
     def close(self) -> None:
         """Close the port; never raises."""
-        with suppress(OSError):
-            self._serial.close()
+        self._stream.close()
 
     def _resend_before(self, number: int) -> bool:
         """Send the lines from `number` up to the latest, without it; return whether they are in the history."""
@@ -208,7 +207,7 @@ class MarlinLink:
         if not 0 <= back < len(self._history):
             return False
         for line in list(self._history)[len(self._history) - 1 - back : -1]:
-            self._write(line)
+            self._stream.send(line)
             list(self._read_until_silent())
         return True
 
@@ -223,13 +222,7 @@ class MarlinLink:
 
     def _receive(self) -> list[str]:
         """Return the lines that have come, after waiting for at most `_READ_S`."""
-        try:
-            data = self._serial.read(1)
-            if data:
-                data += self._serial.read(self._serial.in_waiting)
-        except OSError as error:
-            raise self._lost(error) from error
-        *lines, self._text = (self._text + data).split(b"\n")
+        *lines, self._text = (self._text + self._stream.receive()[1]).split(b"\n")
         texts = [line.decode("ascii", "replace").strip() for line in lines]
         for text in texts:
             self._check_running(text)
@@ -245,15 +238,6 @@ class MarlinLink:
             self.halted = True
             message = f"{self._port}: the printer has halted ({line.removeprefix('Error:')})"
             raise RigFault("emergency_stop", message, f"switch it off and on, {HOMING_ADVICE}")
-
-    def _write(self, data: bytes) -> None:
-        try:
-            self._serial.write(data)
-        except OSError as error:
-            raise self._lost(error) from error
-
-    def _lost(self, error: OSError) -> RigFault:
-        return RigFault("lost", f"{self._port}: the printer is gone ({error})", "check its cable and connect again")
 
 
 def _keep_running(serial: Any) -> None:

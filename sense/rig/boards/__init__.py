@@ -1,1 +1,1 @@
-"""Boards that read the fibres: one folder for each kind."""
+"""Boards that read the fibres: drivers, wire formats and firmware."""

@@ -1,19 +1,18 @@
-"""What all boards need: a serial port, a thread that drains it into a buffer, and the host times of the samples."""
+"""What all boards need: a thread that drains the port into a buffer, and the host times of the samples."""
 
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.rig.devices import RigFault, open_port
+from padforge.sense.rig.devices import RigFault
 
 POLL_S = 0.1
-"""Longest wait of `ByteStream.receive`."""
+"""Longest wait for bytes."""
 SETTLE_S = 0.5
 """Time of blocks before the first samples are returned, so that their times rest on more than one arrival."""
 BUFFER_S = 60.0
@@ -28,48 +27,14 @@ _MAX_BUCKETS = 60
 _MIN_STEP, _MAX_STEP = 0.5, 1.5  # between two returned times, in periods, while a changed line is caught up with
 
 
-class ByteStream:
-    """An open serial port. Any method but `close` raises RigFault("lost") once the board is gone."""
-
-    def __init__(self, port: str, baud: int) -> None:
-        """Open `port` exclusively; raises RigFault("refused") if that fails."""
-        self.port = port
-        self._serial = open_port(port, baud, POLL_S)
-
-    def receive(self) -> tuple[float, bytes]:
-        """Wait for bytes for at most `POLL_S`; return the host time and all that have come, possibly none."""
-        try:
-            data = self._serial.read(1)
-            if data:
-                data += self._serial.read(self._serial.in_waiting)
-        except OSError as error:
-            raise self._lost(error) from error
-        return time.monotonic(), data
-
-    def send(self, data: bytes) -> None:
-        """Send all of `data`."""
-        try:
-            self._serial.write(data)
-        except OSError as error:
-            raise self._lost(error) from error
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        with suppress(OSError):
-            self._serial.close()
-
-    def _lost(self, error: OSError) -> RigFault:
-        return RigFault("lost", f"{self.port}: the board is gone ({error})", "check its cable and connect again")
-
-
-class Block(Protocol):
+class SampleBlock(Protocol):
     """Samples that came together, (n, C) of them."""
 
     @property
     def counts(self) -> Any: ...
 
 
-B = TypeVar("B", bound=Block)
+B = TypeVar("B", bound=SampleBlock)
 
 
 class BlockReader(threading.Thread, Generic[B]):

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from padforge.design.common.validation import InputError
-from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, select_inputs
+from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
 from padforge.sense.rig.boards.due_framing import (
     FULL_SCALE,
     MAX_AVERAGING,
@@ -25,7 +25,7 @@ from padforge.sense.rig.boards.due_framing import (
     Status,
     encode,
 )
-from padforge.sense.rig.devices import BoardSamples, RigFault, host_ports
+from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
 BAUD = 115_200
@@ -78,7 +78,7 @@ class DueLink:
     def __init__(self, port: str) -> None:
         """Open `port` exclusively; raises RigFault("refused") if that fails."""
         self.decoder = DueDecoder()
-        self._stream = ByteStream(port, BAUD)
+        self._stream = SerialStream(port, BAUD, POLL_S)
 
     def receive(self) -> tuple[float, list[DueMessage]]:
         """Wait shortly for bytes; return the host time and the messages that they complete."""

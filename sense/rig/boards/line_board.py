@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from padforge.sense.rig.boards.board_reader import BlockReader, ByteStream, SampleClock, select_inputs
+from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
 from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineDecoder, LineHeader, LineSample
-from padforge.sense.rig.devices import BoardSamples, RigFault, host_ports
+from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
 RESONATOR_SKEW = 5e-3
@@ -59,7 +59,7 @@ class LineBoard:
             inputs: which to read, fibre by fibre, from 0; all in order if empty.
         """
         self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
-        self._stream: ByteStream | None = None
+        self._stream: SerialStream | None = None
         self._decoder = LineDecoder()
         self._reader: BlockReader[LineBlock] | None = None
         self._assembler: LineAssembler | None = None
@@ -72,7 +72,7 @@ class LineBoard:
     def connect(self) -> dict[str, Any]:
         """Open the port, ask the board for its header and start to read; see `Board`."""
         self.close()
-        self._stream, self._decoder = ByteStream(self._port, self._baud), LineDecoder()
+        self._stream, self._decoder = SerialStream(self._port, self._baud, POLL_S), LineDecoder()
         try:
             header = self._identify(self._stream)
             inputs = select_inputs(self._inputs, header.channels, "the board")
@@ -121,7 +121,7 @@ class LineBoard:
             self._stream.close()
         self._reader = None
 
-    def _identify(self, stream: ByteStream) -> LineHeader:
+    def _identify(self, stream: SerialStream) -> LineHeader:
         deadline, resend_s = time.monotonic() + _ANSWER_S, 0.0
         while self._decoder.header is None:
             if (now := time.monotonic()) > deadline:
@@ -137,7 +137,7 @@ class LineBoard:
             raise RigFault("refused", message, f"set board_rate_hz = {header.rate_hz:g}")
         return header
 
-    def _start(self, stream: ByteStream, header: LineHeader) -> None:
+    def _start(self, stream: SerialStream, header: LineHeader) -> None:
         settled, last_sample_s = False, time.monotonic()
 
         def receive() -> tuple[float, list[LineBlock]]:

@@ -80,7 +80,7 @@ def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch,
     recording = Recording.open(model / "recording")
     source = {**recording.source, "rig": {**recording.source["rig"], "mirrored": True}}
     replace(recording, source=source).save("mine/recording", {})
-    monkeypatch.setattr(virtual_pad, "SimulatedConverter", lambda *pad, **size: board)
+    monkeypatch.setattr(virtual_pad, "VirtualPad", lambda *pad, **size: board)
     monkeypatch.setattr(outputs, "MessageBuilder", told)
     ended, out, err = padforge_sense("live", "--port", "0", "--model", "mine", "--json")
     assert (ended, out) == (code, "")

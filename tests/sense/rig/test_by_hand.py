@@ -239,7 +239,7 @@ class Hands:
         with pytest.MonkeyPatch.context() as patch:  # nobody else sleeps meanwhile
             patch.setattr(padforge.sense.rig.streams.time, "sleep", self.clock.sleep)
             board = FingerBoard(self.finger, self.clock)
-            return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.said()], resume)
+            return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.commands()], resume)
 
     def strokes_of(self, recording: Recording) -> list[Any]:
         """The stroke of each press of a recording that was made at once."""
@@ -333,7 +333,7 @@ class Inverted(PressDetector):
 def test_session_restarts_a_confused_detector(hands, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(by_hand, "PressDetector", Inverted)
     hand = hands(presses=14)
-    monkeypatch.setattr(hand.finger, "said", list)  # nobody helps
+    monkeypatch.setattr(hand.finger, "commands", list)  # nobody helps
     recording = hand.record()
     np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
     assert not Inverted.once

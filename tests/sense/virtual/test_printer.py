@@ -1,4 +1,4 @@
-"""The emulated firmware, in time that is told: it must fail as the real one does."""
+"""The emulated firmware, at times that are passed in: it must fail as the real one does."""
 
 from padforge.sense.rig.arms.printer_link import number_line, parse_position
 from padforge.sense.virtual.printer import Firmware

@@ -12,8 +12,8 @@ from padforge.sense.virtual.virtual_hand import LIGHT, MISHAPS, REACTION_S, SHOR
 RATE_HZ = 50.0
 
 
-def pressed(mishaps: float, presses: int) -> Finger:
-    """A finger that was asked for so many presses at (5, -5) mm, two seconds each."""
+def make_presses(mishaps: float, presses: int) -> Finger:
+    """Ask a finger for presses at (5, -5) mm, two seconds each."""
     rig = RigSettings(noise_mv=0.0, drift_mv=0.0)
     finger = Finger(Morphology.straight(2), Contact(), rig, RATE_HZ, mishaps=mishaps)
     block = np.arange(1, 51) / RATE_HZ
@@ -25,7 +25,7 @@ def pressed(mishaps: float, presses: int) -> Finger:
 
 
 def test_finger_presses_where_asked_lifts_and_errs() -> None:
-    finger = pressed(0.0, 30)
+    finger = make_presses(0.0, 30)
     assert [stroke.kind for stroke in finger.strokes] == ["press"] * 30
     places = np.array([stroke.position_mm for stroke in finger.strokes])
     assert places.mean(axis=0) == pytest.approx([5, -5], abs=1.0)
@@ -34,11 +34,11 @@ def test_finger_presses_where_asked_lifts_and_errs() -> None:
     assert (late > [REACTION_S[0], 0]).all()
     assert (late < np.array([REACTION_S[1], REACTION_S[1] / 2]) + 0.04).all()
     assert min(stroke.depth_mm for stroke in finger.strokes) >= 3.5
-    assert finger.said() == []
-    finger.look({"phase": "lift", "target": (5.0, -5.0)})  # it touches nothing where it is told to lift
+    assert finger.commands() == []
+    finger.look({"phase": "lift", "target": (5.0, -5.0)})  # it touches nothing when asked to lift
     finger.volts(150.0 + np.arange(1, 201) / RATE_HZ)
-    assert finger.said() == ["free"]
-    strokes = pressed(1.0, 40).strokes
+    assert finger.commands() == ["free"]
+    strokes = make_presses(1.0, 40).strokes
     assert {stroke.kind for stroke in strokes} == {*MISHAPS, "echo"}
     for before, stroke in pairwise(strokes):
         assert (stroke.kind == "echo") == (before.kind == "double")

@@ -15,7 +15,7 @@ from padforge.sense.rig.devices import RigFault
 from padforge.sense.rig.streams import RECORDED
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.virtual.virtual_pad import SimulatedConverter, virtual_pad_of
+from padforge.sense.virtual.virtual_pad import VirtualPad, virtual_pad_of
 from tests.sense.rig.fakes import Time
 
 
@@ -23,7 +23,7 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
     rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
     recorded, time = simulate(pad, rig), Time(least_s=0)
-    board = SimulatedConverter(pad, rig, PUBLISHED_CONTACT, time)
+    board = VirtualPad(pad, rig, PUBLISHED_CONTACT, time)
     with pytest.raises(RigFault, match="not connected"):
         board.read()
     assert board.connect().items() >= {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}.items()
@@ -44,7 +44,7 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
 def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
     rig = RigSettings(presses=4, seed=4, noise_mv=0.0, drift_mv=0.0, depths_mm=(0.5, 5.0), readings_per_press=20)
     time = Time(least_s=0)
-    board = SimulatedConverter(Morphology.straight(2), rig, Contact(), time)
+    board = VirtualPad(Morphology.straight(2), rig, Contact(), time)
     board.connect()
     time.sleep(4.01 * 20 / rig.rate_hz)
     volts = board.read().volts

@@ -42,8 +42,8 @@ pytestmark = [
 
 PAD = Morphology.straight(2)
 QUIET = {"noise_mv": 0.0, "drift_mv": 0.0, "creep": 0.0, "hysteresis": 0.0}
-NIMBLE = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.0)}
-"""A printer whose z axis is as quick as the others."""
+FAST_AXES = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 3000.0)}
+"""A printer whose z axis is as fast as the others."""
 QUICK = {"rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5}
 QUICK |= {"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000}
 SLOWER = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 2.0, "depth_mm": 3.0, "press_mm_s": 100}
@@ -52,33 +52,33 @@ PRINTER = virtual_rig.printer_settings(RigSettings.model_validate(QUICK | SLOWER
 
 
 class Rig:
-    """An emulated rig that is kept from one recording to the next; `robot` is the emulated arm or printer."""
+    """An emulated rig that lives through several recordings; `robot` is the emulated arm or printer."""
 
-    def __init__(self, settings: RigSettings, emulated: Callable[..., Any]) -> None:
-        self.settings, self.emulated, self.kept = settings, emulated, ExitStack()
-        self.anew()
+    def __init__(self, settings: RigSettings, emulate: Callable[..., Any]) -> None:
+        self.settings, self.emulate, self.stack = settings, emulate, ExitStack()
+        self.replace()
 
-    def anew(self) -> None:
-        """Another rig in the place of this one."""
-        self.kept.close()
-        devices = self.kept.enter_context(self.emulated(PAD, PUBLISHED_CONTACT, self.settings))
+    def replace(self) -> None:
+        """Replace the devices by new ones."""
+        self.stack.close()
+        devices = self.stack.enter_context(self.emulate(PAD, PUBLISHED_CONTACT, self.settings))
         self.arm, self.board_driver, self.robot, self.board = devices
 
     def plan(self, presses: int) -> PressPlan:
         return make_plan(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
 
     def record(self, run: Path, plan: PressPlan, report: OnProgress = lambda done, of: None) -> float:
-        """Record into `run` or go on with it; when that began."""
+        """Record into `run`, or resume it; return the time of the start."""
         with Recorder.resume(run) if run.exists() else Recorder(run, len(PAD.knots), {}, {}) as recorder:
             self.board_driver.connect()
             self.arm.connect()
-            began = time.monotonic()
+            start_s = time.monotonic()
             report(0, len(plan))
             PressLoop(self.arm, self.board_driver, recorder, self.settings).run(plan, report)
-        return began
+        return start_s
 
     def disturbed(self, run: Path, plan: PressPlan, disturb: Callable[["Rig"], object]) -> tuple[RigFault, float]:
-        """Record, disturbed after one more press; the fault, and how long it took to be told."""
+        """Record, disturbed after one more press; return the fault, and how long it took to be raised."""
         moment, at = 0.0, 1 + (len(read_journal(run / "journal.ndjson")) if run.exists() else 0)
 
         def report(done: int, of: int) -> None:
@@ -91,8 +91,8 @@ class Rig:
             self.record(run, plan, report)
         return caught.value, time.monotonic() - moment
 
-    def rests(self) -> bool:
-        """Whether the arm is at rest, in truth, half a second from now, and the printer for as long as it may be."""
+    def is_at_rest(self) -> bool:
+        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds."""
         if isinstance(self.robot, EmulatedPrinter):
             now = time.monotonic()
             return bool(np.ptp(self.robot.true_positions([now, now + 9]), axis=0).max() == 0)
@@ -102,16 +102,16 @@ class Rig:
         return bool(np.linalg.norm(b - a) / 0.04 < 1)
 
     def home(self) -> None:
-        """What a person does after a fault of a printer: switch it off and on, and home it."""
+        """Switch a printer off and on and home it, as a person does after a fault."""
         self.robot.restart()
         self.robot.home()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def quick() -> Iterator[None]:
-    """Printers are nimble, and boards need not settle: their times need not be exact but in one test."""
+    """Make printers fast, and boards settle soon: their times are exact in one test only."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual_rig, "EmulatedPrinter", partial(EmulatedPrinter, **NIMBLE))
+        patch.setattr(virtual_rig, "EmulatedPrinter", partial(EmulatedPrinter, **FAST_AXES))
         patch.setattr(board_reader, "SETTLE_S", 0.15)
         yield
 
@@ -125,19 +125,19 @@ RIGS = {
 
 @pytest.fixture
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    """One of those."""
+    """Open one of `RIGS`."""
     rig = Rig(*RIGS[request.param])
-    with rig.kept:
+    with rig.stack:
         yield rig
 
 
-def assert_whole(run: Path, plan: PressPlan, within_mm: float = 0.1) -> None:
-    """All presses are there, where and as deep as planned, without a gap, and the fibres felt each."""
+def assert_complete(run: Path, plan: PressPlan, atol_mm: float = 0.1) -> None:
+    """Check that all presses are recorded, where and as deep as planned, and that fibres responded to each."""
     recording = Recording.open(run)
     assert np.array_equal(recording.presses_mm, plan.positions_mm)
     events = [json.loads(line) for line in (run / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in events if event["event"] == "done"])
-    assert reached == pytest.approx(np.column_stack([plan.positions_mm, plan.depths_mm]), abs=within_mm)
+    assert reached == pytest.approx(np.column_stack([plan.positions_mm, plan.depths_mm]), abs=atol_mm)
     spans = list(zip(recording.down_command, recording.up_command, strict=True))
     rest = [recording.readings[max(b - 4, 0) : b - 1].mean(axis=0) for b, _ in spans]
     felt = [np.abs(recording.readings[b:u] - rest[press]).max() for press, (b, u) in enumerate(spans)]
@@ -145,33 +145,31 @@ def assert_whole(run: Path, plan: PressPlan, within_mm: float = 0.1) -> None:
 
 
 @pytest.mark.parametrize("rig", ["arm"], indirect=True)
-def test_presses_come_through_the_drivers_and_show_in_the_readings_when_the_tip_goes_down(
-    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One clock: where the tip is, by the controller's states, and what the fibres give, by the board's samples."""
+def test_readings_show_presses_when_tip_goes_down(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readings of the board and states of the controller are on one clock."""
     monkeypatch.setattr(board_reader, "SETTLE_S", 0.5)
     plan = rig.plan(4)
-    began = rig.record(tmp_path / "run", plan)
-    assert_whole(tmp_path / "run", plan)
-    recording, truth = Recording.open(tmp_path / "run"), rig.robot.pose_log.rows()
+    start_s = rig.record(tmp_path / "run", plan)
+    assert_complete(tmp_path / "run", plan)
+    recording, true_rows = Recording.open(tmp_path / "run"), rig.robot.pose_log.rows()
     assert np.diff(recording.times_s).max() < 1.5 / recording.rate_hz
-    truth = truth[truth[:, 0] > began]
-    _, depths = RobotFrame.from_settings(ARM).tip(truth[:, 1:4])
+    true_rows = true_rows[true_rows[:, 0] > start_s]
+    _, depths = RobotFrame.from_settings(ARM).tip(true_rows[:, 1:4])
     touched = np.flatnonzero((depths[1:] > 0) & (depths[:-1] <= 0))
     change = np.abs(recording.readings - np.median(recording.readings, axis=0)).max(axis=1) > 2e-3
     onsets = np.flatnonzero(change[1:] & ~change[:-1]) + 1
-    told = recording.times_s[onsets] + began
-    nearest = np.abs(told[:, None] - truth[touched, 0]).min(axis=1)
+    onset_times_s = recording.times_s[onsets] + start_s
+    nearest = np.abs(onset_times_s[:, None] - true_rows[touched, 0]).min(axis=1)
     assert len(onsets) == len(plan)
     assert np.ptp(nearest) < 0.03  # a reading is a mean over 8 ms, and shallow touches show late
 
 
 @pytest.mark.parametrize("rig", ["printer"], indirect=True)
-def test_a_printer_presses_where_it_is_planned_whatever_noise_there_is(rig: Rig, tmp_path: Path) -> None:
+def test_printer_presses_as_planned_despite_noise(rig: Rig, tmp_path: Path) -> None:
     plan = rig.plan(2)
     rig.record(tmp_path / "run", plan, lambda done, of: rig.robot.garble(1e-3))
     rig.robot.garble(0)
-    assert_whole(tmp_path / "run", plan, 0.06)
+    assert_complete(tmp_path / "run", plan, 0.06)
     moves = rig.robot.firmware.moves
     turned = np.array([move.move.position(move.duration_s) for move in moves]) + PRINTER.tcp_mm
     places, depths = RobotFrame.from_settings(PRINTER).tip(turned)
@@ -186,16 +184,16 @@ FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] 
     "freeze": (lambda rig: rig.robot.freeze(True), "stale", lambda rig: rig.robot.freeze(False)),
     "restart": (lambda rig: rig.robot.restart(0.4), "lost", lambda rig: time.sleep(0.3)),
     "stall": (lambda rig: rig.board.stall(), "stale", lambda rig: rig.board.stall(False)),
-    "unplug": (lambda rig: rig.board.unplug(), "lost", Rig.anew),
+    "unplug": (lambda rig: rig.board.unplug(), "lost", Rig.replace),
     "reset": (lambda rig: rig.board.reset(), "data", lambda rig: None),
     "columns": (lambda rig: rig.board.send_columns(15), "data", lambda rig: rig.board.send_columns(16)),
     "printer_halts": (lambda rig: rig.robot.halt(), "emergency_stop", Rig.home),
     "printer_busy": (lambda rig: rig.robot.busy(10), "stale", Rig.home),
     "printer_restarts": (lambda rig: rig.robot.restart(), "lost", Rig.home),
-    "board_of_printer": (lambda rig: rig.board.unplug(), "lost", Rig.anew),
-    "printer_unplugged": (lambda rig: rig.robot.unplug(), "lost", Rig.anew),
+    "board_of_printer": (lambda rig: rig.board.unplug(), "lost", Rig.replace),
+    "printer_unplugged": (lambda rig: rig.robot.unplug(), "lost", Rig.replace),
 }
-"""How a rig is disturbed, the cause that a person then reads, and what helps."""
+"""How a rig is disturbed, the cause of the fault that is raised, and the remedy."""
 
 
 @pytest.mark.slow
@@ -208,30 +206,30 @@ FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] 
     ],
     indirect=["rig"],
 )
-def test_faults_in_mid_run_stop_the_arm_and_lose_nothing(rig: Rig, presses: int, names: str, tmp_path: Path) -> None:
-    """One after the other in one recording, which is resumed after each, at last with bytes of the board damaged."""
+def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: str, tmp_path: Path) -> None:
+    """One after the other in one recording, which is resumed after each, in the end with a garbled board."""
     run, plan = tmp_path / "run", rig.plan(presses)
     for press, name in enumerate(names.split(), start=1):
         disturb, cause, cure = FAULTS[name]
-        fault, told_s = rig.disturbed(run, plan, disturb)
+        fault, notice_s = rig.disturbed(run, plan, disturb)
         assert fault.cause == cause, name
         assert "\n" not in str(fault)
-        assert told_s < (2 if rig.settings is PRINTER else 5), name
-        assert rig.rests(), name
+        assert notice_s < (2 if rig.settings is PRINTER else 5), name
+        assert rig.is_at_rest(), name
         if name == "board_of_printer":  # the probe is lifted
             tip = rig.robot.true_positions(time.monotonic())[0] + PRINTER.tcp_mm
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
     rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
-    assert_whole(run, plan)
+    assert_complete(run, plan)
     readings = Recording.open(run).readings
-    assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong one would stand out
+    assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong reading would be an outlier
 
 
 @pytest.mark.parametrize(("board", "grid"), [("due", 6), ("line", 8)])
-def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: int) -> None:
-    """As many as the board has inputs, and not in its order."""
+def test_readings_are_in_order_of_fibres(board: str, grid: int) -> None:
+    """As many as the board has inputs, in another order."""
     pad = Morphology.straight(grid)
     channels = np.random.default_rng(1).permutation(2 * grid).tolist()
     rig = virtual_rig.ur5_settings(RigSettings.model_validate({"board": board, "channels": channels, **QUIET}), pad)
@@ -245,7 +243,7 @@ def test_readings_are_of_the_fibres_in_the_order_of_the_pad(board: str, grid: in
     assert np.unique(volts).size > grid
 
 
-def test_a_rig_is_looked_over_at_the_inputs_of_its_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diagnose_reports_inputs_of_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("padforge.sense.rig.doctor.OBSERVE_S", 0.3)
     config = RigConfig(Morphology.straight(1), PUBLISHED_CONTACT, RigSettings(board="line"), tmp_path, "test")
     with virtual_rig.opened_virtual_rig("simulated", config, (14, 3)) as (arm, board, settings):
@@ -266,8 +264,8 @@ main()
 """
 
 
-def await_the_end_of_its_arm(address: str) -> None:
-    """The emulated arm ends as soon as it finds that its program has."""
+def wait_for_end_of_arm(address: str) -> None:
+    """Wait until the emulated arm has noticed the end of its program."""
     end = time.monotonic() + 10
     while time.monotonic() < end:
         try:
@@ -280,7 +278,7 @@ def await_the_end_of_its_arm(address: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
+def test_killed_recording_resumes_to_complete_plan(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -298,11 +296,11 @@ def test_a_recorder_killed_while_a_press_is_under_way_resumes_to_the_whole_plan(
     time.sleep(0.1)
     process.kill()
     process.wait()
-    kept = set(read_journal(journal))
-    await_the_end_of_its_arm(address)
+    presses_before_kill = set(read_journal(journal))
+    wait_for_end_of_arm(address)
     monkeypatch.setattr(sys, "argv", ["padforge", *words])
     with pytest.raises(SystemExit) as done:
         main()
     assert not done.value.code
     assert len(Recording.open(Path("run")).presses_mm) == 5
-    assert set(read_journal(journal)) >= kept >= {0, 1}
+    assert set(read_journal(journal)) >= presses_before_kill >= {0, 1}

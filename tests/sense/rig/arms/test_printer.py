@@ -124,7 +124,7 @@ def test_unconfirmed_stop_halts_printer_and_clipped_move_raises():
         start_s = time.monotonic()
         with pytest.raises(RigFault, match="did not confirm the stop, and was told to halt"):
             arm.stop()
-        with pytest.raises(RigFault, match="told to halt; see that it stands"):  # whoever looks next is identity why
+        with pytest.raises(RigFault, match="told to halt; see that it stands"):  # also for the next caller
             arm.state()
         time.sleep(0.05)
         assert printer.firmware.halted

@@ -39,7 +39,7 @@ def go(arm: UR5, pose: Pose, speed_mm_s: float = 1000) -> ArmState:
 
 
 def start_slow_move(arm: UR5) -> None:
-    """Be a little into a slow way down."""
+    """Start a slow move down and let it go on for a moment."""
     if arm.state().pose[2] < 120:
         go(arm, HOME)
     arm.move(LOW, 50, 500)
@@ -50,13 +50,13 @@ def start_slow_move(arm: UR5) -> None:
 
 
 def last_motion_s(robot: EmulatedUR5) -> float:
-    """When the arm last moved, in truth."""
+    """Return when the arm last moved in truth."""
     rows = robot.pose_log.rows()
     return float(rows[1 + np.flatnonzero(np.diff(rows[:, 1:7], axis=0).any(axis=1))[-1], 0])
 
 
 def within(seconds: float, call: Callable[..., T], *arguments: object) -> T:
-    """The result of a call that may not take longer."""
+    """Return the result of a call, which may not take longer."""
     start_s = time.monotonic()
     try:
         return call(*arguments)
@@ -65,7 +65,7 @@ def within(seconds: float, call: Callable[..., T], *arguments: object) -> T:
 
 
 def fault_of(call: Callable[..., object], *arguments: object, seconds: float = LONGEST_CALL_S) -> str:
-    """Cause of the fault a call ends with: soon, and with one line of text."""
+    """Return the cause of the fault that a call raises, soon and with one line of text."""
     with pytest.raises(RigFault) as caught:
         within(seconds, call, *arguments)
     assert "\n" not in str(caught.value)
@@ -234,7 +234,7 @@ FAULTS: dict[str, tuple[Callable[[EmulatedUR5, UR5], object], str, float, Callab
     "restart": (lambda robot, arm: robot.restart(0.5), "lost", 3.0, lambda robot: time.sleep(0.3)),
     "slow": (lambda robot, arm: robot.slow(1.0), "lost", 3.0, lambda robot: robot.slow(0.0)),
 }
-"""What goes wrong, its cause, how soon it is told, and what helps."""
+"""What goes wrong, its cause, how soon it is raised, and the remedy."""
 QUICK = ("protective stop", "stream frozen", "program stopped", "worker killed")
 
 

@@ -218,7 +218,7 @@ def test_read_raises_after_buffer_overflow(kind: str, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("garbled", [0.0, pytest.param(2e-2, marks=pytest.mark.slow)], ids=["its header", "its times"])
 def test_read_raises_when_line_board_resets(garbled: float) -> None:
-    """A header among so many damaged bytes is hardly ever read, nor is every other line: it is told by the times."""
+    """A header among so many damaged bytes is hardly ever read, nor is every other line: the times show it."""
     board = EmulatedLineBoard(waves, HEADER, seed=5)
     with connected(board) as driver:
         board.garble(garbled)

@@ -138,7 +138,7 @@ def test_firmware_identifies_itself_reports_period_and_skips_damaged_commands(pr
     damaged: list[bytes] = []
     for i in range(len(wanted)):
         damaged += [wanted[:i] + bytes([wanted[i] ^ 0x10]) + wanted[i + 1 :], wanted[:i] + wanted[i + 1 :]]
-    messages = run(program, *(f"host {each.hex()}" for each in [*damaged, b"\x55" * 100]), IDENTIFY)
+    messages = run(program, *(f"host {command.hex()}" for command in [*damaged, b"\x55" * 100]), IDENTIFY)
     intact = Ack(Kind.SETTINGS, Status.OK, BoardSettings(2_000_000, 3, 2))
     (identity,) = [message for message in messages if message != intact]
     assert identity == Identity((1, 0, 0), 12, 12, "padforge-due", b"serial-of-a-chip")

@@ -48,7 +48,10 @@ def test_decode_returns_lines_in_any_portions(data: st.DataObject) -> None:
     )
     counts = st.tuples(*[st.integers(0, header.full_scale)] * header.channels)
     samples = data.draw(st.lists(st.builds(LineSample, st.integers(0, 2**63 - 1), counts), max_size=9))
-    sent = [format_header(header), *(format_sample(each.time_us, each.counts, header.checked) for each in samples)]
+    sent = [
+        format_header(header),
+        *(format_sample(sample.time_us, sample.counts, header.checked) for sample in samples),
+    ]
     stream = b"".join(sent)
     if data.draw(st.booleans()):
         stream = stream.replace(b"\n", b"\r\n")
@@ -68,8 +71,8 @@ def test_decode_never_returns_wrong_sample_for_damaged_line() -> None:
         others = [bytes([line[i] ^ 1 << bit]) for bit in range(8)] + [b"", line[i : i + 1] * 2, b"7", b",", b"\n"]
         damaged = [line[:i] + other + line[i + 1 :] for other in others if other != line[i : i + 1]]
         damaged.append(line[:i] + line[i : i + 2][::-1] + line[i + 2 :])
-        for each in damaged:
-            items, _ = decoded(LINES[0], each, LINES[2])
+        for bad_line in damaged:
+            items, _ = decoded(LINES[0], bad_line, LINES[2])
             assert [sample for sample in items if sample not in (SAMPLES[0], SAMPLES[2])] in ([], [SAMPLES[1]])
             assert items[0] == SAMPLES[0]
 
@@ -104,7 +107,7 @@ def test_decode_skips_comments_and_bounds_memory_of_endless_noise() -> None:
     decoder.decode(short + short + b"1,2\n# hot\n")
     assert decoder.n_errors == 3
     assert "4 numbers" in decoder.error
-    header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"  # whose check may be left out
+    header = b"# padforge-line 1 rate_hz=100 bits=10 reference_v=5 channels=2\r\n"  # its check is optional
     items, decoder = decoded(b"10,1,2\r\n", b"20,1,3*00000000\n", header=header)
     assert (items, decoder.damaged) == ([LineSample(10, (1, 2))], 1)
     decoder = LineDecoder()

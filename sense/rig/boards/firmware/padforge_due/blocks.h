@@ -36,7 +36,7 @@ class BlockQueue {
   static void barrier() { asm volatile("" ::: "memory"); }
 };
 
-// The order in which the ADC converts the inputs of a mask, and where each belongs in a sample.
+// The order in which the ADC converts the inputs of a mask, and their columns in a sample.
 class Layout {
  public:
   // `adc_channel[i]` is the channel of input Ai. The ADC converts by ascending channel, whatever the inputs.
@@ -60,7 +60,7 @@ class Layout {
   unsigned count() const { return count_; }
   uint32_t enabled() const { return enabled_; }  // mask of ADC channels
 
-  // Sum conversions (number of the channel in the top four bits) to the samples of `block`. False where the numbers
+  // Sum conversions (number of the channel in the top four bits) to the samples of `block`. False if the numbers
   // are out of step, which would give one fibre the voltage of another.
   bool sum(const uint16_t *conversions, Block &block) const {
     memset(block.counts, 0, block.samples * count_ * sizeof block.counts[0]);

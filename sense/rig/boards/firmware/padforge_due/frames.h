@@ -1,4 +1,4 @@
-// The wire format of padforge's board, in plain C++ without Arduino: see sense/rig/boards/due/framing.py for the words.
+// The wire format of the Due board in plain C++ without Arduino; sense/rig/boards/due_framing.py describes it.
 //
 // A frame on the wire is `00 coded check 00`: `coded` is the payload with its zeros taken out by COBS, `check` the
 // CRC-16/CCITT-FALSE of `coded` in three bytes without a zero. Numbers are little-endian.
@@ -157,7 +157,7 @@ class CommandReader {
   uint8_t payload[MAX_COMMAND];
   size_t size = 0;  // of `payload`
 
-  // Take one byte; true when it completes a sound frame, whose payload then stands in `payload`.
+  // Take one byte; true when it completes an intact frame, whose payload is then in `payload`.
   bool take(uint8_t byte) {
     if (byte != 0) {
       if (length_ <= MAX_COMMAND) piece_[length_++] = byte;  // a full buffer is damaged whatever follows
@@ -168,7 +168,7 @@ class CommandReader {
     return length > CHECK_BYTES && length <= MAX_COMMAND && sound(length - CHECK_BYTES);
   }
 
-  // Read `payload` as settings; false where it is none.
+  // Read `payload` as settings; false if it is none.
   bool read_settings(Settings &settings) const {
     if (size != 8 || payload[0] != SETTINGS) return false;
     settings.period_ns = payload[1] | payload[2] << 8 | payload[3] << 16 | static_cast<uint32_t>(payload[4]) << 24;

@@ -75,7 +75,7 @@ void apply(const Settings &wanted) {
   block_samples = static_cast<uint8_t>(samples < 1 ? 1 : samples > MAX_SAMPLES ? MAX_SAMPLES : samples);
   layout.set(settings.mask, ADC_CHANNEL);
   for (unsigned input = 0; input < MAX_CHANNELS; input++) {
-    if (settings.mask >> input & 1) pinMode(A0 + input, INPUT);  // without the pull-up, which would bend the divider
+    if (settings.mask >> input & 1) pinMode(A0 + input, INPUT);  // without the pull-up, which would change the divider
   }
 }
 
@@ -92,7 +92,7 @@ void stop_sampling() {
 
 void start_adc() {
   ADC->ADC_CR = ADC_CR_SWRST;
-  // 84 MHz / (2 * (4 + 1)) = 8.4 MHz, and tracking as long as it goes: the fibres are sources of some kilohms.
+  // 84 MHz / (2 * (4 + 1)) = 8.4 MHz, and tracking as long as possible: the fibres are sources of some kilohms.
   ADC->ADC_MR = ADC_MR_TRGEN_EN | ADC_MR_TRGSEL_ADC_TRIG1 | ADC_MR_LOWRES_BITS_12 | ADC_MR_PRESCAL(4) |
                 ADC_MR_STARTUP_SUT64 | ADC_MR_SETTLING_AST3 | ADC_MR_TRACKTIM(15) | ADC_MR_TRANSFER(1);
   ADC->ADC_EMR = ADC_EMR_TAG;  // the number of the channel with every result
@@ -132,7 +132,7 @@ void start_sampling() {
   start_timer();
 }
 
-// Hand a full buffer of conversions on as a block, or count its samples as lost where the host is too slow.
+// Hand a full buffer of conversions on as a block, or count its samples as lost if the host is too slow.
 void finish_block(const uint16_t *full, uint32_t now_us) {
   Block *block = queue.free_slot();
   if (block == nullptr) {
@@ -201,7 +201,7 @@ void send_block() {
   send(payload);
 }
 
-// The 128 bits that tell one chip from another. The second half of the flash gives them in place of its contents for
+// The 128 bit unique identifier of the chip. The second half of the flash returns it in place of its contents for
 // a while, which is safe as the program runs from the first.
 void read_serial_number() {
   EFC1->EEFC_FCR = FLASH_KEY | EFC_FCMD_STUI;

@@ -1,4 +1,4 @@
-// The line protocol of padforge's boards, in plain C++ without Arduino: see sense/rig/boards/line/framing.py for the words.
+// The line protocol in plain C++ without Arduino; sense/rig/boards/line_framing.py describes it.
 #pragma once
 
 #include <stddef.h>

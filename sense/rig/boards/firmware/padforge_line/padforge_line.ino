@@ -10,7 +10,7 @@ using namespace padforge;
 
 // What may be different on your board.
 const char NAME[] = "padforge-line";
-const uint32_t BAUD = 921600;  // of a USB bridge; native USB takes no notice
+const uint32_t BAUD = 921600;  // of a USB bridge; native USB ignores it
 const uint32_t RATE_HZ = 500;
 const unsigned INPUTS = 16;  // C0, C1, ... of the multiplexer
 const unsigned BITS = 12;
@@ -31,7 +31,7 @@ static_assert(PERIOD_US * RATE_HZ == 1000000, "the period must be a whole number
 uint32_t due_us;
 
 void send(const Line &line) {
-  if (Serial.availableForWrite() < static_cast<int>(line.size)) return;  // rather a line less than a clock held up
+  if (Serial.availableForWrite() < static_cast<int>(line.size)) return;  // better a line less than a late clock
   Serial.write(reinterpret_cast<const uint8_t *>(line.text), line.size);
 }
 
@@ -70,7 +70,7 @@ void send_sample(uint32_t now_us) {
 
 void setup() {
 #ifdef ESP32
-  Serial.setTxBufferSize(4096);  // some 40 lines, where the host is held up
+  Serial.setTxBufferSize(4096);  // some 40 lines, in case the host is slow
 #endif
   Serial.begin(BAUD);
   analogReadResolution(BITS);

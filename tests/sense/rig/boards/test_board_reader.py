@@ -27,27 +27,27 @@ class Link:
     stall_s: float = 50e-3
 
     def blocks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Index of the last sample of each block, when it was taken, when it arrived."""
+        """Return the index of the last sample of each block, when it was measured, and when it arrived."""
         rng = np.random.default_rng(self.seed)
         last = (np.arange(int(self.seconds * self.rate_hz / self.block)) + 1) * self.block - 1
         nominal = last / self.rate_hz
         warming = 20e-6 * 300 * (1 - np.cos(nominal / 300))  # the quartz wanders by 20 ppm within half an hour
-        taken = 1e5 + nominal * (1 + self.skew) + warming
-        arrived = taken + rng.uniform(0, self.jitter_s, len(taken))
-        for begin in rng.uniform(taken[0], taken[-1], int(self.seconds / 3)):
+        measured = 1e5 + nominal * (1 + self.skew) + warming
+        arrived = measured + rng.uniform(0, self.jitter_s, len(measured))
+        for begin in rng.uniform(measured[0], measured[-1], int(self.seconds / 3)):
             held = (arrived >= begin) & (arrived < begin + self.stall_s)
             arrived[held] = begin + self.stall_s
-        return last, taken, np.maximum.accumulate(arrived)
+        return last, measured, np.maximum.accumulate(arrived)
 
 
-def block_of(last: int, samples: int) -> np.ndarray:
+def block_indices(last: int, samples: int) -> np.ndarray:
     """Indices of a block."""
     return np.arange(last - samples + 1, last + 1)
 
 
 def run(link: Link) -> tuple[np.ndarray, SampleClock]:
-    """Error of the time of each block's last sample; checks that all times ascend and are given as blocks come."""
-    last, taken, arrived = link.blocks()
+    """Error of the time of each block's last sample; check that all times ascend."""
+    last, measured, arrived = link.blocks()
     clock, before, errors = SampleClock(1 / link.rate_hz), -np.inf, []
     n_done = 0
     for i in range(len(last)):
@@ -55,11 +55,11 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
         if arrived[i] < arrived[0] + SETTLE_S:
             continue
         for j in range(n_done, i + 1):
-            times = clock.times(block_of(int(last[j]), link.block))
+            times = clock.times(block_indices(int(last[j]), link.block))
             assert times[0] > before
             assert (np.diff(times) > 0).all()
             before = times[-1]
-            errors.append(before - taken[j])
+            errors.append(before - measured[j])
         n_done = i + 1
     return np.array(errors), clock
 
@@ -88,16 +88,16 @@ def test_times_stay_accurate_in_bounded_memory() -> None:
 def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
     clock = SampleClock(1e-3)
     with pytest.raises(ValueError, match="no block"):
-        clock.times(block_of(0, 1))
+        clock.times(block_indices(0, 1))
     clock.observe(15, 100.015)
-    early = clock.times(block_of(15, 16))
+    early = clock.times(block_indices(15, 16))
     clock.observe(1015, 101.015)
-    late = clock.times(block_of(1015, 16))
+    late = clock.times(block_indices(1015, 16))
     assert late[0] - early[-1] == pytest.approx(0.985)
     clock, before = SampleClock(1e-3), -np.inf
     for first in range(0, 3200, 16):
         clock.observe(first + 15, (first + 15) * 1e-3 + (0.3 if first < 320 else 0.0))
-        times = clock.times(block_of(first + 15, 16))
+        times = clock.times(block_indices(first + 15, 16))
         assert times[0] > before
         before = times[-1]
     assert before == pytest.approx(3.199, abs=1e-3)
@@ -106,14 +106,14 @@ def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
 def test_times_of_microsecond_clock() -> None:
     """A board that counts microseconds, with a resonator that is off by 3 in a thousand."""
     rng = np.random.default_rng(2)
-    clock, taken_us = SampleClock(1e-6, 5e-3), np.cumsum(rng.integers(900, 1100, 90_000))
-    taken_s = 50 + taken_us * 1e-6 * 1.003
+    clock, measured_us = SampleClock(1e-6, 5e-3), np.cumsum(rng.integers(900, 1100, 90_000))
+    measured_s = 50 + measured_us * 1e-6 * 1.003
     times = np.empty(0)
-    for block in np.split(np.arange(len(taken_us)), 9000):
-        clock.observe(int(taken_us[block[-1]]), float(taken_s[block[-1]]) + rng.uniform(0, 5e-3))
-        times = clock.times(taken_us[block])
-    assert times == pytest.approx(taken_s[-10:], abs=1e-3)
-    assert np.diff(times) == pytest.approx(np.diff(taken_s[-10:]), rel=1e-2)
+    for block in np.split(np.arange(len(measured_us)), 9000):
+        clock.observe(int(measured_us[block[-1]]), float(measured_s[block[-1]]) + rng.uniform(0, 5e-3))
+        times = clock.times(measured_us[block])
+    assert times == pytest.approx(measured_s[-10:], abs=1e-3)
+    assert np.diff(times) == pytest.approx(np.diff(measured_s[-10:]), rel=1e-2)
     assert clock.skew_ppm == pytest.approx(3000, abs=60)
 
 
