@@ -145,11 +145,11 @@ def _replayed(replay: Path, speed: float) -> "tuple[Source, bool]":
 def _pad(title: str, localizer: "LocalizerModel", mirrored: bool) -> dict[str, Any]:
     """What stays the same of the view."""
     scaling = localizer.scaler
-    half_mm = scaling.half_mm
+    half_mm = scaling.half_size_mm
     return {
         "title": title,
         "origin_mm": scaling.origin_mm.tolist(),
-        "half_mm": [scaling.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
+        "half_mm": [scaling.scale_mm] * 2 if not half_mm.any() else half_mm.tolist(),
         "mirrored": mirrored,
     }
 

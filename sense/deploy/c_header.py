@@ -14,9 +14,9 @@ from padforge.sense.arrays import Array, Floats
 from padforge.sense.deploy import streaming as press_stream
 from padforge.sense.deploy.streaming import CODE, LAYERS, POLES, Budget, rates, state_bytes, table_bytes
 from padforge.sense.deploy.student import Student, causal_beside, examine, split, teach
-from padforge.sense.localizer.features import MAX_INPUT
-from padforge.sense.localizer.model import MEASURED, UNKNOWN, LocalizerModel
-from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG
+from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
+from padforge.sense.localizer.network import EPSILON, MAX_LOG_ERROR, MIN_LOG_ERROR
+from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
@@ -107,7 +107,7 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
     """
     localizer, detector = student.localizer, student.detector
     scaling = localizer.scaler
-    span, hidden = scaling.span_mm, student.hidden
+    span, hidden = scaling.scale_mm, student.hidden
     environment = Environment(
         loader=PackageLoader("padforge.sense.deploy", "."),
         undefined=StrictUndefined,
@@ -138,14 +138,14 @@ def c_header(student: Student, budget: Budget, about: Sequence[str]) -> str:
         back=BACK,
         max_input=_float(MAX_INPUT),
         epsilon=_float(EPSILON),
-        least_log=_float(LEAST_LOG),
-        most_log=_float(MOST_LOG),
+        least_log=_float(MIN_LOG_ERROR),
+        most_log=_float(MAX_LOG_ERROR),
         span=_float(span),
         middle=[_float(each) for each in scaling.origin_mm],
-        unknown=[_float(each * span) for each in UNKNOWN[1:]],
+        unknown=[_float(each * span) for each in UNIFORM[1:]],
         measures=[
-            dict(zip(("value", "r90"), MEASURED[each.name], strict=True))
-            | {"span": _float(each.span), "middle": _float(each.middle)}
+            dict(zip(("value", "r90"), MEASURE_COLUMNS[each.name], strict=True))
+            | {"span": _float(each.scale), "middle": _float(each.origin)}
             for each in scaling.measures
         ],
         quantized=student.quantized,
@@ -166,14 +166,14 @@ def _stream_constants() -> dict[str, Any]:
 
 def _tables(student: Student) -> list[dict[str, Any]]:
     localizer, scaling = student.localizer, student.localizer.scaler
-    units = [scaling.span_mm] * 3 + [each.span for each in scaling.measures]
+    units = [scaling.scale_mm] * 3 + [each.scale for each in scaling.measures]
     floats = {
         "rates": rates(),
         "quiet": student.detector.quiet,
-        "centre": scaling.centre,
-        "spread": scaling.spread,
-        "memory": scaling.memory,
-        "usual": scaling.usual,
+        "centre": scaling.mean_v,
+        "spread": scaling.scale_v,
+        "memory": scaling.history_coef,
+        "usual": scaling.history_mean_v,
         "interval_factors": localizer.interval_factors * units,
     }
     out = [_table(name, values) for name, values in floats.items()]

@@ -24,24 +24,31 @@ from padforge.design.common.files import atomic_file
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.localizer import features
-from padforge.sense.localizer.bayes import BEFOREHAND, COMPONENTS, FARTHEST, LEAST_SPREAD, LOOKS, BayesianLocalizer
+from padforge.sense.localizer.bayes import (
+    COMPONENTS,
+    GAUSS_NEWTON_STEPS,
+    MAX_STEP,
+    MIN_STD,
+    PRIOR_WEIGHT,
+    BayesianLocalizer,
+)
 from padforge.sense.localizer.features import (
     DOWN,
-    MAX_INPUT,
+    FEATURES,
     MEDIAN,
     PAST,
     REST,
-    SIZES,
     SLOW,
     SLOW_SAMPLES,
     UP,
     Window,
-    bridged,
-    press_inputs,
+    compute_features,
+    interpolate_gaps,
 )
-from padforge.sense.localizer.model import MEASURED, UNKNOWN, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
-from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, Weights
+from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.network import EPSILON, MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
+from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.recording.recording import Recording
 
 END = np.iinfo(np.int64).max
@@ -98,7 +105,7 @@ class PressFeatures:
         self._following = graph("Concat", graph.part("down_command", 1, END), self._length, axis=0)
 
     def windows(self, kind: str) -> str:
-        """(Q, C, F) V, as `features.press_inputs`."""
+        """(Q, C, F) V, as `features.compute_features`."""
         if kind == "published":
             reach = (-(MEDIAN // 2), MEDIAN // 2 + 1)
             ranges = (
@@ -111,13 +118,13 @@ class PressFeatures:
                 for at, by, low, high in ranges
             ]
             return self._stacked(found)
-        found = [self._mean("down_command", window, "down_command", "up_command") for window in DOWN[: SIZES[kind]]]
+        found = [self._mean("down_command", window, "down_command", "up_command") for window in DOWN[: FEATURES[kind].n_windows]]
         if kind == "press_and_release":
             found += [self._mean("up_command", window, "down_command", self._following) for window in UP]
         return self._g("Sub", self._stacked(found), self._rest(REST, "down_command"))
 
     def history(self) -> str:
-        """(Q, C, J) V, as `features.history`."""
+        """(Q, C, J) V, as `features.compute_history`."""
         g = self._g
         level = g.part("readings", 0, 1)
         sums = g("CumSum", g("Sub", "readings", level), g.constant(np.int64(0)))
@@ -163,17 +170,17 @@ def volts(values: Array, graph: GraphNodes) -> str:
 
 
 def observed(g: GraphNodes, bayes: BayesianLocalizer, inputs: str, fibre_mask: str) -> tuple[str, str]:
-    """Places (Q, 2) and what is told of them (Q, `TOLD`), as `BayesianLocalizer.__call__`, of inputs that are 0 where lost."""
+    """Places (Q, 2) and what is told of them (Q, `N_SUMMARY`), as `BayesianLocalizer.predict`, of inputs that are 0 where lost."""
     fibres, size = len(bayes.projection), COMPONENTS
     inputs, fibre_mask = (g("Cast", each, to=TensorProto.DOUBLE) for each in (inputs, fibre_mask))
     there = g("Unsqueeze", fibre_mask, g.constant([2]))
     by_fibre = g("MatMul", g("Transpose", inputs, perm=[1, 0, 2]), _number(g, bayes.projection))
     seen = g("Transpose", by_fibre, perm=[1, 0, 2])
     mean, variance, both = _on_grid(g, bayes, seen, there)
-    known, place = g("Div", _number(g, BEFOREHAND), variance), mean
-    spread, answers = variance, _number(g, bayes.answers.reshape(len(bayes.answers) ** 2, -1))
-    for _ in range(LOOKS):
-        found = _looked_up(g, answers, len(bayes.answers), place)
+    known, place = g("Div", _number(g, PRIOR_WEIGHT), variance), mean
+    spread, answers = variance, _number(g, bayes.linearization.reshape(len(bayes.linearization) ** 2, -1))
+    for _ in range(GAUSS_NEWTON_STEPS):
+        found = _looked_up(g, answers, len(bayes.linearization), place)
 
         def per_fibre(begin: int, end: int, *shape: int, found: str = found) -> str:
             part = g.part(found, begin * fibres, end * fibres, axis=1)
@@ -186,14 +193,14 @@ def observed(g: GraphNodes, bayes: BayesianLocalizer, inputs: str, fibre_mask: s
         pull = g("ReduceSum", slopes, g.constant([1, 3]), keepdims=0)
         pull = g("Add", pull, g("Mul", known, g("Sub", mean, place)))
         spread, step = _solved(g, curved, known, pull)
-        step = g("Clip", step, _number(g, -FARTHEST), _number(g, FARTHEST))
+        step = g("Clip", step, _number(g, -MAX_STEP), _number(g, MAX_STEP))
         within = g("Max", g("Add", place, step), _number(g, bayes.bounds[0]))
         place = g("Min", within, _number(g, bayes.bounds[1]))
     two = _number(g, 2)
     logs = (g("Add", _number(g, 1), g("Mul", _number(g, 0.25), g("Log", each))) for each in (spread, variance))
     of_place, of_mean = logs
     told = g("Concat", g("Mul", two, place), of_place, g("Mul", two, mean), of_mean, both, axis=1)
-    place = g("Add", g("MatMul", place, _number(g, bayes.turn.T)), _number(g, bayes.shift))
+    place = g("Add", g("MatMul", place, _number(g, bayes.rotation.T)), _number(g, bayes.shift))
     return g("Cast", place, to=TensorProto.FLOAT), g("Cast", told, to=TensorProto.FLOAT)
 
 
@@ -208,12 +215,12 @@ def _on_grid(g: GraphNodes, bayes: BayesianLocalizer, seen: str, there: str) -> 
     """Mean place (Q, 2), its variances (Q, 2) and correlation (Q, 1)."""
     first, second = (g.constant(each) for each in np.triu_indices(COMPONENTS))
     products = g("Mul", g("Gather", seen, first, axis=2), g("Gather", seen, second, axis=2))
-    known = g("Reshape", g("Concat", products, seen, there, axis=2), g.constant([-1, len(bayes.terms)]))
-    share = g("Softmax", g("MatMul", known, _number(g, bayes.terms)), axis=1)
+    known = g("Reshape", g("Concat", products, seen, there, axis=2), g.constant([-1, len(bayes.log_likelihood_coefficients)]))
+    share = g("Softmax", g("MatMul", known, _number(g, bayes.log_likelihood_coefficients)), axis=1)
     grid = bayes.grid
     moments = g("MatMul", share, g.constant(np.column_stack([grid, grid**2, grid[:, 0] * grid[:, 1]]), np.float64))
     mean = g.part(moments, 0, 2, axis=1)
-    limits = (_number(g, limit) for limit in (LEAST_SPREAD**2, 4))
+    limits = (_number(g, limit) for limit in (MIN_STD**2, 4))
     variance = g("Clip", g("Sub", g.part(moments, 2, 4, axis=1), g("Mul", mean, mean)), *limits)
     between = g("Sub", g.part(moments, 4, 5, axis=1), g("Mul", g.part(mean, 0, 1, axis=1), g.part(mean, 1, 2, axis=1)))
     whole = g("Sqrt", g("Mul", g.part(variance, 0, 1, axis=1), g.part(variance, 1, 2, axis=1)))
@@ -221,7 +228,7 @@ def _on_grid(g: GraphNodes, bayes: BayesianLocalizer, seen: str, there: str) -> 
 
 
 def _looked_up(g: GraphNodes, flat: str, side: int, place: str) -> str:
-    """(Q, C (3 D + 3)), as `response_model.looked_up`."""
+    """(Q, C (3 D + 3)), as `response_model.interpolate_grid`."""
     at = g("Mul", g("Add", place, _number(g, 1)), _number(g, (side - 1) / 2))
     at = g("Clip", at, _number(g, 0), _number(g, side - 1 - 1e-3))
     whole = g("Floor", at)
@@ -240,7 +247,7 @@ def _looked_up(g: GraphNodes, flat: str, side: int, place: str) -> str:
 
 
 def _solved(g: GraphNodes, curved: str, known: str, pull: str) -> tuple[str, str]:
-    """(Q, 2) variances and steps, as `observer._solved`."""
+    """(Q, 2) variances and steps, as `bayes.solve_2x2`."""
     own, both = g.part(curved, 0, 2, axis=1), g.part(curved, 2, 3, axis=1)
     x, y = g.part(own, 0, 1, axis=1), g.part(own, 1, 2, axis=1)
     known_x, known_y = g.part(known, 0, 1, axis=1), g.part(known, 1, 2, axis=1)
@@ -317,7 +324,7 @@ def _located(g: GraphNodes, localizer: LocalizerModel) -> dict[str, str]:
     """What computes each output, by its name, as `LocalizerModel.predict_features`."""
     scaling, fibre_mask = localizer.scaler, g("Cast", "fibre_mask", to=TensorProto.FLOAT)
     kept = _inputs(g, localizer)
-    entries = g("Concat", g("Reshape", kept, g.constant([0, scaling.centre.size])), fibre_mask, axis=1)
+    entries = g("Concat", g("Reshape", kept, g.constant([0, scaling.mean_v.size])), fibre_mask, axis=1)
     outputs = _network(g, localizer.weights, entries)
     if localizer.bayes is not None:
         place, told = observed(g, localizer.bayes, kept, fibre_mask)
@@ -338,20 +345,20 @@ def _located(g: GraphNodes, localizer: LocalizerModel) -> dict[str, str]:
 
     place, spread = (g.part(each, 0, 2, axis=1) for each in (numbers, spreads))
     radius = g("ReduceL2", spread, g.constant([1]), keepdims=0)
-    span, every = scaling.span_mm, g.column(blind)
+    span, every = scaling.scale_mm, g.column(blind)
     there = g("Mul", known(place, 0.0, every), g.constant(span, np.float32))
     out = {
         "positions_mm": g("Add", there, g.constant(scaling.origin_mm, np.float32)),
-        "std_mm": known(g("Mul", g.column(factor(0, span)), spread), UNKNOWN[0] * span, every),
-        "r50_mm": known(g("Mul", factor(1, span), radius), UNKNOWN[1] * span),
-        "r90_mm": known(g("Mul", factor(2, span), radius), UNKNOWN[2] * span),
+        "std_mm": known(g("Mul", g.column(factor(0, span)), spread), UNIFORM[0] * span, every),
+        "r50_mm": known(g("Mul", factor(1, span), radius), UNIFORM[1] * span),
+        "r90_mm": known(g("Mul", factor(2, span), radius), UNIFORM[2] * span),
     }
     for column, target in enumerate(scaling.measures):
         value, half = (g("Gather", each, g.constant(2 + column), axis=1) for each in (numbers, spreads))
-        scaled = g("Mul", known(value, 0.0), g.constant(target.span, np.float32))
-        value_name, half_name = MEASURED[target.name]
-        out[value_name] = g("Add", scaled, g.constant(target.middle, np.float32))
-        out[half_name] = known(g("Mul", factor(3 + column, target.span), half), target.span)
+        scaled = g("Mul", known(value, 0.0), g.constant(target.scale, np.float32))
+        value_name, half_name = MEASURE_COLUMNS[target.name]
+        out[value_name] = g("Add", scaled, g.constant(target.origin, np.float32))
+        out[half_name] = known(g("Mul", factor(3 + column, target.scale), half), target.scale)
     return out
 
 
@@ -359,13 +366,13 @@ def _inputs(g: GraphNodes, localizer: LocalizerModel) -> str:
     """(Q, C, F + G) scaled inputs, 0 for lost fibres."""
     scaling, features = localizer.scaler, PressFeatures(g, localizer.fibres)
     windows = features.windows(localizer.features)
-    if scaling.usual.size:
-        history = g("Sub", features.history(), volts(scaling.usual, g))
-        shown = g("MatMul", g("Transpose", history, perm=[1, 0, 2]), volts(scaling.memory, g))
-        gains = scaling.memory.shape[2] - SIZES[localizer.features]
+    if scaling.history_mean_v.size:
+        history = g("Sub", features.history(), volts(scaling.history_mean_v, g))
+        shown = g("MatMul", g("Transpose", history, perm=[1, 0, 2]), volts(scaling.history_coef, g))
+        gains = scaling.history_coef.shape[2] - FEATURES[localizer.features].n_windows
         windows = g("Pad", windows, g.constant([0, 0, 0, 0, 0, gains]), volts(np.array(0.0), g))
         windows = g("Sub", windows, g("Transpose", shown, perm=[1, 0, 2]))
-    scaled = g("Div", g("Sub", windows, volts(scaling.centre, g)), volts(scaling.spread, g))
+    scaled = g("Div", g("Sub", windows, volts(scaling.mean_v, g)), volts(scaling.scale_v, g))
     limits = (volts(np.array(limit), g) for limit in (-MAX_INPUT, MAX_INPUT))
     inputs = g("Cast", g("Clip", scaled, *limits), to=TensorProto.FLOAT)
     return g("Where", g("Unsqueeze", "fibre_mask", g.constant([2])), inputs, g.constant(0, np.float32))
@@ -390,10 +397,10 @@ def _network(g: GraphNodes, weights: Weights, entries: str) -> str:
 
 
 def _pooled(g: GraphNodes, outputs: str, localizer: LocalizerModel) -> tuple[str, str]:
-    """(Q, N) numbers learnt and their standard deviations, as `network.pooled`."""
+    """(Q, N) numbers learnt and their standard deviations, as `network.combine_members`."""
     numbers = 2 + len(localizer.scaler.measures)
     learnt = g.part(outputs, 0, numbers, axis=2)
-    limits = (g.constant(limit, np.float32) for limit in (LEAST_LOG, MOST_LOG))
+    limits = (g.constant(limit, np.float32) for limit in (MIN_LOG_ERROR, MAX_LOG_ERROR))
     logs = g("Clip", g.part(outputs, numbers, END, axis=2), *limits)
     two, members = g.constant(2, np.float32), g.constant([0])
     variance = g("Mul", two, g("Exp", g("Mul", two, logs)))
@@ -451,9 +458,9 @@ def export_onnx(localizer: LocalizerModel, digest: str, path: Path, recording: R
         Fault: places differ by more than `MOST_OFF_MM`.
     """
     if localizer.method != "ensemble":
-        raise InputError(f"the localizer is of method {localizer.method}, expected masked: calibrate again")
+        raise InputError(f"the localizer is of method {localizer.method}, expected ensemble: calibrate again")
     if recording is not None:
-        refuse_other_pad(localizer, "the localizer", recording.fibres, recording.rate_hz)
+        check_same_pad(localizer, "the localizer", recording.fibres, recording.rate_hz)
     metadata = {
         "format": FORMAT,
         "padforge": version("padforge"),
@@ -494,7 +501,7 @@ def _made_up(localizer: LocalizerModel) -> _Readings:
     down_command = CYCLE // 2 + CYCLE * np.arange(TRIED)
     up_command = down_command + DOWN[-1][1]
     readings = 1e-3 * rng.standard_normal((TRIED * CYCLE + CYCLE, localizer.fibres))
-    strength = np.abs(scaling.centre).max(axis=1) + scaling.spread.max(axis=1)
+    strength = np.abs(scaling.mean_v).max(axis=1) + scaling.scale_v.max(axis=1)
     for first, end in zip(down_command, up_command, strict=True):
         readings[first:end] += strength * rng.uniform(-1, 1, localizer.fibres)
     return _Readings(readings, down_command, up_command)
@@ -504,14 +511,14 @@ def _differences(
     localizer: LocalizerModel, session: onnxruntime.InferenceSession, tried: _Readings
 ) -> tuple[float, float, int]:
     """Greatest distance of places, and difference of radii, mm, over all levels of loss that it was trained for."""
-    presses = localizer.scaler.inputs(press_inputs(*tried, localizer.features))
+    presses = localizer.scaler.transform(compute_features(*tried, localizer.features))
     rng, most = np.random.default_rng(0), len(localizer.interval_factors) - 1
     off: list[tuple[float, float]] = []
     for lost in range(most + 1):
         fibre_mask = presses.fibre_mask & _without(presses.fibre_mask.shape, lost, rng)
         found = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
         given = {
-            "readings": bridged(tried.readings),
+            "readings": interpolate_gaps(tried.readings),
             "down_command": tried.down_command,
             "up_command": tried.up_command,
             "fibre_mask": fibre_mask,

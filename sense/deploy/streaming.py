@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.localizer.features import PressFeatures, bridged
+from padforge.sense.localizer.features import PressFeatures, interpolate_gaps
 from padforge.sense.recording.recording import Recording
 
 RING = 32
@@ -232,7 +232,7 @@ class Detector:
 
         The noise is that of the differences of neighbouring readings.
         """
-        steps = np.abs(np.diff(bridged(recording.readings), axis=0))
+        steps = np.abs(np.diff(interpolate_gaps(recording.readings), axis=0))
         noise = 1.4826 * np.sqrt(0.5) * np.median(steps, axis=0)
         plateau = commanded(recording).windows[training, :, len(WINDOWS) - 1]
         noise = np.maximum(noise, LEAST_NOISE * np.sqrt(np.square(plateau).mean(axis=0)))

@@ -8,15 +8,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread
-from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.deploy.streaming import LAYERS, Budget, Detector, Seen, commanded, owners, seen, widest
-from padforge.sense.localizer.calibration import CHECKED, learn, radii, split_presses, split_unseen
+from padforge.sense.localizer.calibration import (
+    CALIBRATION_SHARE,
+    calibrate_intervals,
+    check_trained,
+    fit_recording,
+    split_presses,
+    split_unseen,
+)
 from padforge.sense.localizer.evaluation import distances, errors_by_loss
-from padforge.sense.localizer.features import FeatureScaler, PressFeatures, TrainingPresses
+from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
-from padforge.sense.localizer.network import Weights, refuse_unsound
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.network import Weights
+from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
@@ -65,7 +72,7 @@ class Student:
         """
         fibre_mask = ~np.isin(np.arange(self.localizer.fibres), lost)
         presses = seen(readings, self.detector, held, fibre_mask)
-        shown = self.localizer.scaler.inputs(presses.inputs)
+        shown = self.localizer.scaler.transform(presses.inputs)
         return presses, self.localizer.predict_features(replace(shown, fibre_mask=shown.fibre_mask & fibre_mask))
 
     def matrices(self) -> dict[str, Matrix]:
@@ -141,7 +148,7 @@ def teach(
     """
     rng = np.random.default_rng(options.seed)
     taught, checked = (
-        training[part] for part in split_presses(len(training), options.split, CHECKED["ensemble"], rng, least=2)
+        training[part] for part in split_presses(len(training), options.split, CALIBRATION_SHARE["ensemble"], rng, 2)
     )
     lessons, levels = Lessons.of(recording, teacher), len(teacher.interval_factors)
     hidden = widest(teacher.fibres, len(lessons.measures), levels, budget)
@@ -160,11 +167,11 @@ def teach(
     }
     # LONGER alone says for how long, whichever features the localizer is to take.
     own = options.model_copy(update={**size, "features": "press_and_release"})
-    weights = _trained(_samples(scaling, shown, lessons[rows]), table, own, rng, progress)
+    weights = _trained(_samples(scaling, shown, lessons[rows]), table, scaling, own, rng, progress)
     localizer = LocalizerModel(
-        as_int8(weights) if budget.quantized else weights,
-        scaling,
-        table,
+        weights=as_int8(weights) if budget.quantized else weights,
+        scaler=scaling,
+        table=table,
         method="ensemble",
         features="causal",
         interval_factors=np.ones((1, 3 + len(lessons.measures))),
@@ -172,19 +179,18 @@ def teach(
         training_recording_sha256=recording.digest,
     )
     known = {name: recording.measures[name][checked] for name in lessons.measures}
-    factors = radii(localizer, scaling.inputs(plain[checked]), recording.presses_mm[checked], levels, known)
+    factors = calibrate_intervals(localizer, scaling.transform(plain[checked]), recording.presses_mm[checked], levels, known)
     return Student(replace(localizer, interval_factors=factors), detector, budget.quantized)
 
 
 def _samples(scaling: FeatureScaler, inputs: PressFeatures, lessons: Lessons) -> TrainingPresses:
-    presses = scaling.inputs(inputs)
-    targets = scaling.targets(lessons.positions_mm, lessons.measures)
-    return TrainingPresses(presses.inputs, presses.fibre_mask, targets, scaling.stretch)
+    return scaling.training_presses(inputs, lessons.positions_mm, lessons.measures)
 
 
 def _trained(
     learn: TrainingPresses,
     table: Floats,
+    scaling: FeatureScaler,
     options: LocalizerSettings,
     rng: np.random.Generator,
     progress: Callable[[int, int], None],
@@ -193,13 +199,7 @@ def _trained(
 
     with one_torch_thread():
         weights = train_members(learn, table, options, rng, progress).weights
-    fibres, inputs = learn.inputs.shape[1:]
-    try:
-        refuse_unsound(weights, fibres * (inputs + 1), "ensemble", learn.targets.shape[1] - 2)
-    except InputError as error:
-        raise InputError(
-            f"training diverged at [localizer] learning_rate {options.learning_rate:g}, try a lower one: {error}"
-        ) from error
+    check_trained(weights, {}, scaling, options)
     return weights
 
 
@@ -209,7 +209,7 @@ def split(recording: Recording, teacher: LocalizerModel, options: LocalizerSetti
     Raises:
         InputError: the teacher was recalibrated by the recording, or there are too few presses.
     """
-    refuse_other_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
+    check_same_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
     return split_unseen(recording, teacher, options)
 
 
@@ -225,7 +225,7 @@ def causal_beside(
     It is the teacher, or one trained here on the presses `training` of a recording, by index.
 
     Raises:
-        InputError: as `calibration.learn`.
+        InputError: as `calibration.fit_model`.
     """
     if teacher.features == "causal":
         return teacher
@@ -233,7 +233,7 @@ def causal_beside(
         update={"features": "causal", "method": "ensemble", "max_failures": len(teacher.interval_factors) - 1}
     )
     with one_torch_thread():
-        return learn(recording, training, options, np.random.default_rng(options.seed), progress)
+        return fit_recording(recording, training, options, np.random.default_rng(options.seed), progress)
 
 
 def examine(student: Student, beside: Sequence[LocalizerModel], recording: Recording, test: Indices) -> dict[str, Any]:
@@ -245,7 +245,7 @@ def examine(student: Student, beside: Sequence[LocalizerModel], recording: Recor
         them, and "predicted_mm", the mean error of those found.
     """
     positions_mm, localizer = recording.presses_mm[test], student.localizer
-    shown = {"header": (localizer, localizer.scaler.inputs(commanded(recording)[test]))}
+    shown = {"header": (localizer, localizer.scaler.transform(commanded(recording)[test]))}
     shown |= {each.features: (each, each.scaled_features(recording)[test]) for each in beside}
     levels = range(len(localizer.interval_factors))
     rows = {

@@ -15,9 +15,10 @@ from padforge.design.common.validation import InputError, check_float, check_int
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, stream_of
 from padforge.sense.health.fault_detector import FaultDetector, FibreFault
 from padforge.sense.health.health_model import HealthModel
-from padforge.sense.localizer.features import REST, SIZES, ScaledFeatures, bridged, press_inputs
-from padforge.sense.localizer.model import MEASURED, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
+from padforge.sense.localizer.features import FEATURES, REST, compute_features, interpolate_gaps
+from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import DONE, NEEDS, BufferedPress, Ring
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 
@@ -107,9 +108,9 @@ class Live:
         self._monitor = None if health is None else FaultDetector(health)
         models = [check_type("localizers", each, LocalizerModel) for each in localizers]
         for model in models:
-            refuse_other_pad(model, "the localizer", fibres, rate_hz)
+            check_same_pad(model, "the localizer", fibres, rate_hz)
         if health is not None:
-            refuse_other_pad(health, "health", fibres, rate_hz)
+            check_same_pad(health, "health", fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda each: NEEDS[each.features][::-1])
         self._usual = _usual(self._localizers[-1])
         self._finder = PressDetector(fibres)
@@ -192,7 +193,7 @@ class Live:
 
     def _rest(self, at: int) -> Array:
         """(C,) V, mean of the readings just before index `at`."""
-        return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
+        return interpolate_gaps(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
 
     def _begin(self, touched: int) -> list[Event]:
         """The pad is touched; what was still to come of the press before comes now."""
@@ -230,8 +231,8 @@ class Live:
         readings, down_command, up_command, free = press.excerpt(self._ring, end)
         # The press before stands in by its end alone: the rest of this one reaches back no further.
         begins, ends = ([free - 1, down_command], [free, up_command]) if free > 0 else ([down_command], [up_command])
-        raw = press_inputs(readings, np.array(begins), np.array(ends), localizer.features)[-1:]
-        presses = localizer.scaler.inputs(raw)
+        raw = compute_features(readings, np.array(begins), np.array(ends), localizer.features)[-1:]
+        presses = localizer.scaler.transform(raw)
         fibre_mask = presses.fibre_mask.copy()
         fibre_mask[:, list(self.lost)] = False
         found = localizer.predict_features(ScaledFeatures(presses.inputs, fibre_mask))
@@ -240,7 +241,7 @@ class Live:
         measured = {
             column: float(values[0])
             for name, each in found.measures.items()
-            for column, values in zip(MEASURED[name], (each.values, each.r90), strict=True)
+            for column, values in zip(MEASURE_COLUMNS[name], (each.values, each.r90), strict=True)
         }
         estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, lost=lost, **measured)
         if self.presses and self.presses[-1].press == press.number:
@@ -261,6 +262,6 @@ class Live:
 
 def _usual(localizer: LocalizerModel) -> Array:
     """(C,) V, what a fibre's answer to a press goes up to."""
-    scaling, windows = localizer.scaler, SIZES[localizer.features]
-    usual = (np.abs(scaling.centre) + 2 * scaling.spread)[:, :windows].max(axis=1)
+    scaling, windows = localizer.scaler, FEATURES[localizer.features].n_windows
+    usual = (np.abs(scaling.mean_v) + 2 * scaling.scale_v)[:, :windows].max(axis=1)
     return np.where(usual > 0, usual, 1.0)

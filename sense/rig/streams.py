@@ -17,7 +17,7 @@ from padforge.design.common.validation import InputError, check_float
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.health.trace_model import RELEASED
-from padforge.sense.localizer.features import DOWN, EARLY, MEDIAN, SLOW, UP
+from padforge.sense.localizer.features import DOWN, FEATURES, SLOW, UP
 from padforge.sense.recording.recording import Recording, is_mirrored
 from padforge.sense.recording.run_directory import FORMAT, START
 from padforge.sense.rig.devices import Board, BoardSamples
@@ -31,12 +31,7 @@ HISTORY = SLOW[-1]
 """Readings before a press that its localizer looks at, as far as there are so many."""
 SUNK = DOWN[-1][1]
 """Readings after the probe was sent down that are looked at; of the others until it is sent up, none is."""
-NEEDS = {
-    "onset": (DOWN[EARLY - 1][1], 0),
-    "causal": (SUNK, 0),
-    "published": (SUNK, 10 + MEDIAN // 2 + 1),
-    "press_and_release": (SUNK, UP[-1][1]),
-}
+NEEDS = {name: each.readings_needed for name, each in FEATURES.items()}
 """Readings that features take after the probe was sent down, and after it was sent up."""
 DONE = max(UP[-1][1], RELEASED)
 """Readings after the probe was sent up with which a press is done."""

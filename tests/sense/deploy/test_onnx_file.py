@@ -17,7 +17,7 @@ from padforge.design.common.validation import Fault, InputError
 from padforge.sense import Recording, calibrate, export_csv
 from padforge.sense.deploy import onnx_export as onnx_file
 from padforge.sense.deploy.onnx_export import MOST_OFF_MM, Exported, export_onnx, onnx_line
-from padforge.sense.localizer.features import bridged
+from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import ROOT, tutorial
@@ -42,7 +42,7 @@ def graph(exported: tuple[Path, Exported]) -> onnxruntime.InferenceSession:
 
 def presses_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
     edges = {"down_command": recording.down_command, "up_command": recording.up_command}
-    return {"readings": bridged(recording.readings), **edges, "fibre_mask": fibre_mask}
+    return {"readings": interpolate_gaps(recording.readings), **edges, "fibre_mask": fibre_mask}
 
 
 def require_places(positions_mm: Any, found: Localization) -> None:

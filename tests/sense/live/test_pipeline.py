@@ -202,7 +202,7 @@ def test_without_any_fibre_a_press_may_be_anywhere(recording, learnt) -> None:
     )
     assert events[1].lost == (0, 1, 2, 3)
     assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(scaling.origin_mm))
-    assert events[1].r90_mm > scaling.span_mm
+    assert events[1].r90_mm > scaling.scale_mm
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
 
 
