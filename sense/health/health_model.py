@@ -49,7 +49,7 @@ from padforge.sense.health.trace_model import (
     traces_of,
     train_predictors,
 )
-from padforge.sense.localizer.model_files import files_of, refuse_other_pad
+from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.recording.recording import Recording, rate_of
 
 FORMAT = "padforge-health/2"
@@ -167,7 +167,7 @@ class HealthModel:
 
     def refuse_other(self, readings: Array, times_s: Array) -> None:
         """Raise InputError if a recording has other fibres or another rate than the one that was learnt from."""
-        refuse_other_pad(self, "health", readings.shape[1], rate_of(times_s))
+        check_same_pad(self, "health", readings.shape[1], rate_of(times_s))
 
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; reading them back gives the same to the last bit.

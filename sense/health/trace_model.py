@@ -16,7 +16,6 @@ import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
-from padforge.sense.localizer.model_files import average_in, one_cycle
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.alive` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
@@ -217,6 +216,8 @@ def _train(inputs: Floats, targets: Array, rows: list[Indices], seed: int) -> di
     import torch
     from torch.nn.functional import silu
 
+    from padforge.sense.localizer.training import fit_network
+
     generator = torch.Generator().manual_seed(seed)
     x, y = torch.from_numpy(inputs), torch.from_numpy(targets.astype(np.float32))
     members, (_, fibres, numbers), outputs = len(rows), x.shape, y.shape[2]
@@ -233,12 +234,10 @@ def _train(inputs: Floats, targets: Array, rows: list[Indices], seed: int) -> di
         "last.w": normal(members, fibres, HIDDEN, 2 * outputs, fan_in=HIDDEN, gain=0.1),
         "last.b": torch.zeros(members, fibres, 2 * outputs, requires_grad=True),
     }
-    average = [weight.detach().clone() for weight in weights.values()]
-    optimizer = torch.optim.AdamW(weights.values(), lr=RATE, weight_decay=WEIGHT_DECAY, fused=True)
     ranges = [torch.from_numpy(row) for row in rows]
     shares = torch.tensor(LEFT_OUT[: max(fibres - 1, 1)])
-    steps = min(MOST_STEPS, len(x))
-    for step in range(1, steps + 1):
+
+    def loss_of_batch() -> torch.Tensor:
         chosen = torch.stack([r[torch.randint(len(r), (BATCH,), generator=generator)] for r in ranges])
         count = 1 + torch.multinomial(shares, members * BATCH, replacement=True, generator=generator)
         order = torch.rand(members, BATCH, fibres, generator=generator).argsort(dim=2)
@@ -255,9 +254,6 @@ def _train(inputs: Floats, targets: Array, rows: list[Indices], seed: int) -> di
         likelihood = (FREEDOM + 1) / 2 * torch.log1p(error * torch.exp(-2 * log_spread) / FREEDOM) + log_spread
         # The plain square keeps the mean learning where a wide spread has made the likelihood flat.
         loss = ((likelihood + error / 4) * out).sum(dim=(1, 2, 3)) / out.sum(dim=(1, 2, 3))
-        optimizer.zero_grad()
-        loss.sum().backward()
-        optimizer.param_groups[0]["lr"] = RATE * one_cycle(step / steps)
-        optimizer.step()
-        average_in(average, weights.values(), step)
-    return {name: weight.numpy() for name, weight in zip(weights, average, strict=True)}
+        return loss.sum()
+
+    return fit_network(weights, loss_of_batch, min(MOST_STEPS, len(x)), RATE, weight_decay=WEIGHT_DECAY)

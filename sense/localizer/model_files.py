@@ -1,13 +1,12 @@
-"""What all that is trained on a recording shares: a document with its weights beside it, the pad it suits, its rate."""
+"""Files of a trained model: a JSON document and the arrays beside it, and the pad that a model is for."""
 
 import hashlib
 import json
-import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,35 +14,33 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from padforge.design.common.files import atomic_files, read_bytes
-from padforge.design.common.validation import InputError, check_type, short_repr
-from padforge.design.common.validation import check_path as as_path
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
+from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 
 RATE_TOLERANCE = 0.25
-"""Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
-WARM_UP = 0.2
-"""Share of the steps of a training in which the rate of learning rises."""
-AVERAGE = 0.998
-"""Share of the running average of the weights that a step of training leaves as it was."""
+"""Windows are counted in readings, so the rate must be about that of the training."""
 
 
 class ModelFiles(NamedTuple):
-    """NAME.json and NAME.safetensors, of which the first has the digest of the second.
+    """NAME.json and NAME.safetensors, written together; the document holds the digest of the arrays.
 
-    They are written together; a pair whose halves somebody has mixed is told from a whole one.
+    Attributes:
+        document: path of the JSON file.
+        weights: path of the arrays.
     """
 
     document: Path
     weights: Path
 
     def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write `document`, its "weights_sha256" filled in, and `arrays`, together or not at all.
+        """Write a document with "weights_sha256" added, and arrays, together or not at all.
+
+        Args:
+            document: JSON values.
+            arrays: by name.
+            what: name of the model in messages.
 
         Raises:
-            InputError: the document of `what` is not finite or no JSON, or the folder cannot be written.
+            InputError: the document is not finite or no JSON, or the folder cannot be written.
         """
         content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
@@ -57,10 +54,14 @@ class ModelFiles(NamedTuple):
 
     @contextmanager
     def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the arrays that were written with a document that has this digest of them, to be checked in the body.
+        """Yield the arrays of a document, to be checked in the body of `with`.
+
+        Args:
+            digest: "weights_sha256" of the document.
+            what: name of the model in messages.
 
         Raises:
-            InputError: they cannot be read or are others, or the body raises what says that they are unsound.
+            InputError: they cannot be read, belong to another document, or the body raises one.
         """
         content, name = read_bytes(self.weights), self.document.name
         if hashlib.sha256(content).hexdigest() != digest:
@@ -72,19 +73,19 @@ class ModelFiles(NamedTuple):
 
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
-    """The files of the model `name` in a folder.
+    """Return the files of a model in a folder.
 
     Raises:
         InputError: `folder` is no path, or `name` no plain name.
     """
-    folder = as_path("folder", folder)
+    folder = check_path("folder", folder)
     if not re.fullmatch(r"\w{1,100}", check_type("name", name, str)):
         raise InputError(f"name is {short_repr(name)}, expected letters, digits and underscores")
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 
 class TrainedModel(Protocol):
-    """Trained on `fibres` fibres, lost ones included, of which there were `rate_hz` readings per second."""
+    """A model of `fibres` fibres, trained at `rate_hz` readings per second."""
 
     @property
     def fibres(self) -> int: ...
@@ -93,29 +94,19 @@ class TrainedModel(Protocol):
     def rate_hz(self) -> float: ...
 
 
-def refuse_other_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
-    """Raise InputError if readings are of other fibres, or come at another rate, than those `model` was trained on."""
+def check_same_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
+    """Raise InputError if readings have another number of fibres, or another rate, than the training of a model.
+
+    Args:
+        model: that the readings are for.
+        what: its name in messages.
+        fibres: of the readings.
+        rate_hz: of the readings.
+    """
     if fibres != model.fibres:
-        raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")
+        raise InputError(f"readings have {fibres} fibres, {what} was trained on {model.fibres}")
     if abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
         raise InputError(
-            f"there are {rate_hz:.3g} readings a second, allowed is {model.rate_hz:.3g}, at which {what} was learnt, "
+            f"readings come at {rate_hz:.3g} Hz, allowed is {model.rate_hz:.3g} Hz, at which {what} was trained, "
             f"within {RATE_TOLERANCE:.0%}"
         )
-
-
-def one_cycle(share: float) -> float:
-    """Rate of learning after `share` of the steps: up along a line to 1, then down along a cosine to 0."""
-    if share < WARM_UP:
-        return share / WARM_UP
-    return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
-
-
-def average_in(average: "Iterable[Tensor]", weights: "Iterable[Tensor]", number: int) -> None:
-    """Move the running average by step `number`, counted from 1, of a training.
-
-    It forgets the first steps sooner than the later ones, or it would start from the initial draw.
-    """
-    keep = min(AVERAGE, number / (number + 9))
-    for kept, weight in zip(average, weights, strict=True):
-        kept.lerp_(weight.detach(), 1 - keep)

@@ -19,7 +19,7 @@ from padforge.design.common.files import provenance
 from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import flatten
 from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
-from padforge.sense.localizer.features import REST, bridged
+from padforge.sense.localizer.features import REST, interpolate_gaps
 from padforge.sense.recording.press_plan import free_of, planned, size_of
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, read_journal, refuse_begun
@@ -268,7 +268,7 @@ class HandSession:
     def _late(self) -> Array:
         """(C,) V, mean of the latest readings."""
         rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
-        return bridged(rows[np.searchsorted(rows[:, 0], self._now_s - SOON_S) :, 1:]).mean(axis=0)
+        return interpolate_gaps(rows[np.searchsorted(rows[:, 0], self._now_s - SOON_S) :, 1:]).mean(axis=0)
 
     def _time_s(self, reading: int) -> float:
         return float(self._ring.rows(reading, reading + 1)[0, 0])
@@ -281,7 +281,7 @@ class HandSession:
 
     def _rest_before(self, at: int) -> Array:
         """(C,) V, mean of the readings just before index `at`."""
-        return bridged(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
+        return interpolate_gaps(self._ring.rows(at + REST[0], at)[:, 1:]).mean(axis=0)
 
     def view(self) -> dict[str, Any]:
         """What there is to show now, as JSON.

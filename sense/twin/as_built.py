@@ -28,7 +28,8 @@ from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
 from padforge.design.twin import PlanTransform
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, STEPS, ResponseModel, press_inputs, settled
+from padforge.sense.localizer.features import DOWN, compute_features
+from padforge.sense.localizer.response_model import GRID_CELLS, ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
 CENTRE = 1e-6
@@ -199,11 +200,11 @@ def responses(recording: Recording, learnt: Mask) -> Responses:
         learnt: (Q,) of these presses, those from which is learnt what of its history a channel still shows.
     """
     known = recording.known
-    inputs = press_inputs(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
+    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
     places = recording.presses_mm[known]
     about = _about(places)
     model = ResponseModel.fit(about[learnt], inputs.windows[learnt], inputs.history[learnt], inputs.fibre_mask[learnt])
-    windows = settled(inputs.windows, inputs.history, model.memory, model.usual)
+    windows = remove_history(inputs.windows, inputs.history, model.history_coef, model.history_mean_v)
     return Responses(places, windows @ HOLD, inputs.fibre_mask)
 
 
@@ -214,7 +215,7 @@ def information(recording: Recording, channels: Indices) -> Array:
         channels: (C',) which ones, each by the presses in which it gave enough readings.
     """
     known = recording.known
-    inputs = press_inputs(
+    inputs = compute_features(
         recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
     )
     places = _about(recording.presses_mm[known])
@@ -233,16 +234,16 @@ def _told(places: Array, windows: Array, history: Array) -> float:
     slopes are taken: noise that a model takes for a slope is not in the other one.
     """
     windows, history, fibre_mask = windows[:, None], history[:, None], np.ones((len(places), 1), bool)
-    grid, odd = np.linspace(-1, 1, STEPS + 1), np.arange(len(places)) % 2 == 1
+    grid, odd = np.linspace(-1, 1, GRID_CELLS + 1), np.arange(len(places)) % 2 == 1
     left, tables = np.empty_like(windows), []
     for seen in (odd, ~odd):
         model = ResponseModel.fit(places[seen], windows[seen], history[seen], fibre_mask[seen])
         expected = RegularGridInterpolator((grid, grid), model.table)(places[~seen])
-        left[~seen] = settled(windows[~seen], history[~seen], model.memory, model.usual) - expected
+        left[~seen] = remove_history(windows[~seen], history[~seen], model.history_coef, model.history_mean_v) - expected
         tables.append(model.table[:, :, 0])
     precision, told = np.linalg.pinv(np.cov(left[:, 0].T), hermitian=True), 0.0  # short presses have readings twice
     for axis in (0, 1):
-        one, other = (np.asarray(np.gradient(table, 2 / STEPS, axis=axis)) for table in tables)
+        one, other = (np.asarray(np.gradient(table, 2 / GRID_CELLS, axis=axis)) for table in tables)
         told += float(np.einsum("xyf,fg,xyg->xy", one, precision, other).mean())
     return max(told, 0.0)
 

@@ -16,7 +16,8 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.health.fault_detector import health_files, health_in
 from padforge.sense.health.health_model import COMMANDED, DETECTED, HealthModel
-from padforge.sense.localizer.model_files import ModelFiles, files_of, one_cycle
+from padforge.sense.localizer.model_files import ModelFiles, files_of
+from padforge.sense.localizer.training import one_cycle
 from tests.sense.health.pads import later, spoilt
 from tools.kills import killed
 

@@ -191,7 +191,7 @@ def test_live_without_readings_says_anywhere(recording, trained) -> None:
     live, events = replay(replace(part, readings=readings), [trained("press_and_release")])
     assert events[1].failed == (0, 1, 2, 3)
     assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(scaler.origin_mm))
-    assert events[1].r90_mm > scaler.span_mm
+    assert events[1].r90_mm > scaler.scale_mm
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
 
 

@@ -17,9 +17,9 @@ from padforge.sense.localizer.features import (
     SLOW,
     FeatureScaler,
     PressFeatures,
-    bridged,
+    compute_features,
     history,
-    press_inputs,
+    interpolate_gaps,
 )
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
@@ -32,7 +32,7 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def windows_of(readings: np.ndarray, features: str) -> np.ndarray:
-    return press_inputs(readings, BEGUN, LIFTED, features).windows
+    return compute_features(readings, BEGUN, LIFTED, features).windows
 
 
 def test_windows_are_means_less_the_rest_and_published_inputs_are_medians() -> None:
@@ -50,11 +50,11 @@ def test_windows_are_means_less_the_rest_and_published_inputs_are_medians() -> N
     past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
     slow = [-402, -2010]
     for features, windows in (("press_and_release", down + up), ("causal", down), ("onset", down[:6])):
-        found = press_inputs(ramp, down_command, up_command, features)
+        found = compute_features(ramp, down_command, up_command, features)
         np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
         np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
     np.testing.assert_allclose(
-        press_inputs(ramp, down_command, up_command, "published").windows[0, 0], [4990 - 0, 5010, 5030]
+        compute_features(ramp, down_command, up_command, "published").windows[0, 0], [4990 - 0, 5010, 5030]
     )
 
 
@@ -79,7 +79,7 @@ def test_a_press_is_told_by_its_own_readings_and_a_fibre_by_its_own(name: str, e
 def test_presses_of_any_length_have_inputs_within_the_readings(name: str, gaps: list[int], after: int) -> None:
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     readings = np.random.default_rng(0).uniform(1, 2, (edges[-1] + after, 2))
-    found = press_inputs(readings, edges[::2], edges[1::2], name)
+    found = compute_features(readings, edges[::2], edges[1::2], name)
     assert found.windows.shape == (len(edges) // 2, 2, SIZES[name])
     assert found.history.shape == (len(edges) // 2, 2, PASTS[name])
     assert np.isfinite(found.windows).all()
@@ -106,12 +106,12 @@ def test_short_gaps_are_bridged_and_do_not_spread() -> None:
     readings = noise()
     holed = readings.copy()
     holed[105] = holed[:3, 1] = np.nan
-    filled = bridged(holed)
+    filled = interpolate_gaps(holed)
     assert np.allclose(filled[105], (readings[104] + readings[106]) / 2)
     assert np.array_equal(filled[:3, 1], np.repeat(readings[3, 1], 3))
     there = ~np.isnan(holed)
     assert np.array_equal(filled[there], readings[there])
-    assert press_inputs(holed, BEGUN, LIFTED, "press_and_release").fibre_mask.all()
+    assert compute_features(holed, BEGUN, LIFTED, "press_and_release").fibre_mask.all()
 
 
 @pytest.mark.parametrize(
@@ -125,11 +125,11 @@ def test_a_fibre_counts_where_three_quarters_are_there(features: str, first: int
         for begin in (100 + first, 100 + end - missing):
             readings = noise()
             readings[begin : begin + missing, 1] = np.nan
-            assert press_inputs(readings, BEGUN, LIFTED, features).fibre_mask[2, 1] == there
+            assert compute_features(readings, BEGUN, LIFTED, features).fibre_mask[2, 1] == there
     readings = noise()
     readings[50 : 100 + first, 1] = readings[100 + end : 140, 1] = np.nan
     readings[:, 2] = np.nan
-    found = press_inputs(readings, BEGUN, LIFTED, features)
+    found = compute_features(readings, BEGUN, LIFTED, features)
     assert found.fibre_mask[2].tolist() == [True, True, False]
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()

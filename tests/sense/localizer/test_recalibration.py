@@ -12,7 +12,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer import training as fine_tuning
 from padforge.sense.localizer.evaluation import distances
-from padforge.sense.localizer.features import TrainingPresses, looked_up
+from padforge.sense.localizer.features import TrainingPresses, interpolate_grid
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.recalibration import CrossValidation, fit_correction, recalibrate
 from padforge.sense.localizer.training import adapt
@@ -167,8 +167,8 @@ def test_a_known_correction_is_found(localizer: LocalizerModel, recording: Recor
     # The table is turned with the pad.
     at = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
     one, other = (each.table.reshape(*each.table.shape[:2], -1) for each in (localizer, found))
-    expected = looked_up(one, at)
-    np.testing.assert_allclose(looked_up(other, at @ turn.T + shift), expected, atol=0.05 * np.ptp(expected))
+    expected = interpolate_grid(one, at)
+    np.testing.assert_allclose(interpolate_grid(other, at @ turn.T + shift), expected, atol=0.05 * np.ptp(expected))
 
 
 def test_adapting_weighs_new_presses_and_leaves_lost_fibres_alone(localizer, recording, monkeypatch) -> None:

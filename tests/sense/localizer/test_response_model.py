@@ -11,7 +11,7 @@ from padforge.sense.localizer.features import (
     ResponseModel,
     TrainingPresses,
     as_unseen,
-    looked_up,
+    interpolate_grid,
     settled,
 )
 
@@ -108,7 +108,7 @@ def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float)
     a, b, c, d = np.random.default_rng(seed).standard_normal(4)
     grid = np.linspace(-1, 1, 9)
     u, v = np.meshgrid(grid, grid, indexing="ij")
-    found = looked_up((a + b * u + c * v + d * u * v)[:, :, None], np.array([[x, y]]))
+    found = interpolate_grid((a + b * u + c * v + d * u * v)[:, :, None], np.array([[x, y]]))
     assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
 
 
@@ -131,11 +131,11 @@ def test_presses_are_as_far_off_as_from_a_table_fitted_without_them() -> None:
     table = table_of(places, windows)
     presses = TrainingPresses(windows.astype(np.float32), fibre_mask, places.astype(np.float32))
     flat = table.reshape(*table.shape[:2], -1)
-    rest = as_unseen(presses, table).inputs - looked_up(flat, places).reshape(windows.shape)
+    rest = as_unseen(presses, table).inputs - interpolate_grid(flat, places).reshape(windows.shape)
     for press in (0, 4, 17):
         others = (places != places[press]).any(axis=1)
         without = table_of(places[others], windows[others])
-        expected = looked_up(without.reshape(*table.shape[:2], -1), places[[press]]).reshape(FIBRES, 3)
+        expected = interpolate_grid(without.reshape(*table.shape[:2], -1), places[[press]]).reshape(FIBRES, 3)
         same = (places == places[press]).all(axis=1)
         # Of several presses at one place, left out together, their mean stands to the table as each of them does here.
         np.testing.assert_allclose(rest[same].mean(axis=0), windows[same].mean(axis=0) - expected, atol=0.02, rtol=0.02)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from padforge.sense.localizer import network, training
 from padforge.sense.localizer import training as masked_network
-from padforge.sense.localizer.features import TrainingPresses, looked_up
-from padforge.sense.localizer.training import draw_alive
+from padforge.sense.localizer.features import TrainingPresses, interpolate_grid
+from padforge.sense.localizer.training import sample_fibre_dropout
 from padforge.sense.settings import Features
 from padforge.sense.settings import LocalizerSettings as Options
 
@@ -48,7 +48,7 @@ def test_the_spread_of_members_adds_to_what_they_expect() -> None:
 @given(fibres=st.integers(1, 9), lost=st.integers(0, 4), seed=st.integers(0, 99))
 def test_training_masks_lose_no_more_than_they_may(fibres: int, lost: int, seed: int) -> None:
     lost = min(lost, fibres - 1)
-    fibre_mask = draw_alive(800, fibres, lost, torch.Generator().manual_seed(seed))
+    fibre_mask = sample_fibre_dropout(800, fibres, lost, torch.Generator().manual_seed(seed))
     gone = (~fibre_mask).sum(dim=1)
     assert gone.max() <= lost
     assert set(gone.unique().tolist()) == set(range(lost + 1))
@@ -65,9 +65,9 @@ def test_presses_moved_over_the_edge_are_sent_back_by_as_much(monkeypatch: pytes
 
     def spy(table: torch.Tensor, places: torch.Tensor, xp: ModuleType) -> torch.Tensor:
         seen.append(places)
-        return looked_up(table, places, xp)
+        return interpolate_grid(table, places, xp)
 
-    monkeypatch.setattr(masked_network, "looked_up", spy)
+    monkeypatch.setattr(masked_network, "interpolate_grid", spy)
     options = Options(members=1, hidden=8, layers=1, max_failures=0, batch=256, epochs=1)
     monkeypatch.setattr(training, "MOVED", 0.1)
     table = np.zeros((3, 3, 1, 1), np.float32)
