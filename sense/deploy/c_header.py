@@ -14,7 +14,13 @@ from padforge.design.common.files import write_text
 from padforge.sense.arrays import Array, Floats
 from padforge.sense.deploy import streaming
 from padforge.sense.deploy.streaming import CODE_BYTES, N_LAYERS, MemoryBudget, state_bytes, table_bytes
-from padforge.sense.deploy.student import StudentNetwork, causal_reference, distill, evaluate_student, split_student_presses
+from padforge.sense.deploy.student import (
+    StudentNetwork,
+    causal_reference,
+    distill,
+    evaluate_student,
+    split_student_presses,
+)
 from padforge.sense.localizer import model as localizer_model
 from padforge.sense.localizer import network, scaler
 from padforge.sense.localizer.model import LocalizerModel
@@ -49,8 +55,8 @@ class HeaderReport:
         columns: Mapping[str, Any] = errors["errors"]
         width = max(7, *map(len, columns))
         lines = [
-            f"{student.hidden} neurons in each of {N_LAYERS + 1} layers, {kind}: {flash}, {CODE_BYTES / 1024:g} of them "
-            f"for code; RAM {self.state_bytes / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
+            f"{student.hidden} neurons in each of {N_LAYERS + 1} layers, {kind}: {flash}, {CODE_BYTES / 1024:g} of them for "
+            f"code; RAM {self.state_bytes / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
             f"mean error in mm on {errors['test_presses']} presses never trained on",
             "failed  sets" + "".join(f" {name:>{width}}" for name in columns),
         ]

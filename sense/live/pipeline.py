@@ -16,19 +16,10 @@ from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, M
 from padforge.sense.health.fault_detector import FaultDetector, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
-from padforge.sense.localizer.features import (
-    DOWN,
-    EARLY,
-    MEDIAN,
-    REST,
-    SIZES,
-    UP,
-    ScaledFeatures,
-    bridged,
-    press_inputs,
-)
-from padforge.sense.localizer.model import MEASURED, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
+from padforge.sense.localizer.features import DOWN, FEATURES, REST, UP, compute_features, interpolate_gaps
+from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import HISTORY, RingBuffer
 from padforge.sense.signals.press_detection import SENT_DOWN_S, SENT_UP_S, PressDetector
 

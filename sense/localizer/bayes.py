@@ -152,7 +152,9 @@ class BayesianLocalizer:
         """Mean (Q, 2), variances (Q, 2) and correlation (Q,) of the posterior on the grid."""
         first, second = (each.tolist() for each in np.triu_indices(z.shape[2]))
         monomials = xp.concat([z[:, :, first] * z[:, :, second], z, xp.ones_like(z[:, :, :1])], axis=2)
-        log_likelihood = (monomials * mask[:, :, None]).reshape(-1, len(self.log_likelihood_coefficients)) @ self.log_likelihood_coefficients
+        coefficients = self.log_likelihood_coefficients
+        # -1 for the presses, whose number may be traced
+        log_likelihood = (monomials * mask[:, :, None]).reshape(-1, len(coefficients)) @ coefficients
         log_likelihood -= xp.amax(log_likelihood, axis=1)[:, None]  # in place: fetching memory takes as long as filling
         clipped = xp.clip(log_likelihood, MIN_EXPONENT, 0.0, out=log_likelihood)
         posterior = xp.exp(clipped, out=log_likelihood)

@@ -68,7 +68,9 @@ def network_inputs(features: Floats, fibre_mask: Mask) -> Floats:
     Features of masked fibres are replaced, not multiplied, by 0: not even NaN gets through.
     """
     masked = np.where(fibre_mask[:, :, None], features, np.float32(0))
-    return np.concatenate([masked.reshape(len(features), -1), fibre_mask.astype(np.float32)], axis=1)
+    return np.concatenate(
+        [masked.reshape(len(features), np.prod(features.shape[1:])), fibre_mask.astype(np.float32)], axis=1
+    )
 
 
 def forward(weights: Weights, x: Floats) -> Floats:

@@ -83,7 +83,8 @@ class EnsembleMlp(nn.Module):
 
 
 def _activate(h: Tensor) -> Tensor:
-    return functional.gelu(functional.layer_norm(h, (int(h.shape[-1]),), eps=EPSILON))
+    width = int(h.shape[-1])  # a plain number also where the network is traced for export
+    return functional.gelu(functional.layer_norm(h, (width,), eps=EPSILON))
 
 
 def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, generator: torch.Generator) -> Tensor:
