@@ -211,13 +211,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     padforge sense deploy --model out/pad localizer.onnx
     padforge sense deploy --model out/pad out/pad/recording localizer.h --flash 256k --ram 64k
 
-    An .onnx takes readings and when they were of a press, and gives places and radii. It is tried by onnxruntime
-    beside the localizer, on the presses of RECORDING or on some made up, and not written if they differ.
+    An .onnx takes readings and the commands of presses, and gives positions and radii. It is tested by onnxruntime
+    against the localizer, on the presses of RECORDING or on made-up ones, and not written if they differ.
 
     A .h is one C99 file that takes reading after reading. It holds a network of its own, as large as --flash and
-    --ram allow, which learns from RECORDING what is known by the end of a press. Presses that the model has not
-    learnt from tell how far off it is, beside the model and, where that looks at the release, one that does not,
-    trained for this. [localizer] says for how long they learn.
+    --ram allow, which is distilled from the model on RECORDING, with what is known by the end of a press. Its errors on
+    presses never trained on are printed beside those of the model and, where that looks at the release, of one that
+    does not, trained for this. [localizer] says how long they are trained.
     """
     from padforge.design.common.files import check_writable, sha256
     from padforge.sense.localizer.model import LocalizerModel

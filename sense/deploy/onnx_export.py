@@ -1,8 +1,8 @@
 """`localizer.onnx`: the localizer as one graph, from readings and the commands of presses to positions and radii.
 
 The graph is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian localizer with the
-rest of padforge. It is written only if onnxruntime computes from it what the localizer predicts. Of the two exporters of
-torch this is the older one (`dynamo=False`), since the other needs onnxscript.
+rest of padforge. It is written only if onnxruntime computes from it what the localizer predicts. Of torch's two
+exporters this is the older one (`dynamo=False`), since the other needs onnxscript.
 """
 
 import io
@@ -353,7 +353,7 @@ def _made_up_presses(model: LocalizerModel) -> _TrialPresses:
 def _compare(
     model: LocalizerModel, session: onnxruntime.InferenceSession, trial: _TrialPresses
 ) -> tuple[float, float, int]:
-    """Return the largest differences of positions and of radii, mm, and the failed fibres up to which they were tested."""
+    """Return the largest differences of positions and of radii, mm, and the most failed fibres in the test."""
     presses = model.scaler.transform(compute_features(*trial, model.features))
     rng, max_failures = np.random.default_rng(0), len(model.interval_factors) - 1
     differences = []
