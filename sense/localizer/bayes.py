@@ -21,8 +21,7 @@ COMPONENTS = 6
 COARSENING = 2
 """Cells of the response table along a side of a cell of the posterior's grid."""
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
-"""Standard deviation of the weights in an average of the scatter, in distances between presses; presses that the
-scatter of the whole pad counts as."""
+"""Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
 MIN_VARIANCE = 1e-4
 """Of scaled features, which are about 1."""
 PRIOR_WEIGHT = 0.05

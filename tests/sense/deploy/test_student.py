@@ -76,7 +76,7 @@ def test_a_recording_that_cannot_judge_is_refused(brief: Recording, localizer: L
     seen = replace(localizer, recalibrated_by=(brief.digest,))
     with pytest.raises(InputError, match="the localizer was recalibrated by"):
         split(brief, seen, QUICK)
-    with pytest.raises(InputError, match="presses of known place"):
+    with pytest.raises(InputError, match="presses of known position"):
         split(first_presses(brief, 3), localizer, QUICK)
     with pytest.raises(InputError, match="readings a second"):
         split(replace(brief, times_s=brief.times_s * 2), localizer, QUICK)
