@@ -1,11 +1,5 @@
-"""`padforge sense calibrate` and `evaluate`: learning places, and how well it went.
-
-`padforge sense locate`, `health` and `deploy`: what a recording says of presses and fibres, here and elsewhere.
-
-`padforge sense recalibrate`, `fibre-loss`, `learning-curve`: following a pad; what fibres and presses are worth.
-
-`padforge sense identify`: the edge where a recording becomes a twin.
-"""
+"""Commands that train a localizer, use it and evaluate it: `calibrate`, `evaluate`, `locate`, `recalibrate`, `deploy`,
+`fibre-loss`, `learning-curve`; and `health` and `identify`."""
 
 import re
 from functools import partial
@@ -42,8 +36,12 @@ from padforge.sense.cli.options import (
 
 @click.command()
 @recording_argument
-@click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
-@click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
+@click.option("--method", type=click.Choice(METHODS), help="ensemble: one for every loss of fibres; or as published.")
+@click.option(
+    "--features",
+    type=click.Choice(FEATURES),
+    help="press_and_release; causal: up to its end; onset: its first readings; or published.",
+)
 @click.option(
     "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test."
 )
@@ -63,7 +61,7 @@ def calibrate(
     as_json: bool,
     **overrides: Any,
 ) -> None:
-    """Learn places from RECORDING and test on presses held back.
+    """Train a localizer on RECORDING and test it on presses held back.
 
     \b
     padforge sense calibrate out/pad/recording --test-split chronological
@@ -101,7 +99,7 @@ def calibrate(
 @common.json_option
 @common.profile_option
 def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
-    """Errors on RECORDING for every set of lost fibres.
+    """Evaluate on RECORDING, for every set of failed fibres.
 
     \b
     padforge sense evaluate --model out/pad out/later/recording --max-failures 1
@@ -109,12 +107,9 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
     Of the recording the model was trained on, only the presses that were held back count.
     """
     from padforge.sense.localizer.evaluation import calibration_lines
-    from padforge.sense.localizer.evaluation import evaluate as test
-    from padforge.sense.localizer.model import LocalizerModel
+    from padforge.sense.localizer.localizer import Localizer
 
-    localizer = LocalizerModel.load(model)
-    levels = range(min(max_failures, localizer.fibres - 1) + 1)
-    document = test(localizer, read_recording(recording), levels)
+    document = Localizer.load(model).evaluation_report(read_recording(recording), max_failures)
     common.show_result(document, calibration_lines(document), as_json)
 
 
@@ -124,18 +119,18 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 @click.option(
     "--exclude-fibres", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1."
 )
-@out_option(what="CSV file for the places, places.csv", file=True)
+@out_option(what="CSV file for the positions, places.csv", file=True)
 @profile_option
 def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
-    """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
+    """Predict the position of every press of RECORDING and its uncertainty; no true position is needed.
 
     \b
     padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
-    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
-    of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
+    deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
+    of a model that predicts them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
     from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
     from padforge.sense.localizer.model import LocalizerModel, write_localization
@@ -260,13 +255,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 @common.force_option
 @common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
+    """Adapt to a pad that drifted or was re-made, by presses of known position in RECORDING: 20 to 500.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
 
-    Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
-    if it did not, places are found as before. The old model is written over only where --out says so.
+    Writes a model and recalibration.json. Cross-validation decides whether it got better; if not, positions are
+    predicted as before. The old model is replaced only where --out says so.
     """
     from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.formats.import_export import open_recording
@@ -280,14 +275,14 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     check_writable(target)
     old, health, opened = LocalizerModel.load(model), health_in(model), open_recording(recording)
     with reported("recalibrating") as report:
-        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
+        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
     with atomic_files(target, without=health_files()) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"
         check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *health_files()], force)
         write_json(folder / "recalibration.json", document)
-        for name, known in health.items():  # it was learnt without places
-            known.save(folder, name)
+        for name, watch in health.items():  # it was trained without positions
+            watch.save(folder, name)
     common.show_result(document, recalibration.recalibration_lines(document), as_json)
 
 

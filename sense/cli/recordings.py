@@ -118,7 +118,9 @@ def _findings(model: Path, recording: "Recording") -> "ModelFindings":
 
     known, faults = examined(model, recording) if has_health(model) else (None, [])
     localizer = LocalizerModel.load(model)
-    found = localizer.predict(recording, fibre_mask=fibre_mask_of(faults, len(recording.down_command), localizer.fibres))
+    found = localizer.predict(
+        recording, fibre_mask=fibre_mask_of(faults, len(recording.down_command), localizer.fibres)
+    )
     depth = found.measures.get("depth_mm")
     unknown = np.full(len(found.r90_mm), np.nan)
     return ModelFindings(

@@ -21,12 +21,11 @@ COMPONENTS = 6
 COARSENING = 2
 """Cells of the response table along a side of a cell of the posterior's grid."""
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
-"""Standard deviation of the weights in an average of the scatter, in distances between presses; presses that the
-scatter of the whole pad counts as."""
+"""Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
 MIN_VARIANCE = 1e-4
 """Of scaled features, which are about 1."""
 PRIOR_WEIGHT = 0.05
-"""Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold them."""
+"""Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold."""
 GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2
 """Steps, and the longest, in units of the scaled position."""
 MIN_STD = 1e-2

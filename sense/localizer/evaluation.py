@@ -198,7 +198,7 @@ def distances(predicted_mm: Array, pressed_mm: Array) -> Array:
 
 
 def conformal(predictions: Sequence[Localization], positions_mm: Array, measures: Measures | None = None) -> Array:
-    """Return the factors by which standard deviations, radii and the r90 of measures must grow to hold on these presses.
+    """Return the factors by which standard deviations, radii and r90 of measures must grow to hold on these presses.
 
     Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): a quantile of
     distance over radius on presses that entered nothing before, one rank higher than the share, so that of few presses

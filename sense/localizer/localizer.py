@@ -1,4 +1,4 @@
-"""The estimator: a localizer with `fit`, `predict`, `score`, `evaluate`, `save` and `load`, as scikit-learn has them."""
+"""The estimator: a localizer with `fit`, `predict`, `score`, `evaluate`, `save` and `load`, as in scikit-learn."""
 
 import hashlib
 from collections.abc import Callable, Iterable

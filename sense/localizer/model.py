@@ -4,9 +4,11 @@ Where it was trained on presses of several depths, it predicts depth too, and fo
 """
 
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -221,9 +223,10 @@ class LocalizerModel(LocalizerDocument):
                     self.residual_network,
                 )
             )
-            for first in range(0, max(len(presses), 1), chunk)
+            for first in range(0, len(presses), chunk)
         ]
-        targets, std = (np.concatenate(part) for part in zip(*parts, strict=True))
+        empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
+        targets, std = (np.concatenate(part) for part in zip((empty, empty), *parts, strict=True))
         level = np.minimum((~fibre_mask).sum(axis=1), len(self.interval_factors) - 1)
         to_std, to_r50, to_r90 = self.interval_factors[level, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
@@ -262,7 +265,7 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: something is not finite or no JSON, or `folder` cannot be written.
         """
-        document = {"format": FORMAT, **_DOCUMENT.dump_python(self)}
+        document = {"format": FORMAT, **_DOCUMENT.dump_python(self, warnings=False)}
         arrays = {**self.weights, TABLE: self.table}
         if self.bayes is not None:
             arrays |= self.bayes.to_arrays() | {RESIDUAL + name: part for name, part in self.residual_network.items()}
@@ -312,8 +315,11 @@ def read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDoc
         read = _DOCUMENT.validate_json(json.dumps(values))
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise InputError(f"{where}: {key} is {short_repr(first['input'])}: {first['msg'].lower()}") from error
+        key, value = (
+            ".".join(map(str, first["loc"])),
+            textwrap.shorten(shortened(first["input"]), 100, placeholder=" ..."),
+        )
+        raise InputError(f"{where}: {key} is {value}: {first['msg'].lower()}") from error
     scaler, shape = read.scaler, read.scaler.mean_v.shape
     kind = FEATURES.get(read.features)
     names = [each.name for each in scaler.measures]

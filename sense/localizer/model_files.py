@@ -104,9 +104,9 @@ def check_same_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) 
         rate_hz: of the readings.
     """
     if fibres != model.fibres:
-        raise InputError(f"readings have {fibres} fibres, {what} was trained on {model.fibres}")
+        raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")
     if abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
         raise InputError(
-            f"readings come at {rate_hz:.3g} Hz, allowed is {model.rate_hz:.3g} Hz, at which {what} was trained, "
+            f"there are {rate_hz:.3g} readings a second, allowed is {model.rate_hz:.3g}, at which {what} was learnt, "
             f"within {RATE_TOLERANCE:.0%}"
         )

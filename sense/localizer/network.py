@@ -139,7 +139,7 @@ _ERF_WIDTH = 0.3275911
 
 
 def _gelu(x: Floats) -> Floats:
-    """x Phi(x), with the error function to 1.5e-7 (M. Abramowitz and I. A. Stegun, 1964, 7.1.26) in single precision."""
+    """x Phi(x), with the error function to 1.5e-7 (M. Abramowitz and I. A. Stegun, 1964, 7.1.26)."""
     half = np.abs(x) * np.float32(np.sqrt(0.5))
     t = 1 / (1 + np.float32(_ERF_WIDTH) * half)
     tail = np.float32(_ERF[4]) * t

@@ -11,7 +11,7 @@ from padforge.sense.localizer.network import EPSILON, Weights
 from padforge.sense.settings import LocalizerSettings
 
 FULL_SHARE = 0.25
-"""Share of training presses that keep all fibres; in the others 1 .. `max_failures` are masked, each number as often."""
+"""Share of training presses that keep all fibres; others lose 1 .. `max_failures`, each number as often."""
 
 
 class _Affine(nn.Module):

@@ -16,7 +16,8 @@ from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import health_files
 from padforge.sense.health.health_model import learn_health
-from padforge.sense.localizer.calibration import calibrate, unlearnt_lines
+from padforge.sense.localizer.calibration import unlearnt_lines
+from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import label_losses
@@ -88,24 +89,25 @@ def calibrate_into(
     Nothing in `out` changes before the last result is there.
 
     Args:
-        time_budget: seconds to train for, see `calibrate`.
+        time_budget: seconds to train for, see `Localizer.fit`.
         progress: called with (steps of training done, in all), and (0, 0) when the health of the fibres is learnt.
         warn: told in a line what is not learnt, of depth, force or health, as the recording does not suffice.
         force: whether a localizer is replaced that others in `out` were made from.
 
     Raises:
-        InputError: as `calibrate`, `out` cannot be written, or others were made from the localizer in it.
+        InputError: as `Localizer.fit`, `out` cannot be written, or others were made from the localizer in it.
     """
     check_writable(out)
     path, known = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
     check_replaceable(path, known, FILES, force)
-    localizer, document = calibrate(recording, options, time_budget=time_budget, progress=progress)
-    for line in unlearnt_lines(recording, localizer):
+    localizer = Localizer.from_settings(options).fit(recording, time_budget=time_budget, on_progress=progress)
+    model, document = localizer.model_, localizer.calibration_
+    for line in unlearnt_lines(recording, model):
         warn(line)
     progress(0, 0)
     with stage("health"):
         try:
-            health = learn_health(recording, localizer.test, localizer.provenance)
+            health = learn_health(recording, model.test, model.provenance)
         except InputError as error:
             health = {}
             warn(f"no watch is kept on the fibres' health: {error}")
@@ -114,8 +116,8 @@ def calibrate_into(
     ) as folder:  # it must not speak for another model
         localizer.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings may be told by the result alone
-        for name, model in health.items():
-            model.save(folder, name)
+        for name, watch in health.items():
+            watch.save(folder, name)
         write_json(folder / "calibration.json", document)
         with stage("figures"):
             draw_error_map(document, folder / "error_map.png")
