@@ -214,8 +214,8 @@ def test_view_follows_the_pad(recording, trained, monkeypatch) -> None:
 def test_live_refuses_what_does_not_fit(recording, trained) -> None:
     localizer = trained("press_and_release")
     for models, fibres, rate_hz, error in (
-        ([localizer], 6, localizer.rate_hz, "readings have 6 fibres, the localizer was trained on 4"),
-        ([localizer], 4, 20.0, r"readings come at 20 Hz, allowed is 13\.\d Hz, .* within 25%"),
+        ([localizer], 6, localizer.rate_hz, "6 fibres, the localizer was"),
+        ([localizer], 4, 20.0, r"20 .*, allowed is 13\.\d.* within 25%"),
         ([], 4, localizer.rate_hz, "expected at least one"),
     ):
         with pytest.raises(InputError, match=error):
