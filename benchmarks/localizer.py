@@ -15,9 +15,10 @@ from padforge.design import Morphology
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats
-from padforge.sense.localizer.features import FeatureScaler, press_inputs
-from padforge.sense.localizer.network import learnt, pooled
-from padforge.sense.localizer.training import HIDDEN
+from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.network import combine_members, predict_members
+from padforge.sense.localizer.scaler import FeatureScaler
+from padforge.sense.localizer.training import PUBLISHED_HIDDEN as HIDDEN
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.simulated_recording import simulate
 
@@ -82,9 +83,9 @@ def _trainings(features: str) -> Iterator[BenchTrial]:
 def _scaled(features: str) -> tuple[FeatureScaler, Floats, Floats, Floats]:
     """Return the scaling and the table of the training presses, and the inputs and targets of all presses."""
     recording = recorded()
-    raw = press_inputs(recording.readings, recording.down_command, recording.up_command, features)
+    raw = compute_features(recording.readings, recording.down_command, recording.up_command, features)
     scaling, table = FeatureScaler.fit(raw[:-TEST], recording.presses_mm[:-TEST])
-    return scaling, table, scaling.inputs(raw).inputs, scaling.targets(recording.presses_mm)
+    return scaling, table, scaling.transform(raw).inputs, scaling.scale_targets(recording.presses_mm)
 
 
 class _PublishedNetwork:
@@ -145,21 +146,21 @@ def _train_adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _train_masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    from padforge.sense.localizer.features import TrainingPresses
-    from padforge.sense.localizer.training import LEAST_BATCHES, train_members
+    from padforge.sense.localizer.scaler import TrainingPresses
+    from padforge.sense.localizer.training import MIN_BATCHES, train_members
 
     presses = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
-    batches = max(LEAST_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
+    batches = max(MIN_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
     options = settings.LocalizerSettings(epochs=-(-steps // batches))
     trained = train_members(presses, table, options, np.random.default_rng(0), lambda done, total: None)
 
     def predict(x: Array) -> Array:
         features = x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)
         mask = np.ones(features.shape[:2], dtype=bool)
-        members = learnt(
+        members = predict_members(
             trained.weights, features, mask, bayes=trained.bayes, residual_network=trained.residual_network
         )
-        return pooled(members)[0].astype(np.float64)
+        return combine_members(members)[0].astype(np.float64)
 
     return predict
 

@@ -16,7 +16,7 @@ from padforge.design.contact import signals
 from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import PlanTransform, Twin, TwinChannel
 from padforge.sense.arrays import Array
-from padforge.sense.localizer.features import RIDGE_PLACE, bumps
+from padforge.sense.localizer.response_model import RIDGE_POSITION, rbf_features
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
@@ -165,10 +165,10 @@ def _fit_smooth(world: str, presses: int) -> Predict:
     """Fit a smooth function of position by ridge regression on radial basis functions, as the localizer does."""
     measured = responses(recorded(world, presses), np.ones(presses, bool))
     half_mm = max(printed(world).sensed_mm) / 2
-    design_matrix, mean = bumps(measured.positions_mm / half_mm), measured.volts.mean(axis=0)
-    gram = design_matrix.T @ design_matrix + RIDGE_PLACE * np.eye(design_matrix.shape[1])
+    design_matrix, mean = rbf_features(measured.positions_mm / half_mm), measured.volts.mean(axis=0)
+    gram = design_matrix.T @ design_matrix + RIDGE_POSITION * np.eye(design_matrix.shape[1])
     weights = np.linalg.solve(gram, design_matrix.T @ (measured.volts - mean))
-    return lambda positions_mm: np.asarray(mean + bumps(positions_mm / half_mm) @ weights, np.float64)
+    return lambda positions_mm: np.asarray(mean + rbf_features(positions_mm / half_mm) @ weights, np.float64)
 
 
 def _evaluate(world: str, fitted: Identification | Predict) -> Mapping[str, float | None]:

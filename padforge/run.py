@@ -175,7 +175,7 @@ def check_run(run: Run) -> None:
     FabricationSettings.from_spec(run.spec).require_consistent(run.spec.section(PadSettings).layout)
     localizer = run.spec.section(LocalizerSettings)
     if run.time_budget is not None and localizer.method == "published":
-        reason = "allowed is masked: the published training has no time limit"
+        reason = "allowed is ensemble: the published training has no time limit"
         raise InputError(f"[localizer] method: got published with --time-budget, {reason}")
     split_presses(
         run.spec.section(RigSettings).presses, localizer.split, localizer.test_share, np.random.default_rng(0)

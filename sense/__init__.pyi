@@ -14,6 +14,7 @@ from .health.health_model import HealthModel as HealthModel
 from .live.pipeline import Live as Live
 from .localizer.calibration import calibrate as calibrate
 from .localizer.evaluation import evaluate as evaluate
+from .localizer.localizer import Localizer as Localizer
 from .localizer.model import Localization as Localization
 from .localizer.model import LocalizerModel as LocalizerModel
 from .localizer.recalibration import recalibrate as recalibrate

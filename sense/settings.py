@@ -139,11 +139,11 @@ class RigSettings(Settings):
 
 
 class LocalizerSettings(Settings):
-    """`[localizer]`: how places are learnt from readings."""
+    """`[localizer]`: how positions are learnt from readings."""
 
     method: Method = Field(
         default="ensemble",
-        description="one network for every loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
+        description="one ensemble for every loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
     )
     features: Features = Field(
         default="press_and_release",
@@ -153,16 +153,16 @@ class LocalizerSettings(Settings):
         default="random", description="presses held back for the test: drawn at random, or the last ones"
     )
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")
-    max_failures: int = Field(default=3, ge=0, le=8, description="train and test for up to this many lost fibres")
+    max_failures: int = Field(default=3, ge=0, le=8, description="train and test for up to this many failed fibres")
     members: int = Field(
         default=2,
         ge=1,
         le=64,
-        description="networks whose places are joined, the last of several on the observer",
+        description="members combined by their variances, the last of several a Bayesian localizer",
     )
     hidden: int = Field(default=256, ge=1, le=4096, description="width of the hidden layers")
     layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")
-    epochs: int = Field(default=200, ge=1, le=100_000, description="times the presses are shown, up to 11 000 steps")
+    epochs: int = Field(default=200, ge=1, le=100_000, description="passes through the presses, up to 11 000 steps")
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     learning_rate: float = Field(
         default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule"

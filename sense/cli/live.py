@@ -146,11 +146,11 @@ def _stream_replay(replay: Path, speed: float) -> "tuple[ReadingStream, bool]":
 def _pad_view(title: str, localizer: "LocalizerModel", mirrored: bool) -> dict[str, Any]:
     """Return the part of the view that stays the same."""
     scaler = localizer.scaler
-    half_mm = scaler.half_mm
+    half_mm = scaler.half_size_mm
     return {
         "title": title,
         "origin_mm": scaler.origin_mm.tolist(),
-        "half_mm": [scaler.span_mm] * 2 if half_mm is None or not half_mm.any() else half_mm.tolist(),
+        "half_mm": [scaler.scale_mm] * 2 if not half_mm.any() else half_mm.tolist(),
         "mirrored": mirrored,
     }
 

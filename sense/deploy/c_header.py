@@ -55,8 +55,8 @@ class HeaderReport:
         columns: Mapping[str, Any] = errors["errors"]
         width = max(7, *map(len, columns))
         lines = [
-            f"{student.hidden} neurons in each of {N_LAYERS + 1} layers, {kind}: {flash}, {CODE_BYTES / 1024:g} of them "
-            f"for code; RAM {self.state_bytes / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
+            f"{student.hidden} neurons in each of {N_LAYERS + 1} layers, {kind}: {flash}, "
+            f"{CODE_BYTES / 1024:g} of them for code; RAM {self.state_bytes / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
             f"mean error in mm on {errors['test_presses']} presses never trained on",
             "failed  sets" + "".join(f" {name:>{width}}" for name in columns),
         ]

@@ -1,8 +1,8 @@
 """`localizer.onnx`: the localizer as one graph, from readings and the commands of presses to positions and radii.
 
-The graph is `torch.onnx`'s trace of a torch module, which shares its networks and its Bayesian localizer with the rest of
-padforge. It is written only if onnxruntime computes from it what the localizer predicts. The exporter is the one by
-tracing (`dynamo=False`): the other one needs onnxscript, and specializes data-dependent windows.
+The graph is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian localizer with the
+rest of padforge. It is written only if onnxruntime computes from it what the localizer predicts. Of torch's two
+exporters this is the older one (`dynamo=False`), since the other needs onnxscript.
 """
 
 import io
@@ -279,8 +279,8 @@ class OnnxReport:
     def text(self) -> str:
         """One line."""
         return (
-            f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses with up to {self.max_failures} failed fibres: "
-            f"positions within {1e3 * self.position_difference_mm:.2f} µm of the localizer's, "
+            f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses with up to {self.max_failures} failed "
+            f"fibres: positions within {1e3 * self.position_difference_mm:.2f} µm of the localizer's, "
             f"radii within {1e3 * self.r90_difference_mm:.2f} µm"
         )
 
@@ -353,7 +353,7 @@ def _made_up_presses(model: LocalizerModel) -> _TrialPresses:
 def _compare(
     model: LocalizerModel, session: onnxruntime.InferenceSession, trial: _TrialPresses
 ) -> tuple[float, float, int]:
-    """Return the largest differences of positions and radii, mm, for up to so many failed fibres, which it returns too."""
+    """Return the largest differences of positions and of radii, mm, and the most failed fibres in the test."""
     presses = model.scaler.transform(compute_features(*trial, model.features))
     rng, max_failures = np.random.default_rng(0), len(model.interval_factors) - 1
     differences = []

@@ -4,11 +4,10 @@ All memory is fixed: a ring holds the latest readings, and exponential moving av
 constants, stand for the history before. They lag LAG readings behind, as a touch is detected only after it began.
 
 The touch detector is simpler than `signals.press_detection` on purpose: that one tracks levels by Kalman filters in
-float64 and looks back at whole runs of readings; this one has a baseline, a threshold and a few integers, takes a
-hundred operations a fibre, and can be read in C. Both share only the windows of the features. While the pad is free, the
-baseline follows each fibre; the pad is touched when the sum of squared deviations, in units of the fibres' noise,
-exceeds a threshold in two readings in a row, and released when the deviation has gone back by half. The baseline then
-starts anew.
+float64 and looks back at whole runs of readings; this one has a baseline, a threshold and a few integers of fixed size,
+and can be read in C. While the pad is free, the baseline follows each fibre; the pad is touched when the sum of squared
+deviations, in units of the fibres' noise, exceeds a threshold in two readings in a row, and released when the deviation
+has gone back by half. The baseline then starts anew.
 """
 
 from dataclasses import dataclass
@@ -317,7 +316,7 @@ def commanded_presses(recording: Recording) -> Mask:
 
 
 def commanded_features(recording: Recording) -> PressFeatures:
-    """Return the features of every press as commanded; a press that the readings end too soon for has no valid fibre."""
+    """Return the features of every press as commanded; one that the readings end too soon for has no valid fibre."""
     unused = ThresholdDetector(np.full(recording.fibres, np.inf), np.inf, 0)
     presses = stream_presses(recording.readings, unused, commanded_presses(recording))
     rows = np.searchsorted(recording.down_command, presses.down_command)

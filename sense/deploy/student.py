@@ -142,7 +142,7 @@ class DistillationTargets:
 
     @classmethod
     def compute(cls, recording: Recording, teacher: LocalizerModel) -> "DistillationTargets":
-        """Mix what is known of every press with what the teacher predicts, or take the latter where nothing is known."""
+        """Mix what is known of every press with the prediction of the teacher, or take that where nothing is known."""
         prediction = teacher.predict(recording)
 
         def mix(known: Array, predicted: Array) -> Array:

@@ -16,33 +16,17 @@ from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, M
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
-from padforge.sense.localizer.features import (
-    DOWN,
-    EARLY,
-    MEDIAN,
-    REST,
-    SIZES,
-    UP,
-    ScaledFeatures,
-    bridged,
-    press_inputs,
-)
-from padforge.sense.localizer.model import MEASURED, LocalizerModel
-from padforge.sense.localizer.model_files import refuse_other_pad
+from padforge.sense.localizer.features import DOWN, FEATURES, REST, UP, compute_features, interpolate_gaps
+from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
+from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import HISTORY, RingBuffer
-from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
+from padforge.sense.signals.press_detection import TOUCH_DELAY_S, RELEASE_DELAY_S, PressDetector
 
 MAX_SHOWN = 12
 """Latest presses that are shown."""
 OPENING = DOWN[-1][1]
 """Readings after `down_command` that features look at; of those until `up_command`, they look at no more."""
-READINGS_NEEDED = {
-    "onset": (DOWN[EARLY - 1][1], 0),
-    "causal": (OPENING, 0),
-    "published": (OPENING, 10 + MEDIAN // 2 + 1),
-    "press_and_release": (OPENING, UP[-1][1]),
-}
-"""Readings after `down_command`, and after `up_command`, that each kind of features needs."""
 RELEASE = max(UP[-1][1], RELEASED)
 """Readings after `up_command` with which a press is complete."""
 
@@ -147,7 +131,7 @@ class BufferedPress:
 
     def end_of(self, features: str) -> int | None:
         """Return the index after the last reading that `features` need; None while that is not known."""
-        after_down, after_up = READINGS_NEEDED[features]
+        after_down, after_up = FEATURES[features].readings_needed
         if after_up:
             return None if self.up_command is None else self.up_command + after_up
         end = self.down_command + after_down
@@ -197,11 +181,11 @@ class Live:
         if not isinstance(localizers, Sequence) or not localizers:
             raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
         for model in localizers:
-            refuse_other_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
+            check_same_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
         self._monitor = None if health is None else FaultMonitor(health)
         if health is not None:
-            refuse_other_pad(health, "health", fibres, rate_hz)
-        self._localizers = sorted(localizers, key=lambda model: READINGS_NEEDED[model.features][::-1])
+            check_same_pad(health, "health", fibres, rate_hz)
+        self._localizers = sorted(localizers, key=lambda model: FEATURES[model.features].readings_needed[::-1])
         self._response_v = _typical_response(self._localizers[-1])
         self._detector = PressDetector(fibres)
         self._buffer = RingBuffer(1 + fibres)  # times, then volts
@@ -288,7 +272,7 @@ class Live:
 
     def _rest(self, index: int) -> Array:
         """(C,) V, mean of the readings just before `index`."""
-        return bridged(self._buffer.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
+        return interpolate_gaps(self._buffer.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
 
     def _begin(self, touched: int) -> list[Event]:
         """Begin a press, after the press before has given all that is still to come of it."""
@@ -328,8 +312,8 @@ class Live:
         downs, ups = [down_command], [up_command]
         if previous_end > 0:  # a stand-in for the press before, so that the rest of this one reaches back no further
             downs, ups = [previous_end - 1, *downs], [previous_end, *ups]
-        features = press_inputs(readings, np.array(downs), np.array(ups), localizer.features)[-1:]
-        scaled = localizer.scaler.inputs(features)
+        features = compute_features(readings, np.array(downs), np.array(ups), localizer.features)[-1:]
+        scaled = localizer.scaler.transform(features)
         fibre_mask = scaled.fibre_mask.copy()
         fibre_mask[:, list(self.failed)] = False
         result = localizer.predict_features(ScaledFeatures(scaled.inputs, fibre_mask))
@@ -337,7 +321,7 @@ class Live:
         measures = {
             column: float(values[0])
             for name, measure in result.measures.items()
-            for column, values in zip(MEASURED[name], (measure.values, measure.r90), strict=True)
+            for column, values in zip(MEASURE_COLUMNS[name], (measure.values, measure.r90), strict=True)
         }
         final, failed = localizer is self._localizers[-1], tuple(np.flatnonzero(~fibre_mask[0]).tolist())
         estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, failed=failed, **measures)
@@ -359,6 +343,6 @@ class Live:
 
 def _typical_response(localizer: LocalizerModel) -> Array:
     """(C,) V that the response of each fibre to a press goes up to."""
-    scaler, n_windows = localizer.scaler, SIZES[localizer.features]
-    response = (np.abs(scaler.centre) + 2 * scaler.spread)[:, :n_windows].max(axis=1)
+    scaler, n_windows = localizer.scaler, FEATURES[localizer.features].n_windows
+    response = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
     return np.where(response > 0, response, 1.0)

@@ -1,10 +1,10 @@
-"""Where a press lies by what the fitted pad answers, with any fibres lost: Bayes' rule, and nothing learnt by trying.
+"""Bayesian localizer: position of a press by the fitted response of the pad, with any fibres masked.
 
-What a fibre gives is normally distributed about what the `response_model` expects at a place, with the scatter that
-the presses near it had. First the likelihood of all fibres that live is looked at on a grid over the pad, each of whose
-cells counts as a whole: a mean place and its spread. From there, a few Gauss-Newton steps lead to the most likely
-place, the spread being what is known beforehand. (M. S. Grewal and A. P. Andrews, Kalman filtering, 2015, has the
-steps as those of an iterated filter.)"""
+The features of a fibre are normally distributed about the response expected at a position, with the scatter of the
+presses near it. A posterior on a grid over the pad, whose positions stand for their cells, gives a mean and variances.
+From there a few Gauss-Newton steps lead to the maximum a posteriori position, the grid's posterior being the prior
+(the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -14,228 +14,260 @@ import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Mask
-from padforge.sense.localizer.features import looked_up
+from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
 COMPONENTS = 6
-"""Numbers that the windows of a fibre are brought down to: those in which places differ most for their scatter."""
-FINE = 2
-"""Cells of the table along a side of those of the grid."""
-NEAR, USUAL = 4.0, 10.0
-"""Scatter is averaged over presses so many distances between neighbours around, as is that of the whole pad, which
-counts as so many presses."""
-LEAST_VARIANCE = 1e-4
-"""Of scaled inputs, which are about 1."""
-BEFOREHAND = 0.05
-"""Weight of what the grid says in the steps after it, which look at the same answers: a little, lest they run away."""
-LOOKS, FARTHEST, LEAST_SPREAD = 2, 0.2, 1e-2
-"""Steps, how far one leads, and the least spread on the grid, a seventh of a cell; both in spans of the pad."""
-TOLD = 9
-"""Numbers told of a press: place, mean place on the grid, logarithms of the spreads of both, and how x goes with y."""
-LEAST_EXPONENT = -60.0
-"""Less counts for nothing, and its exponential takes ten times as long."""
-MAX_TERM = 1e12
-_VALUES = 2**15
+"""Discriminant directions of a fibre: those in which positions differ most for their scatter."""
+COARSENING = 2
+"""Cells of the response table along a side of a cell of the posterior's grid."""
+SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
+"""Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
+MIN_VARIANCE = 1e-4
+"""Of scaled features, which are about 1."""
+PRIOR_WEIGHT = 0.05
+"""Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold."""
+GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2
+"""Steps, and the longest, in units of the scaled position."""
+MIN_STD = 1e-2
+"""Smallest standard deviation on the grid, a seventh of a cell."""
+N_SUMMARY = 9
+"""Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
+MIN_EXPONENT = -60.0
+"""Smaller exponents count for nothing, and their exponential takes ten times as long."""
+MAX_COEFFICIENT = 1e12
+PREFIX = "bayes."
+"""Of the names of the arrays in files."""
+_CHUNK = 2**15
 
 
 @dataclass(frozen=True)
 class BayesianLocalizer:
-    """What is known of a pad, as arrays of NumPy or of torch.
+    """Fitted likelihood of a pad, in arrays of NumPy or of torch.
 
-    Numbers are such as single precision holds. NumPy works in double precision, since the steps are as large as they
-    are sure; for training, single precision does.
+    All numbers are representable in single precision. NumPy computes in double precision, as the steps are only as
+    accurate as the residuals; for training, single precision suffices.
 
     Attributes:
-        projection: (C, F + G, D) from scaled inputs to components.
-        grid: (P, 2) places of the grid. terms: (C (D (D + 3) / 2 + 1), P) of the logarithm of their likelihood:
-            factors of the products of components, of components, and of 1, fibre by fibre.
-        answers: (S, S, C (3 D + 3)) by place, over [-1, 1] in x and y: components expected, their slopes in x and in y
-            weighted by their scatter, and what these say of the curvature in x, in y and between.
+        projection: (C, F + G, D), scaled features to whitened discriminants.
+        grid: (P, 2) positions.
+        log_likelihood_coefficients: (C (D (D + 3) / 2 + 1), P), of products of discriminants, of discriminants and of
+            1, fibre by fibre.
+        linearization: (S, S, C (3 D + 3)) on a grid over [-1, 1] in x and y: expected discriminants, their weighted
+            Jacobian J' S^-1, and the Fisher information J' S^-1 J in xx, yy and xy.
         bounds: (2, 2) least and greatest x and y of presses.
-        turn: (2, 2), shift: (2,) what places are called now, by what they were called when all this was fitted.
+        rotation: (2, 2), from the positions of the fit to those that are returned.
+        shift: (2,), added to the rotated positions.
     """
 
     projection: Any
     grid: Any
-    terms: Any
-    answers: Any
+    log_likelihood_coefficients: Any
+    linearization: Any
     bounds: Any
-    turn: Any
+    rotation: Any
     shift: Any
 
     @classmethod
-    def fit(cls, table: Any, inputs: Any, fibre_mask: Mask, places: Any) -> "BayesianLocalizer":
-        """From a table (S, S, C, F + G) of expected inputs, and presses: inputs (Q, C, F + G), alive, places (Q, 2)."""
-        side, _, fibres, size = table.shape
-        table, inputs, places = (part.astype(np.float64) for part in (table, inputs, places))
-        low, high = places.min(axis=0), places.max(axis=0)
-        axis = np.linspace(-1, 1, side)
-        everywhere = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-        coarse = everywhere[::FINE, ::FINE]
-        cell = float(axis[FINE] - axis[0])
-        inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
-        projection = np.zeros((fibres, size, COMPONENTS))
-        rest = inputs - looked_up(table.reshape(side, side, -1), places).reshape(inputs.shape)
-        for fibre in range(fibres):
-            told, there = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
-            found = _components(table[:, :, fibre, told].reshape(side * side, -1), rest[there, fibre][:, told])
-            projection[fibre, told] = found
-        rest = np.einsum("qcf,cfd->qcd", rest, projection) * fibre_mask[:, :, None]
-        scatter = _scatter(coarse.reshape(-1, 2), places, rest, fibre_mask, max(cell, NEAR * _apart(places)))
-        scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
-        terms, answers, slopes, curvatures = [], [], [], []
-        for fibre in range(fibres):
-            expected = table[:, :, fibre] @ projection[fibre]
-            own = looked_up(scatter[:, :, fibre], everywhere.reshape(-1, 2))
-            own = own.reshape(side, side, COMPONENTS, COMPONENTS)
-            nothing = np.flatnonzero(~projection[fibre].any(axis=0))
-            own[:, :, nothing, nothing] = 1.0  # as sure of it everywhere, or it would tell where presses are dense
-            slope = np.stack(np.gradient(expected, axis[1] - axis[0], axis=(0, 1)), axis=2)
-            weighted = slope @ np.linalg.inv(own)
-            curved = weighted @ slope.swapaxes(2, 3)
-            answers.append(expected)
-            slopes.append(weighted.reshape(side, side, -1))
-            along = (np.maximum(curved[..., k, k], 0) for k in (0, 1))  # rounding may leave less than none
-            curvatures.append(np.stack([*along, curved[..., 0, 1]], axis=2))
-            at = slope[::FINE, ::FINE][inside]
-            whole = own[::FINE, ::FINE][inside] + cell**2 / 12 * at.swapaxes(1, 2) @ at
-            terms.append(_terms(expected[::FINE, ::FINE][inside], np.linalg.inv(whole)))
-        parts = (
-            projection,
-            coarse[inside],
-            np.concatenate(terms),
-            np.concatenate([*answers, *slopes, *curvatures], axis=2),
-        )
-        return cls(*(_rounded(part) for part in (*parts, np.stack([low, high]), np.eye(2), np.zeros(2))))
-
-    def __call__(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
-        """(Q, C, F + G) scaled inputs and (Q, C) which count, to places (Q, 2) and what is told of them (Q, `TOLD`).
+    def fit(cls, table: Any, inputs: Any, fibre_mask: Mask, positions: Any) -> "BayesianLocalizer":
+        """Fit to presses and their response.
 
         Args:
-            xp: the module whose arrays all these are, numpy or torch.
+            table: (S, S, C, F + G) expected inputs on a grid over [-1, 1] in x and y.
+            inputs: (Q, C, F + G).
+            fibre_mask: (Q, C).
+            positions: (Q, 2).
+        """
+        side, _, fibres, size = table.shape
+        table, inputs, positions = (part.astype(np.float64) for part in (table, inputs, positions))
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        grid = grid_positions(side)
+        step, coarse = float(grid[1, 0, 0] - grid[0, 0, 0]), grid[::COARSENING, ::COARSENING]
+        cell = float(coarse[1, 0, 0] - coarse[0, 0, 0])
+        inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
+        residual = inputs - interpolate_grid(table.reshape(side, side, -1), positions).reshape(inputs.shape)
+        projection = np.zeros((fibres, size, COMPONENTS))
+        for fibre in range(fibres):
+            used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
+            expected = table[:, :, fibre, used].reshape(side * side, -1)
+            projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used])
+        residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
+        width = max(cell, SCATTER_WIDTH * _press_distance(positions))
+        scatter = _local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
+        scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
+        coefficients, responses, jacobians, informations = [], [], [], []
+        for fibre in range(fibres):
+            expected = table[:, :, fibre] @ projection[fibre]
+            covariance = interpolate_grid(scatter[:, :, fibre], grid.reshape(-1, 2))
+            covariance = covariance.reshape(side, side, COMPONENTS, COMPONENTS)
+            unused = np.flatnonzero(~projection[fibre].any(axis=0))
+            covariance[:, :, unused, unused] = 1.0  # the same everywhere, or it would tell where presses are dense
+            jacobian = np.stack(np.gradient(expected, step, axis=(0, 1)), axis=2)
+            weighted = jacobian @ np.linalg.inv(covariance)
+            fisher = weighted @ jacobian.swapaxes(2, 3)
+            responses.append(expected)
+            jacobians.append(weighted.reshape(side, side, -1))
+            diagonal = (np.maximum(fisher[..., k, k], 0) for k in (0, 1))  # rounding may leave less than 0
+            informations.append(np.stack([*diagonal, fisher[..., 0, 1]], axis=2))
+            # A position of the grid stands for its cell, over which the response varies by its slope.
+            slope = jacobian[::COARSENING, ::COARSENING][inside]
+            blurred = covariance[::COARSENING, ::COARSENING][inside] + cell**2 / 12 * slope.swapaxes(1, 2) @ slope
+            on_grid = expected[::COARSENING, ::COARSENING][inside]
+            coefficients.append(_log_likelihood_coefficients(on_grid, np.linalg.inv(blurred)))
+        linearization = np.concatenate([*responses, *jacobians, *informations], axis=2)
+        arrays = projection, coarse[inside], np.concatenate(coefficients), linearization, np.stack([low, high])
+        return cls(*map(_rounded, (*arrays, np.eye(2), np.zeros(2))))
+
+    def predict(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
+        """Return the MAP position and the posterior summary of each press, from the fibres in the mask.
+
+        Args:
+            inputs: (Q, C, F + G) scaled features.
+            fibre_mask: (Q, C).
+            xp: module of all arrays, numpy or torch.
+
+        Returns:
+            (Q, 2) positions and (Q, N_SUMMARY) summaries.
         """
         fibres, _, size = self.projection.shape
-        there = xp.asarray(fibre_mask, dtype=inputs.dtype)
-        seen = xp.matmul(xp.where(fibre_mask[:, :, None], inputs, 0.0).swapaxes(0, 1), self.projection).swapaxes(0, 1)
-        mean, variance, both = self._on_grid(seen, there, xp)
-        known, place, spread = BEFOREHAND / variance, mean, variance
-        for _ in range(LOOKS):
-            found = looked_up(self.answers, place, xp)
-            off = there[:, :, None] * (seen - found[:, : fibres * size].reshape(-1, fibres, size))
-            slopes = found[:, fibres * size : 3 * fibres * size].reshape(-1, fibres, 2, size)
-            curved = (there[:, :, None] * found[:, 3 * fibres * size :].reshape(-1, fibres, 3)).sum(axis=1)
-            pull = (slopes * off[:, :, None, :]).sum(axis=3).sum(axis=1) + known * (mean - place)
-            spread, step = _solved(curved, known, pull, xp)
-            place = xp.clip(place + xp.clip(step, -FARTHEST, FARTHEST), self.bounds[0], self.bounds[1])
-        told = [2 * place, 1 + 0.25 * xp.log(spread), 2 * mean, 1 + 0.25 * xp.log(variance), both[:, None]]
-        return place @ self.turn.T + self.shift, xp.concat(told, axis=1)
+        mask = xp.asarray(fibre_mask, dtype=inputs.dtype)
+        z = xp.matmul(xp.where(fibre_mask[:, :, None], inputs, 0.0).swapaxes(0, 1), self.projection).swapaxes(0, 1)
+        grid_mean, grid_var, grid_corr = self._grid_posterior(z, mask, xp)
+        prior_precision, position, var = PRIOR_WEIGHT / grid_var, grid_mean, grid_var
+        for _ in range(GAUSS_NEWTON_STEPS):
+            local = interpolate_grid(self.linearization, position, xp)
+            residual = mask[:, :, None] * (z - local[:, : fibres * size].reshape(-1, fibres, size))
+            weighted = local[:, fibres * size : 3 * fibres * size].reshape(-1, fibres, 2, size)
+            fisher = (mask[:, :, None] * local[:, 3 * fibres * size :].reshape(-1, fibres, 3)).sum(axis=1)
+            gradient = (weighted * residual[:, :, None, :]).sum(axis=3).sum(axis=1)
+            gradient = gradient + prior_precision * (grid_mean - position)
+            var, step = solve_2x2(fisher, prior_precision, gradient, xp)
+            position = xp.clip(position + xp.clip(step, -MAX_STEP, MAX_STEP), self.bounds[0], self.bounds[1])
+        # All of it about 1, as the inputs of a network should be.
+        logs = [1 + 0.25 * xp.log(each) for each in (var, grid_var)]
+        summary = xp.concat([2 * position, logs[0], 2 * grid_mean, logs[1], grid_corr[:, None]], axis=1)
+        return position @ self.rotation.T + self.shift, summary
 
-    def _on_grid(self, seen: Any, there: Any, xp: Any) -> tuple[Any, Any, Any]:
-        """Mean place (Q, 2), its variances (Q, 2) and correlation (Q,) on the grid."""
-        first, second = (each.tolist() for each in np.triu_indices(seen.shape[2]))
-        known = xp.concat([seen[:, :, first] * seen[:, :, second], seen, xp.ones_like(seen[:, :, :1])], axis=2)
-        likely = (known * there[:, :, None]).reshape(len(seen), -1) @ self.terms
-        likely -= xp.amax(likely, axis=1)[:, None]  # in place, as to fetch memory takes as long as to fill it
-        share = xp.exp(xp.clip(likely, LEAST_EXPONENT, 0.0, out=likely), out=likely)
-        moments = share @ xp.concat([self.grid, self.grid**2, self.grid[:, :1] * self.grid[:, 1:]], axis=1)
-        moments = moments / share.sum(axis=1)[:, None]
+    def _grid_posterior(self, z: Any, mask: Any, xp: Any) -> tuple[Any, Any, Any]:
+        """Mean (Q, 2), variances (Q, 2) and correlation (Q,) of the posterior on the grid."""
+        first, second = (each.tolist() for each in np.triu_indices(z.shape[2]))
+        monomials = xp.concat([z[:, :, first] * z[:, :, second], z, xp.ones_like(z[:, :, :1])], axis=2)
+        coefficients = self.log_likelihood_coefficients
+        # -1 for the presses, whose number may be traced
+        log_likelihood = (monomials * mask[:, :, None]).reshape(-1, len(coefficients)) @ coefficients
+        log_likelihood -= xp.amax(log_likelihood, axis=1)[:, None]  # in place: fetching memory takes as long as filling
+        clipped = xp.clip(log_likelihood, MIN_EXPONENT, 0.0, out=log_likelihood)
+        posterior = xp.exp(clipped, out=log_likelihood)
+        moments = posterior @ xp.concat([self.grid, self.grid**2, self.grid[:, :1] * self.grid[:, 1:]], axis=1)
+        moments = moments / posterior.sum(axis=1)[:, None]
         mean = moments[:, :2]
-        variance = xp.clip(moments[:, 2:4] - mean**2, LEAST_SPREAD**2, 4.0)
-        both = (moments[:, 4] - mean[:, 0] * mean[:, 1]) / xp.sqrt(variance[:, 0] * variance[:, 1])
-        return mean, variance, xp.clip(both, -1, 1)
+        var = xp.clip(moments[:, 2:4] - mean**2, MIN_STD**2, 4.0)
+        corr = (moments[:, 4] - mean[:, 0] * mean[:, 1]) / xp.sqrt(var[:, 0] * var[:, 1])
+        return mean, var, xp.clip(corr, -1, 1)
 
-    def refuse_unsound(self, fibres: int, size: int) -> None:
-        """Raise InputError unless this is what `fit` makes of `fibres` with `size` inputs each."""
-        shapes = [part.shape for part in self.arrays().values()]
-        places, side = (len(self.grid), len(self.answers)) if self.grid.ndim and self.answers.ndim else (0, 0)
-        terms = fibres * (COMPONENTS * (COMPONENTS + 3) // 2 + 1)
-        expected = [
-            *((fibres, size, COMPONENTS), (places, 2), (terms, places), (side, side, fibres * 3 * (COMPONENTS + 1))),
-            *((2, 2), (2, 2), (2,)),
-        ]
-        if shapes != expected or not places or side < 2:
-            raise InputError(f"observer has shapes {shapes}, expected {expected}")
-        for name, part in self.arrays().items():
-            greatest = np.abs(part).max(initial=0)
-            if not greatest <= MAX_TERM:
-                raise InputError(f"{name} is up to {greatest:g}, allowed is up to {MAX_TERM:g}")
-        curved = self.answers[:, :, 3 * fibres * COMPONENTS :].reshape(side, side, fibres, 3)[..., :2]
-        if curved.min() < 0:
-            raise InputError(f"observer.answers has curvatures of {curved.min():g}, expected 0 or more")
+    def transformed(self, rotation: Array, shift: Array) -> "BayesianLocalizer":
+        """Return one whose positions are rotated (or any linear map, (2, 2)) and shifted, (2,)."""
+        both = rotation @ self.rotation, rotation @ self.shift + shift
+        return replace(self, rotation=_rounded(both[0]), shift=_rounded(both[1]))
 
-    def arrays(self) -> dict[str, Any]:
-        """All of it, by the names under which it is kept, in single precision, which takes nothing off it."""
+    def map_arrays(self, function: Callable[[Any], Any]) -> "BayesianLocalizer":
+        """Apply a function to every array in single precision, as to convert them to torch."""
+        return BayesianLocalizer(*map(function, self.to_arrays().values()))
+
+    def to_arrays(self) -> dict[str, Any]:
+        """Return the arrays by their names in files, in single precision, which is exact."""
         return {PREFIX + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
 
-    def moved(self, turn: Array, shift: Array) -> "BayesianLocalizer":
-        """One that calls places otherwise: by turn (2, 2) and shift (2,) of what it calls them now."""
-        named = (turn @ self.turn, turn @ self.shift + shift)
-        return replace(self, turn=_rounded(named[0]), shift=_rounded(named[1]))
-
-    def changed(self, change: Callable[[Any], Any]) -> "BayesianLocalizer":
-        """With every array, in single precision, changed: as into one of torch."""
-        return BayesianLocalizer(*map(change, self.arrays().values()))
-
     @classmethod
-    def of(cls, arrays: Mapping[str, Any]) -> "BayesianLocalizer":
-        """What `arrays` gave; raises KeyError for one that is not there."""
-        return cls(**{each.name: arrays[PREFIX + each.name].astype(np.float64) for each in fields(cls)})
+    def from_arrays(cls, arrays: Mapping[str, Any], fibres: int, n_features: int) -> "BayesianLocalizer":
+        """Read what `to_arrays` returned.
+
+        Raises:
+            KeyError: an array is missing.
+            InputError: shapes or values are none that `fit` makes of so many fibres and features.
+        """
+        bayes = cls(**{each.name: arrays[PREFIX + each.name].astype(np.float64) for each in fields(cls)})
+        shapes = [part.shape for part in vars(bayes).values()]
+        n_grid, side = (len(part) if part.ndim else 0 for part in (bayes.grid, bayes.linearization))
+        n_coefficients = fibres * (COMPONENTS * (COMPONENTS + 3) // 2 + 1)
+        expected = [
+            *((fibres, n_features, COMPONENTS), (n_grid, 2), (n_coefficients, n_grid)),
+            *((side, side, fibres * 3 * (COMPONENTS + 1)), (2, 2), (2, 2), (2,)),
+        ]
+        if shapes != expected or not n_grid or side < 2:
+            raise InputError(f"Bayesian localizer has shapes {shapes}, expected {expected}")
+        for name, part in vars(bayes).items():
+            largest = np.abs(part).max(initial=0)
+            if not largest <= MAX_COEFFICIENT:
+                raise InputError(f"{name} is up to {largest:g}, allowed is up to {MAX_COEFFICIENT:g}")
+        fisher = bayes.linearization[:, :, 3 * fibres * COMPONENTS :].reshape(side, side, fibres, 3)[..., :2]
+        if fisher.min() < 0:
+            raise InputError(f"linearization has a Fisher information of {fisher.min():g}, expected 0 or more")
+        return bayes
 
 
-PREFIX = "observer."
-"""Of the names of its arrays."""
+def fit_lda(expected: Array, residual: Array) -> Array:
+    """Fit linear discriminants: (F, D) directions in which positions differ most for their scatter, whitened.
+
+    Args:
+        expected: (S, F) inputs at the positions of a grid.
+        residual: (Q, F) of presses, whose covariance becomes the unit matrix.
+    """
+    size = residual.shape[1]
+    scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)
+    whitening = np.linalg.inv(np.linalg.cholesky(scatter)).T
+    between = (expected - expected.mean(axis=0)) @ whitening
+    _, directions = np.linalg.eigh(between.T @ between)
+    projection = np.zeros((size, COMPONENTS))
+    projection[:, : min(size, COMPONENTS)] = whitening @ directions[:, ::-1][:, :COMPONENTS]
+    return projection
+
+
+def solve_2x2(fisher: Any, prior_precision: Any, gradient: Any, xp: Any) -> tuple[Any, Any]:
+    """Solve (J + P) step = gradient for each press; return (Q, 2) variances and steps.
+
+    Args:
+        fisher: (Q, 3) information J in xx, yy and xy.
+        prior_precision: (Q, 2) diagonal of P.
+        gradient: (Q, 2) of the log posterior.
+        xp: module of the arrays, numpy or torch.
+    """
+    xx, yy, xy = fisher[:, 0] + prior_precision[:, 0], fisher[:, 1] + prior_precision[:, 1], fisher[:, 2]
+    det = xp.clip(fisher[:, 0] * fisher[:, 1] - xy**2, 0.0, np.inf)  # rounding may leave less than 0
+    det = det + fisher[:, 0] * prior_precision[:, 1] + fisher[:, 1] * prior_precision[:, 0]
+    det = det + prior_precision[:, 0] * prior_precision[:, 1]
+    step = xp.stack([yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]], axis=1)
+    return xp.stack([yy, xx], axis=1) / det[:, None], step / det[:, None]
 
 
 def _rounded(part: Array) -> Array:
     return part.astype(np.float32).astype(np.float64)
 
 
-def _scatter(around: Array, places: Array, rest: Array, fibre_mask: Mask, width: float) -> Any:
-    """(P, C, D, D) mean products of what is left (Q, C, D) of components, which are about 1, near places (P, 2)."""
-    fibres, size = rest.shape[1:]
-    sums, weights = np.zeros((len(around), fibres * size * size)), np.zeros((len(around), fibres))
-    step = max(1, _VALUES // fibres)
-    for first in range(0, len(rest), step):
-        part = slice(first, first + step)
-        apart = ((around[:, None] - places[part]) ** 2).sum(axis=2)
-        near = np.exp(-0.5 * apart / width**2)
-        sums += near @ (rest[part, :, :, None] * rest[part, :, None, :]).reshape(near.shape[1], -1)
-        weights += near @ fibre_mask[part]
-    usual = USUAL * np.eye(size)
-    return (sums.reshape(-1, fibres, size, size) + usual) / (weights + USUAL)[:, :, None, None]
+def _local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask: Mask, width: float) -> Any:
+    """(P, C, D, D) covariances of (Q, C, D) residuals, weighted by the distance of presses from (P, 2) centres."""
+    fibres, size = residual.shape[1:]
+    sums, weights = np.zeros((len(centres), fibres * size * size)), np.zeros((len(centres), fibres))
+    step = max(1, _CHUNK // fibres)
+    for first in range(0, len(residual), step):
+        rows = slice(first, first + step)
+        squared = ((centres[:, None] - positions[rows]) ** 2).sum(axis=2)
+        weight = np.exp(-0.5 * squared / width**2)
+        sums += weight @ (residual[rows, :, :, None] * residual[rows, :, None, :]).reshape(weight.shape[1], -1)
+        weights += weight @ fibre_mask[rows]
+    prior = SCATTER_PRIOR_COUNT * np.eye(size)  # residuals are whitened
+    return (sums.reshape(-1, fibres, size, size) + prior) / (weights + SCATTER_PRIOR_COUNT)[:, :, None, None]
 
 
-def _apart(places: Array) -> float:
-    """Distance between neighbours, if they lay on a grid."""
-    low, high = places.min(axis=0), places.max(axis=0)
-    return float(np.sqrt((high - low).prod() / len(np.unique(places, axis=0))))
+def _press_distance(positions: Array) -> float:
+    """Distance between neighbouring positions, if they lay on a grid."""
+    return float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
 
 
-def _components(expected: Array, rest: Array) -> Array:
-    """(F, D) directions in which (S, F) expected inputs differ most, for the scatter of (Q, F), which they make 1."""
-    size = rest.shape[1]
-    scatter = rest.T @ rest / max(len(rest), 1) + LEAST_VARIANCE * np.eye(size)
-    whiten = np.linalg.inv(np.linalg.cholesky(scatter)).T
-    differing = (expected - expected.mean(axis=0)) @ whiten
-    _, directions = np.linalg.eigh(differing.T @ differing)
-    found = np.zeros((size, COMPONENTS))
-    found[:, : min(size, COMPONENTS)] = whiten @ directions[:, ::-1][:, :COMPONENTS]
-    return found
-
-
-def _terms(expected: Array, precise: Array) -> Array:
-    """(D (D + 3) / 2 + 1, P) of the logarithm of a normal density about (P, D), of precision (P, D, D)."""
+def _log_likelihood_coefficients(expected: Array, precision: Array) -> Array:
+    """(D (D + 3) / 2 + 1, P) coefficients of a normal log density about (P, D), of precision (P, D, D)."""
     first, second = np.triu_indices(expected.shape[1])
-    products = -precise[:, first, second] * np.where(first == second, 0.5, 1.0)
-    linear = np.einsum("pij,pj->pi", precise, expected)
-    whole = 0.5 * (np.linalg.slogdet(precise)[1] - (linear * expected).sum(axis=1))
-    terms = np.column_stack([products, linear, whole]).T
-    return terms - terms.mean(axis=1, keepdims=True)  # what all places share says nothing, and costs digits
-
-
-def _solved(curved: Any, known: Any, pull: Any, xp: Any) -> tuple[Any, Any]:
-    """(Q, 2) variances and steps of (Q, 3) curvatures in x, in y and between, and (Q, 2) of what is known before."""
-    x, y = curved[:, 0] + known[:, 0], curved[:, 1] + known[:, 1]
-    own = xp.clip(curved[:, 0] * curved[:, 1] - curved[:, 2] ** 2, 0.0, np.inf)  # rounding may leave less than none
-    whole = own + curved[:, 0] * known[:, 1] + curved[:, 1] * known[:, 0] + known[:, 0] * known[:, 1]
-    step = xp.stack([y * pull[:, 0] - curved[:, 2] * pull[:, 1], x * pull[:, 1] - curved[:, 2] * pull[:, 0]], axis=1)
-    return xp.stack([y, x], axis=1) / whole[:, None], step / whole[:, None]
+    quadratic = -precision[:, first, second] * np.where(first == second, 0.5, 1.0)
+    linear = np.einsum("pij,pj->pi", precision, expected)
+    constant = 0.5 * (np.linalg.slogdet(precision)[1] - (linear * expected).sum(axis=1))
+    coefficients = np.column_stack([quadratic, linear, constant]).T
+    return coefficients - coefficients.mean(axis=1, keepdims=True)  # what positions share costs digits only

@@ -1,279 +1,365 @@
-"""Calibration: learn places from a recording, and say how far off they are on presses never learnt from.
+"""Calibration: train a localizer on a recording, calibrate its uncertainty, and test it on presses held back.
 
-Of presses of several depths, depth is learnt as well, and force where it is known of all."""
+Presses are split three ways: training, calibration of the uncertainty, and test; of method "published", also those
+whose error ends the training.
+"""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from padforge.design.common.files import provenance
+from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.profiling import stage
-from padforge.design.common.settings import or_default, validate
+from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.bayes import TOLD
-from padforge.sense.localizer.evaluation import conformal, evaluate, held_back
-from padforge.sense.localizer.features import PHASES, FeatureScaler, ScaledFeatures, TrainingPresses, press_inputs
+from padforge.sense.localizer.bayes import N_SUMMARY
+from padforge.sense.localizer.evaluation import conformal, evaluate, held_back_presses
+from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.network import LEAST_LOG, MOST_LOG, Weights, learnt, refuse_unsound
+from padforge.sense.localizer.network import (
+    MAX_LOG_ERROR,
+    MIN_LOG_ERROR,
+    Weights,
+    check_weights,
+    predict_members,
+)
+from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
 from padforge.sense.recording.recording import Recording
+from padforge.sense.settings import LocalizerSettings
 
-LEAST_TRAINING = 3
-"""Presses needed to learn from and to check on: of fewer, the span is none."""
-CHECKED = {"ensemble": 0.08, "published": 0.15 / 0.85}
-"""Share of the presses of training that are not learnt from but find the radii. Of the published method, 15 % of all,
-half of which end the training."""
-MOST_SECONDS = 1e9
-"""Longest time budget: some thirty years."""
-LEAST_SPREAD_MM = 0.2
-"""Depths of which nine tenths lie within so much are one."""
-TRUSTED, PROVEN = 2, 6
-"""Presses that count for what a member expects of itself; sets of lost fibres of a size that it is proven on."""
-SUBSETS = 32
-"""Sets of lost fibres of a size that the radii are found on, at most."""
+MIN_TRAINING = 3
+"""Presses that a split must leave to learn from: fewer have no scale."""
+CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
+"""Share of the presses of training that calibrate the uncertainty. Of the published method, 15 % of all, half of which
+end the training."""
+MAX_TIME_BUDGET_S = 1e9
+MIN_DEPTH_RANGE_MM = 0.2
+"""Depths of which nine tenths lie within this are one depth."""
+PRIOR_COUNT, SCALE_SUBSETS = 2, 6
+"""Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
+INTERVAL_SUBSETS = 32
+"""Sets of failed fibres of a size that intervals are calibrated on, at most."""
+OnProgress = Callable[[int, int], None]
+
+
+def _ignore(done: int, total: int) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class CalibrationData:
+    """Presses of known position to train on and to calibrate by.
+
+    Attributes:
+        features: (Q) as commanded.
+        detected: the same presses as they would be detected in the readings; None where they are not augmented so.
+        positions_mm: (Q, 2).
+        measures: (Q,) of each of depth and force to be predicted.
+        feature_set: a name in `FEATURES`, or "array".
+        rate_hz: readings per second.
+        sha256: digest of what they came from.
+    """
+
+    features: PressFeatures
+    detected: PressFeatures | None
+    positions_mm: Array
+    measures: Mapping[str, Array]
+    feature_set: str
+    rate_hz: float
+    sha256: str
+
+    @classmethod
+    def from_recording(cls, recording: Recording, training: Indices, options: LocalizerSettings) -> "CalibrationData":
+        """Compute the features of all presses of a recording; `training` are those that are trained on."""
+        from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
+
+        commands, detected = (recording.down_command, recording.up_command), None
+        if options.method == "ensemble":
+            again = align_to_detected(recording.readings, recording.times_s, *commands)
+            detected = compute_features(recording.readings, *again, options.features)
+        return cls(
+            compute_features(recording.readings, *commands, options.features),
+            detected,
+            recording.presses_mm,
+            known_measures(recording, training) if options.method == "ensemble" else {},
+            options.features,
+            recording.rate_hz,
+            recording.digest,
+        )
 
 
 def calibrate(
     recording: Recording,
-    options: settings.LocalizerSettings | None = None,
+    options: LocalizerSettings | None = None,
     *,
-    split: str | None = None,
-    seed: int | None = None,
     time_budget: float | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = _ignore,
 ) -> tuple[LocalizerModel, dict[str, Any]]:
-    """Train a localizer on a part of the presses and test it on the rest.
+    """Train a localizer on a part of the presses and test it on the others.
 
-    Test presses enter nothing but the test, which looks at them once: not the scaling, not the training, not its
-    length, not the radii. Presses whose place is not known are left out.
+    Test presses enter nothing but the test, which looks at them once. Presses of unknown position are left out.
 
     Args:
-        recording: readings and presses with known places.
-        options: how to learn; the defaults if None. split, seed: win over those of `options`.
-        time_budget: seconds to train for, with as many members as that is good for; what is found depends on the pace
-            then. None for the length and the members of `options`.
-        progress: called with (steps done, steps in all); in a time budget, with seconds.
+        recording: readings and presses of known position.
+        options: how to train; the defaults if None.
+        time_budget: seconds to train for, with as many members as that is good for; the result then depends on the
+            pace of the machine. None for the length and the members of `options`.
+        on_progress: called with (steps done, steps in all); with a time budget, with seconds.
 
     Returns:
         The localizer, and the document of `calibration.json`.
 
     Raises:
-        InputError: an option out of range, a time budget for the published method, too few presses to hold a share
-            back, or a training that diverged.
+        InputError: an option out of range, a time budget for the published method, too few presses, or a training
+            that diverged.
     """
     check_type("recording", recording, Recording)
-    options = or_default("options", options, settings.LocalizerSettings)
-    given = {key: value for key, value in (("split", split), ("seed", seed)) if value is not None}
-    options = validate(settings.LocalizerSettings, {**options.model_dump(), **given}, "[localizer]")
-    time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MOST_SECONDS)
+    options = or_default("options", options, LocalizerSettings)
+    time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
     if options.method == "published":
         if time_budget is not None:
-            raise InputError("time_budget is given: method published trains until it gains no more, expected masked")
+            raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
         options = options.model_copy(update={"features": "published"})
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.has_position)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
-    from padforge.design.common.parallel import one_torch_thread
-
     with stage("train"), one_torch_thread():
-        localizer = learn(recording, training, options, rng, progress, time_budget)
-    localizer = replace(localizer, split=options.split, test=tuple(test.tolist()), provenance=made_by)
-    levels = range(min(options.max_failures, recording.fibres - 1) + 1) if options.method == "ensemble" else (0,)
+        model = fit_model(
+            CalibrationData.from_recording(recording, training, options),
+            training,
+            options,
+            rng,
+            on_progress,
+            time_budget,
+        )
+    model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     with stage("evaluate"):
-        document = evaluate(localizer, recording, levels)
+        document = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
     document |= {"training_presses": len(training), "settings": options.model_dump()}
-    return replace(localizer, errors=document["errors"]), document
+    return replace(model, errors=document["errors"]), document
 
 
-def learn(
+def fit_recording(
     recording: Recording,
     training: Indices,
-    options: settings.LocalizerSettings,
+    options: LocalizerSettings,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = _ignore,
+) -> LocalizerModel:
+    """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
+    return fit_model(CalibrationData.from_recording(recording, training, options), training, options, rng, on_progress)
+
+
+def fit_model(
+    data: CalibrationData,
+    training: Indices,
+    options: LocalizerSettings,
+    rng: np.random.Generator,
+    on_progress: OnProgress = _ignore,
     time_budget: float | None = None,
 ) -> LocalizerModel:
-    """Train a localizer on the presses `training` of a recording, by index.
+    """Train a localizer and calibrate its uncertainty.
 
-    Of them, a share finds the radii: drawn at random, or the last ones, as the split is. The others are shown as they
-    were commanded and, once more, as they would be found in the readings. The published training ends by presses of
-    its own: were they those that find the radii, the weights would be those that suit them, and the radii too short.
+    A share of the presses calibrates the uncertainty, drawn at random or the last ones, as the split is. The others
+    are trained on as they were commanded and, once more, as they would be detected. The published training ends by
+    presses of its own: were they those of the calibration, its intervals would be too short.
+
+    Args:
+        data: presses.
+        training: indices of the presses to train on and to calibrate by.
+        options: how to train.
+        rng: source of all that is random.
+        on_progress: called with (steps done, steps in all); with a time budget, with seconds.
+        time_budget: seconds to train for, see `calibrate`.
 
     Raises:
-        InputError: the training diverged.
+        InputError: too few presses, or the training diverged.
     """
-    taught, ending, proving = _parts(training, options, rng)
-    masked = options.method == "ensemble"
-    raw = press_inputs(recording.readings, recording.down_command, recording.up_command, options.features)
-    measures = learnable(recording, training) if masked else {}
-    shown_raw, rows = raw[taught], taught
-    if masked:
-        from padforge.sense.signals.press_detection import align_to_detected
+    # torch is slow to import, and predictions need none
+    from padforge.sense.localizer.training import train_members, train_published
 
-        again = align_to_detected(recording.readings, recording.times_s, recording.down_command, recording.up_command)
-        shown_raw += press_inputs(recording.readings, *again, options.features)[taught]
-        rows = np.concatenate([taught, taught])
-    shown_mm, shown_more = recording.presses_mm[rows], _of(measures, rows)
-    scaling, table = FeatureScaler.fit(shown_raw, shown_mm, shown_more, PHASES[options.features])
-    shown = _samples(scaling, scaling.inputs(shown_raw), shown_mm, shown_more)
+    is_ensemble = options.method == "ensemble"
+    train, early_stop, calibration = _split_training(training, options, rng)
+    features, rows = data.features[train], train
+    if data.detected is not None:
+        features, rows = features + data.detected[train], np.concatenate([train, train])
+    phases = FEATURES[data.feature_set].phases if data.feature_set in FEATURES else ()
+    positions_mm, measures = data.positions_mm[rows], _rows(data.measures, rows)
+    scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
+    presses = scaler.training_presses(features, positions_mm, measures)
     bayes, residual_network = None, {}
-    if masked:
-        from padforge.sense.localizer.training import train_members
-
-        weights, bayes, residual_network = train_members(shown, table, options, rng, progress, time_budget)
+    if is_ensemble:
+        weights, bayes, residual_network = train_members(presses, table, options, rng, on_progress, time_budget)
     else:
-        from padforge.sense.localizer.training import train_published
-
-        held = _samples(scaling, scaling.inputs(raw[ending]), recording.presses_mm[ending], {})
-        weights = train_published(shown, held, rng)
-    _refuse_diverged(weights, residual_network, scaling, options)
-    localizer = LocalizerModel(
+        held_back = scaler.training_presses(data.features[early_stop], data.positions_mm[early_stop])
+        weights = train_published(presses, held_back, rng)
+    check_trained(weights, residual_network, scaler, options)
+    model = LocalizerModel(
         weights=weights,
-        scaler=scaling,
+        scaler=scaler,
         table=table,
         bayes=bayes,
         residual_network=residual_network,
         method=options.method,
-        features=options.features,
+        features=data.feature_set,  # pyright: ignore[reportArgumentType]
         interval_factors=np.ones((1, 3 + len(measures))),
-        rate_hz=recording.rate_hz,
-        training_recording_sha256=recording.digest,
+        rate_hz=data.rate_hz,
+        training_recording_sha256=data.sha256,
     )
-    levels = min(options.max_failures, recording.fibres - 1) + 1 if masked else 1
-    presses, positions_mm = scaling.inputs(raw[proving]), recording.presses_mm[proving]
+    levels = _n_levels(options, model.fibres)
+    scaled, positions_mm = scaler.transform(data.features[calibration]), data.positions_mm[calibration]
     if bayes is not None:
-        localizer = proven(localizer, presses, positions_mm, levels)
-    return replace(localizer, interval_factors=radii(localizer, presses, positions_mm, levels, _of(measures, proving)))
+        model = calibrate_scales(model, scaled, positions_mm, levels)
+    factors = calibrate_intervals(model, scaled, positions_mm, levels, _rows(data.measures, calibration))
+    return replace(model, interval_factors=factors)
 
 
-def proven(localizer: LocalizerModel, presses: ScaledFeatures, positions_mm: Array, levels: int) -> LocalizerModel:
-    """One whose members expect the errors that they make of presses never learnt from, and so count as they deserve.
+def _n_levels(options: LocalizerSettings, fibres: int) -> int:
+    return min(options.max_failures, fibres - 1) + 1 if options.method == "ensemble" else 1
 
-    Of few presses, or badly placed ones, an observer is far surer than it may be: it finds the presses of training,
-    moved as the response says, by that same response.
+
+def calibrate_scales(
+    model: LocalizerModel, presses: ScaledFeatures, positions_mm: Array, levels: int
+) -> LocalizerModel:
+    """Scale the expected errors of the members to those on presses never trained on, so that their weights are right.
+
+    The Bayesian localizer is overconfident of few or badly placed presses: those of training are augmented by the same
+    response that it predicts them by.
+
+    Args:
+        model: with a Bayesian localizer.
+        presses: of the calibration.
+        positions_mm: (Q, 2).
+        levels: numbers of failed fibres, from 0.
     """
-    targets = localizer.scaler.targets(positions_mm)
+    targets = model.scaler.scale_targets(positions_mm)
     ratios = []
-    for lost in (lost for level in range(levels) for lost in failure_subsets(localizer.fibres, level, PROVEN)):
-        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(localizer.fibres), lost)
-        outputs = learnt(
-            localizer.weights, presses.inputs, fibre_mask, "ensemble", localizer.bayes, localizer.residual_network
+    for failed in (subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)):
+        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(model.fibres), failed)
+        outputs = predict_members(
+            model.weights, presses.inputs, fibre_mask, "ensemble", model.bayes, model.residual_network
         )
-        found, logs = np.split(outputs, 2, axis=2)
-        ratios.append(np.abs(found - targets).mean(axis=2) / np.exp(np.clip(logs, LEAST_LOG, MOST_LOG)).mean(axis=2))
-    whole = np.mean(ratios, axis=0)
-    logs = np.log((TRUSTED + whole.sum(axis=1)) / (TRUSTED + whole.shape[1]))
+        predicted, log_error = np.split(outputs, 2, axis=2)
+        expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
+        ratios.append(np.abs(predicted - targets).mean(axis=2) / expected)
+    ratio = np.mean(ratios, axis=0)
+    log_scale = np.log((PRIOR_COUNT + ratio.sum(axis=1)) / (PRIOR_COUNT + ratio.shape[1]))
 
-    def honest(weights: Weights, more: Array) -> Weights:
+    def scaled(weights: Weights, log_scale: Array) -> Weights:
         bias = weights["last.b"].copy()
-        bias[:, :, 2:] += more[:, None, None]
+        bias[:, :, 2:] += log_scale[:, None, None]
         return {**weights, "last.b": bias}
 
-    weights, residual_network = honest(localizer.weights, logs[:-1]), honest(localizer.residual_network, logs[-1:])
-    return replace(localizer, weights=weights, residual_network=residual_network)
+    residual_network = scaled(model.residual_network, log_scale[-1:])
+    return replace(model, weights=scaled(model.weights, log_scale[:-1]), residual_network=residual_network)
 
 
-def _refuse_diverged(
-    weights: Weights, residual_network: Weights, scaling: FeatureScaler, options: settings.LocalizerSettings
+def calibrate_intervals(
+    model: LocalizerModel,
+    presses: ScaledFeatures,
+    positions_mm: Array,
+    levels: int,
+    measures: Mapping[str, Array] | None = None,
+) -> Array:
+    """Return the (levels, 3 + T) `interval_factors` that hold on presses never trained on.
+
+    Args:
+        model: whose `interval_factors` are not used.
+        presses: of the calibration.
+        positions_mm: (Q, 2).
+        levels: numbers of failed fibres, from 0.
+        measures: (Q,) of each that is predicted, NaN where unknown.
+    """
+    plain = replace(model, interval_factors=np.ones((1, model.interval_factors.shape[1])))
+    factors = []
+    for level in range(levels):
+        subsets = failure_subsets(model.fibres, level, INTERVAL_SUBSETS)
+        predictions = [plain.predict_features(presses, subset) for subset in subsets]
+        factors.append(conformal(predictions, positions_mm, measures))
+    return np.clip(factors, 1e-6, 1e6)
+
+
+def check_trained(
+    weights: Weights, residual_network: Weights, scaler: FeatureScaler, options: LocalizerSettings
 ) -> None:
-    entries = scaling.entries(options.method)
+    """Raise InputError if a training diverged."""
+    n_inputs = scaler.n_inputs(options.method)
     try:
-        refuse_unsound(weights, entries, options.method, len(scaling.measures))
+        check_weights(weights, n_inputs, options.method, len(scaler.measures))
         if residual_network:
-            refuse_unsound(residual_network, entries + TOLD, options.method)
+            check_weights(residual_network, n_inputs + N_SUMMARY, options.method)
     except InputError as error:
         raise InputError(
             f"training diverged at [localizer] learning_rate {options.learning_rate:g}, try a lower one: {error}"
         ) from error
 
 
-def _parts(
-    training: Indices, options: settings.LocalizerSettings, rng: np.random.Generator
+def _split_training(
+    training: Indices, options: LocalizerSettings, rng: np.random.Generator
 ) -> tuple[Indices, Indices, Indices]:
-    """Presses to learn from, those that end a published training and those that find the radii."""
-    taught, checked = (
-        training[part] for part in split_presses(len(training), options.split, CHECKED[options.method], rng, least=2)
-    )
-    if options.method == "ensemble" or len(checked) < 2:
-        return taught, checked, checked
-    ending, proving = (checked[part] for part in split_presses(len(checked), options.split, 0.5, rng, least=1))
-    return taught, ending, proving
+    """Presses to train on, to end a published training by, and to calibrate by."""
+    share = CALIBRATION_SHARE[options.method]
+    train, held_back = (training[part] for part in split_presses(len(training), options.split, share, rng, 2))
+    if options.method == "ensemble" or len(held_back) < 2:
+        return train, held_back, held_back
+    early_stop, calibration = (held_back[part] for part in split_presses(len(held_back), options.split, 0.5, rng, 1))
+    return train, early_stop, calibration
 
 
-def _samples(
-    scaling: FeatureScaler, presses: ScaledFeatures, positions_mm: Array, measures: Mapping[str, Array]
-) -> TrainingPresses:
-    return TrainingPresses(presses.inputs, presses.fibre_mask, scaling.targets(positions_mm, measures), scaling.stretch)
+def _rows(measures: Mapping[str, Array], rows: Indices) -> dict[str, Array]:
+    return {name: values[rows] for name, values in measures.items()}
 
 
-def _of(measures: Mapping[str, Array], presses: Indices) -> dict[str, Array]:
-    return {name: values[presses] for name, values in measures.items()}
+def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:
+    """Return the measures that can be learnt, (Q,) of all presses, by the names of `Recording.measures`.
 
-
-def learnable(recording: Recording, presses: Indices) -> dict[str, Array]:
-    """What is learnt of the presses beside their places, (Q,) of all there are, by the names of `Recording.measures`.
-
-    Depth, where it is known of all `presses` and not the same; then force too, where it is known of all.
+    Depth, if it is known of all `presses` and varies; then force too, if it is known of all.
     """
     measures = recording.measures
-    deep, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
-    if np.isnan(deep).any() or deep.min() <= 0 or np.ptp(np.percentile(deep, [5, 95])) <= LEAST_SPREAD_MM:
+    depth, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
+    if np.isnan(depth).any() or depth.min() <= 0 or np.ptp(np.percentile(depth, [5, 95])) <= MIN_DEPTH_RANGE_MM:
         return {}
-    return measures if not np.isnan(force).any() else {"depth_mm": measures["depth_mm"]}
+    return {"depth_mm": measures["depth_mm"]} if np.isnan(force).any() else measures
 
 
-def left_out(recording: Recording, localizer: LocalizerModel) -> list[str]:
-    """Why `localizer` has not learnt a depth or force that is known of some presses of `recording`, a line each."""
-    if localizer.method != "ensemble":
-        return []
-    learnt = {target.name for target in localizer.scaler.measures}
+def unlearnt_lines(recording: Recording, model: LocalizerModel) -> list[str]:
+    """Say in lines why a model has not learnt a depth or force that is known of some presses of a recording."""
+    learnt = {target.name for target in model.scaler.measures}
     measures = {name: values[recording.has_position] for name, values in recording.measures.items()}
-    deep, force = measures["depth_mm"], measures["force_n"]
-    out = []
-    if "depth_mm" not in learnt:
-        above = int((deep <= 0).sum())
-        if above:
-            out.append(f"depth is not learnt: {above} of {len(deep)} presses reached 0 mm or less")
-        elif 0 < (known := int((~np.isnan(deep)).sum())) < len(deep):
-            out.append(f"depth is not learnt: it is known of {known} of {len(deep)} presses, needed is of all")
-    elif "force_n" not in learnt and (known := int((~np.isnan(force)).sum())):
-        out.append(f"force is not learnt: it is known of {known} of {len(force)} presses, needed is of all")
-    return out
-
-
-def radii(
-    localizer: LocalizerModel,
-    presses: ScaledFeatures,
-    positions_mm: Array,
-    levels: int,
-    measures: Mapping[str, Array] | None = None,
-) -> Array:
-    """(levels, 3 + T) what makes of expected errors, by number of lost fibres, standard deviations and radii."""
-    plain = replace(localizer, interval_factors=np.ones((1, localizer.interval_factors.shape[1])))
-    by_level = (failure_subsets(localizer.fibres, level, SUBSETS) for level in range(levels))
-    found = ([plain.predict_features(presses, subset) for subset in subsets] for subsets in by_level)
-    return np.clip([conformal(each, positions_mm, measures) for each in found], 1e-6, 1e6)
+    depth, force = measures["depth_mm"], measures["force_n"]
+    presses, n_above = len(depth), int((depth <= 0).sum())
+    n_depth, n_force = int((~np.isnan(depth)).sum()), int((~np.isnan(force)).sum())
+    if model.method != "ensemble":
+        return []
+    if "depth_mm" not in learnt and n_above:
+        return [f"depth is not learnt: {n_above} of {presses} presses reached 0 mm or less"]
+    if "depth_mm" not in learnt and 0 < n_depth < presses:
+        return [f"depth is not learnt: it is known of {n_depth} of {presses} presses, needed is of all"]
+    if "depth_mm" in learnt and "force_n" not in learnt and n_force:
+        return [f"force is not learnt: it is known of {n_force} of {presses} presses, needed is of all"]
+    return []
 
 
 def split_unseen(
-    recording: Recording, localizer: LocalizerModel | None, options: settings.LocalizerSettings
+    recording: Recording, model: LocalizerModel | None, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
-    """Presses of known place to learn from, and those to test on, which `localizer`, if there is one, has not learnt.
+    """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen.
 
     Raises:
-        InputError: the localizer was recalibrated by the recording, or there are too few presses.
+        InputError: the model was recalibrated by the recording, or there are too few presses.
     """
     known, digest = np.flatnonzero(recording.has_position), recording.digest
-    if localizer is not None and digest in localizer.recalibrated_by:
+    if model is not None and digest in model.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    if localizer is not None and digest == localizer.training_recording_sha256:
-        test = held_back(localizer, recording)
+    if model is not None and digest == model.training_recording_sha256:
+        test = held_back_presses(model, recording)
         return np.setdiff1d(known, test), test
     rng = np.random.default_rng(options.seed)
     training, test = split_presses(len(known), options.split, options.test_share, rng)
@@ -281,18 +367,25 @@ def split_unseen(
 
 
 def split_presses(
-    presses: int, split: str, share: float, rng: np.random.Generator, least: int = LEAST_TRAINING
+    presses: int, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
 ) -> tuple[Indices, Indices]:
-    """Indices (ascending) of the presses to learn from and of those held back: drawn at random, or the last.
+    """Return ascending indices of the presses to train on and of those held back: drawn at random, or the last.
+
+    Args:
+        presses: how many there are.
+        split: "random" or "chronological".
+        share: of the presses to hold back.
+        rng: of the draw.
+        min_training: presses that must be left to train on.
 
     Raises:
-        InputError: a share of so few presses leaves none on one side, or fewer than `least` to learn from.
+        InputError: one of the two would have too few.
     """
-    held = max(round(share * presses), 1 if least < LEAST_TRAINING else 0)
-    if not 1 <= held <= presses - least:
+    n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
+    if not 1 <= n_held_back <= presses - min_training:
         raise InputError(
-            f"recording has {presses} presses of known place: a share of {share:g} holds {held} back, "
-            f"expected at least 1, and {least} to learn from"
+            f"recording has {presses} presses of known position: a share of {share:g} holds {n_held_back} back, "
+            f"expected at least 1, and {min_training} to learn from"
         )
     order = rng.permutation(presses) if split == "random" else np.arange(presses)
-    return np.sort(order[:-held]), np.sort(order[-held:])
+    return np.sort(order[:-n_held_back]), np.sort(order[-n_held_back:])

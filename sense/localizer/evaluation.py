@@ -1,198 +1,246 @@
-"""Evaluation: how far off a localizer is, by sets of lost fibres, by place, and whether its radii hold."""
+"""Evaluation of a localizer: errors for every set of failed fibres and by position, and coverage of its radii."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from math import ceil, isnan
 from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_int, check_type, short_repr
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.features import bridged, window_inputs
-from padforge.sense.localizer.model import Localization, LocalizerModel, Measured
+from padforge.sense.localizer.features import FEATURES, interpolate_gaps, window_means
+from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/2"
 CELLS = 5
-"""Cells along a side of the map of errors by place."""
+"""Cells along a side of the map of errors by position."""
 ACTIVE = 0.02
-"""Share of its total variation that a fibre must change by to be active in a press (paper, table III)."""
+"""Share of its range that a fibre must change by to be active in a press (paper, table III)."""
+Measures = Mapping[str, Array]
 
 
-def evaluate(localizer: LocalizerModel, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
-    """Errors of a localizer for every set of lost fibres of the sizes `levels`.
+def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
+    """Evaluate a localizer for every set of failed fibres of some sizes.
 
-    On the recording it was trained on, only the presses held back then count; of any other, all of known place do.
+    Of the recording of the training, only the presses that were held back count; of any other, all of known position.
+
+    Args:
+        model: to evaluate.
+        recording: of a pad with the fibres and the rate of the training.
+        levels: numbers of failed fibres.
 
     Returns:
-        A document with "errors", one row per level: how many sets of lost fibres were tried; mean, standard deviation
-        and greatest of their mean errors; median and 95th percentile over all their presses, mm; shares of presses
-        within the radii of 50 and 90 %; where they were learnt and are known, the mean and 95th percentile of the error
-        of depths and forces, and the share within their r90. Besides "split" ("none" for another recording),
-        "test_presses", "by_subset" (mean error of each set), "by_place" (`by_place`), "idle_share" of each fibre, and
-        "test" (places, depths and forces pressed, and found with all fibres).
+        The document of `calibration.json`: "errors", rows of `error_row`; "by_subset", the mean error of each set of
+        failed fibres; "by_position", see `errors_by_position`; "idle_share" of each fibre; "split", "none" for another
+        recording; "test_presses", their number; and "test", true and predicted positions, depths and forces with all
+        fibres.
 
     Raises:
-        InputError: no level, one that leaves no fibre, no place known, or a recording that does not suit the localizer
-            or was seen in its recalibration.
+        InputError: no level, one that leaves no fibre, no press of known position, or a recording that does not suit
+            the localizer or was seen in its recalibration.
     """
-    check_type("localizer", localizer, LocalizerModel)
+    check_type("localizer", model, LocalizerModel)
     check_type("recording", recording, Recording)
-    presses = len(recording.presses_mm)
-    try:
-        levels = tuple(levels)
-    except TypeError as error:
-        raise InputError(f"lost is {short_repr(levels)}, expected numbers of lost fibres") from error
+    levels = tuple(levels)
     if not levels:
-        raise InputError(f"lost names no number of fibres, expected one or more of 0 to {localizer.fibres - 1}")
+        raise InputError(f"levels name no number of failed fibres, expected one or more of 0 to {model.fibres - 1}")
     digest = recording.digest
-    if digest in localizer.recalibrated_by:
+    if digest in model.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    own = digest == localizer.training_recording_sha256
-    test = held_back(localizer, recording) if own else np.flatnonzero(recording.has_position)
+    is_training = digest == model.training_recording_sha256
+    test = held_back_presses(model, recording) if is_training else np.flatnonzero(recording.has_position)
     if len(test) == 0:
-        raise InputError(f"recording has no press of known place among its {presses}, expected at least one")
-    inputs, positions_mm = localizer.scaled_features(recording)[test], recording.presses_mm[test]
+        raise InputError(
+            f"recording has no press of known position to test on among {len(recording.presses_mm)}, "
+            "expected at least one"
+        )
+    features, positions_mm = model.scaled_features(recording)[test], recording.presses_mm[test]
     measures = {name: values[test] for name, values in recording.measures.items()}
-    locate = partial(localizer.predict_features, inputs)
-    rows, by_subset = errors_by_loss(localizer.fibres, levels, locate, positions_mm, measures)
-    whole = localizer.predict_features(inputs)
+    rows, by_subset = errors_by_loss(
+        model.fibres, levels, lambda failed: model.predict_features(features, failed), positions_mm, measures
+    )
+    prediction = model.predict_features(features)
     return {
         "format": FORMAT,
         "errors": rows,
-        "split": localizer.split if own else "none",
+        "split": model.split if is_training else "none",
         "test_presses": len(test),
         "by_subset": by_subset,
-        "by_place": by_place(whole.positions_mm, positions_mm),
+        "by_position": errors_by_position(prediction.positions_mm, positions_mm),
         "idle_share": idle_share(recording).tolist(),
         "test": {
             "press": test.tolist(),
             "pressed_mm": positions_mm.tolist(),
-            "predicted_mm": whole.positions_mm.tolist(),
-            "r90_mm": whole.r90_mm.tolist(),
-            **_measures_told(whole, measures),
+            "predicted_mm": prediction.positions_mm.tolist(),
+            "r90_mm": prediction.r90_mm.tolist(),
+            **{
+                name: {
+                    "pressed": [None if isnan(value) else value for value in measures[name].tolist()],
+                    "predicted": estimate.values.tolist(),
+                    "r90": estimate.r90.tolist(),
+                }
+                for name, estimate in prediction.measures.items()
+            },
         },
-        "provenance": {**localizer.provenance, "recording_kind": recording.source.get("kind")},
+        "provenance": {**model.provenance, "recording_kind": recording.source.get("kind")},
     }
 
 
-def held_back(localizer: LocalizerModel, recording: Recording) -> Indices:
-    """Presses of the recording it was trained on that a localizer says were held back, by index.
+def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices:
+    """Return the indices of the test presses of a model in the recording of its training.
 
     Raises:
-        InputError: one of them is not there, or its place is not known, so that it was not.
+        InputError: there is no such press, or its position is unknown.
     """
     presses = len(recording.presses_mm)
-    for press in localizer.test:
+    for press in model.test:
         if not 0 <= press < presses or not recording.has_position[press]:
             raise InputError(
-                f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known place"
+                f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known position"
             )
-    return np.array(localizer.test, dtype=np.int64)
-
-
-def _measures_told(found: Localization, measures: Mapping[str, Array]) -> dict[str, Any]:
-    """Depths and forces found, their `r90`, and what they were, None where that is not known; by name."""
-    return {
-        name: {
-            "pressed": [None if isnan(value) else value for value in measures[name].tolist()],
-            "found": each.values.tolist(),
-            "r90": each.r90.tolist(),
-        }
-        for name, each in found.measures.items()
-    }
+    return np.array(model.test, dtype=np.int64)
 
 
 def errors_by_loss(
     fibres: int,
     levels: Iterable[int],
-    locate: Callable[[tuple[int, ...]], Localization],
+    predict: Callable[[tuple[int, ...]], Localization],
     positions_mm: Array,
-    measures: Mapping[str, Array] | None = None,
+    measures: Measures | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """ "errors" and "by_subset" as `evaluate` gives them.
+    """Return "errors" and "by_subset" of `evaluate`.
 
     Args:
-        fibres: how many there are. levels: how many are lost.
-        locate: finds the presses without the fibres given by index. positions_mm: (Q, 2) where they were.
-        measures: (Q,) how deep and forceful they were, see `Recording.measures`.
+        fibres: C.
+        levels: numbers of failed fibres.
+        predict: predicts the presses without the fibres of these indices.
+        positions_mm: (Q, 2) true positions.
+        measures: (Q,) true depths and forces, NaN where unknown.
 
     Raises:
         InputError: a level that leaves no fibre.
     """
     rows, by_subset = [], []
     for level in levels:
-        level = check_int("lost", level, 0, fibres - 1)
-        subsets = failure_subsets(fibres, level)
-        found = [locate(subset) for subset in subsets]
-        rows.append(error_row(level, found, positions_mm, measures))
+        n_failed = check_int("n_failed", level, 0, fibres - 1)
+        subsets = failure_subsets(fibres, n_failed)
+        predictions = [predict(subset) for subset in subsets]
+        rows.append(error_row(n_failed, predictions, positions_mm, measures))
         by_subset += [
             {"failed": list(subset), "mean_mm": float(distances(each.positions_mm, positions_mm).mean())}
-            for subset, each in zip(subsets, found, strict=True)
+            for subset, each in zip(subsets, predictions, strict=True)
         ]
     return rows, by_subset
 
 
+def error_row(
+    n_failed: int, predictions: Sequence[Localization], positions_mm: Array, measures: Measures | None = None
+) -> dict[str, Any]:
+    """Summarize the errors of presses predicted with each set of failed fibres of a size.
+
+    Args:
+        n_failed: size of the sets.
+        predictions: of Q presses, one a set.
+        positions_mm: (Q, 2) true positions.
+        measures: (Q,) true depths and forces, NaN where unknown.
+
+    Returns:
+        Number of sets; mean, standard deviation and greatest of their mean errors; median and 95th percentile over all
+        presses; shares within the radii; of depth and force that are predicted and known, mean and 95th percentile of
+        the error, and the share within r90.
+    """
+    errors = np.stack([distances(each.positions_mm, positions_mm) for each in predictions])
+    means = errors.mean(axis=1)
+    row = {
+        "n_failed": n_failed,
+        "subsets": len(errors),
+        "mean_mm": float(means.mean()),
+        "std_mm": float(means.std()),
+        "max_mm": float(means.max()),
+        "median_mm": float(np.median(errors)),
+        "p95_mm": float(np.percentile(errors, 95)),
+        "within_r50": float((errors <= np.stack([each.r50_mm for each in predictions])).mean()),
+        "within_r90": float((errors <= np.stack([each.r90_mm for each in predictions])).mean()),
+    }
+    for name, (errors, r90) in _measure_errors(predictions, measures).items():
+        kind, unit = name.rsplit("_", 1)
+        known = np.isfinite(errors[0])
+        if known.any():
+            row |= {
+                f"{kind}_mean_{unit}": float(errors[:, known].mean()),
+                f"{kind}_p95_{unit}": float(np.percentile(errors[:, known], 95)),
+                f"{kind}_within_r90": float((errors <= r90)[:, known].mean()),
+            }
+    return row
+
+
+def _measure_errors(predictions: Sequence[Localization], measures: Measures | None) -> dict[str, tuple[Array, Array]]:
+    """(sets, Q) errors of each predicted measure, NaN where the true value is unknown, and their r90."""
+    unknown = np.full(len(predictions[0].positions_mm), np.nan)
+
+    def stack(name: str, values: Callable[[MeasureEstimate], Array]) -> Array:
+        return np.stack([values(each.measures[name]) for each in predictions])
+
+    return {
+        name: (
+            np.abs(stack(name, lambda each: each.values) - (measures or {}).get(name, unknown)),
+            stack(name, lambda each: each.r90),
+        )
+        for name in predictions[0].measures
+    }
+
+
 def distances(predicted_mm: Array, pressed_mm: Array) -> Array:
-    """(Q,) distance of (Q, 2) places."""
+    """Return the (Q,) distances of (Q, 2) positions."""
     return np.hypot(*(predicted_mm - pressed_mm).T)
 
 
-def conformal(found: Sequence[Localization], positions_mm: Array, measures: Mapping[str, Array] | None = None) -> Array:
-    """(3 + T,) factors by which standard deviations, the radii of 50 and 90 %, and the r90 of T measures must grow.
+def conformal(predictions: Sequence[Localization], positions_mm: Array, measures: Measures | None = None) -> Array:
+    """Return the factors by which standard deviations, radii and r90 of measures must grow to hold on these presses.
 
-    They are then right for these presses.
-
-    The radii are split-conformal (Lei et al. 2018, Distribution-free predictive inference for regression): of distance
-    over radius on presses that entered nothing before, the least that is not below a share of them and the next one.
-    So of few presses they are the more cautious.
+    Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): a quantile of
+    distance over radius on presses that entered nothing before, one rank higher than the share, so that of few presses
+    they are more cautious.
 
     Args:
-        found: the Q presses, with each of some sets of lost fibres. positions_mm: (Q, 2).
-        measures: (Q,) of those that were learnt; where none is known its factor is 1.
+        predictions: of Q presses, one a set of failed fibres.
+        positions_mm: (Q, 2) true positions.
+        measures: (Q,) true depths and forces; where none is known, the factor is 1.
+
+    Returns:
+        (3 + T,) of the standard deviation, the radii of 50 and 90 %, and the r90 of T measures.
     """
-    off = [(each.positions_mm - positions_mm) / each.std_mm for each in found]
-    errors = [distances(each.positions_mm, positions_mm) for each in found]
-    r50 = _covering(0.5, np.array([error / each.r50_mm for error, each in zip(errors, found, strict=True)]))
-    r90 = _covering(0.9, np.array([error / each.r90_mm for error, each in zip(errors, found, strict=True)]))
-    more = [_conformal_r90(each) for each in _paired(found, measures).values()]
-    return np.array([np.sqrt(np.square(off).mean()), r50, r90, *more])
+    standardized = [(each.positions_mm - positions_mm) / each.std_mm for each in predictions]
+    errors = np.array([distances(each.positions_mm, positions_mm) for each in predictions])
+    factors = [float(np.sqrt(np.square(standardized).mean()))]
+    factors += [
+        _conformal_quantile(0.5, errors / [each.r50_mm for each in predictions]),
+        _conformal_quantile(0.9, errors / [each.r90_mm for each in predictions]),
+    ]
+    for measure_errors, r90 in _measure_errors(predictions, measures).values():
+        ratios = measure_errors / r90
+        ratios = ratios[:, np.isfinite(ratios).all(axis=0)]
+        factors.append(_conformal_quantile(0.9, ratios) if ratios.shape[1] else 1.0)
+    return np.array(factors)
 
 
-def _covering(share: float, ratios: Array) -> float:
-    """The least of the ratios (sets, Q) that a share of them and one more does not exceed; the greatest if all are few.
+def _conformal_quantile(share: float, ratios: Array) -> float:
+    """The least of (sets, Q) ratios that a share of them, and one more, does not exceed; the greatest if they are few.
 
-    Sets of one press are not independent of each other: they count for as many as the presses differ in how often they
-    keep to the share.
+    The sets of one press are not independent: they count for as many as presses differ in how often they keep within.
     """
     ranked = np.sort(ratios, axis=None)
-    kept = (ratios <= np.quantile(ratios, share)).mean(axis=0)
-    presses, spread = len(kept), float(kept.var())
-    alone = min(max(presses, share * (1 - share) * presses / spread), ranked.size) if spread else ranked.size
-    rank = ceil(round(share * (1 + 1 / alone) * ranked.size, 9))
+    within = (ratios <= np.quantile(ratios, share)).mean(axis=0)
+    presses, variance = len(within), float(within.var())
+    effective = min(max(presses, share * (1 - share) * presses / variance), ranked.size) if variance else ranked.size
+    rank = ceil(round(share * (1 + 1 / effective) * ranked.size, 9))
     return float(ranked[min(rank, ranked.size) - 1])
 
 
-def _conformal_r90(pairs: list[tuple[Measured, Array]]) -> float:
-    """The factor of `conformal` of the r90 of a measure."""
-    ratios = np.array([np.abs(each.values - true) / each.r90 for each, true in pairs])
-    ratios = ratios[:, np.isfinite(ratios).all(axis=0)]
-    return _covering(0.9, ratios) if ratios.shape[1] else 1.0
-
-
-def _paired(
-    found: Sequence[Localization], measures: Mapping[str, Array] | None
-) -> dict[str, list[tuple[Measured, Array]]]:
-    """Of each measure learnt, how it was found with each set of lost fibres, and what it was; NaN if unknown."""
-    names = list(found[0].measures)
-    unknown = np.full(len(found[0].positions_mm), np.nan)
-    return {name: [(each.measures[name], (measures or {}).get(name, unknown)) for each in found] for name in names}
-
-
-def by_place(predicted_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
-    """Presses, mean and greatest error in each cell of the pad that was pressed; "x_mm", "y_mm" are its middle."""
+def errors_by_position(predicted_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
+    """Return presses, mean and greatest error in each cell that was pressed; "x_mm" and "y_mm" are its centre."""
     low, high = pressed_mm.min(axis=0), pressed_mm.max(axis=0)
     side = np.where(high > low, (high - low) / CELLS, 1.0)
     cells = np.minimum(((pressed_mm - low) / side).astype(int), CELLS - 1)
@@ -200,91 +248,41 @@ def by_place(predicted_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
     rows = []
     for cell in np.unique(cells, axis=0):
         inside = (cells == cell).all(axis=1)
-        x, y = low + (cell + 0.5) * side
-        rows.append(
-            {
-                "x_mm": float(x),
-                "y_mm": float(y),
-                "presses": int(inside.sum()),
-                "mean_mm": float(errors[inside].mean()),
-                "max_mm": float(errors[inside].max()),
-            }
-        )
+        x, y = (low + (cell + 0.5) * side).tolist()
+        mean, worst = float(errors[inside].mean()), float(errors[inside].max())
+        rows.append({"x_mm": x, "y_mm": y, "presses": int(inside.sum()), "mean_mm": mean, "max_mm": worst})
     return rows
 
 
 def idle_share(recording: Recording) -> Array:
-    """(C,) share of presses in which each fibre is idle: it changes by less than 2 % of its range over all presses."""
-    changes = window_inputs(bridged(recording.readings), recording.down_command, recording.up_command, release=False)[
-        :, :, -1
-    ]
-    variation = np.ptp(changes, axis=0)
-    return (np.abs(changes) <= ACTIVE * variation).mean(axis=0)
-
-
-def error_row(
-    lost: int, found: list[Localization], positions_mm: Array, measures: Mapping[str, Array] | None = None
-) -> dict[str, Any]:
-    """A row of "errors" from what was found with each set of so many lost fibres, and what was pressed."""
-    errors = np.stack([distances(each.positions_mm, positions_mm) for each in found])
-    means = errors.mean(axis=1)
-    return {
-        "n_failed": lost,
-        "subsets": len(errors),
-        "mean_mm": float(means.mean()),
-        "std_mm": float(means.std()),
-        "max_mm": float(means.max()),
-        "median_mm": float(np.median(errors)),
-        "p95_mm": float(np.percentile(errors, 95)),
-        "within_r50": float(np.mean([error <= each.r50_mm for error, each in zip(errors, found, strict=True)])),
-        "within_r90": float(np.mean([error <= each.r90_mm for error, each in zip(errors, found, strict=True)])),
-        **_measure_errors(found, measures),
-    }
-
-
-def _measure_errors(found: Sequence[Localization], measures: Mapping[str, Array] | None) -> dict[str, float]:
-    """What a row of "errors" says of the measures that were learnt and are known."""
-    out = {}
-    for name, pairs in _paired(found, measures).items():
-        kind, unit = name.rsplit("_", 1)
-        known = ~np.isnan(pairs[0][1])
-        if known.any():
-            errors = np.stack([np.abs(each.values - true)[known] for each, true in pairs])
-            within = [error <= each.r90[known] for error, (each, _) in zip(errors, pairs, strict=True)]
-            out |= {
-                f"{kind}_mean_{unit}": float(errors.mean()),
-                f"{kind}_p95_{unit}": float(np.percentile(errors, 95)),
-                f"{kind}_within_r90": float(np.mean(within)),
-            }
-    return out
+    """Return the (C,) share of presses in which a fibre changes by less than `ACTIVE` of its range over all presses."""
+    readings = interpolate_gaps(recording.readings)
+    windows = window_means(readings, recording.down_command, recording.up_command, FEATURES["causal"])
+    changes = windows[:, :, -1]
+    return (np.abs(changes) <= ACTIVE * np.ptp(changes, axis=0)).mean(axis=0)
 
 
 def calibration_lines(document: Mapping[str, Any]) -> list[str]:
-    """The errors of a calibration document as tables for people: of places, and of depth and force if learnt."""
+    """Format the errors of a calibration document as tables: of positions, and of depth and force if predicted."""
     names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
-    of = " of a simulated pad" if document["provenance"].get("recording_kind") == "simulated" else ""
-    return [
-        f"error in mm on {document['test_presses']} presses{of} (split: {document['split']})",
+    rows = document["errors"]
+    pad = " of a simulated pad" if document["provenance"].get("recording_kind") == "simulated" else ""
+    lines = [
+        f"error in mm on {document['test_presses']} presses{pad} (split: {document['split']})",
         "lost  sets   mean    std    max median    p95  in r50  in r90",
         *(
             f"{row['n_failed']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
             f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
-            for row in document["errors"]
+            for row in rows
         ),
-        *measure_lines(document["errors"]),
     ]
-
-
-def measure_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Errors of depth and force as tables for people, by rows of "errors"; none where they were not learnt."""
-    out = []
     for kind, unit in (("depth", "mm"), ("force", "N")):
         names = (f"{kind}_mean_{unit.lower()}", f"{kind}_p95_{unit.lower()}")
         if names[0] in rows[0]:
-            out += [f"error of {kind} in {unit}", "lost  sets   mean    p95  in r90"]
-            out += [
+            lines += [f"error of {kind} in {unit}", "lost  sets   mean    p95  in r90"]
+            lines += [
                 f"{row['n_failed']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
                 f"{row[f'{kind}_within_r90']:7.1%}"
                 for row in rows
             ]
-    return out
+    return lines

@@ -1,4 +1,4 @@
-"""What all that is trained on a recording shares: a document with its weights beside it, the pad it suits, its rate."""
+"""Files of a trained model: a JSON document and the arrays beside it, and the pad that a model is for."""
 
 import hashlib
 import json
@@ -14,27 +14,33 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from padforge.design.common.files import atomic_files, read_bytes
-from padforge.design.common.validation import InputError, check_type, short_repr
-from padforge.design.common.validation import check_path as as_path
+from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 
 RATE_TOLERANCE = 0.25
-"""Windows are counted in readings, so a recording must be about as fast as the one that was learnt from."""
+"""Windows are counted in readings, so the rate must be about that of the training."""
 
 
 class ModelFiles(NamedTuple):
-    """NAME.json and NAME.safetensors, of which the first has the digest of the second.
+    """NAME.json and NAME.safetensors, written together; the document holds the digest of the arrays.
 
-    They are written together; a pair whose halves somebody has mixed is told from a whole one.
+    Attributes:
+        document: path of the JSON file.
+        weights: path of the arrays.
     """
 
     document: Path
     weights: Path
 
     def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write `document`, its "weights_sha256" filled in, and `arrays`, together or not at all.
+        """Write a document with "weights_sha256" added, and arrays, together or not at all.
+
+        Args:
+            document: JSON values.
+            arrays: by name.
+            what: name of the model in messages.
 
         Raises:
-            InputError: the document of `what` is not finite or no JSON, or the folder cannot be written.
+            InputError: the document is not finite or no JSON, or the folder cannot be written.
         """
         content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
@@ -48,10 +54,14 @@ class ModelFiles(NamedTuple):
 
     @contextmanager
     def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the arrays that were written with a document that has this digest of them, to be checked in the body.
+        """Yield the arrays of a document, to be checked in the body of `with`.
+
+        Args:
+            digest: "weights_sha256" of the document.
+            what: name of the model in messages.
 
         Raises:
-            InputError: they cannot be read or are others, or the body raises what says that they are unsound.
+            InputError: they cannot be read, belong to another document, or the body raises one.
         """
         content, name = read_bytes(self.weights), self.document.name
         if hashlib.sha256(content).hexdigest() != digest:
@@ -63,19 +73,19 @@ class ModelFiles(NamedTuple):
 
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
-    """The files of the model `name` in a folder.
+    """Return the files of a model in a folder.
 
     Raises:
         InputError: `folder` is no path, or `name` no plain name.
     """
-    folder = as_path("folder", folder)
+    folder = check_path("folder", folder)
     if not re.fullmatch(r"\w{1,100}", check_type("name", name, str)):
         raise InputError(f"name is {short_repr(name)}, expected letters, digits and underscores")
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 
 class TrainedModel(Protocol):
-    """Trained on `fibres` fibres, lost ones included, of which there were `rate_hz` readings per second."""
+    """A model of `fibres` fibres, trained at `rate_hz` readings per second."""
 
     @property
     def fibres(self) -> int: ...
@@ -84,8 +94,15 @@ class TrainedModel(Protocol):
     def rate_hz(self) -> float: ...
 
 
-def refuse_other_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
-    """Raise InputError if readings are of other fibres, or come at another rate, than those `model` was trained on."""
+def check_same_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
+    """Raise InputError if readings have another number of fibres, or another rate, than the training of a model.
+
+    Args:
+        model: that the readings are for.
+        what: its name in messages.
+        fibres: of the readings.
+        rate_hz: of the readings.
+    """
     if fibres != model.fibres:
         raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")
     if abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:

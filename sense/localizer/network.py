@@ -1,132 +1,137 @@
-"""The networks of the localizer, in NumPy: what they compute, apart from how they are trained.
+"""Networks of the localizer in NumPy, for inference; `torch_network` is the same ensemble in torch, for training.
 
-Of the method "ensemble": masked inputs enter together with the mask, so one network serves every set of lost fibres. A
-first layer leads to residual layers h + gelu(normalised h) W + b, and a normalised last one to two coordinates, to what
-else is learnt of a press, and to the logarithms of the expected errors of all these. Members of an ensemble are stacked
-along the first axis of every array. Of the method "published": one layer of tanh neurons leads to two coordinates."""
+Method "ensemble": a heteroscedastic ensemble of residual MLPs whose inputs are masked features and the mask, so that
+one network serves every set of failed fibres. Residual layers are h + gelu(layer_norm(h)) W + b; the outputs are scaled
+position (and depth, force) and the logarithms of their expected absolute errors. Method "published": one tanh layer.
+"""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
 
 from padforge.design.common.validation import InputError
-from padforge.sense.arrays import Array, Floats, Mask
+from padforge.sense.arrays import Floats, Mask
+from padforge.sense.localizer.bayes import BayesianLocalizer
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
-`last.b` (E, 1, 2 N), for E members, D inputs, H hidden units, L residual layers and N numbers learnt, the first of them
-x and y; of the published network, E = 1, no `hidden`, and 2 in place of 2 N."""
+`last.b` (E, 1, 2 N), for E members, D inputs, H hidden units, L residual layers and N targets; of the published
+network, E = 1, no `hidden`, and 2 in place of 2 N."""
 
-Observing = Callable[[Array, Mask], tuple[Array, Array]]
-"""From (Q, C, F) inputs and (Q, C) which count to (Q, 2) places, and (Q, T) what their corrector is told."""
-
-OUTPUTS = 4
-"""x, y, and the logarithms of the mean absolute errors expected of them, all in units of the localizer's span. What
-else is learnt follows y, in units of its own span, and its logarithms follow theirs."""
+N_OUTPUTS = 4
+"""x, y and their log errors, in scaled units; with T measures, 2 T more: values follow y, and their logs the logs."""
 EPSILON = 1e-5
-"""Added to the variance that a layer is normalised by."""
-LEAST_LOG, MOST_LOG = -9.0, 2.0
-"""Range of the logarithms of expected errors: from a ten-thousandth of the span to the whole pad and more."""
+"""Added to the variance in layer normalization."""
+MIN_LOG_ERROR, MAX_LOG_ERROR = -9.0, 2.0
+"""Range of log errors: from a ten-thousandth of the pad to the whole pad and more."""
 MAX_WEIGHT = 1e4
-"""Greatest weight of a sound network, far above any that training ends with; no sum of a pass overflows below it."""
+"""Largest weight of a network, far above any that training ends with; no sum overflows below it."""
 
 
-def refuse_unsound(weights: Weights, entries: int, method: str, measures: int = 0) -> None:
-    """Raise InputError unless `weights` are those of a network that takes `entries` numbers, and all of them sane.
+def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:
+    """Raise InputError unless weights have the shapes and values of a network of a method.
 
     Args:
-        measures: how many numbers it gives beside the place, each with an expected error.
+        weights: of the network.
+        n_inputs: D.
+        method: "ensemble" or "published".
+        n_measures: targets beside the position.
     """
-    found = {name: weight.shape for name, weight in weights.items()}
-    first, layers = found.get("first.w", ()), found.get("hidden.w", (0,))[:1]
+    shapes = {name: weight.shape for name, weight in weights.items()}
+    first, layers = shapes.get("first.w", ()), shapes.get("hidden.w", (0,))[:1]
     if len(first) != 3 or len(layers) != 1 or 0 in first:
-        raise InputError(f"weights have shapes {found}, expected first.w (E, D, H) and others")
+        raise InputError(f"weights have shapes {shapes}, expected first.w (E, D, H) and others")
     members, _, hidden = first
-    outputs = OUTPUTS + 2 * measures if method == "ensemble" else 2
+    outputs = N_OUTPUTS + 2 * n_measures if method == "ensemble" else 2
     expected = {
-        "first.w": (members, entries, hidden),
+        "first.w": (members, n_inputs, hidden),
         "first.b": (members, 1, hidden),
         "last.w": (members, hidden, outputs),
         "last.b": (members, 1, outputs),
     }
     if method == "ensemble":
         expected |= {"hidden.w": (*layers, members, hidden, hidden), "hidden.b": (*layers, members, 1, hidden)}
-    if found != expected:
-        raise InputError(f"weights have shapes {found}, expected {expected}")
+    if shapes != expected:
+        raise InputError(f"weights have shapes {shapes}, expected {expected}")
     for name, weight in weights.items():
-        greatest = np.abs(weight).max(initial=0)
-        if weight.dtype != np.float32 or not greatest <= MAX_WEIGHT:
+        largest = np.abs(weight).max(initial=0)
+        if weight.dtype != np.float32 or not largest <= MAX_WEIGHT:
             raise InputError(
-                f"weights {name} are {weight.dtype} up to {greatest:g}, allowed is float32 up to {MAX_WEIGHT:g}"
+                f"weights {name} are {weight.dtype} up to {largest:g}, allowed is float32 up to {MAX_WEIGHT:g}"
             )
 
 
-def masked(inputs: Floats, fibre_mask: Mask) -> Floats:
-    """What enters the network: the inputs of the living fibres, zeros for the lost, then the mask.
+def network_inputs(features: Floats, fibre_mask: Mask) -> Floats:
+    """Return (Q, C F + C) inputs of a network from (Q, C, F) features and a (Q, C) mask.
 
-    Args:
-        inputs: (Q, C, F) scaled inputs. fibre_mask: (C,) or (Q, C).
-
-    Returns:
-        (Q, C F + C). A lost fibre's inputs are replaced, not multiplied: not even NaN gets through.
+    Features of masked fibres are replaced, not multiplied, by 0: not even NaN gets through.
     """
-    fibre_mask = np.broadcast_to(fibre_mask, inputs.shape[:2])
-    kept = np.where(fibre_mask[:, :, None], inputs, np.float32(0))
-    return np.concatenate([kept.reshape(len(inputs), -1), fibre_mask.astype(np.float32)], axis=1)
+    masked = np.where(fibre_mask[:, :, None], features, np.float32(0))
+    return np.concatenate(
+        [masked.reshape(len(features), np.prod(features.shape[1:])), fibre_mask.astype(np.float32)], axis=1
+    )
 
 
 def forward(weights: Weights, x: Floats) -> Floats:
-    """(Q, D) entries to (E, Q, 2 N): what is learnt and logarithms of expected errors, see `OUTPUTS`.
-
-    The published network expects the same error of every press, which is called 1.
-    """
+    """Return (E, Q, 2 N) targets and log errors for (Q, D) inputs; log errors of the published network are 0."""
     h = x @ weights["first.w"] + weights["first.b"]
     if "hidden.w" not in weights:
-        places = np.tanh(h) @ weights["last.w"] + weights["last.b"]
-        return np.concatenate([places, np.zeros_like(places)], axis=2)
+        targets = np.tanh(h) @ weights["last.w"] + weights["last.b"]
+        return np.concatenate([targets, np.zeros_like(targets)], axis=2)
     for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
-        h = h + _gelu(_normalised(h)) @ w + b
-    return _gelu(_normalised(h)) @ weights["last.w"] + weights["last.b"]
+        h = h + _gelu(_layer_norm(h)) @ w + b
+    return _gelu(_layer_norm(h)) @ weights["last.w"] + weights["last.b"]
 
 
-def learnt(
+def predict_members(
     weights: Weights,
-    inputs: Floats,
+    features: Floats,
     fibre_mask: Mask,
     method: str = "ensemble",
-    bayes: Observing | None = None,
+    bayes: BayesianLocalizer | None = None,
     residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
-    """(E, Q, 2 N) what the members give of Q presses, see `network.forward`, the corrected observer as the last.
+    """Return the (E, Q, 2 N) outputs of all members; the Bayesian localizer, corrected by its network, is the last.
 
     Args:
-        inputs: (Q, C, F + G) scaled. fibre_mask: (Q, C).
+        weights: of the other members.
+        features: (Q, C, F + G) scaled.
+        fibre_mask: (Q, C).
+        method: "ensemble" or "published".
+        bayes: the Bayesian localizer, if any.
+        residual_network: weights of the network that corrects it.
     """
-    entries = inputs.reshape(len(inputs), -1) if method == "published" else masked(inputs, fibre_mask)
-    outputs = forward(weights, entries)
+    x = features.reshape(len(features), -1) if method == "published" else network_inputs(features, fibre_mask)
+    outputs = forward(weights, x)
     if bayes is None:
         return outputs
-    place, told = bayes(inputs.astype(np.float64), fibre_mask)
-    corrected = forward(residual_network, np.concatenate([entries, told.astype(np.float32)], axis=1))
-    corrected[:, :, :2] += place
+    position, summary = bayes.predict(features.astype(np.float64), fibre_mask)
+    corrected = forward(residual_network, np.concatenate([x, summary.astype(np.float32)], axis=1))
+    corrected[:, :, :2] += position
     return np.concatenate([outputs, corrected])
 
 
-def pooled(outputs: Floats) -> tuple[Floats, Floats]:
-    """(E, Q, 2 N) outputs of all members to (Q, N) numbers learnt and their standard deviations, in units of spans.
+def combine_members(outputs: Floats) -> tuple[Floats, Floats]:
+    """Combine (E, Q, 2 N) outputs by inverse variances: (Q, N) targets and their standard deviations, scaled.
 
-    A member's error is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b. A member counts
-    by the inverse of that, press by press, as much in x as in y; the spread of the members adds to it (Lakshminarayanan
-    et al. 2017, Simple and scalable predictive uncertainty).
+    The error of a member is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b. Members are
+    weighted press by press, alike in x and y; their disagreement adds to the variance (Lakshminarayanan et al. 2017,
+    Simple and scalable predictive uncertainty estimation using deep ensembles).
     """
-    learnt, logs = np.split(outputs, 2, axis=2)
-    variance = 2 * np.exp(2 * np.clip(logs, LEAST_LOG, MOST_LOG))
-    doubt = variance.copy()
-    doubt[:, :, :2] = variance[:, :, :2].mean(axis=2, keepdims=True)
-    share = 1 / doubt / (1 / doubt).sum(axis=0)
-    mean = (share * learnt).sum(axis=0)
-    return mean, np.sqrt((share * (variance + (learnt - mean) ** 2)).sum(axis=0))
+    targets, log_errors = np.split(outputs, 2, axis=2)
+    variance = 2 * np.exp(2 * np.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
+    pooled = variance.copy()
+    pooled[:, :, :2] = variance[:, :, :2].mean(axis=2, keepdims=True)
+    weight = 1 / pooled / (1 / pooled).sum(axis=0)
+    mean = (weight * targets).sum(axis=0)
+    return mean, np.sqrt((weight * (variance + (targets - mean) ** 2)).sum(axis=0))
+
+
+def stack_members(members: list[Weights]) -> Weights:
+    """Stack the weights of networks of one size into an ensemble."""
+    axes = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
+    return {name: np.concatenate([each[name] for each in members], axis=axis) for name, axis in axes.items()}
 
 
 _ERF = (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
@@ -134,16 +139,16 @@ _ERF_WIDTH = 0.3275911
 
 
 def _gelu(x: Floats) -> Floats:
-    """x Phi(x), with the error function to 1.5e-7 (M. Abramowitz and I. A. Stegun, 1964, 7.1.26), a few roundings."""
+    """x Phi(x), with the error function to 1.5e-7 (M. Abramowitz and I. A. Stegun, 1964, 7.1.26)."""
     half = np.abs(x) * np.float32(np.sqrt(0.5))
     t = 1 / (1 + np.float32(_ERF_WIDTH) * half)
     tail = np.float32(_ERF[4]) * t
-    for term in _ERF[3::-1]:
-        tail = (tail + np.float32(term)) * t
+    for coefficient in _ERF[3::-1]:
+        tail = (tail + np.float32(coefficient)) * t
     tail *= np.exp(-half * half)
     return (np.float32(0.5) * (x + np.abs(x) * (1 - tail))).astype(np.float32, copy=False)
 
 
-def _normalised(x: Floats) -> Floats:
+def _layer_norm(x: Floats) -> Floats:
     x = x - x.mean(axis=-1, keepdims=True)
     return x / np.sqrt((x * x).mean(axis=-1, keepdims=True) + np.float32(EPSILON))

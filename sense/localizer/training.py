@@ -1,25 +1,15 @@
-"""The masked network in torch, for training it: what `sense.localizer.network` computes in NumPy, and first weights.
+"""Training of the networks in torch: one loop for all, and what the localizer minimizes by it.
 
-The published localizer as a preset: 50 tanh neurons trained by Levenberg-Marquardt.
-It knows no lost fibres; the published way is to train another network for every set of them (`fibre_loss_study`). Set
-torch to one thread: see `padforge.design.networks`.
+`fit_network` is AdamW with a one-cycle learning rate and averaged weights. The loss is the distance itself, not its
+square, and a likelihood of the expected error. Every step masks random fibres and augments the positions of presses by
+a few millimetres, their features following the response model; where depths vary, they are augmented too, more for
+light presses, which noise blurs more. The members of the ensemble know nothing of the Bayesian localizer; a smaller
+network learns its residual. Their errors are of different kinds, so that together they err by a tenth less. Nothing is
+selected on presses held back: of so few, chance would select.
 
-Training the network: with `fine_tuning` and `published_training`, the only place of the localizer that needs torch.
-The loss is the distance itself, not its square; beside it the network learns how far off it expects to be. Every step
-loses a random few fibres of every press and moves the press by a few millimetres, its readings following as the fitted
-`response_model` of the pad says. Of several depths, these are learnt too, with forces where they are known, and presses
-are moved in depth as well: the lighter, and so the more blurred, the farther. The rate follows one cycle; what is kept
-is a running average of the weights. None of it is chosen by presses held back: so few as there are choose by chance.
-Beside the members, which know nothing of it, a smaller network learns to correct what an `bayes` finds: their
-errors are of different kinds, so together they err by a tenth less than two of either. All are independent, each on a
-thread of its own. In a time budget, the cycle is one of time, and there is a network for every core, and more of them
-only where each can be trained for five times its usual length: until then, longer training gains more.
-
-Adapting a trained network to a pad that has changed a little, by few presses: needs torch.
-So few presses would drag a network of thousands of weights after their own noise. So every step looks at two sets of
-presses: the new ones, moved by a few millimetres as in `training`, whose places are known; and the new ones moved
-anywhere on the pad, whose places the network is to go on finding where it found them before (Li & Hoiem 2016, Learning
-without forgetting). The more presses there are, the more the first count. Expected errors stay as they were.
+Fine tuning follows a pad that has changed a little, by few presses: a step looks at new presses, augmented near their
+positions, and at the same presses moved anywhere on the pad, where the predictions must stay as they were (Li & Hoiem
+2016, Learning without forgetting). The published network is trained by Levenberg-Marquardt.
 """
 
 import math
@@ -34,15 +24,22 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.networks import fit_batch
-from padforge.sense import settings
 from padforge.sense.arrays import Floats
-from padforge.sense.localizer.bayes import TOLD, BayesianLocalizer
-from padforge.sense.localizer.features import TrainingPresses, as_unseen, looked_up
-from padforge.sense.localizer.network import EPSILON, LEAST_LOG, MOST_LOG, OUTPUTS, Weights
+from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
+from padforge.sense.localizer.network import (
+    MAX_LOG_ERROR,
+    MIN_LOG_ERROR,
+    N_OUTPUTS,
+    Weights,
+    stack_members,
+)
+from padforge.sense.localizer.response_model import interpolate_grid
+from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
+from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs, sample_fibre_dropout
+from padforge.sense.settings import LocalizerSettings
 
 WARM_UP = 0.2
 """Share of the steps in which the learning rate rises."""
@@ -132,179 +129,64 @@ def fit_network(
     return {name: mean.cpu().numpy() for name, mean in zip(parameters, average, strict=True)}
 
 
-WHOLE = 0.25
-"""Share of training presses that keep all fibres; the others lose 1 .. `lost`, each as often."""
-MEASURING = 0.5
-"""Weight of the error of a depth or force in units of its span, beside the distance."""
-
-
-def misses(off: Tensor) -> Tensor:
-    """(..., 2 + T) differences of what is learnt to (...) what they count: the distance, and a share of the others."""
-    distance = off[..., :2].square().sum(dim=-1).add(1e-8).sqrt()
-    return distance if off.shape[-1] == 2 else distance + MEASURING * off[..., 2:].abs().sum(dim=-1)
-
-
-def inputs_at(table: Tensor, targets: Tensor, stretch: float) -> Tensor:
-    """(B, D) scaled inputs of presses with (B, 2 + T) targets, by `looked_up`; in proportion to their depth."""
-    found = looked_up(table, targets[:, :2], torch)
-    return found if targets.shape[1] == 2 else (1 + stretch * targets[:, 2:3]) * found
-
-
-def initial(
-    entries: int, options: settings.LocalizerSettings, generator: torch.Generator, outputs: int = OUTPUTS
-) -> dict[str, Tensor]:
-    """Random first weights of one member, named and shaped as in `network.Weights`, for `entries` numbers entering."""
-    hidden, layers = options.hidden, options.layers
-
-    def normal(*shape: int, gain: float = 1.0) -> Tensor:
-        return torch.randn(*shape, generator=generator, device=generator.device) * (gain / shape[-2] ** 0.5)
-
-    def zeros(*shape: int) -> Tensor:
-        return torch.zeros(*shape, device=generator.device)
-
-    weights = {
-        "first.w": normal(1, entries, hidden),
-        "first.b": zeros(1, 1, hidden),
-        "hidden.w": normal(layers, 1, hidden, hidden, gain=0.5),
-        "hidden.b": zeros(layers, 1, 1, hidden),
-        "last.w": normal(1, hidden, outputs, gain=0.3),
-        "last.b": zeros(1, 1, outputs),
-    }
-    return {name: w.requires_grad_() for name, w in weights.items()}
-
-
-def draw_alive(batch: int, fibres: int, lost: int, generator: torch.Generator) -> Tensor:
-    """(B, C) masks, true where a fibre lives: all of them, or 1 .. `lost` fewer, each set of a size as likely."""
-    device = generator.device
-    count = torch.randint(1, max(lost, 1) + 1, (batch, 1), generator=generator, device=device)
-    whole = torch.rand(batch, 1, generator=generator, device=device) < (WHOLE if lost else 1.0)
-    rank = torch.rand(batch, fibres, generator=generator, device=device).argsort(dim=1)
-    return (rank >= count) | whole
-
-
-def masked(inputs: Tensor, fibre_mask: Tensor) -> Tensor:
-    """(B, C, F) inputs and (B, C) masks to (B, C F + C) entries, as `network.masked`."""
-    kept = torch.where(fibre_mask[..., None], inputs, 0.0)
-    return torch.cat([kept.flatten(1), fibre_mask.to(inputs.dtype)], dim=1)
-
-
-def entries(inputs: Tensor, fibre_mask: Tensor, bayes: BayesianLocalizer | None) -> tuple[Tensor, Tensor]:
-    """(B, D) what enters a network for (B, C, F) inputs, and the place that it is to correct: (B, 2), or 0 for none."""
-    known = masked(inputs, fibre_mask)
-    if bayes is None:
-        return known, known.new_zeros(())
-    with torch.no_grad():
-        place, told = bayes(inputs, fibre_mask, torch)
-    return torch.cat([known, told], dim=1), place
-
-
-def forward(weights: dict[str, Tensor], x: Tensor) -> Tensor:
-    """(E, B, D) entries to (E, B, 2 N), as `network.forward`."""
-    h = torch.baddbmm(weights["first.b"], x, weights["first.w"])
-    for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
-        h = h + torch.baddbmm(b, _ready(h), w)
-    return torch.baddbmm(weights["last.b"], _ready(h), weights["last.w"])
-
-
-def forward_fast(weights: dict[str, Tensor], x: Tensor) -> Tensor:
-    """What `forward` gives to about 1 %, for training, which errs no more for it.
-
-    A processor that has instructions for it multiplies matrices in bfloat16, with sums in single precision, four times
-    as fast; on others, and in a torch that does not say so, this is `forward` itself.
-    """
-    able = getattr(torch.cpu, "get_capabilities", dict)().get("avx512_bf16", False)
-    with torch.autocast("cpu", torch.bfloat16, enabled=able):
-        return forward(weights, x).float()
-
-
-def _ready(h: Tensor) -> Tensor:
-    return functional.gelu(functional.layer_norm(h, h.shape[-1:], eps=EPSILON))
-
-
-HIDDEN = 50
-"""Neurons of the experiment's network."""
-
-
-def train_published(learn: TrainingPresses, check: TrainingPresses, rng: np.random.Generator) -> Weights:
-    """Fit the published network.
-
-    Args:
-        learn, check: presses to learn from, and to tell by when to stop.
-        rng: source of the first weights.
-
-    Returns:
-        Weights as `network.forward` takes them, the scales of the published network folded in.
-    """
-    x, y, *checks = (_flat(part) for part in (learn.inputs, learn.targets, check.inputs, check.targets))
-    network = fit_batch(x[None], y, [rng], HIDDEN, validation=(checks[0][None], checks[1]))[0]
-    into, onto = network.inputs, network.targets
-    plain = network.hidden[:, :-1]
-    slope = np.divide(plain, into.half, out=np.zeros_like(plain), where=into.half > 0)
-    weights = {
-        "first.w": slope.T,
-        "first.b": (network.hidden[:, -1] - slope @ into.middle)[None],
-        "last.w": (onto.half[:, None] * network.output[:, :-1]).T,
-        "last.b": (onto.middle + onto.half * network.output[:, -1])[None],
-    }
-    return {name: np.ascontiguousarray(weight[None], dtype=np.float32) for name, weight in weights.items()}
-
-
-def _flat(values: np.ndarray) -> np.ndarray:
-    return values.reshape(len(values), -1).astype(np.float64)
-
-
-LEAST_BATCHES, MOST_STEPS, LONGER = 10, 11_000, 2
-"""Steps an epoch at least and of a training at most, as presses are moved and so never the same; of several depths, and
-without the release, which are harder to learn, so many times more."""
-WEIGHT_DECAY = 1e-2
-INPUT_NOISE = 0.02
-"""Noise on the scaled inputs while training, their spread being about 1."""
-MOVED = 2.2
-"""Standard deviation of the way a press is moved, in distances between neighbours: 2 mm among 3000 presses on a pad of
-45 mm, 7 mm among 240, which leave more to guess between them."""
-BLURRED, DEEPENED = 0.26, 0.3
-"""Of several depths, the same and what is added to the depth, in its spans, for one of the middle depth. Lighter ones
-are moved by as much more as noise blurs them more, or they would be known again by their noise."""
-EXPECTING = 0.1
-"""Weight of learning the expected error, beside the distance."""
-CORRECTOR = {"hidden": 128, "layers": 3}
-"""Size of the network that corrects what the observer finds, at most: larger ones gain nothing."""
-TRIED, LENGTHENED, MOST_MEMBERS = 12, 5, 64
-"""Of a time budget: steps that tell the pace, usual lengths of a member before there are more of them, and the most."""
-
-
 class StoppedError(Exception):
-    """Another training failed, or the user broke off."""
+    """Another training failed, or the user interrupted."""
 
 
 class JointProgress:
-    """How far trainings beside each other are; those still at work when the body of `with` ends stop where they tell.
+    """Progress of trainings in several threads; those still at work when the `with` block ends stop at their next step.
 
     Args:
-        totals: steps of each. progress: called with (steps done, steps in all), of all together.
+        totals: steps of each.
+        on_progress: called with (steps done, steps in all), of all together.
     """
 
-    def __init__(self, totals: Sequence[int], progress: Callable[[int, int], None]) -> None:
-        self._done, self._total, self._progress = [0] * len(totals), sum(totals), progress
-        self._lock, self._over = Lock(), Event()
+    def __init__(self, totals: Sequence[int], on_progress: Callable[[int, int], None]) -> None:
+        self._done, self._total, self._on_progress = [0] * len(totals), sum(totals), on_progress
+        self._lock, self._stopped = Lock(), Event()
 
-    def tell(self, number: int, done: int) -> None:
-        """So many steps of one of the trainings are done."""
-        if self._over.is_set():
+    def update(self, number: int, done: int) -> None:
+        """Set the steps done of one training.
+
+        Raises:
+            StoppedError: the `with` block has ended.
+        """
+        if self._stopped.is_set():
             raise StoppedError
         with self._lock:
             self._done[number] = done
-            self._progress(sum(self._done), self._total)
+            self._on_progress(sum(self._done), self._total)
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, *error: object) -> None:
-        self._over.set()
+        self._stopped.set()
 
 
-class Trained(NamedTuple):
-    """Weights as `network.forward` takes them, of the members and of the network that corrects the observer, if any."""
+MEASURE_WEIGHT = 0.5
+"""Weight of the error of a scaled depth or force, beside the distance."""
+LOG_ERROR_WEIGHT = 0.1
+"""Weight of the likelihood of the expected error, beside the distance."""
+INPUT_NOISE = 0.02
+"""Standard deviation of noise on scaled features, which are about 1."""
+AUGMENTATION = 2.2
+"""Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm among 3000 presses on a
+pad of 45 mm, 7 mm among 240, which leave more to interpolate."""
+POSITION_AUGMENTATION, DEPTH_AUGMENTATION = 0.26, 0.3
+"""Where depths vary: standard deviations in scaled position and depth, of a press of the middle depth."""
+MIN_BATCHES, MAX_STEPS, HARDER = 10, 11_000, 2
+"""Steps of an epoch at least, and of a training at most; how much longer training takes where depths vary or the
+release is not looked at, which is harder to learn."""
+RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
+"""Largest size of the network that corrects the Bayesian localizer: larger ones gain nothing."""
+PACE_STEPS, MIN_LENGTHS, MAX_MEMBERS = 12, 5, 64
+"""With a time budget: steps that measure the pace, usual lengths of a training before there is another for each core,
+and the most networks."""
+
+
+class TrainedNetworks(NamedTuple):
+    """Weights of the members, and the Bayesian localizer with the network that corrects it, if any."""
 
     weights: Weights
     bayes: BayesianLocalizer | None
@@ -312,245 +194,261 @@ class Trained(NamedTuple):
 
 
 def train_members(
-    learn: TrainingPresses,
+    presses: TrainingPresses,
     table: Floats,
-    options: settings.LocalizerSettings,
+    options: LocalizerSettings,
     rng: np.random.Generator,
-    progress: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
     time_budget: float | None = None,
-) -> Trained:
-    """Fit the members of the localizer, an observer, and the network that corrects it, the last of several members.
+) -> TrainedNetworks:
+    """Train the members of the localizer; the last of several is a Bayesian localizer with its residual network.
 
-    Of presses of several depths there is no observer.
+    Where depths vary there is no Bayesian localizer. Networks are trained in threads.
 
     Args:
-        learn: presses to learn from.
-        table: (S, S, C, F + G) scaled inputs by place, over [-1, 1] in x and y.
-        options: size of the network and length of the training. rng: of the seeds of torch's own generators.
-        progress: called with (steps done, steps in all), of all members together; in a time budget, with seconds.
-        time_budget: seconds of wall clock to train for, with the members that these are good for; None for the
-            members and the length of `options`.
+        presses: to learn from.
+        table: (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
+        options: size of the networks and length of the training.
+        rng: source of the seeds of torch's generators.
+        on_progress: called with (steps done, steps in all), of all networks; with a time budget, with seconds.
+        time_budget: seconds to train for, with as many members as these are good for; None for the members and the
+            length of `options`.
     """
     begin = time.monotonic()
-    learn = as_unseen(learn, table)
-    steps = training_steps(len(learn.inputs), options) * (
-        LONGER if learn.stretch or options.features != "press_and_release" else 1
+    presses = leave_one_out_residuals(presses, table)
+    steps = training_steps(len(presses.inputs), options) * (
+        HARDER if presses.depth_gain or options.features != "press_and_release" else 1
     )
     networks, seconds = options.members, None
     with one_torch_thread():
         if time_budget is not None:
-            pace, cores = _Training(learn, table, options, 0).pace(), os.cpu_count() or 1
-            in_turn = max(1, min(round(time_budget / (pace * LENGTHENED * steps)), MOST_MEMBERS // cores))
+            pace, cores = _Training(presses, table, options, 0).measure_pace(), os.cpu_count() or 1
+            in_turn = max(1, min(round(time_budget / (pace * MIN_LENGTHS * steps)), MAX_MEMBERS // cores))
             networks = max(2, cores * in_turn)
             seconds = max(0.0, time_budget - (time.monotonic() - begin)) / math.ceil(networks / cores)
-    observing = networks > 1 and not learn.stretch
-    bayes = BayesianLocalizer.fit(table, learn.inputs, learn.fibre_mask, learn.targets) if observing else None
+    has_bayes = networks > 1 and not presses.depth_gain
+    bayes = BayesianLocalizer.fit(table, presses.inputs, presses.fibre_mask, presses.targets) if has_bayes else None
     seeds = [int(seed) for seed in rng.integers(2**63, size=networks)]
-    joint = JointProgress([TrainingLength(steps, seconds).total] * networks, progress)
-    small = options.model_copy(update={name: min(most, getattr(options, name)) for name, most in CORRECTOR.items()})
-    members = networks - observing
+    joint = JointProgress([TrainingLength(steps, seconds).total] * networks, on_progress)
+    smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
+    members = networks - has_bayes
 
     def train(number: int) -> Weights:
-        corrects = number == members
-        training = _Training(learn, table, small if corrects else options, seeds[number], bayes if corrects else None)
-        return training.run(TrainingLength(steps, seconds), lambda done: joint.tell(number, done))
+        size, corrected = (options, None) if number < members else (options.model_copy(update=smaller), bayes)
+        training = _Training(presses, table, size, seeds[number], corrected)
+        return fit_network(
+            dict(training.network.named_parameters()),
+            training.loss,
+            TrainingLength(steps, seconds),
+            options.learning_rate,
+            on_progress=lambda done: joint.update(number, done),
+        )
 
     with one_torch_thread(), joint:
-        weights = dict(run_tasks((number, partial(train, number)) for number in range(len(seeds))))
-    return Trained(joined([weights[number] for number in range(members)]), bayes, weights.get(members, {}))
+        weights = dict(run_tasks((number, partial(train, number)) for number in range(networks)))
+    return TrainedNetworks(
+        stack_members([weights[number] for number in range(members)]), bayes, weights.get(members, {})
+    )
 
 
-def joined(members: Sequence[Weights]) -> Weights:
-    """Weights of one member each, on the same presses, as those of all."""
-    axis = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
-    return {name: np.concatenate([each[name] for each in members], axis=axis[name]) for name in axis}
+def training_steps(presses: int, options: LocalizerSettings) -> int:
+    """Return the steps of a training: `epochs` times through the presses, within `MIN_BATCHES` and `MAX_STEPS`."""
+    return min(MAX_STEPS, options.epochs * max(MIN_BATCHES, presses // options.batch))
 
 
-def training_steps(presses: int, options: settings.LocalizerSettings) -> int:
-    """Steps that a member takes: `epochs` times through the presses, within `LEAST_BATCHES` and `MOST_STEPS`."""
-    return min(MOST_STEPS, options.epochs * max(LEAST_BATCHES, presses // options.batch))
-
-
-class _Training:
-    """One network in training, on the GPU where there is one: on its own, or to correct an observer."""
-
-    def __init__(
-        self,
-        learn: TrainingPresses,
-        table: Floats,
-        options: settings.LocalizerSettings,
-        seed: int,
-        bayes: BayesianLocalizer | None = None,
-    ) -> None:
-        self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self._generator = torch.Generator(self._device).manual_seed(seed)
-        self._options = options
-        arrays = (learn.inputs, learn.fibre_mask, learn.targets)
-        self._x, self._fibre_mask, self._y = (torch.from_numpy(array).to(self._device) for array in arrays)
-        self._fibres, size = self._x.shape[1:]
-        self._lost = min(options.max_failures, self._fibres - 1)
-        self._table = torch.from_numpy(table).to(self._device).flatten(2)
-        self._bounds = self._y[:, :3].amin(dim=0), self._y[:, :3].amax(dim=0)
-        places = self._y[:, :2].unique(dim=0)
-        apart = ((self._bounds[1] - self._bounds[0])[:2].prod() / len(places)).sqrt()
-        self._steps = (
-            torch.tensor([BLURRED, BLURRED, DEEPENED], device=self._device)
-            if learn.stretch
-            else (MOVED * apart).expand(2)
-        )
-        off = (self._y - self._y.mean(dim=0))[:, 2:]
-        self._harder = (off[:, :1] * off[:, 1:]).sum() / off[:, :1].square().sum()  # force by depth, in line
-        self._stretch = learn.stretch
-        at_home = inputs_at(self._table, self._y, self._stretch)
-        self._rest = self._x - at_home.view_as(self._x)
-        self._bayes = bayes and bayes.changed(lambda part: torch.from_numpy(part).to(self._device))
-        width = self._fibres * (size + 1) + (0 if bayes is None else TOLD)
-        self._weights = initial(width, options, self._generator, OUTPUTS + 2 * (self._y.shape[1] - 2))
-
-    def pace(self) -> float:
-        """Seconds that a step takes."""
-        took = []
-        for _ in range(TRIED):
-            begin = time.monotonic()
-            self._loss().backward()
-            took.append(time.monotonic() - begin)
-        return float(np.median(took))
-
-    def run(self, length: TrainingLength, tell: Callable[[int], None]) -> Weights:
-        return fit_network(self._weights, self._loss, length, self._options.learning_rate, on_progress=tell)
-
-    def _loss(self) -> Tensor:
-        batch = min(self._options.batch, len(self._x))
-        rows = torch.randint(len(self._x), (batch,), generator=self._generator, device=self._device)
-        targets = self._moved(self._y[rows])
-        rest = self._rest[rows]
-        inputs = inputs_at(self._table, targets, self._stretch).view_as(rest) + rest
-        inputs += INPUT_NOISE * self._normal(*rest.shape)
-        fibre_mask = self._fibre_mask[rows] & draw_alive(batch, self._fibres, self._lost, self._generator)
-        known, found = entries(inputs, fibre_mask, self._bayes)
-        learnt, logs = forward_fast(self._weights, known[None])[0].chunk(2, dim=1)
-        off, logs = learnt + found - targets, logs.clamp(LEAST_LOG, MOST_LOG)
-        return (misses(off) + EXPECTING * (off.detach().abs() * (-logs).exp() + logs).sum(dim=1)).mean()
-
-    def _moved(self, targets: Tensor) -> Tensor:
-        """(B, 2 + T) targets of presses moved by a few millimetres, and in depth, with the force that goes with it."""
-        low, high = self._bounds
-        steps = self._steps / (1 + self._stretch * targets[:, 2:3]) if self._stretch else self._steps
-        moved = targets[:, :3] + steps * self._normal(len(targets), len(self._steps))
-        moved = torch.where(moved < low, 2 * low - moved, moved)  # a press that would leave the pad is sent back
-        moved = torch.where(moved > high, 2 * high - moved, moved).clamp(-1, 1)
-        forces = targets[:, 3:] + self._harder * (moved - targets[:, :3])[:, 2:]
-        return torch.cat([moved, forces], dim=1)
-
-    def _normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self._generator, device=self._device)
-
-
-STEPS, BATCH, RATE = 200, 128, 1e-4
-"""Enough to follow what drifts and too little to forget: errors hardly change for half and twice as much."""
-OLD_PRESSES = 100
-"""New presses that count as much as what was learnt before."""
-MOVED_FINE_TUNING = 0.09
-"""Standard deviation of the way a press is moved, in units of the span: 2 mm on a pad of 45 mm."""
-FAR_NOISE = 0.1
-"""Noise on the scaled inputs of presses moved anywhere, which is less sure than a move by millimetres."""
-SPREAD_KEPT = 0.02
-"""Weight of keeping the logarithms of expected errors, beside the places."""
-
-
-def adapt(
-    weights: Weights,
-    samples: TrainingPresses,
-    table: Floats,
-    lost: int,
-    rng: np.random.Generator,
-    bayes: BayesianLocalizer | None = None,
-) -> Weights:
-    """Adapt the members of a network of method "ensemble", or the network that corrects an observer.
+def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np.random.Generator) -> Weights:
+    """Train the published network: 50 tanh neurons, by Levenberg-Marquardt.
 
     Args:
-        weights: as `network.forward` takes them.
-        samples: presses of known place, depth and force, where these were learnt.
-        table: (S, S, C, F) scaled inputs by place, over [-1, 1] in x and y.
-        lost: fibres that are lost at once, at most, while adapting.
-        rng: source of the seed of torch's generator, which draws all that is random here.
-        bayes: what they correct, if anything; it stays as it is.
+        train: presses to learn from.
+        early_stop: presses whose error ends the training.
+        rng: source of the first weights.
 
     Returns:
-        Weights of the same shapes.
+        Weights as `network.forward` takes them, the network's own scaling folded in.
     """
-    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-    before = {name: torch.from_numpy(weight) for name, weight in weights.items()}
-    now = {name: weight.clone().requires_grad_() for name, weight in before.items()}
-    presses = _Presses(samples, table, min(lost, samples.inputs.shape[1] - 1), generator, bayes)
-    members = len(now["first.w"])
-    trust = len(samples.inputs) / (len(samples.inputs) + OLD_PRESSES)
-
-    def loss() -> Tensor:
-        known, left = presses.nearby()
-        off = forward(now, known.expand(members, -1, -1))[..., : left.shape[1]] - left
-        near = trust * misses(off).mean(dim=1).sum()
-        known = presses.anywhere().expand(members, -1, -1)
-        with torch.no_grad():
-            found = forward(before, known)
-        return near + (1 - trust) * _change(forward(now, known), found)
-
-    with one_torch_thread():
-        return fit_network(now, loss, STEPS, RATE, weight_decay=0.0, averaged=False)
+    x, y, *held_back = (
+        part.reshape(len(part), -1).astype(np.float64)
+        for part in (train.inputs, train.targets, early_stop.inputs, early_stop.targets)
+    )
+    network = fit_batch(x[None], y, [rng], PUBLISHED_HIDDEN, validation=(held_back[0][None], held_back[1]))[0]
+    inputs, targets = network.inputs, network.targets
+    hidden = network.hidden[:, :-1]
+    slope = np.divide(hidden, inputs.half, out=np.zeros_like(hidden), where=inputs.half > 0)
+    weights = {
+        "first.w": slope.T,
+        "first.b": (network.hidden[:, -1] - slope @ inputs.middle)[None],
+        "last.w": (targets.half[:, None] * network.output[:, :-1]).T,
+        "last.b": (targets.middle + targets.half * network.output[:, -1])[None],
+    }
+    return {name: np.ascontiguousarray(weight[None], dtype=np.float32) for name, weight in weights.items()}
 
 
-class _Presses:
-    """Draws presses that resemble the known ones."""
+PUBLISHED_HIDDEN = 50
+"""Neurons of the published network."""
+
+
+def loss(error: Tensor) -> Tensor:
+    """Return the (...) loss of (..., 2 + T) errors: the distance, and a share of the others."""
+    distance = error[..., :2].square().sum(dim=-1).add(1e-8).sqrt()
+    return distance if error.shape[-1] == 2 else distance + MEASURE_WEIGHT * error[..., 2:].abs().sum(dim=-1)
+
+
+class _PressSampler:
+    """Presses whose features follow the response model to other targets."""
 
     def __init__(
         self,
-        samples: TrainingPresses,
+        presses: TrainingPresses,
         table: Floats,
-        lost: int,
+        max_failures: int,
         generator: torch.Generator,
         bayes: BayesianLocalizer | None,
     ) -> None:
-        self._x, self._fibre_mask, self._y = (
-            torch.from_numpy(a) for a in (samples.inputs, samples.fibre_mask, samples.targets)
+        self.generator, device = generator, generator.device
+
+        def tensor(array: Floats) -> Tensor:
+            return torch.from_numpy(array).to(device)
+
+        x, self.fibre_mask, self.targets = map(tensor, (presses.inputs, presses.fibre_mask, presses.targets))
+        self.fibres, self.depth_gain = x.shape[1], presses.depth_gain
+        self._table, self._max_failures = tensor(table).flatten(2), min(max_failures, self.fibres - 1)
+        self._residual = x - self._expected(self.targets).view_as(x)
+        self._bayes = bayes and bayes.map_arrays(tensor)
+        self.n_inputs = self.fibres * (x.shape[2] + 1) + (N_SUMMARY if bayes else 0)
+
+    def draw(self, batch: int) -> Tensor:
+        """Draw (B,) rows of presses."""
+        return torch.randint(len(self.targets), (batch,), generator=self.generator, device=self.generator.device)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator, device=self.generator.device)
+
+    def inputs(self, rows: Tensor, targets: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+        """Network inputs (1, B, D), and positions to correct, of presses moved to (B, 2 + T) targets."""
+        residual = self._residual[rows]
+        features = self._expected(targets).view_as(residual) + residual
+        features += noise * self.normal(*residual.shape)
+        dropout = sample_fibre_dropout(len(rows), self.fibres, self._max_failures, self.generator)
+        x, position = network_inputs(features, self.fibre_mask[rows] & dropout, self._bayes)
+        return x[None], position
+
+    def _expected(self, targets: Tensor) -> Tensor:
+        expected = interpolate_grid(self._table, targets[:, :2], torch)
+        return expected if targets.shape[1] == 2 else (1 + self.depth_gain * targets[:, 2:3]) * expected
+
+
+class _Training:
+    """A network and its loss, on the GPU where there is one."""
+
+    def __init__(
+        self,
+        presses: TrainingPresses,
+        table: Floats,
+        options: LocalizerSettings,
+        seed: int,
+        bayes: BayesianLocalizer | None = None,
+    ) -> None:
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        generator = torch.Generator(device).manual_seed(seed)
+        self._presses = sampler = _PressSampler(presses, table, options.max_failures, generator, bayes)
+        self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
+        self._bounds = targets[:, :3].amin(dim=0), targets[:, :3].amax(dim=0)
+        positions = targets[:, :2].unique(dim=0)
+        distance = ((self._bounds[1] - self._bounds[0])[:2].prod() / len(positions)).sqrt()
+        self._std = (
+            torch.tensor([POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION], device=device)
+            if sampler.depth_gain
+            else (AUGMENTATION * distance).expand(2)
         )
-        self._table, self._stretch = torch.from_numpy(table).flatten(2), samples.stretch
-        self._at_home = inputs_at(self._table, self._y, self._stretch)
-        self._lost, self._generator = lost, generator
-        self._bayes = bayes and bayes.changed(torch.from_numpy)
+        centred = (targets - targets.mean(dim=0))[:, 2:]
+        self._force_per_depth = (centred[:, :1] * centred[:, 1:]).sum() / centred[:, :1].square().sum()
+        n_outputs = N_OUTPUTS + 2 * (targets.shape[1] - 2)
+        self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
 
-    def nearby(self) -> tuple[Tensor, Tensor]:
-        """Entries (1, B, D) and what is to be found of them (B, 2 + T), of presses moved by a few millimetres."""
-        rows = self._rows()
-        targets = self._at(rows, (self._y[rows, :2] + MOVED_FINE_TUNING * self._normal(BATCH, 2)).clamp(-1, 1))
-        known, found = self._entries(rows, targets, INPUT_NOISE)
-        return known, targets - found
+    def measure_pace(self) -> float:
+        """Return the seconds that a step takes."""
+        durations = []
+        for _ in range(PACE_STEPS):
+            begin = time.monotonic()
+            self.loss().backward()
+            durations.append(time.monotonic() - begin)
+        return float(np.median(durations))
 
-    def anywhere(self) -> Tensor:
-        """Entries (1, B, D) of presses moved to any place of the pad."""
-        rows = self._rows()
-        anywhere = 2 * torch.rand(BATCH, 2, generator=self._generator) - 1
-        return self._entries(rows, self._at(rows, anywhere), FAR_NOISE)[0]
+    def loss(self) -> Tensor:
+        rows = self._presses.draw(self._batch)
+        targets = self.augment_position(self._presses.targets[rows])
+        x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
+        predicted, log_error = self.network.forward_bfloat16(x)[0].chunk(2, dim=1)
+        error, log_error = predicted + position - targets, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
+        likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
+        return (loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
 
-    def _rows(self) -> Tensor:
-        return torch.randint(len(self._x), (BATCH,), generator=self._generator)
-
-    def _at(self, rows: Tensor, places: Tensor) -> Tensor:
-        """(B, 2 + T) targets of presses at other places, as deep and forceful as they were."""
-        return torch.cat([places, self._y[rows, 2:]], dim=1)
-
-    def _entries(self, rows: Tensor, targets: Tensor, noise: float) -> tuple[Tensor, Tensor]:
-        moved = (inputs_at(self._table, targets, self._stretch) - self._at_home[rows]).view_as(self._x[rows])
-        inputs = self._x[rows] + moved
-        inputs = inputs + noise * self._normal(*inputs.shape)
-        fibre_mask = self._fibre_mask[rows] & draw_alive(BATCH, self._x.shape[1], self._lost, self._generator)
-        known, found = entries(inputs, fibre_mask, self._bayes)
-        return known[None], found
-
-    def _normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self._generator)
+    def augment_position(self, targets: Tensor) -> Tensor:
+        """Move (B, 2 + T) targets at random, and their force with their depth; reflect them at the bounds."""
+        low, high = self._bounds
+        gain = self._presses.depth_gain
+        std = self._std / (1 + gain * targets[:, 2:3]) if gain else self._std
+        moved = targets[:, :3] + std * self._presses.normal(len(targets), len(self._std))
+        moved = torch.where(moved < low, 2 * low - moved, moved)
+        moved = torch.where(moved > high, 2 * high - moved, moved).clamp(-1, 1)
+        forces = targets[:, 3:] + self._force_per_depth * (moved - targets[:, :3])[:, 2:]
+        return torch.cat([moved, forces], dim=1)
 
 
-def _change(found: Tensor, before: Tensor) -> Tensor:
-    """How far what is found and expected errors (E, B, 2 N) moved, summed over members."""
-    change, logs = (found - before).chunk(2, dim=2)
-    return (misses(change) + SPREAD_KEPT * logs.abs().mean(dim=2)).mean(dim=1).sum()
+FINE_TUNING_STEPS, FINE_TUNING_BATCH, FINE_TUNING_RATE = 200, 128, 1e-4
+"""Enough to follow drift and too little to forget: errors hardly change for half and twice as much."""
+PRIOR_PRESSES = 100
+"""New presses that weigh as much as what was learnt before."""
+NEAR_STD, FAR_NOISE = 0.09, 0.1
+"""Standard deviations of augmented scaled positions, 2 mm on a pad of 45 mm, and of noise on presses moved anywhere."""
+KEEP_LOG_ERROR_WEIGHT = 0.02
+"""Weight of keeping log errors, beside the positions."""
+
+
+def fine_tune(
+    weights: Weights,
+    presses: TrainingPresses,
+    table: Floats,
+    max_failures: int,
+    rng: np.random.Generator,
+    bayes: BayesianLocalizer | None = None,
+) -> Weights:
+    """Fine-tune the members of method "ensemble", or the residual network of a Bayesian localizer.
+
+    Args:
+        weights: as `network.forward` takes them.
+        presses: new ones.
+        table: (S, S, C, F + G) scaled response by position.
+        max_failures: most fibres that are masked at once.
+        rng: source of the seed of torch's generator.
+        bayes: the Bayesian localizer, which stays as it is, for its residual network.
+    """
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+    before, network = EnsembleMlp.from_numpy(weights), EnsembleMlp.from_numpy(weights)
+    sampler = _PressSampler(presses, table, max_failures, generator, bayes)
+    share = len(presses.inputs) / (len(presses.inputs) + PRIOR_PRESSES)
+
+    def inputs(rows: Tensor, positions: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+        targets = torch.cat([positions, sampler.targets[rows, 2:]], dim=1)
+        x, position = sampler.inputs(rows, targets, noise)
+        return x.expand(network.n_members, -1, -1), position, targets
+
+    def loss_of_batch() -> Tensor:
+        rows = sampler.draw(FINE_TUNING_BATCH)
+        near = (sampler.targets[rows, :2] + NEAR_STD * sampler.normal(FINE_TUNING_BATCH, 2)).clamp(-1, 1)
+        x, position, targets = inputs(rows, near, INPUT_NOISE)
+        new = loss(network(x)[..., : targets.shape[1]] - (targets - position)).mean(dim=1).sum()
+        rows = sampler.draw(FINE_TUNING_BATCH)
+        x, _, _ = inputs(rows, 2 * torch.rand(FINE_TUNING_BATCH, 2, generator=generator) - 1, FAR_NOISE)
+        with torch.no_grad():
+            outputs = before(x)
+        change, log_change = (network(x) - outputs).chunk(2, dim=2)
+        kept = (loss(change) + KEEP_LOG_ERROR_WEIGHT * log_change.abs().mean(dim=2)).mean(dim=1).sum()
+        return share * new + (1 - share) * kept
+
+    parameters = dict(network.named_parameters())
+    with one_torch_thread():
+        return fit_network(
+            parameters, loss_of_batch, FINE_TUNING_STEPS, FINE_TUNING_RATE, weight_decay=0.0, averaged=False
+        )

@@ -15,7 +15,7 @@ from padforge.design.common.plotting import ALARM, INK, add_caption, new_figure,
 from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
-from padforge.sense.localizer.calibration import calibrate, left_out
+from padforge.sense.localizer.calibration import calibrate, unlearnt_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import label_losses
@@ -99,7 +99,7 @@ def calibrate_into(
     path, known = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
     check_replaceable(path, known, FILES, force)
     localizer, document = calibrate(recording, options, time_budget=time_budget, progress=progress)
-    for line in left_out(recording, localizer):
+    for line in unlearnt_lines(recording, localizer):
         warn(line)
     progress(0, 0)
     with stage("health"):

@@ -14,7 +14,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
-from padforge.sense.localizer.features import REST, bridged
+from padforge.sense.localizer.features import REST, interpolate_gaps
 from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, check_new_recording, read_journal
@@ -245,7 +245,7 @@ class HandSession:
     def _check_detector(self) -> None:
         """Believe the readings if they contradict the detector, and restart it."""
         rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
-        volts = bridged(rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]).mean(axis=0)  # the latest
+        volts = interpolate_gaps(rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]).mean(axis=0)  # the latest
         if self._sequence.is_pressed:
             if self._validator.is_untouched(volts, self._baseline, self._sequence.held_s(self._now_s)):
                 self._restart_detector()
@@ -275,7 +275,7 @@ class HandSession:
 
     def _mean_before(self, reading: int) -> Array:
         """(C,) V, mean of the readings just before an index."""
-        return bridged(self._ring.rows(reading + REST[0], reading)[:, 1:]).mean(axis=0)
+        return interpolate_gaps(self._ring.rows(reading + REST[0], reading)[:, 1:]).mean(axis=0)
 
     def view(self) -> dict[str, Any]:
         """Return what there is to show now, as JSON.

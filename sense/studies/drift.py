@@ -30,7 +30,7 @@ from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import split_presses
 from padforge.sense.localizer.evaluation import ACTIVE, distances
 from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
-from padforge.sense.localizer.features import bridged, press_inputs
+from padforge.sense.localizer.features import compute_features, interpolate_gaps
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.filters import running_median, total_variation
@@ -328,7 +328,7 @@ def _places(readings: int, down_command: Indices, up_command: Indices) -> tuple[
 def scheme_inputs(name: str, readings: Array, down_command: Indices, up_command: Indices, taught: Indices) -> Array:
     """(Q, D) what a network is given of each press when the drift is taken off as `name`, one of `SCHEMES`, says.
 
-    "windows" are the windows of `press_inputs`, of which the principal components are taken that are as many as
+    "windows" are the windows of `compute_features`, of which the principal components are taken that are as many as
     "published" has inputs: else the networks would differ by their size.
 
     Args:
@@ -336,7 +336,7 @@ def scheme_inputs(name: str, readings: Array, down_command: Indices, up_command:
         taught: presses that the principal components are of.
     """
     if name == "windows":
-        windows = press_inputs(readings, down_command, up_command, "press_and_release").windows.reshape(
+        windows = compute_features(readings, down_command, up_command, "press_and_release").windows.reshape(
             len(down_command), -1
         )
         middle = windows[taught].mean(axis=0)
@@ -363,7 +363,7 @@ def _tried(source: Callable[[], Recording], name: str, share: float, hidden: int
 
     recording = source()
     down_command, up_command, positions_mm = recording.down_command, recording.up_command, recording.presses_mm
-    readings = bridged(recording.readings)
+    readings = interpolate_gaps(recording.readings)
     FILTERS[name](readings[:2])  # compiled before the clock runs
     clock = perf_counter()
     filtered = FILTERS[name](readings)

@@ -23,8 +23,8 @@ from padforge.design.common.validation import InputError, check_int, check_path,
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices
-from padforge.sense.localizer.calibration import learn, split_unseen
-from padforge.sense.localizer.evaluation import by_place, errors_by_loss
+from padforge.sense.localizer.calibration import fit_recording, split_unseen
+from padforge.sense.localizer.evaluation import errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 
@@ -51,7 +51,7 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
             axes.text(at + sideways, 0.03, f"{row['mean_mm']:.2f}", color=INK, fontsize=9, ha="center", va="bottom")
     axes.legend(frameon=False, loc="upper left")
     label_losses(axes, next(iter(ways.values()))["errors"], f"Lost fibres, {document['test_presses']}")
-    means = [cell["mean_mm"] for way in ways.values() for each in way["maps"] for cell in each["by_place"]]
+    means = [cell["mean_mm"] for way in ways.values() for each in way["maps"] for cell in each["by_position"]]
     for row, (way, found) in enumerate(ways.items()):
         panels = [figure.add_subplot(grid[1 + row, column], aspect="equal") for column in range(len(found["maps"]))]
         pictures = [_draw_map(panel, each, max(means)) for panel, each in zip(panels, found["maps"], strict=True)]
@@ -73,7 +73,7 @@ def label_losses(axes: Any, rows: Sequence[Mapping[str, Any]], title: str) -> No
 
 def _draw_map(axes: Any, found: Mapping[str, Any], highest_mm: float) -> Any:
     """Draw mean errors by cell of the pad, without the fibres that its title names."""
-    cells = found["by_place"]
+    cells = found["by_position"]
     places = np.array([[cell["x_mm"], cell["y_mm"]] for cell in cells])
     low, high = places.min(axis=0), places.max(axis=0)
     # not every row or column need have a cell: nothing is pressed in holes
@@ -183,7 +183,7 @@ def _way(
         for level in levels
     ]
     maps = [
-        {"failed": list(lost), "by_place": by_place(locate(tuple(lost)).positions_mm, positions_mm)}
+        {"failed": list(lost), "by_position": errors_by_position(locate(tuple(lost)).positions_mm, positions_mm)}
         for lost in (*worst, *chosen)
     ]
     return {"errors": rows, "by_subset": by_subset, "maps": maps}
@@ -225,7 +225,7 @@ def train_without(
     """Train on the other fibres alone, and find the test presses; the same whatever else is trained, and when."""
     rest = np.setdiff1d(np.arange(recording.fibres), lost)
     fewer = replace(recording, readings=recording.readings[:, rest])
-    localizer = learn(fewer, training, options, np.random.default_rng([options.seed, _number(lost)]))
+    localizer = fit_recording(fewer, training, options, np.random.default_rng([options.seed, _number(lost)]))
     return localizer.predict_features(localizer.scaled_features(fewer)[test])
 
 

@@ -20,7 +20,7 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_type
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.calibration import learn, split_presses
+from padforge.sense.localizer.calibration import fit_recording, split_presses
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recording.recording import Recording
 
@@ -139,10 +139,10 @@ def _found(
 
     def train(number: int) -> Array:
         def report(step: int, total: int) -> None:
-            joint.tell(number, round(step / total * steps[number]))
+            joint.update(number, round(step / total * steps[number]))
 
         training = trainings[number]
-        localizer = learn(recording, training, options, np.random.default_rng([options.seed, len(training)]), report)
+        localizer = fit_recording(recording, training, options, np.random.default_rng([options.seed, len(training)]), report)
         return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
 
     longest_first = reversed(range(len(steps)))

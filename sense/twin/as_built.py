@@ -28,7 +28,7 @@ from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
 from padforge.design.twin import PlanTransform
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, STEPS, ResponseModel, press_inputs, settled
+from padforge.sense.localizer.features import DOWN, STEPS, ResponseModel, compute_features, remove_history
 from padforge.sense.recording.recording import Recording
 
 CENTRE = 1e-6
@@ -199,11 +199,11 @@ def responses(recording: Recording, learnt: Mask) -> Responses:
         learnt: (Q,) of these presses, those from which is learnt what of its history a channel still shows.
     """
     known = recording.has_position
-    inputs = press_inputs(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
+    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
     places = recording.presses_mm[known]
     about = _about(places)
     model = ResponseModel.fit(about[learnt], inputs.windows[learnt], inputs.history[learnt], inputs.fibre_mask[learnt])
-    windows = settled(inputs.windows, inputs.history, model.memory, model.usual)
+    windows = remove_history(inputs.windows, inputs.history, model.memory, model.usual)
     return Responses(places, windows @ HOLD, inputs.fibre_mask)
 
 
@@ -214,7 +214,7 @@ def information(recording: Recording, channels: Indices) -> Array:
         channels: (C',) which ones, each by the presses in which it gave enough readings.
     """
     known = recording.has_position
-    inputs = press_inputs(
+    inputs = compute_features(
         recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
     )
     places = _about(recording.presses_mm[known])
@@ -238,7 +238,7 @@ def _told(places: Array, windows: Array, history: Array) -> float:
     for seen in (odd, ~odd):
         model = ResponseModel.fit(places[seen], windows[seen], history[seen], fibre_mask[seen])
         expected = RegularGridInterpolator((grid, grid), model.table)(places[~seen])
-        left[~seen] = settled(windows[~seen], history[~seen], model.memory, model.usual) - expected
+        left[~seen] = remove_history(windows[~seen], history[~seen], model.memory, model.usual) - expected
         tables.append(model.table[:, :, 0])
     precision, told = np.linalg.pinv(np.cov(left[:, 0].T), hermitian=True), 0.0  # short presses have readings twice
     for axis in (0, 1):
@@ -398,7 +398,7 @@ class LaidPad:
             values[own_values(channel)[:2]] = found
         return replace(self, values=values)
 
-    def settled(self) -> "LaidPad":
+    def remove_history(self) -> "LaidPad":
         """The same pad, with what all its fibres have in common of their ways beside the plan told by the frame."""
         low, high = sensed_rectangle(self.plan.layout)
         planned = np.concatenate([self.plan.course[fibre] for fibre in self.fibres])

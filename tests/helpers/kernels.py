@@ -88,7 +88,7 @@ def sense_kernels() -> None:
         simulate,
         total_variation,
     )
-    from padforge.sense.deploy.streaming import Detector
+    from padforge.sense.deploy.streaming import ThresholdDetector
     from padforge.sense.twin.identification import identify
 
     recording = simulate(Morphology.straight(2), RigSettings(presses=60))
@@ -100,7 +100,7 @@ def sense_kernels() -> None:
         recording, LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=1)
     )
     localizer.predict(recording)
-    Detector.fit(recording, np.arange(20))
+    ThresholdDetector.fit(recording, np.arange(20))
     identify(recording, Morphology.straight(2))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import padforge.sense.cli.localizer
 import padforge.sense.report.calibration
-from padforge.sense.localizer import training as fine_tuning
+from padforge.sense.localizer import training
 
 
 def files_in(folder: str) -> dict[str, bytes]:
@@ -91,7 +91,7 @@ def test_errors_of_depth_and_force_are_listed(padforge_sense, deep_localizer, de
 
 
 def test_a_drifted_pad_is_followed_into_a_new_model(few, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fine_tuning, "STEPS", 15)
+    monkeypatch.setattr(training, "FINE_TUNING_STEPS", 15)
     before = files_in("model")
     assert few("record", "--presses", "20", "--seed", "2", "--out", "later/recording")[0] == 0
     assert few("recalibrate", "--model", "model", "later/recording")[0] == 0

@@ -64,8 +64,8 @@ deploy --model model none l.h                   | none: no recording
 deploy --model model rec there.h                | there.h: cannot be written, it is there and no file
 deploy --model model other l.h                  | readings are of 6 fibres, the localizer was learnt from 4
 deploy --model model other l.onnx               | readings are of 6 fibres, the localizer was learnt from 4
-deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the least localizer of 4 fibres takes
-deploy --model model rec l.h --ram 512          | --ram is 512 bytes: the least localizer of 4 fibres takes
+deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the smallest localizer of 4 fibres takes
+deploy --model model rec l.h --ram 512          | --ram is 512 bytes: the smallest localizer of 4 fibres takes
 deploy --model model rec l.h --ram much         | '--ram': got 'much', expected bytes, as 65536, 64k or 1M
 deploy --model rec rec l.h                      | rec/localizer.json: cannot be read
 record --presses 0 --out r                      | [rig] presses

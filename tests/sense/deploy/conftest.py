@@ -81,7 +81,7 @@ def deep_student(deep_recording: Recording, deep_localizer: LocalizerModel) -> S
 def build_program(
     student: StudentNetwork, folder: Path, *flags: str, budget: MemoryBudget = BUDGET, text: str = ""
 ) -> Program:
-    """Build a program of the header of a student, which takes readings, whether the pad is pressed, and failed fibres."""
+    """Build a program that takes readings, whether the pad is pressed, and failed fibres."""
     (folder / "localizer.h").write_text(text or render_header(student, budget, ["of a test"]))
     path = compile_c(HERE / "driver.c", folder, *flags)
 

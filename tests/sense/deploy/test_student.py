@@ -83,7 +83,7 @@ def test_split_refuses_recordings_that_cannot_test(brief: Recording, localizer: 
         split_student_presses(brief, recalibrated, QUICK)
     with pytest.raises(InputError, match="presses of known position"):
         split_student_presses(first_presses(brief, 3), localizer, QUICK)
-    with pytest.raises(InputError, match="readings a second"):
+    with pytest.raises(InputError, match="within 25%"):
         split_student_presses(replace(brief, times_s=brief.times_s * 2), localizer, QUICK)
 
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, import_mat
-from padforge.sense.health.fault_detector import FibreFault, mask_faults
-from padforge.sense.localizer.calibration import learnable, left_out, proven, split_presses
+from padforge.sense.health.fault_detector import FibreFault, fibre_mask_of
+from padforge.sense.localizer.calibration import calibrate_scales, known_measures, split_presses, unlearnt_lines
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.network import learnt
+from padforge.sense.localizer.network import predict_members
 from padforge.sense.settings import LocalizerSettings as Options
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
@@ -35,7 +35,7 @@ def short(recording: Recording) -> LocalizerModel:
     split=st.sampled_from(["random", "chronological"]),
     seed=st.integers(0, 99),
 )
-def test_a_split_holds_back_a_share_and_uses_the_rest(presses: int, share: float, split: str, seed: int) -> None:
+def test_split_presses_partitions(presses: int, share: float, split: str, seed: int) -> None:
     if not 1 <= round(share * presses) <= presses - 3:
         with pytest.raises(InputError, match="holds"):
             split_presses(presses, split, share, np.random.default_rng(seed))
@@ -47,25 +47,23 @@ def test_a_split_holds_back_a_share_and_uses_the_rest(presses: int, share: float
 
 
 @pytest.mark.parametrize("split", ["random", "chronological"])
-def test_presses_held_back_leave_no_trace_in_the_localizer(
-    recording: Recording, short: LocalizerModel, split: str
-) -> None:
-    plain = short if split == SHORT.split else calibrate(recording, SHORT, split=split)[0]
+def test_calibrate_is_blind_to_test_presses(recording: Recording, short: LocalizerModel, split: str) -> None:
+    plain = short if split == SHORT.split else calibrate(recording, SHORT.model_copy(update={"split": split}))[0]
     test = np.array(plain.test)
     readings, places = np.array(recording.readings), np.array(recording.presses_mm)
     places[test] = 5e4 + np.arange(len(test))[:, None]
     if split == "chronological":  # of random ones, the readings are what came before the presses learnt from
         readings[recording.down_command[test[0]] + 20 :] = 77.0
-    spoilt, _ = calibrate(replace(recording, readings=readings, presses_mm=places), SHORT, split=split)
+    spoilt, _ = calibrate(
+        replace(recording, readings=readings, presses_mm=places), SHORT.model_copy(update={"split": split})
+    )
     assert spoilt.test == plain.test
     assert np.array_equal(spoilt.interval_factors, plain.interval_factors)
     assert all(np.array_equal(spoilt.weights[name], weight) for name, weight in plain.weights.items())
-    assert np.array_equal(spoilt.scaler.spread, plain.scaler.spread)
+    assert np.array_equal(spoilt.scaler.scale_v, plain.scaler.scale_v)
 
 
-def test_the_seed_and_presses_of_training_leave_a_trace_and_one_depth_that_is_known_none(
-    recording: Recording, short: LocalizerModel
-) -> None:
+def test_calibrate_repeats_by_seed(recording: Recording, short: LocalizerModel) -> None:
     places = np.array(recording.presses_mm)
     places[sorted(set(range(len(places))) - set(short.test))[:50]] *= 0.5
     changed, document = calibrate(replace(recording, presses_mm=places), SHORT)
@@ -73,7 +71,7 @@ def test_the_seed_and_presses_of_training_leave_a_trace_and_one_depth_that_is_kn
     again, same = calibrate(replace(recording, presses_mm=places), SHORT)
     assert document == same
     assert all(np.array_equal(again.weights[name], weight) for name, weight in changed.weights.items())
-    other, _ = calibrate(recording, SHORT, seed=7)
+    other, _ = calibrate(recording, SHORT.model_copy(update={"seed": 7}))
     assert short.test != other.test
     unknown = replace(recording, depths_mm=np.empty(0))
     assert unknown.digest == recording.digest
@@ -82,7 +80,7 @@ def test_the_seed_and_presses_of_training_leave_a_trace_and_one_depth_that_is_kn
     assert short.scaler.measures == ()
 
 
-def test_the_document_says_what_was_measured(calibrated: tuple[LocalizerModel, dict], recording: Recording) -> None:
+def test_calibrate_documents_its_errors(calibrated: tuple[LocalizerModel, dict], recording: Recording) -> None:
     localizer, document = calibrated
     assert document["format"] == "padforge-calibration/2"
     assert document["split"] == "random"
@@ -102,10 +100,10 @@ def test_the_document_says_what_was_measured(calibrated: tuple[LocalizerModel, d
     assert row["max_mm"] == pytest.approx(np.max(means))
     assert document["errors"][0]["std_mm"] == 0
     assert len(document["idle_share"]) == 4
-    cells = document["by_place"]
+    cells = document["by_position"]
     mean = sum(cell["presses"] * cell["mean_mm"] for cell in cells) / document["test_presses"]
     assert mean == pytest.approx(document["errors"][0]["mean_mm"])
-    assert localizer.scaler.centre.shape == (4, 9 + 8 + 3)  # windows, and gains of the phases
+    assert localizer.scaler.mean_v.shape == (4, 9 + 8 + 3)  # windows, and gains of the phases
     guess = np.median(np.delete(recording.presses_mm, test, axis=0), axis=0)
     trivial = np.hypot(*(recording.presses_mm[test] - guess).T).mean()
     assert document["errors"][0]["mean_mm"] < 0.5 * trivial
@@ -115,7 +113,7 @@ def test_the_document_says_what_was_measured(calibrated: tuple[LocalizerModel, d
     assert document["errors"][0]["within_r90"] > 0.9 - 0.25
 
 
-def test_evaluation_counts_presses_held_back(calibrated: tuple[LocalizerModel, dict], recording: Recording) -> None:
+def test_evaluate_counts_presses_held_back(calibrated: tuple[LocalizerModel, dict], recording: Recording) -> None:
     localizer, document = calibrated
     own = evaluate(localizer, recording, [0, 2])
     assert own["errors"] == [document["errors"][0], document["errors"][2]]
@@ -123,7 +121,7 @@ def test_evaluation_counts_presses_held_back(calibrated: tuple[LocalizerModel, d
     other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
     assert other["test_presses"] == 300
     assert other["split"] == "none"
-    for lost, said in (([4], "lost is 4, allowed is a whole number from 0 to 3"), ([], "lost names no number")):
+    for lost, said in (([4], "n_failed is 4, allowed is a whole number from 0 to 3"), ([], "levels name no number")):
         with pytest.raises(InputError, match=said):
             evaluate(localizer, recording, lost)
     with pytest.raises(InputError, match="test press 300 of the localizer: no such press, allowed are 0 to 299"):
@@ -133,20 +131,19 @@ def test_evaluation_counts_presses_held_back(calibrated: tuple[LocalizerModel, d
 @pytest.mark.parametrize(
     ("change", "given", "message"),
     [
-        ({}, {"split": "alphabetical"}, r"\[localizer\] split: got 'alphabetical'"),
         ({"test_share": 1e-4}, {}, "holds 0 back"),
         *(({}, {"time_budget": budget}, "time_budget is") for budget in (-1.0, float("nan"), True, "5")),
-        ({"method": "published"}, {"time_budget": 5}, "expected masked"),
+        ({"method": "published"}, {"time_budget": 5}, "expected method ensemble"),
     ],
 )
-def test_options_out_of_range_are_refused(
+def test_calibrate_refuses_options_out_of_range(
     recording: Recording, change: dict, given: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
         calibrate(recording, SHORT.model_copy(update=change), **given)
 
 
-def test_the_published_preset_knows_all_fibres_only(recording: Recording, tmp_path: Path) -> None:
+def test_calibrate_published_takes_no_failures(recording: Recording, tmp_path: Path) -> None:
     localizer, document = calibrate(recording, Options(method="published"))
     guess = np.hypot(*(recording.presses_mm - np.median(recording.presses_mm, axis=0)).T).mean()
     assert [row["n_failed"] for row in document["errors"]] == [0]
@@ -155,11 +152,11 @@ def test_the_published_preset_knows_all_fibres_only(recording: Recording, tmp_pa
     localizer.save(tmp_path)
     again = LocalizerModel.load(tmp_path).predict(recording)
     assert np.array_equal(again.positions_mm, localizer.predict(recording).positions_mm)
-    with pytest.raises(InputError, match="a published localizer knows none"):
+    with pytest.raises(InputError, match="method published knows no fibre loss"):
         localizer.predict(recording, [1])
 
 
-def test_presses_of_unknown_place_are_left_out(recording: Recording) -> None:
+def test_calibrate_leaves_out_unknown_positions(recording: Recording) -> None:
     places = np.array(recording.presses_mm)
     places[::3] = np.nan
     part = replace(recording, presses_mm=places)
@@ -170,14 +167,14 @@ def test_presses_of_unknown_place_are_left_out(recording: Recording) -> None:
 
 
 @pytest.mark.slow
-def test_a_short_training_on_the_published_recording_is_already_near(published: Path) -> None:
+def test_calibrate_short_on_the_published_recording(published: Path) -> None:
     recording = import_mat(published / "para5_long_first4500.mat")
     _, document = calibrate(recording, Options(members=1, hidden=64, epochs=8, max_failures=1))
     assert document["test_presses"] == 675
     assert document["errors"][0]["mean_mm"] < 2.4
 
 
-def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibrate_reports_divergence(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     import padforge.sense.localizer.training
 
     train = padforge.sense.localizer.training.train_members
@@ -187,23 +184,21 @@ def test_a_training_that_diverges_is_one_clear_line(recording: Recording, monkey
         return trained._replace(weights={name: w * np.float32(np.nan) for name, w in trained.weights.items()})
 
     monkeypatch.setattr(padforge.sense.localizer.training, "train_members", diverged)
-    with pytest.raises(InputError, match=r"training diverged at \[localizer\] rate 0.004, try a lower one"):
+    with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate 0.004, try a lower one"):
         calibrate(recording, SHORT)
 
 
-def test_a_fibre_at_fault_is_left_out_from_the_first_bad_press_on(
-    localizer: LocalizerModel, recording: Recording
-) -> None:
+def test_predict_masks_a_fault_from_its_first_press(localizer: LocalizerModel, recording: Recording) -> None:
     whole, without = (localizer.predict(recording, lost).positions_mm for lost in ((), (1,)))
     found = localizer.predict(
-        recording, fibre_mask=mask_faults([FibreFault(9, 5, (1,), "reduced_gain", 6.0)], len(recording.down_command), 4)
+        recording, fibre_mask=fibre_mask_of([FibreFault(9, 5, (1,), "weak", 6.0)], len(recording.down_command), 4)
     ).positions_mm
     assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
     np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)
     np.testing.assert_allclose(found[5:], without[5:], atol=1e-4)
 
 
-def test_presses_of_several_depths_teach_depth_and_force(deep_recording: Recording, deeply_calibrated: tuple) -> None:
+def test_calibrate_learns_depth_and_force(deep_recording: Recording, deeply_calibrated: tuple) -> None:
     localizer, document = deeply_calibrated
     row = document["errors"][0]
     assert row["depth_mean_mm"] < 0.3
@@ -212,7 +207,7 @@ def test_presses_of_several_depths_teach_depth_and_force(deep_recording: Recordi
     assert 0.75 <= row["force_within_r90"] <= 1
     assert localizer.interval_factors.shape[1] == 5
     test, found = np.array(document["test"]["press"]), document["test"]["depth_mm"]
-    off = np.abs(np.array(found["found"]) - deep_recording.depths_mm[test])
+    off = np.abs(np.array(found["predicted"]) - deep_recording.depths_mm[test])
     assert off.mean() == pytest.approx(row["depth_mean_mm"])
     assert found["pressed"] == deep_recording.depths_mm[test].tolist()
     # of light presses errors of places grow as the answers shrink, not more: so do the radii
@@ -234,50 +229,55 @@ def test_presses_of_several_depths_teach_depth_and_force(deep_recording: Recordi
         ({}, ["depth_mm", "force_n"]),
     ],
 )
-def test_depth_is_learnt_where_it_is_known_and_varies(deep_recording: Recording, change: dict, learnt: list) -> None:
-    assert list(learnable(replace(deep_recording, **change), np.arange(400))) == learnt
+def test_known_measures_need_depth_that_varies(deep_recording: Recording, change: dict, learnt: list) -> None:
+    assert list(known_measures(replace(deep_recording, **change), np.arange(400))) == learnt
     unknown = np.where(np.arange(400) == 7, np.nan, deep_recording.depths_mm)
-    assert learnable(replace(deep_recording, depths_mm=unknown), np.arange(400)) == {}
-    assert list(learnable(replace(deep_recording, depths_mm=unknown), np.arange(8, 400))) == ["depth_mm", "force_n"]
+    assert known_measures(replace(deep_recording, depths_mm=unknown), np.arange(400)) == {}
+    assert list(known_measures(replace(deep_recording, depths_mm=unknown), np.arange(8, 400))) == [
+        "depth_mm",
+        "force_n",
+    ]
 
 
-def test_it_is_told_why_depth_known_of_some_presses_is_not_learnt(
-    deep_recording: Recording, short: LocalizerModel
-) -> None:
+def test_unlearnt_lines_say_why(deep_recording: Recording, short: LocalizerModel) -> None:
     one = np.arange(400) == 7
     unknown, above = (np.where(one, value, deep_recording.depths_mm) for value in (np.nan, -0.1))
-    said = left_out(replace(deep_recording, depths_mm=unknown), short)
+    said = unlearnt_lines(replace(deep_recording, depths_mm=unknown), short)
     assert said == ["depth is not learnt: it is known of 399 of 400 presses, needed is of all"]
-    said = left_out(replace(deep_recording, reached_mm=above), short)
+    said = unlearnt_lines(replace(deep_recording, reached_mm=above), short)
     assert said == ["depth is not learnt: 1 of 400 presses reached 0 mm or less"]
     for depths in (np.empty(0), np.full(400, 5.0)):
-        assert left_out(replace(deep_recording, depths_mm=depths), short) == []
+        assert unlearnt_lines(replace(deep_recording, depths_mm=depths), short) == []
 
 
-def test_members_expect_the_errors_that_they_make(recording: Recording, localizer: LocalizerModel) -> None:
+def test_calibrate_scales_corrects_overconfidence(recording: Recording, localizer: LocalizerModel) -> None:
     """A member that has far too high an opinion of itself is put right by them, and counts for what it is worth."""
     bias = localizer.residual_network["last.b"].copy()
     bias[:, :, 2:] -= np.log(50)
     proud = replace(localizer, residual_network={**localizer.residual_network, "last.b": bias})
     presses, test = proud.scaled_features(recording), np.array(proud.test)
-    put_right = proven(proud, presses[test], recording.presses_mm[test], 2)
+    put_right = calibrate_scales(proud, presses[test], recording.presses_mm[test], 2)
     shift = put_right.residual_network["last.b"] - bias
     assert not shift[:, :, :2].any()
     assert shift[0, 0, 2] == shift[0, 0, 3] == pytest.approx(np.log(50), abs=0.7)
 
     alone = (proud.bayes, proud.residual_network), (put_right.bayes, put_right.residual_network)
     before, after = (
-        learnt(proud.weights, presses.inputs, presses.fibre_mask, "ensemble", *each)[-1, :, 2:] for each in alone
+        predict_members(proud.weights, presses.inputs, presses.fibre_mask, "ensemble", *each)[-1, :, 2:]
+        for each in alone
     )
     np.testing.assert_allclose(after - before, np.full_like(before, shift[0, 0, 2]), atol=1e-4)
 
 
 @pytest.mark.slow
-def test_a_time_budget_is_kept(recording: Recording) -> None:
+def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
     seen: list[tuple[int, int]] = []
     begin = time.monotonic()
     localizer, document = calibrate(
-        recording, SHORT.model_copy(update={"epochs": 10**5}), time_budget=2, progress=lambda *step: seen.append(step)
+        recording,
+        SHORT.model_copy(update={"epochs": 10**5}),
+        time_budget=2,
+        on_progress=lambda *step: seen.append(step),
     )
     assert time.monotonic() - begin < 60  # with what is done before and after, on a machine that does other things
     assert localizer.bayes is not None
@@ -288,6 +288,6 @@ def test_a_time_budget_is_kept(recording: Recording) -> None:
     assert document["errors"][0]["mean_mm"] < 9
 
 
-def test_a_time_budget_that_is_over_at_once_trains_a_step(recording: Recording) -> None:
+def test_calibrate_takes_a_step_without_time(recording: Recording) -> None:
     localizer, _ = calibrate(recording, SHORT, time_budget=0)
     assert np.isfinite(localizer.predict_features(localizer.scaled_features(recording)).positions_mm).all()

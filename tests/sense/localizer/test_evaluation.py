@@ -1,4 +1,4 @@
-"""How far off a localizer is: what is told of errors that are known."""
+"""Evaluation of a localizer by errors that are known."""
 
 from dataclasses import replace
 
@@ -7,8 +7,8 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.localizer.evaluation import by_place, conformal, error_row, errors_by_loss, idle_share
-from padforge.sense.localizer.model import Localization, Measured
+from padforge.sense.localizer.evaluation import conformal, error_row, errors_by_loss, errors_by_position, idle_share
+from padforge.sense.localizer.model import Localization, MeasureEstimate
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
 
@@ -19,14 +19,16 @@ def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0)
     return Localization(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
 
 
-def test_rows_of_errors_are_made_of_the_means_of_every_set_and_of_measures_that_are_known() -> None:
+def test_error_row_summarizes_sets_and_known_measures() -> None:
     row = error_row(2, [off_by(0, 1, 2, 3), off_by(1, 1, 1, 9, r50=1.5, r90=8.0)], PLACES)
     assert (row["n_failed"], row["subsets"]) == (2, 2)
     assert (row["mean_mm"], row["std_mm"], row["max_mm"]) == pytest.approx((2.25, 0.75, 3.0))
     assert row["median_mm"] == 1
     assert row["p95_mm"] == pytest.approx(3 + 0.65 * 6)
     assert (row["within_r50"], row["within_r90"]) == pytest.approx((5 / 8, 6 / 8))
-    found = replace(off_by(0, 0, 0, 0), measures={"depth_mm": Measured(np.array([1.0, 2, 3, 4]), np.full(4, 0.15))})
+    found = replace(
+        off_by(0, 0, 0, 0), measures={"depth_mm": MeasureEstimate(np.array([1.0, 2, 3, 4]), np.full(4, 0.15))}
+    )
     depths = np.array([1.1, 2.0, 3.3, np.nan])
     row = error_row(0, [found], PLACES, {"depth_mm": depths, "force_n": depths})
     assert row["depth_mean_mm"] == pytest.approx(0.4 / 3)
@@ -43,11 +45,11 @@ def test_rows_of_errors_are_made_of_the_means_of_every_set_and_of_measures_that_
     assert [(row["n_failed"], row["subsets"], row["mean_mm"]) for row in rows] == [(0, 1, 0.0), (2, 3, 2.0)]
     assert [(each["failed"], each["mean_mm"]) for each in by_subset] == [([], 0), ([0, 1], 1), ([0, 2], 2), ([1, 2], 3)]
     for level in (-1, 3):
-        with pytest.raises(InputError, match=f"lost is {level}, allowed is a whole number from 0 to 2"):
+        with pytest.raises(InputError, match=f"n_failed is {level}, allowed is a whole number from 0 to 2"):
             errors_by_loss(3, (level,), locate, PLACES)
 
 
-def test_radii_grow_by_a_quantile_a_rank_higher_than_their_share() -> None:
+def test_conformal_takes_a_quantile_one_rank_higher() -> None:
     """Ninety-nine presses off by 0.01, 0.02 ... of their radius: the 50th and the 90th."""
     ranks = np.random.default_rng(0).permutation(np.arange(1, 100) / 100)
     places = np.zeros((99, 2))
@@ -63,7 +65,7 @@ def test_radii_grow_by_a_quantile_a_rank_higher_than_their_share() -> None:
 
 
 @pytest.mark.parametrize("presses", [9, 40])
-def test_radii_hold_what_they_say_on_average_also_of_few_presses_with_several_sets_lost(presses: int) -> None:
+def test_conformal_covers_of_few_presses_and_several_sets(presses: int) -> None:
     rng = np.random.default_rng(presses)
 
     def drawn(count: int) -> list[Localization]:
@@ -81,16 +83,16 @@ def test_radii_hold_what_they_say_on_average_also_of_few_presses_with_several_se
     assert 0.885 < most < 0.915 + 1 / presses
 
 
-def test_errors_by_place_are_those_of_a_fifth_and_a_fibre_is_idle_below_two_percent_of_its_range() -> None:
+def test_errors_by_position_and_idle_share() -> None:
     """Idle in five presses of 20 readings, of which fibre 1 moves by 0 to 1 V, fibre 2 by far less in one."""
     pressed = np.array([[0.0, 0.0], [1.9, 0.9], [2.1, 0.0], [10.0, 5.0], [9.9, 4.9]])
     found = pressed + np.array([[1, 0], [3, 0], [1.2, 1.6], [0, 0], [0, 4]])
-    rows = by_place(found, pressed)
+    rows = errors_by_position(found, pressed)
     keys = ("x_mm", "y_mm", "presses", "mean_mm", "max_mm")
     np.testing.assert_allclose(
         [[row[key] for key in keys] for row in rows], [[1, 0.5, 2, 2, 3], [3, 0.5, 1, 2, 2], [9, 4.5, 2, 2, 4]]
     )
-    (row,) = by_place(PLACES[:1] + 1, PLACES[:1])
+    (row,) = errors_by_position(PLACES[:1] + 1, PLACES[:1])
     assert (row["x_mm"], row["y_mm"], row["presses"]) == (0.5, 0.5, 1)
     steps = np.array([[0.0, 1.0], [0.015, -1.0], [0.025, 0.03], [1.0, 0.05], [0.5, 0.5]])
     readings = np.zeros((200, 2))

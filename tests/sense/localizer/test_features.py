@@ -1,4 +1,4 @@
-"""Inputs of the localizer: where windows lie, that they stay within their press and fibre, and how they are scaled."""
+"""Features of presses: where windows lie, that they stay within press and fibre, and how they are scaled."""
 
 from dataclasses import replace
 
@@ -9,22 +9,19 @@ from hypothesis import strategies as st
 
 from padforge.sense.localizer.features import (
     FEATURES,
-    MAX_INPUT,
     PAST,
-    PASTS,
     REST,
-    SIZES,
     SLOW,
-    FeatureScaler,
     PressFeatures,
-    bridged,
-    history,
-    press_inputs,
+    compute_features,
+    compute_history,
+    interpolate_gaps,
 )
+from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
-BEGUN = 40 * np.arange(PRESSES) + 20
-LIFTED = BEGUN + 20
+DOWN_COMMAND = 40 * np.arange(PRESSES) + 20
+UP_COMMAND = DOWN_COMMAND + 20
 
 
 def noise(seed: int = 0) -> np.ndarray:
@@ -32,10 +29,10 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def windows_of(readings: np.ndarray, features: str) -> np.ndarray:
-    return press_inputs(readings, BEGUN, LIFTED, features).windows
+    return compute_features(readings, DOWN_COMMAND, UP_COMMAND, features).windows
 
 
-def test_windows_are_means_less_the_rest_and_published_inputs_are_medians() -> None:
+def test_compute_features_takes_means_and_medians() -> None:
     """Of noise; and of a ramp that counts itself, with a press from 5000 to 5020 and its rest 5.5 before it."""
     readings = noise()
     found, rest = windows_of(readings, "press_and_release")[2], readings[90:100].mean(axis=0)
@@ -50,18 +47,18 @@ def test_windows_are_means_less_the_rest_and_published_inputs_are_medians() -> N
     past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
     slow = [-402, -2010]
     for features, windows in (("press_and_release", down + up), ("causal", down), ("onset", down[:6])):
-        found = press_inputs(ramp, down_command, up_command, features)
+        found = compute_features(ramp, down_command, up_command, features)
         np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
         np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
     np.testing.assert_allclose(
-        press_inputs(ramp, down_command, up_command, "published").windows[0, 0], [4990 - 0, 5010, 5030]
+        compute_features(ramp, down_command, up_command, "published").windows[0, 0], [4990 - 0, 5010, 5030]
     )
 
 
 @pytest.mark.parametrize(
     ("name", "end"), [("press_and_release", 140), ("published", 140), ("causal", 120), ("onset", 108)]
 )
-def test_a_press_is_told_by_its_own_readings_and_a_fibre_by_its_own(name: str, end: int) -> None:
+def test_compute_features_stays_within_press_and_fibre(name: str, end: int) -> None:
     """Up to the next press; without the release, up to its end; early, of the first 8 readings alone."""
     readings, press = noise(), 2
     before = windows_of(readings, name)
@@ -76,21 +73,21 @@ def test_a_press_is_told_by_its_own_readings_and_a_fibre_by_its_own(name: str, e
 @pytest.mark.parametrize("name", FEATURES)
 @settings(max_examples=20)
 @given(gaps=st.lists(st.integers(1, 30), min_size=2, max_size=20), after=st.integers(0, 30))
-def test_presses_of_any_length_have_inputs_within_the_readings(name: str, gaps: list[int], after: int) -> None:
+def test_compute_features_takes_presses_of_any_length(name: str, gaps: list[int], after: int) -> None:
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     readings = np.random.default_rng(0).uniform(1, 2, (edges[-1] + after, 2))
-    found = press_inputs(readings, edges[::2], edges[1::2], name)
-    assert found.windows.shape == (len(edges) // 2, 2, SIZES[name])
-    assert found.history.shape == (len(edges) // 2, 2, PASTS[name])
+    found = compute_features(readings, edges[::2], edges[1::2], name)
+    assert found.windows.shape == (len(edges) // 2, 2, FEATURES[name].n_windows)
+    assert found.history.shape == (len(edges) // 2, 2, FEATURES[name].n_history)
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
     assert found.fibre_mask.all()
 
 
-def test_history_is_what_came_before_relative_to_the_rest() -> None:
+def test_compute_history_is_relative_to_rest() -> None:
     readings = np.random.default_rng(3).standard_normal((6000, 2))
     down_command = np.array([20, 5000])
-    found = history(readings, down_command)
+    found = compute_history(readings, down_command)
     rest = readings[5000 + REST[0] : 5000].mean(axis=0)
     for number, (first, end) in enumerate(PAST):
         assert np.allclose(found[1, :, number], readings[5000 + first : 5000 + end].mean(axis=0) - rest)
@@ -99,37 +96,37 @@ def test_history_is_what_came_before_relative_to_the_rest() -> None:
     # before the first reading there is the first reading
     assert np.allclose(found[0, :, len(PAST) - 1], readings[0] - readings[10:20].mean(axis=0))
     readings[5000:] = 99
-    assert np.array_equal(history(readings, down_command), found)
+    assert np.array_equal(compute_history(readings, down_command), found)
 
 
-def test_short_gaps_are_bridged_and_do_not_spread() -> None:
+def test_interpolate_gaps_fills_gaps_only() -> None:
     readings = noise()
     holed = readings.copy()
     holed[105] = holed[:3, 1] = np.nan
-    filled = bridged(holed)
+    filled = interpolate_gaps(holed)
     assert np.allclose(filled[105], (readings[104] + readings[106]) / 2)
     assert np.array_equal(filled[:3, 1], np.repeat(readings[3, 1], 3))
     there = ~np.isnan(holed)
     assert np.array_equal(filled[there], readings[there])
-    assert press_inputs(holed, BEGUN, LIFTED, "press_and_release").fibre_mask.all()
+    assert compute_features(holed, DOWN_COMMAND, UP_COMMAND, "press_and_release").fibre_mask.all()
 
 
 @pytest.mark.parametrize(
     ("features", "first", "end"),
     [("press_and_release", -10, 40), ("causal", -10, 20), ("onset", -10, 20), ("published", -10, 40)],
 )
-def test_a_fibre_counts_where_three_quarters_are_there(features: str, first: int, end: int) -> None:
+def test_fibre_mask_needs_three_quarters_of_readings(features: str, first: int, end: int) -> None:
     """Press 2 is sent down at 100 and up at 120; the last readings that count are what is missing."""
     most = (end - first) // 4
     for missing, there in ((most, True), (most + 1, False)):
         for begin in (100 + first, 100 + end - missing):
             readings = noise()
             readings[begin : begin + missing, 1] = np.nan
-            assert press_inputs(readings, BEGUN, LIFTED, features).fibre_mask[2, 1] == there
+            assert compute_features(readings, DOWN_COMMAND, UP_COMMAND, features).fibre_mask[2, 1] == there
     readings = noise()
     readings[50 : 100 + first, 1] = readings[100 + end : 140, 1] = np.nan
     readings[:, 2] = np.nan
-    found = press_inputs(readings, BEGUN, LIFTED, features)
+    found = compute_features(readings, DOWN_COMMAND, UP_COMMAND, features)
     assert found.fibre_mask[2].tolist() == [True, True, False]
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
@@ -148,38 +145,37 @@ def made(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
     )
 
 
-def test_windows_are_scaled_by_their_spread_and_places_by_half_of_the_longer_side() -> None:
+def test_scaler_standardizes_features_and_positions() -> None:
     inputs, places = made()
-    scaling, table = FeatureScaler.fit(inputs, places)
+    scaling, _ = FeatureScaler.fit(inputs, places)
     for fibre in range(FIBRES):
         own = inputs.windows[inputs.fibre_mask[:, fibre], fibre]
         variance = own.var(axis=0)
-        np.testing.assert_allclose(scaling.centre[fibre], own.mean(axis=0))
-        np.testing.assert_allclose(scaling.spread[fibre], np.sqrt(np.sqrt(variance) * np.sqrt(variance.mean())))
-    scaled, expected = scaling.inputs(inputs), (inputs.windows[1] - scaling.centre) / scaling.spread
+        np.testing.assert_allclose(scaling.mean_v[fibre], own.mean(axis=0))
+        np.testing.assert_allclose(scaling.scale_v[fibre], np.sqrt(np.sqrt(variance) * np.sqrt(variance.mean())))
+    scaled, expected = scaling.transform(inputs), (inputs.windows[1] - scaling.mean_v) / scaling.scale_v
     np.testing.assert_allclose(scaled.inputs[1], expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(scaled.fibre_mask, inputs.fibre_mask)
-    scaling.refuse_unsound(table)
     for sign in (1, -1):  # what lies far off is held
-        assert (scaling.scaled(sign * np.full((1, FIBRES, WINDOWS), 1e9)) == sign * MAX_INPUT).all()
-    assert scaling.entries("ensemble") == FIBRES * WINDOWS + FIBRES
-    assert scaling.entries("published") == FIBRES * WINDOWS
+        assert (scaling.scale(sign * np.full((1, FIBRES, WINDOWS), 1e9)) == sign * MAX_INPUT).all()
+    assert scaling.n_inputs("ensemble") == FIBRES * WINDOWS + FIBRES
+    assert scaling.n_inputs("published") == FIBRES * WINDOWS
     places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]
     scaling, _ = FeatureScaler.fit(inputs, places)
     np.testing.assert_allclose(scaling.origin_mm, [5, 5])
-    assert scaling.span_mm == 25
-    np.testing.assert_allclose(scaling.targets(places[:4]), [[-1, -0.2], [1, 0.2], [1, -0.2], [0, 0]], atol=1e-6)
-    np.testing.assert_allclose(scaling.positions_mm(scaling.targets(places)), places, atol=1e-4)
+    assert scaling.scale_mm == 25
+    np.testing.assert_allclose(scaling.scale_targets(places[:4]), [[-1, -0.2], [1, 0.2], [1, -0.2], [0, 0]], atol=1e-6)
+    np.testing.assert_allclose(scaling.positions_mm(scaling.scale_targets(places)), places, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["silent", "never there", "rounding"])
-def test_a_fibre_that_tells_nothing_is_scaled_to_finite_numbers(kind: str) -> None:
+def test_scaler_keeps_silent_fibres_finite(kind: str) -> None:
     inputs, places = made(10)
     windows, fibre_mask = inputs.windows.copy(), inputs.fibre_mask.copy()
     windows[:, 1] = 3.3 + (1e-15 * windows[:, 1] if kind == "rounding" else 0)
     fibre_mask[:, 1] = kind != "never there"
     inputs = replace(inputs, windows=windows, fibre_mask=fibre_mask)
     scaling, table = FeatureScaler.fit(inputs, places)
-    assert np.isfinite(scaling.inputs(inputs).inputs).all()
+    assert np.isfinite(scaling.transform(inputs).inputs).all()
     assert np.isfinite(table).all()
-    assert (scaling.spread[1] == 1).all()
+    assert (scaling.scale_v[1] == 1).all()

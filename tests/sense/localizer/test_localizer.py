@@ -1,121 +1,93 @@
-"""The localizer: masks hide, a press that no fibre tells may be anywhere, places are written as CSV."""
+"""The estimator: fitted to recordings and arrays, within scikit-learn's tools, and read back from files."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from sklearn.base import clone
+from sklearn.model_selection import cross_val_score
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Recording
-from padforge.sense.localizer.features import ScaledFeatures
-from padforge.sense.localizer.model import UNKNOWN, Localization, LocalizerModel, Measured, joined, write_localization
+from padforge.sense import Localizer, Recording
+from padforge.sense.localizer.features import compute_features
+from padforge.sense.settings import LocalizerSettings
+
+TINY: dict[str, Any] = {"hidden": 16, "layers": 1, "epochs": 5, "batch": 64}
 
 
-def test_a_fibre_masked_or_without_readings_does_nothing(localizer: LocalizerModel, recording: Recording) -> None:
-    presses = localizer.scaled_features(recording)
-    spoilt = presses.inputs.copy()
-    spoilt[:, 1] = np.nan
-    masked = localizer.predict_features(presses, [1])
-    assert np.array_equal(
-        localizer.predict_features(ScaledFeatures(spoilt, presses.fibre_mask), [1]).positions_mm, masked.positions_mm
-    )
-    assert not np.array_equal(masked.positions_mm, localizer.predict_features(presses).positions_mm)
-    readings = np.array(recording.readings)
-    readings[:, 1] = np.nan
-    found = localizer.predict_features(localizer.scaled_features(replace(recording, readings=readings)))
-    assert np.array_equal(found.positions_mm, masked.positions_mm)
-    assert np.array_equal(found.r90_mm, masked.r90_mm)
+@pytest.fixture(scope="module")
+def arrays(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    features = compute_features(recording.readings, recording.down_command, recording.up_command, "causal")
+    return features.windows, recording.presses_mm
 
 
-def test_less_is_known_with_fibres_lost_and_nothing_without_any(
-    localizer: LocalizerModel, recording: Recording
-) -> None:
-    readings = np.array(recording.readings)
-    readings[recording.down_command[7] - 15 : recording.up_command[7] + 25] = np.nan
-    found = localizer.predict_features(localizer.scaled_features(replace(recording, readings=readings)))
-    assert found.positions_mm[7] == pytest.approx(localizer.scaler.origin_mm)
-    assert found.r50_mm[7] < found.r90_mm[7]
-    assert found.r50_mm[7] > 0.5 * localizer.scaler.span_mm
-    assert np.isfinite(found.positions_mm).all()
-    far = np.hypot(*np.random.default_rng(0).uniform(-1, 1, (2, 200_000)))
-    assert np.mean(far <= UNKNOWN[1]) == pytest.approx(0.5, abs=0.005)
-    assert np.mean(far <= UNKNOWN[2]) == pytest.approx(0.9, abs=0.005)
-    presses = localizer.scaled_features(recording)
-    means = [localizer.predict_features(presses, range(lost)).r90_mm.mean() for lost in range(4)]
-    assert means[:2] == sorted(means)[:2]
-    assert min(means[2:]) > 1.1 * means[0]
-    found = localizer.predict_features(presses)
-    assert (found.r50_mm < found.r90_mm).all()
-    assert (found.std_mm > 0).all()
-    # alone as among others
-    assert np.allclose(localizer.predict_features(presses[17:18]).positions_mm, found.positions_mm[17:18], atol=1e-4)
-    assert localizer.predict_features(presses[:0]).positions_mm.shape == (0, 2)
+def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarray]) -> None:
+    x, y = arrays
+    localizer = Localizer(max_failures=1, random_state=3, **TINY)
+    scores = cross_val_score(localizer, x, y, cv=3)
+    trivial = np.hypot(*(y - np.median(y, axis=0)).T).mean()
+    assert ((-0.8 * trivial < scores) & (scores < 0)).all()
+    fitted = localizer.fit(x[:200], y[:200])
+    errors = np.hypot(*(fitted.predict(x[200:]).positions_mm - y[200:]).T)
+    assert fitted.score(x[200:], y[200:]) == pytest.approx(-errors.mean())
+    assert fitted.predict(x[200:], failed=[1]).r90_mm.mean() > fitted.predict(x[200:]).r90_mm.mean()
+    missing = x[200:].copy()
+    missing[:, 1] = np.nan
+    assert np.array_equal(fitted.predict(missing).positions_mm, fitted.predict(x[200:], [1]).positions_mm)
+    again = clone(fitted).fit(x[:200], y[:200])
+    assert np.array_equal(again.predict(x).positions_mm, fitted.predict(x).positions_mm)
 
 
-@pytest.mark.parametrize(
-    ("lost", "message"),
-    [
-        ([4], "lost fibre at index 4: none, allowed are 0 to 3"),
-        *(([fibre], "lost fibre at index .*: none") for fibre in (-1, 10**20, 0.5, True, "a")),
-        ([0, 1, 2, 3], "all 4 fibres"),
-    ],
-)
-def test_bad_masks_are_refused(localizer: LocalizerModel, recording: Recording, lost: list[Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        localizer.predict_features(localizer.scaled_features(recording), lost)
+def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_path: Path) -> None:
+    localizer = Localizer(2, features="causal", split="chronological", **TINY).fit(brief)
+    rows = localizer.evaluate(brief)
+    assert rows == localizer.calibration_["errors"]
+    assert [row["n_failed"] for row in rows] == [0, 1, 2]
+    assert localizer.evaluate(brief, max_failures=0) == rows[:1]
+    assert localizer.score(brief) < 0
+    localizer.save(tmp_path)
+    again = Localizer.load(tmp_path)
+    assert np.array_equal(again.predict(brief, [0]).r90_mm, localizer.predict(brief, [0]).r90_mm)
+    params = again.get_params()
+    assert [params[name] for name in ("max_failures", "features", "split")] == [2, "causal", "chronological"]
 
 
-def test_what_are_no_inputs_of_its_presses_is_refused(localizer: LocalizerModel, recording: Recording) -> None:
-    with pytest.raises(InputError, match=r"presses is .*, expected a Scaled"):
-        localizer.predict_features(recording)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="3 fibres, the localizer was learnt from 4"):
-        localizer.scaled_features(replace(recording, readings=recording.readings[:, :3]))
+def test_localizer_of_arrays_is_kept_in_files(arrays: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    x, y = arrays
+    localizer = Localizer(1, members=1, **TINY).fit(x[:60, :, :3], y[:60])
+    localizer.save(tmp_path)
+    again = Localizer.load(tmp_path).predict(x[:, :, :3])
+    assert np.array_equal(again.positions_mm, localizer.predict(x[:, :, :3]).positions_mm)
 
 
-def test_a_recording_is_up_to_a_quarter_faster_or_slower(localizer: LocalizerModel, recording: Recording) -> None:
-    for ratio in (0.76, 1.24):
-        presses = localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
-        assert np.isfinite(localizer.predict_features(presses).positions_mm).all()
-    for ratio in (0.74, 1.26):
-        with pytest.raises(InputError, match="readings a second"):
-            localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
+def test_localizer_params_are_settings() -> None:
+    settings = LocalizerSettings(members=3, seed=7, method="published")
+    localizer = Localizer.from_settings(settings)
+    assert localizer.get_params() == {**settings.model_dump(exclude={"seed"}), "random_state": 7}
+    assert localizer.set_params(hidden=9).get_params()["hidden"] == 9
+    with pytest.raises(InputError, match="no option depth"):
+        Localizer(depth=3)
 
 
-def test_depth_and_force_come_with_widths_that_grow(deep_localizer: LocalizerModel, deep_recording: Recording) -> None:
-    presses = deep_localizer.scaled_features(deep_recording)
-    whole, fewer = (deep_localizer.predict_features(presses, lost).measures for lost in ((), (1, 2)))
-    assert list(whole) == ["depth_mm", "force_n"]
-    assert np.corrcoef(whole["depth_mm"].values, deep_recording.depths_mm)[0, 1] > 0.95
-    np.testing.assert_allclose(whole["force_n"].values, 3 * whole["depth_mm"].values, atol=2)
-    assert (whole["depth_mm"].r90 > 0).all()
-    assert fewer["depth_mm"].r90.mean() > whole["depth_mm"].r90.mean()
-    depth = deep_localizer.predict_features(ScaledFeatures(presses.inputs, np.zeros_like(presses.fibre_mask))).measures[
-        "depth_mm"
-    ]
-    assert depth.values == pytest.approx(2.75, abs=0.05)
-    assert depth.r90 == pytest.approx(2.25, abs=0.05)
-    found = joined([deep_localizer.predict_features(presses[:5]), deep_localizer.predict_features(presses[5:9])])
-    expected = deep_localizer.predict_features(presses[:9])
-    np.testing.assert_allclose(found.positions_mm, expected.positions_mm, atol=1e-3)
-    np.testing.assert_allclose(found.measures["force_n"].r90, expected.measures["force_n"].r90, rtol=1e-3)
-
-
-def test_places_are_written_one_line_a_press(tmp_path: Path) -> None:
-    places, sd = np.array([[1.23456, -2.0], [0.0, 3.5]]), np.array([[0.5, 0.25], [1.0, 2.0]])
-    plain = Localization(places, sd, np.array([0.4, 1.5]), np.ones(2) * 3)
-    write_localization(plain, tmp_path / "places.csv")
-    assert (tmp_path / "places.csv").read_text().splitlines() == [
-        "press,x_mm,y_mm,sd_x_mm,sd_y_mm,r50_mm,r90_mm",
-        "0,1.2346,-2.0000,0.5000,0.2500,0.4000,3.0000",
-        "1,0.0000,3.5000,1.0000,2.0000,1.5000,3.0000",
-    ]
-    force = Measured(np.array([7.0, 8.0]), np.ones(2))
-    deep = replace(plain, measures={"depth_mm": Measured(np.array([1.25, 2]), np.array([0.5, 1])), "force_n": force})
-    write_localization(deep, tmp_path / "places.csv")
-    header, line, _ = (tmp_path / "places.csv").read_text().splitlines()
-    assert header.endswith("r90_mm,depth_mm,depth_r90_mm,force_n,force_r90_n")
-    assert line.endswith("3.0000,1.2500,0.5000,7.0000,1.0000")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_localization(plain, tmp_path)
+def test_localizer_refuses_unfit_input(brief: Recording, arrays: tuple[np.ndarray, np.ndarray]) -> None:
+    x, y = arrays
+    with pytest.raises(InputError, match="not fitted"):
+        Localizer().predict(brief)
+    for bad, target, message in (
+        (x[:, :, 0], y, r"X has shape \(300, 4\)"),
+        (x, y[:, 0], r"y has shape \(300,\)"),
+        (x, None, "y has shape"),
+        (x[:9], y, "X has 9 presses and y 300"),
+        (brief, y, "y is given beside a recording"),
+        (x[:1], y[:1], "has 1 presses"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Localizer(**TINY).fit(bad, target)
+    with pytest.raises(InputError, match=r"\[localizer\] hidden"):
+        Localizer(hidden=0).fit(brief)
+    fitted = Localizer(members=1, **TINY).fit(x[:40], y[:40])
+    with pytest.raises(InputError, match="fitted to arrays"):
+        fitted.predict(brief)
+    with pytest.raises(InputError, match=r"expected a recording, or \(Q, C, F\)"):
+        fitted.predict(x[:, :, :2])

@@ -28,38 +28,36 @@ WILD = (np.nan, np.inf, 1e13)
     ("path", "value", "named"),
     [
         ("features", "smell", "features"),
-        ("scaling", {}, "scaling"),
-        ("features", "published", r"scaling\.mean_v"),
-        ("fibres", 3, r"scaling\.mean_v"),
-        ("fibres", 0, "fibres"),
+        ("scaler", {}, "scaler"),
+        ("features", "published", r"scaler\.mean_v"),
         ("method", "guess", "method"),
         ("method", "published", "force_n of method published"),
         ("interval_factors", [], "interval_factors"),
-        ("factors.0", [1.0, 1.0], "interval_factors"),
-        ("factors.0.0", -1.0, "interval_factors"),
-        ("scaling.memory.0.0", [1.0], r"scaling\.memory"),
-        ("scaling.memory.0.0.0", np.nan, "memory"),
-        ("scaling.history_mean_v.0", [1.0], r"scaling\.history_mean_v"),
+        ("interval_factors.0", [1.0, 1.0], "interval_factors"),
+        ("interval_factors.0.0", -1.0, "interval_factors"),
+        ("scaler.history_coef.0.0", [1.0], r"scaler\.history_coef"),
+        ("scaler.history_coef.0.0.0", np.nan, "history_coef"),
+        ("scaler.history_mean_v.0", [1.0], r"scaler\.history_mean_v"),
         *(("rate_hz", value, "rate_hz") for value in (0, -1.0, "13", np.nan, np.inf, 1e-300, None)),
-        *((f"scaling.{key}.0.0", value, key) for key in ("mean_v", "spread_v") for value in (np.nan, np.inf, 1e9, "1")),
-        ("scaling.spread_v.0.0", 0.0, "spread_v"),
-        ("scaling.spread_v.0", [1.0], "spread_v"),
-        *(("scaling.origin_mm", value, "origin_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
-        *(("scaling.span_mm", value, "span_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
+        *((f"scaler.{key}.0.0", value, key) for key in ("mean_v", "scale_v") for value in (np.nan, np.inf, 1e9, "1")),
+        ("scaler.scale_v.0.0", 0.0, "scale_v"),
+        ("scaler.scale_v.0", [1.0], "scale_v"),
+        *(("scaler.origin_mm", value, "origin_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
+        *(("scaler.scale_mm", value, "scale_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
         ("split", "alphabetical", "split"),
-        *(("test", value, "test") for value in ([], [0.5], ["a"], [-1], [True], {}, [3, 3], [7])),
-        ("errors", [{}], r"errors\.0\.lost"),
+        *(("test", value, "test") for value in ([0.5], ["a"], [-1], [True], {}, [3, 3])),
+        ("errors", [{"mean_mm": np.nan}], r"errors\.0\.mean_mm"),
         ("training_recording_sha256", 7, "training_recording_sha256"),
+        ("weights_sha256", 7, "weights_sha256"),
         ("more", 1, "more"),
-        ("scaling.measures", [{"name": "force_n", "middle": 1.0, "span": 1.0}], "force_n of method masked"),
-        ("scaling.measures.0.name", "width_mm", "measures"),
-        ("scaling.measures.0.span", 0.0, "span"),
-        ("scaling.measures.0.middle", np.nan, "middle"),
-        ("scaling.measures", [], "factors have .5. values a row, expected 3"),
-        ("factors.0", [1.0, 1.0, 1.0], "factors have .3, 5. values"),
+        ("scaler.measures", [{"name": "force_n", "origin": 1.0, "scale": 1.0}], "force_n of method ensemble"),
+        ("scaler.measures.0.name", "width_mm", "measures"),
+        ("scaler.measures.0.scale", 0.0, "scale"),
+        ("scaler.measures.0.origin", np.nan, "origin"),
+        ("scaler.measures", [], "interval_factors has shape .4, 5."),
     ],
 )
-def test_a_document_out_of_bounds_is_refused(
+def test_load_refuses_documents_out_of_range(
     deep_localizer: LocalizerModel, tmp_path: Path, path: str, value: object, named: str
 ) -> None:
     deep_localizer.save(tmp_path)
@@ -85,20 +83,25 @@ def test_a_document_out_of_bounds_is_refused(
         lambda of: {"residual_network": of.weights},
         lambda of: {"residual_network": {name: weight * np.nan for name, weight in of.residual_network.items()}},
         lambda of: {"bayes": replace(of.bayes, grid=of.bayes.grid[1:])},
-        *(lambda of, x=x: {"bayes": replace(of.bayes, terms=np.full_like(of.bayes.terms, x))} for x in WILD),
-        lambda of: {"bayes": replace(of.bayes, answers=-of.bayes.answers)},
+        *(
+            lambda of, x=x: {
+                "bayes": replace(
+                    of.bayes, log_likelihood_coefficients=np.full_like(of.bayes.log_likelihood_coefficients, x)
+                )
+            }
+            for x in WILD
+        ),
+        lambda of: {"bayes": replace(of.bayes, linearization=-of.bayes.linearization)},
     ],
 )
-def test_arrays_that_do_not_fit_the_document_are_refused(
-    localizer: LocalizerModel, tmp_path: Path, change: Change
-) -> None:
+def test_load_refuses_arrays_of_other_documents(localizer: LocalizerModel, tmp_path: Path, change: Change) -> None:
     assert localizer.bayes is not None
     replace(localizer, **change(localizer)).save(tmp_path)
     with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
         LocalizerModel.load(tmp_path)
 
 
-def test_files_keep_every_bit(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
+def test_save_keeps_every_bit(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     found = LocalizerModel.load(tmp_path)
     presses = localizer.scaled_features(recording)
@@ -111,14 +114,14 @@ def test_files_keep_every_bit(localizer: LocalizerModel, recording: Recording, t
     for name in ("localizer.json", "localizer.safetensors"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
     document = json.loads((tmp_path / "localizer.json").read_text())
-    assert "measures" not in document["scaling"]  # one of a single depth says nothing of any
+    assert document["scaler"]["measures"] == []
     assert not [key for row in document["errors"] for key in row if key.startswith(("depth", "force"))]
     (tmp_path / "localizer.json").write_text(json.dumps(document | {"method": "published"}))
     with pytest.raises(InputError, match="features"):
         LocalizerModel.load(tmp_path)
 
 
-def test_files_keep_depth_and_force(deep_localizer: LocalizerModel, deep_recording: Recording, tmp_path: Path) -> None:
+def test_save_keeps_depth_and_force(deep_localizer: LocalizerModel, deep_recording: Recording, tmp_path: Path) -> None:
     deep_localizer.save(tmp_path)
     again = LocalizerModel.load(tmp_path)
     assert again.scaler.measures == deep_localizer.scaler.measures
@@ -132,7 +135,7 @@ def test_files_keep_depth_and_force(deep_localizer: LocalizerModel, deep_recordi
 @pytest.mark.parametrize("name", ["localizer.json", "localizer.safetensors"])
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(0, 255), cut=st.integers(0, 300))
-def test_damaged_bytes_are_refused_or_read(
+def test_load_refuses_damaged_bytes(
     localizer: LocalizerModel, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int
 ) -> None:
     """A byte is changed, and some behind it are lost."""
@@ -152,9 +155,7 @@ def test_damaged_bytes_are_refused_or_read(
 
 
 @pytest.mark.parametrize("value", [np.nan, object()])
-def test_a_save_that_fails_leaves_the_model_that_was_there(
-    localizer: LocalizerModel, tmp_path: Path, value: object
-) -> None:
+def test_save_that_fails_changes_nothing(localizer: LocalizerModel, tmp_path: Path, value: object) -> None:
     localizer.save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = {name: weight + 1 for name, weight in localizer.weights.items()}
@@ -163,7 +164,7 @@ def test_a_save_that_fails_leaves_the_model_that_was_there(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: LocalizerModel, tmp_path: Path) -> None:
+def test_save_into_an_unusable_folder_changes_nothing(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     (tmp_path / "localizer.json").unlink()
     (tmp_path / "localizer.json").mkdir()
@@ -183,9 +184,7 @@ def test_a_save_into_a_place_that_is_taken_changes_nothing(localizer: LocalizerM
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
-def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_one(
-    localizer: LocalizerModel, tmp_path: Path
-) -> None:
+def test_save_killed_leaves_the_old_or_the_new_model(localizer: LocalizerModel, tmp_path: Path) -> None:
     later = replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()})
     name, found = next(iter(localizer.weights)), []
     for number in count():

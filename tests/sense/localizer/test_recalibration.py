@@ -10,12 +10,13 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
-from padforge.sense.localizer import training as fine_tuning
+from padforge.sense.localizer import training
 from padforge.sense.localizer.evaluation import distances
-from padforge.sense.localizer.features import TrainingPresses, looked_up
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.recalibration import CrossValidation, fit_correction, recalibrate
-from padforge.sense.localizer.training import adapt
+from padforge.sense.localizer.response_model import interpolate_grid
+from padforge.sense.localizer.scaler import TrainingPresses
+from padforge.sense.localizer.training import fine_tune
 from tests.helpers.door import called
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])
@@ -46,7 +47,7 @@ NEW, LATER = slice(0, 50), slice(60, 300)
 def short() -> Iterator[None]:
     """Few steps of adapting, which are slow."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(fine_tuning, "STEPS", 12)
+        patched.setattr(training, "FINE_TUNING_STEPS", 12)
         yield
 
 
@@ -62,7 +63,7 @@ def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> CrossVali
     return CrossValidation(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
 
 
-def test_what_presses_left_out_say_of_a_change() -> None:
+def test_cross_validation_compares_presses_left_out() -> None:
     """With all fibres errors shrink by 1, 2, 3, 4 mm, with one lost by 0 and by 4 mm: by 1.5 to 3 in the mean."""
     before = {(): off_by(2, 4, 6, 8), (0,): off_by(5, 5, 5, 5), (1,): off_by(5, 5, 5, 5)}
     after = {(): off_by(1, 2, 3, 4), (0,): off_by(5, 5, 5, 5), (1,): off_by(1, 1, 1, 1)}
@@ -70,7 +71,7 @@ def test_what_presses_left_out_say_of_a_change() -> None:
     assert gain == pytest.approx(2.25)
     assert error == pytest.approx(np.std([1.5, 2.0, 2.5, 3.0], ddof=1) / 2)
     found = {(): off_by(0.1, 0.1, 0.1, 0.1), (0,): off_by(3, 3, 3, 3), (1,): off_by(3, 3, 3, 3)}
-    widened = trial_of([[0, 1], [2, 3]]).widened(found)  # where radii hold, they are not narrowed
+    widened = trial_of([[0, 1], [2, 3]]).widening(found)  # where radii hold, they are not narrowed
     np.testing.assert_allclose(widened, [[1, 1, 1], [3 / np.sqrt(2), 3, 3]])
     seen: list[list[int]] = []
 
@@ -79,7 +80,7 @@ def test_what_presses_left_out_say_of_a_change() -> None:
         seen.append(raw.tolist())
         return localizer + 1
 
-    assert trial_of([[1, 3], [0, 2]], np.arange(4)).changed([10, 20], change) == [11, 21]  # pyright: ignore
+    assert trial_of([[1, 3], [0, 2]], np.arange(4)).change([10, 20], change) == [11, 21]  # pyright: ignore
     assert seen == [[0, 2], [1, 3]]  # a fold is changed by the other presses only
 
 
@@ -88,7 +89,7 @@ def followed(localizer: LocalizerModel, recording: Recording) -> tuple[Localizer
     return recalibrate(localizer, known_only(remade(recording), NEW))
 
 
-def test_a_remade_pad_is_followed(
+def test_recalibrate_follows_a_remade_pad(
     localizer: LocalizerModel, recording: Recording, followed: tuple, tmp_path: Path
 ) -> None:
     now, document = followed
@@ -125,15 +126,13 @@ def test_a_remade_pad_is_followed(
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same(localizer: LocalizerModel, recording: Recording, followed: tuple) -> None:
+def test_recalibrate_repeats_by_seed(localizer: LocalizerModel, recording: Recording, followed: tuple) -> None:
     (one, document), (two, again) = followed, recalibrate(localizer, known_only(remade(recording), NEW))
     assert document == again
     assert all(np.array_equal(one.weights[name], two.weights[name]) for name in one.weights)
 
 
-def test_an_unchanged_pad_is_not_spoilt_and_too_few_presses_are_refused(
-    localizer: LocalizerModel, recording: Recording
-) -> None:
+def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording: Recording) -> None:
     now, document = recalibrate(localizer, known_only(recording, NEW))
     assert "corrected" not in document["changes"]
     # adapting is kept unless new presses speak against it by a standard error
@@ -142,20 +141,20 @@ def test_an_unchanged_pad_is_not_spoilt_and_too_few_presses_are_refused(
     if not document["changes"]:
         assert document["before"] == document["after"]
     for presses in (0, 1, 3, 9):
-        with pytest.raises(InputError, match=f"has {presses} presses of known place, expected at least 10"):
+        with pytest.raises(InputError, match=f"has {presses} presses of known position, expected at least 10"):
             recalibrate(localizer, known_only(recording, slice(0, presses)))
 
 
-def test_a_known_correction_is_found(localizer: LocalizerModel, recording: Recording) -> None:
+def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recording: Recording) -> None:
     scaling, gains, shift = localizer.scaler, np.array([1.2, 0.8, 1.1, 0.9]), np.array([0.06, -0.08])
     turn = 1.02 * np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]])
     pad = replace(recording, readings=recording.readings * gains)
     # Places are those that the localizer itself finds, so that nothing but the correction is to be found.
     places = localizer.predict_features(localizer.scaled_features(recording)).positions_mm
-    moved = ((places - scaling.origin_mm) / scaling.span_mm) @ turn.T + shift
-    moved = moved * scaling.span_mm + scaling.origin_mm
+    moved = ((places - scaling.origin_mm) / scaling.scale_mm) @ turn.T + shift
+    moved = moved * scaling.scale_mm + scaling.origin_mm
     found = fit_correction(localizer, localizer.raw_features(pad), moved)
-    np.testing.assert_allclose(found.scaler.spread[:, 0] / scaling.spread[:, 0], gains, rtol=0.02)
+    np.testing.assert_allclose(found.scaler.scale_v[:, 0] / scaling.scale_v[:, 0], gains, rtol=0.02)
     np.testing.assert_allclose(
         found.scaled_features(pad).inputs, localizer.scaled_features(recording).inputs, atol=0.15
     )
@@ -167,25 +166,25 @@ def test_a_known_correction_is_found(localizer: LocalizerModel, recording: Recor
     # The table is turned with the pad.
     at = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
     one, other = (each.table.reshape(*each.table.shape[:2], -1) for each in (localizer, found))
-    expected = looked_up(one, at)
-    np.testing.assert_allclose(looked_up(other, at @ turn.T + shift), expected, atol=0.05 * np.ptp(expected))
+    expected = interpolate_grid(one, at)
+    np.testing.assert_allclose(interpolate_grid(other, at @ turn.T + shift), expected, atol=0.05 * np.ptp(expected))
 
 
-def test_adapting_weighs_new_presses_and_leaves_lost_fibres_alone(localizer, recording, monkeypatch) -> None:
+def test_fine_tune_weighs_new_presses_and_ignores_masked_fibres(localizer, recording, monkeypatch) -> None:
     presses = localizer.scaled_features(recording)[NEW]
-    targets = localizer.scaler.targets(recording.presses_mm[NEW])
+    targets = localizer.scaler.scale_targets(recording.presses_mm[NEW])
     spoilt, dead = presses.inputs.copy(), presses.fibre_mask.copy()
     spoilt[:, 1], dead[:, 1] = np.nan, False
     samples = TrainingPresses(spoilt, dead, targets)
-    weights = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
+    weights = fine_tune(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
     assert all(np.isfinite(weight).all() for weight in weights.values())
     assert not np.array_equal(weights["last.w"], localizer.weights["last.w"])
-    places = localizer.scaler.targets(recording.presses_mm[NEW] + 3.0)
+    places = localizer.scaler.scale_targets(recording.presses_mm[NEW] + 3.0)
     samples = TrainingPresses(presses.inputs, presses.fibre_mask, places)
     shifts = []
     for old in (0.0, 1e18):
-        monkeypatch.setattr(fine_tuning, "OLD_PRESSES", old)
-        now = adapt(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
+        monkeypatch.setattr(training, "PRIOR_PRESSES", old)
+        now = fine_tune(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
         found = replace(localizer, weights=now, bayes=None, residual_network={}).predict_features(presses).positions_mm
         plain = replace(localizer, bayes=None, residual_network={}).predict_features(presses).positions_mm
         shifts.append((found - plain).mean())
@@ -193,7 +192,7 @@ def test_adapting_weighs_new_presses_and_leaves_lost_fibres_alone(localizer, rec
     assert abs(shifts[1]) < 0.2 * shifts[0]
 
 
-def test_the_command_writes_a_whole_model(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
+def test_recalibrate_command_writes_a_model(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
     localizer.save(tmp_path / "old")
     known_only(remade(recording), slice(0, 20)).save(tmp_path / "new", {})
     command = ("sense", "recalibrate", "--model", "old", "new", "--out")
@@ -209,7 +208,7 @@ def test_the_command_writes_a_whole_model(localizer: LocalizerModel, recording: 
 
 
 @pytest.mark.slow
-def test_several_depths_are_followed_known_or_not(deep_localizer: LocalizerModel, deep_recording: Recording) -> None:
+def test_recalibrate_follows_depths_known_or_not(deep_localizer: LocalizerModel, deep_recording: Recording) -> None:
     names = ("presses_mm", "down_command", "up_command", "depths_mm", "forces_n")
     few = {name: getattr(deep_recording, name)[:40] for name in names}
     later = replace(deep_recording, **few, reached_mm=np.empty(0))

@@ -1,19 +1,18 @@
-"""The pad's response: a smooth map and a linear memory are found again from presses made of them."""
+"""The response model recovers a smooth response and a linear history from presses made of them."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.features import (
+from padforge.sense.localizer.response_model import (
+    GRID_CELLS,
     RIDGE_HISTORY,
-    STEPS,
     ResponseModel,
-    TrainingPresses,
-    as_unseen,
-    looked_up,
-    settled,
+    interpolate_grid,
+    remove_history,
 )
+from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
 
 FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 9000
 Made = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -36,27 +35,27 @@ def made() -> Made:
     return places, windows + 0.05 * rng.standard_normal(windows.shape), history, memory
 
 
-def test_map_and_memory_are_found_again(made: Made) -> None:
+def test_fit_recovers_response_and_history(made: Made) -> None:
     places, windows, history, memory = made
     found = ResponseModel.fit(places, windows, history, np.ones((PRESSES, FIBRES), dtype=bool))
     spread = history.std(axis=0)[:, :, None]
     kept = PRESSES / (PRESSES + RIDGE_HISTORY)  # the rest is the ridge's
-    assert np.abs((found.memory - kept * memory) * spread).max() < 0.02
-    assert found.usual == pytest.approx(history.mean(axis=0))
-    inner = slice(STEPS // 4, -STEPS // 4)
-    grid = np.linspace(-1, 1, STEPS + 1)[inner]
+    assert np.abs((found.history_coef - kept * memory) * spread).max() < 0.02
+    assert found.history_mean_v == pytest.approx(history.mean(axis=0))
+    inner = slice(GRID_CELLS // 4, -GRID_CELLS // 4)
+    grid = np.linspace(-1, 1, GRID_CELLS + 1)[inner]
     at = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)
     expected = answer(at.reshape(-1, 2)).reshape(len(grid), len(grid), FIBRES, WINDOWS)
     assert np.abs(found.table[inner, inner] - expected).max() < 0.08
-    # settled windows depend on the place only
-    left = settled(windows, history, found.memory / kept, found.usual) - answer(places)
+    # windows without history depend on the place only
+    left = remove_history(windows, history, found.history_coef / kept, found.history_mean_v) - answer(places)
     assert left.std() < 0.06
     history[:] = history[:1]  # which tells nothing then
     still = ResponseModel.fit(places[:500], windows[:500], history[:500], np.ones((500, FIBRES), dtype=bool))
-    assert not still.memory.any()
+    assert not still.history_coef.any()
 
 
-def test_gains_are_told_by_the_history_and_answers_in_proportion_to_depth_are_one_table() -> None:
+def test_fit_recovers_sensitivity_modulation_and_depth() -> None:
     """A fibre answers by 0.3 more for a spread of its history while the probe rests, by 0.1 when it left.
 
     Another one answers 0.1 V per mm at any place, to presses of 1 to 4 mm, none of which is of 2 mm.
@@ -70,7 +69,7 @@ def test_gains_are_told_by_the_history_and_answers_in_proportion_to_depth_are_on
     found = ResponseModel.fit(places, windows, history, fibre_mask, phases=phases)
     assert found.table.shape[3] == WINDOWS + len(phases)
     assert not found.table[..., WINDOWS:].any()
-    shown = settled(windows, history, found.memory, found.usual)
+    shown = remove_history(windows, history, found.history_coef, found.history_mean_v)
     assert shown.shape == (FEW, FIBRES, WINDOWS + len(phases))
     rested, left = shown[:, 0, WINDOWS:].T
     assert np.corrcoef(rested, history[:, 0, 0])[0, 1] > 0.95
@@ -85,7 +84,7 @@ def test_gains_are_told_by_the_history_and_answers_in_proportion_to_depth_are_on
     assert model.table.mean() == pytest.approx(0.2, rel=0.02)
 
 
-def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
+def test_fit_ignores_masked_presses(made: Made) -> None:
     places, windows, history, _ = (part[:FEW] for part in made)
     fibre_mask = np.ones((FEW, FIBRES), dtype=bool)
     fibre_mask[::3, 0] = False
@@ -93,8 +92,8 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
     windows[::3, 0], history[::3, 0] = 99.0, -99.0
     after = ResponseModel.fit(places, windows, history, fibre_mask)
     assert np.array_equal(before.table, after.table)
-    assert np.array_equal(before.memory, after.memory)
-    assert after.usual[0] == pytest.approx(history[fibre_mask[:, 0], 0].mean(axis=0))
+    assert np.array_equal(before.history_coef, after.history_coef)
+    assert after.history_mean_v[0] == pytest.approx(history[fibre_mask[:, 0], 0].mean(axis=0))
     fibre_mask[:, 1] = False
     gone = ResponseModel.fit(places, windows, history, fibre_mask)
     assert not gone.table[:, :, 1].any()
@@ -103,19 +102,19 @@ def test_a_fibre_learns_only_from_presses_in_which_it_lived(made: Made) -> None:
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 999), x=st.floats(-1, 1), y=st.floats(-1, 1))
-def test_a_table_is_looked_up_between_its_entries(seed: int, x: float, y: float) -> None:
+def test_interpolate_grid_is_bilinear(seed: int, x: float, y: float) -> None:
     """Against a bilinear function, which linear interpolation gives exactly."""
     a, b, c, d = np.random.default_rng(seed).standard_normal(4)
     grid = np.linspace(-1, 1, 9)
     u, v = np.meshgrid(grid, grid, indexing="ij")
-    found = looked_up((a + b * u + c * v + d * u * v)[:, :, None], np.array([[x, y]]))
+    found = interpolate_grid((a + b * u + c * v + d * u * v)[:, :, None], np.array([[x, y]]))
     assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
 
 
 def pressed() -> tuple[np.ndarray, np.ndarray]:
     """Places that the table has an entry for, some of them pressed twice, and what fibres gave there."""
     rng = np.random.default_rng(0)
-    places = rng.integers(-STEPS // 2, STEPS // 2, (90, 2)) / (STEPS / 2)
+    places = rng.integers(-GRID_CELLS // 2, GRID_CELLS // 2, (90, 2)) / (GRID_CELLS / 2)
     places[1::9] = places[0::9]
     return places, np.sin(3 * places[:, :1, None] + np.arange(3)) + rng.standard_normal((90, FIBRES, 3))
 
@@ -125,22 +124,22 @@ def table_of(places: np.ndarray, windows: np.ndarray) -> np.ndarray:
     return ResponseModel.fit(places, windows, nothing, fibre_mask).table.astype(np.float32)
 
 
-def test_presses_are_as_far_off_as_from_a_table_fitted_without_them() -> None:
+def test_leave_one_out_residuals_are_those_of_fits_without_them() -> None:
     places, windows = pressed()
     fibre_mask = np.ones((90, FIBRES), dtype=bool)
     table = table_of(places, windows)
     presses = TrainingPresses(windows.astype(np.float32), fibre_mask, places.astype(np.float32))
     flat = table.reshape(*table.shape[:2], -1)
-    rest = as_unseen(presses, table).inputs - looked_up(flat, places).reshape(windows.shape)
+    rest = leave_one_out_residuals(presses, table).inputs - interpolate_grid(flat, places).reshape(windows.shape)
     for press in (0, 4, 17):
         others = (places != places[press]).any(axis=1)
         without = table_of(places[others], windows[others])
-        expected = looked_up(without.reshape(*table.shape[:2], -1), places[[press]]).reshape(FIBRES, 3)
+        expected = interpolate_grid(without.reshape(*table.shape[:2], -1), places[[press]]).reshape(FIBRES, 3)
         same = (places == places[press]).all(axis=1)
         # Of several presses at one place, left out together, their mean stands to the table as each of them does here.
         np.testing.assert_allclose(rest[same].mean(axis=0), windows[same].mean(axis=0) - expected, atol=0.02, rtol=0.02)
     # What no table expects is left as it was.
     more = np.pad(windows, ((0, 0), (0, 0), (0, 1)), constant_values=0.7).astype(np.float32)
     padded = np.pad(table, ((0, 0), (0, 0), (0, 0), (0, 1)))
-    found = as_unseen(TrainingPresses(more, fibre_mask, places.astype(np.float32)), padded).inputs
+    found = leave_one_out_residuals(TrainingPresses(more, fibre_mask, places.astype(np.float32)), padded).inputs
     assert np.array_equal(found[:, :, -1], more[:, :, -1])

@@ -28,7 +28,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def mean_of(part: dict) -> float:
-    cells = part["by_place"]
+    cells = part["by_position"]
     return float(np.average([cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells]))
 
 
@@ -40,7 +40,7 @@ def test_one_network_is_judged_as_by_evaluate(localizer: LocalizerModel, recordi
     assert list(document["ways"]) == [ONE]
     way = document["ways"][ONE]
     assert (way["errors"], way["by_subset"]) == (expected["errors"], expected["by_subset"])
-    assert way["maps"][0] == {"failed": [], "by_place": expected["by_place"]}
+    assert way["maps"][0] == {"failed": [], "by_position": expected["by_position"]}
     worst = max((each for each in expected["by_subset"] if len(each["failed"]) == 2), key=lambda each: each["mean_mm"])
     assert way["maps"][2]["failed"] == worst["failed"]
     assert mean_of(way["maps"][2]) == pytest.approx(worst["mean_mm"])
@@ -183,7 +183,7 @@ def test_maps_of_errors_have_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fibre_loss_figure, "save_figure", lambda figure, path: drawn.append(figure))
     errors = {"errors": [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}], "by_subset": [{"failed": [], "mean_mm": 1.0}]}
     cells = [{"x_mm": 0.0, "y_mm": y_mm, "mean_mm": mean_mm} for y_mm, mean_mm in ((-5.0, 1.0), (5.0, 9.0))]
-    ways = {"one network": errors | {"maps": [{"failed": [], "by_place": cells}]}}
+    ways = {"one network": errors | {"maps": [{"failed": [], "by_position": cells}]}}
     fibre_loss_figure.draw_fibre_loss({"ways": ways, "test_presses": 2}, Path("none.png"))
     (image,) = (image for axes in drawn[0].axes for image in axes.images)
     assert image.origin == "lower"

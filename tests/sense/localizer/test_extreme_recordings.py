@@ -9,9 +9,10 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, recalibrate
-from padforge.sense.localizer import training as fine_tuning
-from padforge.sense.localizer.features import FEATURES, ResponseModel
+from padforge.sense.localizer import training
+from padforge.sense.localizer.features import FEATURES
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.response_model import ResponseModel
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
 
@@ -58,13 +59,13 @@ def require_finite(localizer: LocalizerModel, recording: Recording, document: An
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_the_worst_recordings_are_located_and_evaluated(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
+def test_predict_and_evaluate_stay_finite(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
     one = worst(seed, brief)
     require_finite(localizer, one, evaluate(localizer, one, (0, 3)) if one.has_position.any() else ())
 
 
 @pytest.mark.parametrize(("seed", "features"), enumerate([*FEATURES, *FEATURES]))
-def test_the_worst_recordings_teach_or_are_refused(brief: Recording, seed: int, features: str) -> None:
+def test_calibrate_learns_or_refuses(brief: Recording, seed: int, features: str) -> None:
     one = worst(seed, brief)
     try:
         localizer, document = calibrate(one, TINY.model_copy(update={"features": features}))
@@ -75,10 +76,10 @@ def test_the_worst_recordings_teach_or_are_refused(brief: Recording, seed: int, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_the_worst_recordings_are_followed_or_refused(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
+def test_recalibrate_follows_or_refuses(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
     one = worst(seed, brief)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(fine_tuning, "STEPS", 15)
+        patched.setattr(training, "FINE_TUNING_STEPS", 15)
         try:
             now, document = recalibrate(localizer, one)
         except InputError:
@@ -88,8 +89,8 @@ def test_the_worst_recordings_are_followed_or_refused(localizer: LocalizerModel,
 
 
 @pytest.mark.slow
-def test_many_presses_take_memory_in_parts() -> None:
-    """The bumps of all of them at once would take 350 MB, and as much again beside their history."""
+def test_fit_takes_memory_in_chunks() -> None:
+    """The basis functions of all of them at once would take 350 MB, and as much again beside their history."""
     rng, presses = np.random.default_rng(0), 100_000
     windows, fibre_mask = rng.standard_normal((presses, 1, 3)), np.ones((presses, 1), dtype=bool)
     tracemalloc.start()

@@ -1,4 +1,4 @@
-"""The observer: of linear answers it finds what least squares find, of others what a fine grid finds."""
+"""The Bayesian localizer finds what least squares find of linear responses, and what a fine grid finds of others."""
 
 from collections.abc import Callable
 
@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.bayes import BEFOREHAND, TOLD, BayesianLocalizer
+from padforge.sense.localizer.bayes import N_SUMMARY, PRIOR_WEIGHT, BayesianLocalizer
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
-Answer = Callable[[np.ndarray], np.ndarray]
+Response = Callable[[np.ndarray], np.ndarray]
 
 
 def linear(places: np.ndarray) -> np.ndarray:
@@ -26,8 +26,8 @@ def waves(places: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=1).reshape(len(places), FIBRES, WINDOWS)
 
 
-def fitted(answer: Answer, noise: float = NOISE, seed: int = 0) -> "Fitted":
-    """An observer of a pad that answers so, with new presses: inputs and places."""
+def fitted(answer: Response, noise: float = NOISE, seed: int = 0) -> "Fitted":
+    """A Bayesian localizer of a pad of this response, with new presses: inputs and positions."""
     rng = np.random.default_rng(seed)
     grid = np.linspace(-1, 1, SIDE)
     at = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -43,23 +43,23 @@ Fitted = tuple[BayesianLocalizer, np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def observed() -> Fitted:
+def fitted_waves() -> Fitted:
     return fitted(waves)
 
 
 @pytest.fixture(scope="module")
-def observed_line() -> Fitted:
+def fitted_line() -> Fitted:
     return fitted(linear)
 
 
 @pytest.mark.parametrize("lost", [(), (0,), (1, 3), (0, 1, 2)])
-def test_linear_answers_are_solved_as_by_least_squares(observed_line: Fitted, lost: tuple[int, ...]) -> None:
-    bayes, inputs, places = observed_line
+def test_predict_solves_least_squares_of_linear_responses(fitted_line: Fitted, lost: tuple[int, ...]) -> None:
+    bayes, inputs, places = fitted_line
     inner = (np.abs(places) < 0.7).all(axis=1)
     inputs, places = inputs[inner], places[inner]
     fibre_mask = np.ones((len(inputs), FIBRES), dtype=bool)
     fibre_mask[:, list(lost)] = False
-    found, told = bayes(inputs, fibre_mask)
+    found, summary = bayes.predict(inputs, fibre_mask)
     kept = [fibre for fibre in range(FIBRES) if fibre not in lost]
     slopes = linear(np.eye(2))[:, kept].reshape(2, -1)
     solved = np.linalg.solve(slopes @ slopes.T, slopes @ inputs[:, kept].reshape(len(inputs), -1).T).T
@@ -67,14 +67,14 @@ def test_linear_answers_are_solved_as_by_least_squares(observed_line: Fitted, lo
     # What the grid tells counts a little besides, and the scatter is that of some hundred presses nearby.
     assert np.abs(found - solved).mean() < 0.2 * np.sqrt(bound.mean())
     assert np.sqrt(((found - places) ** 2).mean()) < 1.05 * np.sqrt(bound.mean())
-    variance = np.exp(4 * (told[:, 2:4] - 1)).mean(axis=0)
-    np.testing.assert_allclose(variance, bound / (1 + BEFOREHAND), rtol=0.15)
+    variance = np.exp(4 * (summary[:, 2:4] - 1)).mean(axis=0)
+    np.testing.assert_allclose(variance, bound / (1 + PRIOR_WEIGHT), rtol=0.15)
 
 
-def test_other_answers_are_found_as_on_a_fine_grid(observed: Fitted) -> None:
-    bayes, inputs, places = observed
+def test_predict_finds_the_maximum_of_a_fine_grid(fitted_waves: Fitted) -> None:
+    bayes, inputs, places = fitted_waves
     inputs, places = inputs[:40], places[:40]
-    found, _ = bayes(inputs, np.ones((40, FIBRES), dtype=bool))
+    found, _ = bayes.predict(inputs, np.ones((40, FIBRES), dtype=bool))
     fine = np.linspace(-1, 1, 201)
     at = np.stack(np.meshgrid(fine, fine, indexing="ij"), axis=-1).reshape(-1, 2)
     answers = waves(at).reshape(len(at), -1)
@@ -84,7 +84,7 @@ def test_other_answers_are_found_as_on_a_fine_grid(observed: Fitted) -> None:
     assert off.mean() < 0.2 * np.hypot(*(likeliest - places).T).mean() + 0.5 * (fine[1] - fine[0])
 
 
-def test_places_that_answer_alike_are_all_thought_of() -> None:
+def test_predict_spreads_over_positions_of_equal_response() -> None:
     """Fibres tell how far a press is from the middle, but not on which side; or nothing, as they never answered."""
 
     def even(places: np.ndarray) -> np.ndarray:
@@ -92,9 +92,9 @@ def test_places_that_answer_alike_are_all_thought_of() -> None:
 
     bayes, _, _ = fitted(even)
     press = even(np.array([[0.6, 0.1]]))
-    found, told = bayes(press, np.ones((1, FIBRES), dtype=bool))
-    on_grid = np.exp(2 * (told[0, 6:8] - 1))  # standard deviations
-    assert abs(told[0, 4]) / 2 < 0.1
+    found, summary = bayes.predict(press, np.ones((1, FIBRES), dtype=bool))
+    on_grid = np.exp(2 * (summary[0, 6:8] - 1))  # standard deviations
+    assert abs(summary[0, 4]) / 2 < 0.1
     assert on_grid[0] == pytest.approx(0.6, rel=0.1)
     assert on_grid[1] < 0.1
     assert found[0, 1] == pytest.approx(0.1, abs=0.05)
@@ -103,12 +103,12 @@ def test_places_that_answer_alike_are_all_thought_of() -> None:
     places = rng.uniform(-1, 1, (50, 2))
     fibre_mask = np.tile([True, False], (50, 1))
     bayes = BayesianLocalizer.fit(table, np.zeros((50, 2, WINDOWS)), fibre_mask, places)
-    found, told = bayes(rng.standard_normal((5, 2, WINDOWS)), np.ones((5, 2), dtype=bool))
+    found, summary = bayes.predict(rng.standard_normal((5, 2, WINDOWS)), np.ones((5, 2), dtype=bool))
     np.testing.assert_allclose(found, np.tile(bayes.grid.mean(axis=0), (5, 1)), atol=1e-6)
-    assert np.isfinite(told).all()
+    assert np.isfinite(summary).all()
 
 
-def test_a_grid_position_stands_for_its_whole_cell() -> None:
+def test_grid_positions_stand_for_their_cells() -> None:
     """A fibre without noise that gives the position itself: what blurs it is where in its cell a press lies."""
     axis, nodes = np.linspace(-1, 1, SIDE), np.linspace(-1, 1, (SIDE + 1) // 2)
     table = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)[:, :, None]
@@ -116,60 +116,62 @@ def test_a_grid_position_stands_for_its_whole_cell() -> None:
     positions = rng.uniform(-1, 1, (PRESSES, 2))
     bayes = BayesianLocalizer.fit(table, positions[:, None], np.ones((PRESSES, 1), dtype=bool), positions)
     presses = rng.uniform(-0.8, 0.8, (50, 2))
-    _, told = bayes(presses[:, None], np.ones((50, 1), dtype=bool))
+    _, summary = bayes.predict(presses[:, None], np.ones((50, 1), dtype=bool))
     cell = nodes[1] - nodes[0]
     # Beside it the scatter that is taken for usual where there is none is little.
     likelihood = np.exp(-0.5 * (presses[:, :, None] - nodes) ** 2 / (cell**2 / 12))
     share = likelihood / likelihood.sum(axis=2, keepdims=True)
     mean = share @ nodes
-    np.testing.assert_allclose(told[:, 4:6] / 2, mean, atol=0.02 * cell)
-    np.testing.assert_allclose(np.exp(4 * (told[:, 6:8] - 1)), np.maximum(share @ nodes**2 - mean**2, 1e-4), rtol=0.12)
+    np.testing.assert_allclose(summary[:, 4:6] / 2, mean, atol=0.02 * cell)
+    np.testing.assert_allclose(
+        np.exp(4 * (summary[:, 6:8] - 1)), np.maximum(share @ nodes**2 - mean**2, 1e-4), rtol=0.12
+    )
 
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 999), size=st.sampled_from([0.1, 1.0, 1e4]))
-def test_lost_fibres_are_not_looked_at_and_torch_finds_the_same(observed: Fitted, seed: int, size: float) -> None:
+def test_predict_ignores_masked_fibres_and_agrees_with_torch(fitted_waves: Fitted, seed: int, size: float) -> None:
     """Of presses of the pad; others, however large, are put somewhere on it by both."""
-    bayes, inputs, _ = observed
+    bayes, inputs, _ = fitted_waves
     rng = np.random.default_rng(seed)
     fibre_mask = rng.random((20, FIBRES)) < 0.7
     press = inputs[rng.integers(len(inputs), size=20)].astype(np.float32)
     spoilt = np.where(fibre_mask[:, :, None], press, rng.choice([np.nan, np.inf, 1e4]))
-    expected = bayes(press.astype(np.float64), fibre_mask)
-    for one, other in zip(expected, bayes(spoilt, fibre_mask), strict=True):
+    expected = bayes.predict(press.astype(np.float64), fibre_mask)
+    for one, other in zip(expected, bayes.predict(spoilt, fibre_mask), strict=True):
         assert np.isfinite(one).all()
         assert np.array_equal(one, other)
-    in_torch = bayes.changed(torch.from_numpy)
-    found, told = in_torch(torch.from_numpy(press), torch.from_numpy(fibre_mask), torch)
+    in_torch = bayes.map_arrays(torch.from_numpy)
+    found, summary = in_torch.predict(torch.from_numpy(press), torch.from_numpy(fibre_mask), torch)
     np.testing.assert_allclose(found.numpy(), expected[0], atol=2e-3)
-    np.testing.assert_allclose(told.numpy(), expected[1], atol=1e-2)
-    assert told.shape == (20, TOLD)
+    np.testing.assert_allclose(summary.numpy(), expected[1], atol=1e-2)
+    assert summary.shape == (20, N_SUMMARY)
     wild = (size * rng.standard_normal(press.shape)).astype(np.float32)
     for xp, one, values in ((np, bayes, wild.astype(np.float64)), (torch, in_torch, torch.from_numpy(wild))):
-        place, about = one(values, fibre_mask if xp is np else torch.from_numpy(fibre_mask), xp)
+        place, about = one.predict(values, fibre_mask if xp is np else torch.from_numpy(fibre_mask), xp)
         assert np.abs(np.asarray(place)).max() <= 1 + 1e-6
         assert np.isfinite(np.asarray(about)).all()
 
 
 @pytest.mark.parametrize("places", [np.zeros((9, 2)), np.linspace([-1, 0], [1, 0], 9)], ids=["one place", "a line"])
-def test_presses_at_one_place_or_on_a_line_will_do(places: np.ndarray) -> None:
+def test_fit_takes_presses_on_a_point_or_line(places: np.ndarray) -> None:
     grid = np.linspace(-1, 1, SIDE)
     table = linear(np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2))
     table = table.reshape(SIDE, SIDE, FIBRES, WINDOWS)
     bayes = BayesianLocalizer.fit(table, linear(places), np.ones((9, FIBRES), dtype=bool), places)
-    found, told = bayes(linear(places), np.ones((9, FIBRES), dtype=bool))
+    found, summary = bayes.predict(linear(places), np.ones((9, FIBRES), dtype=bool))
     np.testing.assert_allclose(found, places, atol=0.02)
-    assert np.isfinite(told).all()
+    assert np.isfinite(summary).all()
 
 
-def test_places_may_be_called_otherwise_more_than_once(observed: Fitted) -> None:
-    bayes, inputs, _ = observed
+def test_transformed_can_be_repeated(fitted_waves: Fitted) -> None:
+    bayes, inputs, _ = fitted_waves
     turn, shift, fibre_mask = (
         np.array([[0.9, -0.2], [0.3, 1.1]]),
         np.array([0.1, -0.4]),
         np.ones((30, FIBRES), dtype=bool),
     )
-    place, told = bayes(inputs[:30], fibre_mask)
-    moved, as_before = bayes.moved(turn, shift).moved(turn, shift)(inputs[:30], fibre_mask)
+    place, summary = bayes.predict(inputs[:30], fibre_mask)
+    moved, as_before = bayes.transformed(turn, shift).transformed(turn, shift).predict(inputs[:30], fibre_mask)
     np.testing.assert_allclose(moved, (place @ turn.T + shift) @ turn.T + shift, atol=1e-6)
-    assert np.array_equal(told, as_before)
+    assert np.array_equal(summary, as_before)

@@ -1,0 +1,207 @@
+"""The estimator: a localizer with `fit`, `predict`, `score`, `evaluate`, `save` and `load`, as in scikit-learn."""
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from padforge.design.common.settings import validate
+from padforge.design.common.validation import InputError, check_float
+from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
+from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model
+from padforge.sense.localizer.evaluation import distances, evaluate
+from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.recording.recording import Recording
+from padforge.sense.settings import LocalizerSettings
+
+OPTIONS = tuple(name for name in LocalizerSettings.model_fields if name not in ("max_failures", "seed"))
+
+
+class Localizer:
+    """Localizer of presses, in the manner of scikit-learn's estimators.
+
+    Args:
+        max_failures: failed fibres that it is trained for.
+        random_state: seed of the split and of the training.
+        **options: other fields of `LocalizerSettings`, with their defaults; checked by `fit`.
+
+    Attributes:
+        model_: the trained `LocalizerModel`, after `fit` or `load`.
+        calibration_: the document of `calibration.json`, after `fit` to a recording.
+
+    Raises:
+        InputError: an option that `LocalizerSettings` has not.
+    """
+
+    model_: LocalizerModel
+    calibration_: dict[str, Any]
+
+    def __init__(self, max_failures: int = 3, random_state: int = 0, **options: Any) -> None:
+        for name in options.keys() - set(OPTIONS):
+            raise InputError(f"Localizer has no option {name}, expected one of {', '.join(OPTIONS)}")
+        self.max_failures, self.random_state = max_failures, random_state
+        for name in OPTIONS:
+            setattr(self, name, options.get(name, LocalizerSettings.model_fields[name].default))
+
+    @classmethod
+    def from_settings(cls, settings: LocalizerSettings) -> "Localizer":
+        """Make a localizer of the section `[localizer]` of `pad.toml`."""
+        options = settings.model_dump()
+        return cls(random_state=options.pop("seed"), **options)
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Return the arguments of the constructor by name."""
+        return {name: getattr(self, name) for name in ("max_failures", "random_state", *OPTIONS)}
+
+    def set_params(self, **params: Any) -> "Localizer":
+        """Set arguments of the constructor.
+
+        Raises:
+            InputError: there is no such argument.
+        """
+        self.__init__(**{**self.get_params(), **params})
+        return self
+
+    def __sklearn_tags__(self) -> Any:
+        from sklearn.utils import InputTags, RegressorTags, Tags, TargetTags  # only scikit-learn itself asks
+
+        return Tags(
+            estimator_type="regressor",
+            target_tags=TargetTags(required=True, two_d_labels=True, multi_output=True),
+            regressor_tags=RegressorTags(),
+            input_tags=InputTags(two_d_array=False, three_d_array=True, allow_nan=True),
+        )
+
+    def fit(
+        self,
+        X: "Recording | ArrayLike",
+        y: ArrayLike | None = None,
+        *,
+        time_budget: float | None = None,
+        on_progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> "Localizer":
+        """Train on a recording, a share of whose presses is held back for a test; or on arrays, without a test.
+
+        Args:
+            X: a recording; or (Q, C, F) features of presses, V, NaN where a fibre gave none.
+            y: (Q, 2) positions, mm, with arrays.
+            time_budget: seconds to train for, with as many members as that is good for.
+            on_progress: called with (steps done, steps in all); with a time budget, with seconds.
+
+        Raises:
+            InputError: an option or array out of range, too few presses, or a training that diverged.
+        """
+        params = self.get_params()
+        settings = validate(LocalizerSettings, {"seed": params.pop("random_state"), **params}, "[localizer]")
+        if isinstance(X, Recording):
+            if y is not None:
+                raise InputError("y is given beside a recording, which holds the positions; expected None")
+            self.model_, self.calibration_ = calibrate(X, settings, time_budget=time_budget, on_progress=on_progress)
+            return self
+        if settings.method != "ensemble":
+            raise InputError(f"method is {settings.method}, allowed with arrays is ensemble")
+        budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
+        features, positions_mm = _array_features(X), _array_positions(y)
+        if len(features) != len(positions_mm):
+            raise InputError(f"X has {len(features)} presses and y {len(positions_mm)}, expected as many")
+        digest = hashlib.sha256(features.windows.tobytes() + positions_mm.tobytes()).hexdigest()
+        data = CalibrationData(features, None, positions_mm, {}, "array", 1.0, digest)
+        rng = np.random.default_rng(settings.seed)
+        self.model_ = fit_model(data, np.arange(len(features)), settings, rng, on_progress, budget)
+        self.model_ = replace(self.model_, split=settings.split)
+        return self
+
+    def predict(self, X: "Recording | ArrayLike", failed: ArrayLike = ()) -> Localization:
+        """Predict the position of every press.
+
+        Args:
+            X: a recording; or (Q, C, F) features as those that were fitted, V.
+            failed: indices of fibres to mask in every press.
+
+        Raises:
+            InputError: not fitted, or as `LocalizerModel.predict`.
+        """
+        if isinstance(X, Recording):
+            return self._fitted.predict(X, failed)
+        model, features = self._fitted, _array_features(X)
+        if model.features != "array" or features.windows.shape[1:] != model.scaler.mean_v.shape:
+            raise InputError(
+                f"X has shape {features.windows.shape} for a localizer of {model.fibres} fibres and features "
+                f"{model.features}, expected a recording, or (Q, C, F) as it was fitted to"
+            )
+        return model.predict_features(model.scaler.transform(features), failed)
+
+    def score(self, X: "Recording | ArrayLike", y: ArrayLike | None = None) -> float:
+        """Return the negative mean error, mm: greater is better.
+
+        Args:
+            X: as `predict`.
+            y: (Q, 2) true positions, mm; None for those of a recording, of which presses of unknown position are left
+                out.
+        """
+        predicted = self.predict(X).positions_mm
+        true = X.presses_mm if isinstance(X, Recording) and y is None else _array_positions(y)
+        return -float(np.nanmean(distances(predicted, true)))
+
+    def evaluate(self, recording: Recording, max_failures: int | None = None) -> list[dict[str, Any]]:
+        """Return the rows "errors" of `evaluation_report`, one a number of failed fibres."""
+        return self.evaluation_report(recording, max_failures)["errors"]
+
+    def evaluation_report(self, recording: Recording, max_failures: int | None = None) -> dict[str, Any]:
+        """Evaluate on a recording, for every set of failed fibres.
+
+        Args:
+            recording: of the recording of the training, only the presses held back count.
+            max_failures: most fibres that are failed; None for those it was trained for.
+
+        Returns:
+            The document of `evaluation.evaluate`.
+
+        Raises:
+            InputError: not fitted, or as `evaluation.evaluate`.
+        """
+        model = self._fitted
+        most = len(model.interval_factors) - 1 if max_failures is None else max_failures
+        levels: Iterable[int] = range(min(most, model.fibres - 1) + 1)
+        return evaluate(model, recording, levels)
+
+    def save(self, folder: str | Path) -> None:
+        """Write `localizer.json` and `localizer.safetensors`; raises as `LocalizerModel.save`, or if not fitted."""
+        self._fitted.save(folder)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "Localizer":
+        """Read what `save` wrote; options that the files do not hold have their defaults."""
+        model = LocalizerModel.load(folder)
+        options = {} if model.features == "array" else {"features": model.features}
+        localizer = cls(len(model.interval_factors) - 1, method=model.method, split=model.split, **options)
+        localizer.model_ = model
+        return localizer
+
+    @property
+    def _fitted(self) -> LocalizerModel:
+        if not hasattr(self, "model_"):
+            raise InputError("the localizer is not fitted, expected fit or load before")
+        return self.model_
+
+
+def _array_features(X: ArrayLike) -> PressFeatures:
+    windows = check_numbers(X, np.float64, "X").astype(np.float64)
+    if windows.ndim != 3 or 0 in windows.shape[1:]:
+        raise InputError(f"X has shape {windows.shape}, expected (Q, C, F)")
+    check_magnitude("X", windows.reshape(len(windows), -1), MAX_VOLTS, "V", missing=True)
+    present = np.isfinite(windows).all(axis=2)
+    return PressFeatures(np.where(present[:, :, None], windows, 0.0), np.empty((*present.shape, 0)), present)
+
+
+def _array_positions(y: ArrayLike | None) -> Array:
+    positions_mm = check_numbers([] if y is None else y, np.float64, "y").astype(np.float64)
+    if positions_mm.ndim != 2 or positions_mm.shape[1] != 2:
+        raise InputError(f"y has shape {positions_mm.shape}, expected (Q, 2)")
+    check_magnitude("y", positions_mm, MAX_MM, "mm")
+    return positions_mm

@@ -1,0 +1,178 @@
+"""Response model of a pad: what each fibre answers to a press at a position, and what still shows of its history.
+
+The windows of a fibre are a sum of Gaussian radial basis functions of the position (in proportion to the depth, if
+depths vary) plus a linear function of its history, fitted together by ridge regression. Silicone creeps, so the history
+is subtracted before the windows are used. It also modulates the sensitivity: a fibre that was stretched a moment ago
+answers by a fifth more. That cannot be corrected before the position is known, so the modulation, a linear function of
+the history for each phase of a press, is an input of the networks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
+
+RBF_SIDE = 21
+"""Basis functions along a side of the pad."""
+RBF_STD = 2.0
+"""Their standard deviation, in distances between neighbours: wide enough that sums of them are smooth."""
+RIDGE_POSITION, RIDGE_HISTORY = 1.0, 300.0
+"""Penalties on squared weights, of basis functions and of standardized history. Features of the history are collinear:
+with a small penalty weights cancel each other, and a few hundred presses err by a tenth more."""
+GRID_CELLS = 60
+"""Cells along a side of the grid on which the response is tabulated."""
+_CHUNK = 16_384
+
+
+@dataclass(frozen=True)
+class ResponseModel:
+    """Fitted response of a pad.
+
+    Attributes:
+        table: (S, S, C, F + G), V, windows on a grid over [-1, 1] in x and y; 0 for the G modulations.
+        history_coef: (C, J, F + G), V/V, effect of a volt of history on the windows; and, with a minus sign, on the
+            relative sensitivity in each of G phases, 1/V.
+        history_mean_v: (C, J), history that the table is for.
+    """
+
+    table: Array
+    history_coef: Array
+    history_mean_v: Array
+
+    @classmethod
+    def fit(
+        cls,
+        positions: Array,
+        windows: Array,
+        history: Array,
+        fibre_mask: Mask,
+        relative_depth: Array | None = None,
+        phases: Sequence[slice] = (),
+    ) -> "ResponseModel":
+        """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
+
+        Args:
+            positions: (Q, 2) within [-1, 1].
+            windows: (Q, C, F), V.
+            history: (Q, C, J), V.
+            fibre_mask: (Q, C).
+            relative_depth: (Q,) depth of each press over that of the table; None if all are equal.
+            phases: windows whose sensitivity is modulated together.
+        """
+        fibres, pasts = history.shape[1:]
+        size, n_rbf = windows.shape[2], RBF_SIDE**2
+        grid_rbf = rbf_features(grid_positions(GRID_CELLS + 1).reshape(-1, 2))
+        history_mean = np.zeros((fibres, pasts))
+        history_coef = np.zeros((fibres, pasts, size + len(phases)))
+        table = np.zeros((len(grid_rbf), fibres, size + len(phases)))
+        penalty = np.diag(np.repeat([RIDGE_POSITION, RIDGE_HISTORY], [n_rbf, pasts]))
+        for fibre in np.flatnonzero(fibre_mask.any(axis=0)):
+            valid = fibre_mask[:, fibre]
+            past, response = history[valid, fibre], windows[valid, fibre]
+            history_mean[fibre] = past.mean(axis=0)
+            std = past.std(axis=0)
+            past = np.divide(past - history_mean[fibre], std, out=np.zeros_like(past), where=std > MIN_SCALE_V)
+            depth = None if relative_depth is None else relative_depth[valid]
+            gram, moments = _normal_equations(positions[valid], past, response, depth)
+            weights = np.linalg.solve(gram + penalty, moments)
+            modulation = []
+            if phases:
+                expected = _expected(positions[valid], weights[:n_rbf], depth)
+                residual = response - expected - past @ weights[n_rbf:]
+                modulation = [
+                    _sensitivity_modulation(expected[:, phase].mean(axis=1), residual[:, phase].mean(axis=1), past)
+                    for phase in phases
+                ]
+            coef = np.column_stack([weights[n_rbf:], *(-each for each in modulation)])
+            history_coef[fibre] = np.divide(
+                coef, std[:, None], out=np.zeros(coef.shape), where=std[:, None] > MIN_SCALE_V
+            )
+            table[:, fibre, :size] = grid_rbf @ weights[:n_rbf]
+        return cls(table.reshape(GRID_CELLS + 1, GRID_CELLS + 1, fibres, -1), history_coef, history_mean)
+
+
+def grid_positions(side: int) -> Array:
+    """Return the (side, side, 2) positions of a grid over [-1, 1] in x and y."""
+    axis = np.linspace(-1, 1, side)
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+
+
+def rbf_features(positions: Array) -> Array:
+    """Return the (Q, RBF_SIDE^2) values of Gaussian radial basis functions at (Q, 2) positions."""
+    centres = np.linspace(-1, 1, RBF_SIDE)
+    std = RBF_STD * (2 / (RBF_SIDE - 1))
+    x, y = np.exp(-0.5 * ((positions[:, :, None] - centres) / std) ** 2).transpose(1, 0, 2)
+    return (x[:, :, None] * y[:, None, :]).reshape(len(positions), -1)
+
+
+def remove_history(windows: Array, history: Array, history_coef: Array, history_mean_v: Array) -> Array:
+    """Return (Q, C, F + G) windows without the effect of their history, and the modulations of the sensitivity."""
+    n_phases = history_coef.shape[2] - windows.shape[2]
+    effect = np.einsum("qcj,cjf->qcf", history - history_mean_v, history_coef)
+    return np.pad(windows, ((0, 0), (0, 0), (0, n_phases))) - effect
+
+
+def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
+    """Interpolate a (S, S, D) table over [-1, 1] bilinearly at (B, 2) positions: (B, D).
+
+    Args:
+        table: values on the grid.
+        positions: where to interpolate; beyond the edge, the value at the edge.
+        xp: module of the arrays, numpy or torch.
+    """
+    side = table.shape[0]
+    cell = xp.clip((positions + 1) * ((side - 1) / 2), 0, side - 1 - 1e-3)
+    lower = xp.floor(cell)
+    x, y = (cell - lower).T[:, :, None]
+    corner = xp.asarray(lower[:, 0] * side + lower[:, 1], dtype=xp.int64)
+    flat = table.reshape(side * side, -1)
+    near = (1 - y) * flat[corner] + y * flat[corner + 1]
+    return (1 - x) * near + x * ((1 - y) * flat[corner + side] + y * flat[corner + side + 1])
+
+
+def leverages(positions: Array, relative_depth: Array | None = None) -> Array:
+    """Return the (Q,) leverages of presses in the fit, 0 to 1; presses at one position count together."""
+    empty = np.empty((len(positions), 0))
+    gram = _normal_equations(positions, empty, empty, relative_depth)[0] + RIDGE_POSITION * np.eye(RBF_SIDE**2)
+    single = np.empty(len(positions))
+    for rows, rbf in _scaled_rbf(positions, relative_depth):
+        single[rows] = (rbf * np.linalg.solve(gram, rbf.T).T).sum(axis=1)
+    _, position = np.unique(positions, axis=0, return_inverse=True)
+    return np.bincount(position.ravel(), single).astype(np.float64)[position.ravel()]
+
+
+def _scaled_rbf(positions: Array, relative_depth: Array | None) -> Any:
+    """Yield slices of presses and their basis functions times the depth, in chunks: they take kilobytes a press."""
+    for first in range(0, len(positions), _CHUNK):
+        rows = slice(first, first + _CHUNK)
+        rbf = rbf_features(positions[rows])
+        yield rows, rbf if relative_depth is None else relative_depth[rows, None] * rbf
+
+
+def _normal_equations(
+    positions: Array, past: Array, response: Array, relative_depth: Array | None
+) -> tuple[Array, Array]:
+    """Gram matrix X' X and moments X' response of the design matrix X of basis functions and history."""
+    gram = moments = np.zeros(())
+    for rows, rbf in _scaled_rbf(positions, relative_depth):
+        design_matrix = np.hstack([rbf, past[rows]])
+        gram, moments = gram + design_matrix.T @ design_matrix, moments + design_matrix.T @ response[rows]
+    return gram, moments
+
+
+def _expected(positions: Array, weights: Array, relative_depth: Array | None) -> Array:
+    expected = np.concatenate([rbf @ weights for _, rbf in _scaled_rbf(positions, None)])
+    return expected if relative_depth is None else relative_depth[:, None] * expected
+
+
+def _sensitivity_modulation(expected: Array, residual: Array, past: Array) -> Array:
+    """(J,) share by which a standard deviation of history strengthens (Q,) responses, fitted to (Q,) residuals."""
+    scale = expected.std()
+    if not past.shape[1] or scale <= MIN_SCALE_V:
+        return np.zeros(past.shape[1])
+    design_matrix = np.hstack([expected[:, None] / scale * past, past])  # an additive effect is no modulation
+    gram = design_matrix.T @ design_matrix + RIDGE_HISTORY * np.eye(design_matrix.shape[1])
+    return np.linalg.solve(gram, design_matrix.T @ residual)[: past.shape[1]] / scale

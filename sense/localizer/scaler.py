@@ -1,0 +1,232 @@
+"""Scaling of features to numbers of about 1, and of positions, depths and forces to the outputs of the networks.
+
+Where depths vary, the networks predict depth (and force) too, and features are not centred, so that they stay in
+proportion to the depth.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
+from pydantic_core import PydanticCustomError
+
+from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask
+from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
+
+MAX_INPUT = 1e4
+"""Largest scaled feature, in standard deviations; beyond lies no press, and features are clipped."""
+MAX_LEVERAGE = 0.9
+"""Of a press far from all others; its residual grows tenfold at most."""
+DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
+
+
+def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerializer]:
+    """Annotate an array that is nested lists of numbers from `low` to `high` in a document."""
+
+    def check(value: object) -> Array:
+        try:
+            array = np.array(value)
+        except ValueError:  # rows of several lengths
+            array = np.empty(0, dtype=object)
+        if array.dtype.kind not in "fi" or not np.all((array >= low) & (array <= high)):
+            message = "expected an array of numbers from {low} to {high}"
+            raise PydanticCustomError("array", message, {"low": f"{low:g}", "high": f"{high:g}"})
+        return array.astype(np.float64)
+
+    return PlainValidator(check), PlainSerializer(lambda array: array.tolist())
+
+
+@dataclass(frozen=True)
+class ScaledFeatures:
+    """Features of Q presses as the networks take them.
+
+    Attributes:
+        inputs: (Q, C, F + G), about 1.
+        fibre_mask: (Q, C), whether the fibre gave enough readings.
+    """
+
+    inputs: Floats
+    fibre_mask: Mask
+
+    def __getitem__(self, rows: slice | Indices) -> "ScaledFeatures":
+        return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows])
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+
+@dataclass(frozen=True)
+class TargetScaler:
+    """Scaling of a depth or force to [-1, 1].
+
+    Attributes:
+        name: one of `Recording.measures`, which ends in its unit.
+        origin: value that is 0 when scaled.
+        scale: difference that is 1 when scaled.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
+    name: Literal["depth_mm", "force_n"]
+    origin: Annotated[float, Field(ge=0, le=MAX_MM)]
+    scale: Annotated[float, Field(gt=0, le=MAX_MM)]
+
+    @classmethod
+    def fit(cls, name: str, values: Array) -> "TargetScaler":
+        """Fit to (Q,) values."""
+        low, high = float(values.min()), float(values.max())
+        return cls(name, (low + high) / 2, (high - low) / 2 or 1.0)  # pyright: ignore[reportArgumentType]
+
+    def transform(self, values: Array) -> Array:
+        """Scale (Q,) values."""
+        return (values - self.origin) / self.scale
+
+    def inverse_transform(self, scaled: Array) -> Array:
+        """Return the values of (Q,) scaled ones."""
+        return scaled * self.scale + self.origin
+
+
+@dataclass(frozen=True)
+class FeatureScaler:
+    """Scaling of features and targets, fitted to the presses of training.
+
+    Attributes:
+        mean_v: (C, F + G), V; the G modulations of sensitivity are not scaled.
+        scale_v: (C, F + G), V.
+        history_coef: (C, J, F + G), effect of a volt of history, see `ResponseModel`.
+        history_mean_v: (C, J), V.
+        origin_mm: (2,) position that is 0 when scaled.
+        scale_mm: distance that is 1 when scaled.
+        half_size_mm: (2,) half the width and height of the area that was pressed.
+        measures: scaling of depth, or of depth and force, where they are predicted.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
+    mean_v: Annotated[Array, *array_field(-2 * MAX_VOLTS, 2 * MAX_VOLTS)]
+    scale_v: Annotated[Array, *array_field(MIN_SCALE_V, 2 * MAX_VOLTS)]
+    history_coef: Annotated[Array, *array_field(-1e6, 1e6)]
+    history_mean_v: Annotated[Array, *array_field(-2 * MAX_VOLTS, 2 * MAX_VOLTS)]
+    origin_mm: Annotated[Array, *array_field(-MAX_MM, MAX_MM)]
+    scale_mm: Annotated[float, Field(gt=0, le=MAX_MM)]
+    half_size_mm: Annotated[Array, *array_field(0, MAX_MM)]
+    measures: Annotated[tuple[TargetScaler, ...], Field(max_length=2, strict=False)] = ()
+
+    @classmethod
+    def fit(
+        cls,
+        features: PressFeatures,
+        positions_mm: Array,
+        measures: Mapping[str, Array] | None = None,
+        phases: Sequence[slice] = (),
+    ) -> tuple["FeatureScaler", Floats]:
+        """Fit the response model of the pad and the scaling of its features.
+
+        A window is divided by the geometric mean of its own standard deviation and its fibre's, so that the fine
+        windows of a touch keep some of their smallness, and so of their noise.
+
+        Args:
+            features: of the presses of training.
+            positions_mm: (Q, 2).
+            measures: (Q,) of each of depth and force to be predicted.
+            phases: windows whose sensitivity is modulated together.
+
+        Returns:
+            The scaler, and the (S, S, C, F + G) scaled table of the response by position; where depths vary, for the
+            depth that is 0 when scaled.
+        """
+        targets = tuple(TargetScaler.fit(name, values) for name, values in (measures or {}).items())
+        low, high = positions_mm.min(axis=0), positions_mm.max(axis=0)
+        origin, scale_mm = (low + high) / 2, float((high - low).max() / 2) or 1.0
+        relative_depth = measures["depth_mm"] / targets[0].origin if measures else None
+        scaled_mm = (positions_mm - origin) / scale_mm
+        response = ResponseModel.fit(
+            scaled_mm, features.windows, features.history, features.fibre_mask, relative_depth, phases
+        )
+        history = response.history_coef, response.history_mean_v
+        windows = remove_history(features.windows, features.history, *history)[:, :, : features.windows.shape[2]]
+        mean = _masked_mean(windows, features.fibre_mask)
+        variance = _masked_mean((windows - mean) ** 2, features.fibre_mask)
+        scale = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
+        scale = np.where(scale >= MIN_SCALE_V, scale, 1.0)  # what never varied keeps its size
+        padding = ((0, 0), (0, len(phases)))
+        mean = np.pad(np.zeros_like(mean) if targets else mean, padding)
+        scale = np.pad(scale, padding, constant_values=1.0)
+        scaler = cls(mean, scale, *history, origin, scale_mm, (high - low) / 2, targets)
+        return scaler, scaler.scale(response.table)
+
+    def n_inputs(self, method: str) -> int:
+        """Return D, the inputs of a network: features and, of method "ensemble", the mask of the fibres."""
+        return self.mean_v.size + (len(self.mean_v) if method == "ensemble" else 0)
+
+    def transform(self, features: PressFeatures) -> ScaledFeatures:
+        """Remove the history from features in volts and scale them."""
+        windows = remove_history(features.windows, features.history, self.history_coef, self.history_mean_v)
+        return ScaledFeatures(self.scale(windows), features.fibre_mask)
+
+    def scale(self, windows: Array) -> Floats:
+        """Scale (..., C, F + G) windows without history and modulations."""
+        return np.clip((windows - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).astype(np.float32)
+
+    @property
+    def depth_gain(self) -> float:
+        """Relative growth of the response for a scaled depth that is 1 larger; 0 where depths do not vary."""
+        return self.measures[0].scale / self.measures[0].origin if self.measures else 0.0
+
+    def scale_targets(self, positions_mm: Array, measures: Mapping[str, Array] | None = None) -> Floats:
+        """Return (Q, 2 + T) scaled targets of (Q, 2) positions and (Q,) of each measure."""
+        columns = [each.transform((measures or {})[each.name]) for each in self.measures]
+        return np.column_stack([(positions_mm - self.origin_mm) / self.scale_mm, *columns]).astype(np.float32)
+
+    def positions_mm(self, targets: Floats) -> Array:
+        """Return the positions of (Q, 2) scaled ones, mm."""
+        return targets * self.scale_mm + self.origin_mm
+
+    def training_presses(
+        self, features: PressFeatures, positions_mm: Array, measures: Mapping[str, Array] | None = None
+    ) -> "TrainingPresses":
+        """Scale features and targets of presses."""
+        scaled = self.transform(features)
+        targets = self.scale_targets(positions_mm, measures)
+        return TrainingPresses(scaled.inputs, scaled.fibre_mask, targets, self.depth_gain)
+
+
+def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
+    """(C, F) means over the presses in which a fibre is valid; 0 for one that never is."""
+    total = np.where(fibre_mask[:, :, None], windows, 0.0).sum(axis=0)
+    return total / np.maximum(fibre_mask.sum(axis=0), 1)[:, None]
+
+
+@dataclass(frozen=True)
+class TrainingPresses:
+    """Scaled presses of known targets, to train or to check on.
+
+    Attributes:
+        inputs: (Q, C, F + G).
+        fibre_mask: (Q, C).
+        targets: (Q, 2 + T).
+        depth_gain: see `FeatureScaler.depth_gain`.
+    """
+
+    inputs: Floats
+    fibre_mask: Mask
+    targets: Floats
+    depth_gain: float = 0.0
+
+
+def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:
+    """Move presses as far from the response table as if it had been fitted without them.
+
+    The leave-one-out residual of a linear fit is the residual over 1 - leverage: of a few hundred presses, a third
+    more. All presses at one position are left out together.
+    """
+    targets = presses.targets.astype(np.float64)
+    positions, relative_depth = targets[:, :2], np.ones(len(targets))
+    if presses.depth_gain:
+        relative_depth += presses.depth_gain * targets[:, 2]
+    expected = interpolate_grid(table.reshape(*table.shape[:2], -1), positions).reshape(presses.inputs.shape)
+    expected = relative_depth[:, None, None] * expected
+    leverage = np.minimum(leverages(positions, relative_depth), MAX_LEVERAGE)[:, None, None]
+    residual = (presses.inputs - expected) / np.where(table.any(axis=(0, 1)), 1 - leverage, 1.0)
+    return replace(presses, inputs=(expected + residual).astype(np.float32))
