@@ -179,7 +179,9 @@ def teach(
         training_recording_sha256=recording.digest,
     )
     known = {name: recording.measures[name][checked] for name in lessons.measures}
-    factors = calibrate_intervals(localizer, scaling.transform(plain[checked]), recording.presses_mm[checked], levels, known)
+    factors = calibrate_intervals(
+        localizer, scaling.transform(plain[checked]), recording.presses_mm[checked], levels, known
+    )
     return Student(replace(localizer, interval_factors=factors), detector, budget.quantized)
 
 

@@ -23,7 +23,9 @@ def test_presses_are_seen_as_commanded_with_the_windows_of_the_features(recordin
     assert found.inputs.fibre_mask.all()
     assert (press_stream.WINDOWS, press_stream.MOST_V) == (features.DOWN, limits.MAX_VOLTS)
     assert features.REST == (-press_stream.REST, 0)
-    expected = features.window_means(recording.readings, recording.down_command, recording.up_command, features.FEATURES["causal"])
+    expected = features.window_means(
+        recording.readings, recording.down_command, recording.up_command, features.FEATURES["causal"]
+    )
     np.testing.assert_allclose(commanded(recording).windows, expected, atol=2e-6)
 
 
