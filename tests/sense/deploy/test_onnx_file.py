@@ -108,7 +108,7 @@ def test_the_file_says_what_it_is(exported: tuple[Path, Exported]) -> None:
 
 def test_what_is_off_or_does_not_suit_is_not_written(localizer, tmp_path, monkeypatch) -> None:
     path = tmp_path / "l.onnx"
-    with pytest.raises(InputError, match="method published, expected masked"):
+    with pytest.raises(InputError, match="method published, expected ensemble"):
         export_onnx(replace(localizer, method="published"), DIGEST, path)
     monkeypatch.setattr(onnx_file, "MOST_OFF_MM", 1e-9)
     with pytest.raises(Fault, match="not written, onnxruntime finds places"):
