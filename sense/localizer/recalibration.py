@@ -75,7 +75,7 @@ def recalibrate(
         InputError: too few presses of known position, or a recording that does not suit the localizer.
     """
     check_type("localizer", model, LocalizerModel)
-    known = np.flatnonzero(check_type("recording", recording, Recording).known)
+    known = np.flatnonzero(check_type("recording", recording, Recording).has_position)
     seed = check_int("seed", seed, 0, 2**32 - 1)
     if len(known) < MIN_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known position, expected at least {MIN_PRESSES}")

@@ -142,7 +142,9 @@ def _found(
             joint.update(number, round(step / total * steps[number]))
 
         training = trainings[number]
-        localizer = fit_recording(recording, training, options, np.random.default_rng([options.seed, len(training)]), report)
+        localizer = fit_recording(
+            recording, training, options, np.random.default_rng([options.seed, len(training)]), report
+        )
         return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
 
     longest_first = reversed(range(len(steps)))

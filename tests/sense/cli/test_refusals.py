@@ -162,7 +162,7 @@ def files_of(folder: Path) -> dict[Path, int]:
 def test_what_cannot_be_done_is_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
-    monkeypatch.setattr("padforge.sense.localizer.training.STEPS", 15)
+    monkeypatch.setattr("padforge.sense.localizer.training.FINE_TUNING_STEPS", 15)
     monkeypatch.setattr("padforge.sense.rig.boards.due.list_due_ports", list)
     monkeypatch.chdir(workshop)
     before = files_of(workshop)

@@ -45,7 +45,7 @@ def quick() -> Iterator[None]:
     """Few resamplings, and a coarse map of the answers."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("padforge.sense.studies.learning_curve.DRAWS", 40)
-        patched.setattr("padforge.sense.localizer.features.BUMPS", 7)
+        patched.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
         yield
 
 
