@@ -394,7 +394,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 @common.json_option
 @common.profile_option
 def identify(recording: Path, morphology: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Find from RECORDING how a printed pad was laid and wired, and what a press really does to it.
+    """Identify the twin of a printed pad from RECORDING: fibres as built, wiring, pose and sensitivity profile.
 
     \b
     padforge sense identify out/pad/recording --morphology out/pad/morphology.json
@@ -411,11 +411,11 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     with locked_folder(folder), common.progress() as bar:
         task = bar.add_task("identify", total=None, note="")
 
-        def report(what: str, done: int, of: int) -> None:
-            bar.update(task, completed=done, total=of, note=what)
+        def show(what: str, done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total, note=what)
 
         inputs = [path for path in (recording, morphology) if not path.is_dir()]
         document = identify_into(
-            read_recording(recording), pad, folder, seed or 0, inputs=inputs, report=report, force=force
+            read_recording(recording), pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force
         )
     common.show_result(document, identification_lines(document, folder), as_json)
