@@ -91,7 +91,7 @@ def header_lines(header: Header, budget: Budget) -> list[str]:
     ]
     for row in zip(*columns.values(), strict=True):
         means = "".join(f" {each['mean_mm']:{width}.2f}" for each in row)
-        lines.append(f"{row[0]['lost']:4d} {row[0]['subsets']:5d}{means}")
+        lines.append(f"{row[0]['n_failed']:4d} {row[0]['subsets']:5d}{means}")
     return [
         *lines,
         f"its own detector finds {errors['found']} of {errors['test_presses']} presses, "

@@ -267,7 +267,7 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
         f"error in mm on {document['test_presses']} presses{of} (split: {document['split']})",
         "lost  sets   mean    std    max median    p95  in r50  in r90",
         *(
-            f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+            f"{row['n_failed']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
             f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
             for row in document["errors"]
         ),
@@ -283,7 +283,7 @@ def measure_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         if names[0] in rows[0]:
             out += [f"error of {kind} in {unit}", "lost  sets   mean    p95  in r90"]
             out += [
-                f"{row['lost']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
+                f"{row['n_failed']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
                 f"{row[f'{kind}_within_r90']:7.1%}"
                 for row in rows
             ]

@@ -81,7 +81,7 @@ class ScalingTable(Settings):
 class ErrorRow(Settings):
     """A row of `errors`, see `evaluation.evaluate`."""
 
-    lost: int = Field(ge=0)
+    n_failed: int = Field(ge=0)
     subsets: int = Field(ge=1)
     mean_mm: Distance
     std_mm: Distance

@@ -335,7 +335,7 @@ def recalibration_lines(document: Mapping[str, Any]) -> list[str]:
         f"{document['presses']} new presses, each found by what was changed without it",
         "  ".join(names),
         *(
-            f"{old['lost']:4d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
+            f"{old['n_failed']:4d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
             f"{old['within_r90']:13.1%}  {new['within_r90']:12.1%}"
             for old, new in zip(document["before"], document["after"], strict=True)
         ),

@@ -10,7 +10,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.localizer.features import ScaledFeatures
-from padforge.sense.localizer.model import UNKNOWN, Localization, LocalizerModel, Measured, joined
+from padforge.sense.localizer.model import UNKNOWN, Localization, LocalizerModel, Measured, joined, write_localization
 
 
 def test_a_fibre_masked_or_without_readings_does_nothing(localizer: LocalizerModel, recording: Recording) -> None:
