@@ -1,11 +1,4 @@
-"""`padforge sense calibrate` and `evaluate`: learning places, and how well it went.
-
-`padforge sense locate`, `health` and `deploy`: what a recording says of presses and fibres, here and elsewhere.
-
-`padforge sense recalibrate`, `fibre-loss`, `learning-curve`: following a pad; what fibres and presses are worth.
-
-`padforge sense identify`: the edge where a recording becomes a twin.
-"""
+"""Commands of `padforge sense` that fit models to recordings, evaluate and apply them."""
 
 import re
 from functools import partial
@@ -34,18 +27,18 @@ from padforge.sense.cli.options import (
     fibre_indices,
     max_failures_option,
     model_option,
+    progress_bar,
     read_recording,
     recording_argument,
-    reported,
 )
 
 
 @click.command()
 @recording_argument
-@click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
-@click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
+@click.option("--method", type=click.Choice(METHODS), help="ensemble: one localizer for all failures; or as published.")
+@click.option("--features", type=click.Choice(FEATURES), help="Windows of press and release, to its end, of its onset.")
 @click.option(
-    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test."
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held out for the test."
 )
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
@@ -63,7 +56,7 @@ def calibrate(
     as_json: bool,
     **overrides: Any,
 ) -> None:
-    """Learn places from RECORDING and test on presses held back.
+    """Train a localizer on RECORDING, and test it on held-out presses.
 
     \b
     padforge sense calibrate out/pad/recording --test-split chronological
@@ -81,14 +74,14 @@ def calibrate(
     with locked_folder(folder):
         options = common.load_spec(spec).section(LocalizerSettings, **overrides)
         presses = read_recording(recording)
-        with reported("training") as report:
+        with progress_bar("training") as show:
             document = calibrate_into(
                 presses,
                 folder,
                 options,
                 time_budget=time_budget,
-                progress=report,
-                warn=partial(click.echo, err=True),
+                on_progress=show,
+                on_message=partial(click.echo, err=True),
                 force=force,
             )
     common.show_result(document, calibration_lines(document), as_json)
@@ -101,12 +94,12 @@ def calibrate(
 @common.json_option
 @common.profile_option
 def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
-    """Errors on RECORDING for every set of lost fibres.
+    """Errors on RECORDING for every set of failed fibres.
 
     \b
     padforge sense evaluate --model out/pad out/later/recording --max-failures 1
 
-    Of the recording the model was trained on, only the presses that were held back count.
+    On the recording that the model was trained on, only the held-out presses count.
     """
     from padforge.sense.localizer.evaluation import calibration_lines
     from padforge.sense.localizer.evaluation import evaluate as test
@@ -247,7 +240,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
         raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
     budget, options = Budget(flash, ram, quantize == "int8"), load_spec(spec).section(LocalizerSettings)
     opened = read_recording(recording)
-    with reported("training") as report:
+    with progress_bar("training") as report:
         header = export_header(localizer, digest, path, opened, budget, options, report)
     click.echo("\n".join([*header_lines(header, budget), f"localizer -> {path}"]))
 
@@ -279,7 +272,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
     check_writable(target)
     old, health, opened = LocalizerModel.load(model), health_in(model), open_recording(recording)
-    with reported("recalibrating") as report:
+    with progress_bar("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
     with atomic_files(target, without=health_files()) as folder:
         localizer.save(folder)
@@ -293,8 +286,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 
 @click.command("fibre-loss")
 @recording_argument
-@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for every loss.")
-@click.option("--retrain", is_flag=True, help="As published: another network for every set of lost fibres.")
+@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for all failures.")
+@click.option("--retrain", is_flag=True, help="As published: another network for every set of failed fibres.")
 @max_failures_option
 @click.option("--failed", type=FibreNumbers(), default=(), help="Map errors without these fibres too, from 1: as 2,5.")
 @common.seed_option
@@ -312,14 +305,14 @@ def fibre_loss(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Errors on RECORDING for every set of lost fibres, of one network or of networks retrained for each, or both.
+    """Errors on RECORDING for every set of failed fibres, by one network, by networks retrained for each, or by both.
 
     \b
     padforge sense fibre-loss out/pad/recording --model out/pad
 
     Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
-    worst set of each size, and without those fibres that --failed names. Retrained networks that are done are
-    kept when it is broken off, and the same command goes on from them.
+    worst set of each size, and without the fibres of --failed. Finished networks are kept after an interruption, and
+    the same command continues with them.
     """
     from padforge.design.common.files import atomic_files, check_writable, write_json
     from padforge.design.common.parallel import Checkpoints
@@ -335,7 +328,7 @@ def fibre_loss(
     check_writable(target)
     localizer = LocalizerModel.load(model) if model else None
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
-    with reported("networks") as report:
+    with progress_bar("networks") as show:
         document = fibre_loss_study(
             opened,
             localizer,
@@ -343,8 +336,8 @@ def fibre_loss(
             options=options,
             max_failures=max_failures,
             failed=fibre_indices(failed, opened.fibres),
-            keep_in=unfinished,
-            progress=report,
+            checkpoints=unfinished,
+            on_progress=show,
         )
     with atomic_files(target) as folder:
         write_json(folder / "fibre_loss.json", document)
@@ -361,7 +354,7 @@ def fibre_loss(
 @common.out_option()
 @common.json_option
 def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Path | None, as_json: bool) -> None:
-    """Errors by number of presses learnt from, and what recording more of them would bring.
+    """Errors by number of training presses, and what recording more of them would bring.
 
     \b
     padforge sense learning-curve out/pad/recording
@@ -377,8 +370,8 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     target = out or common.pad_folder(recording)
     check_writable(target)
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
-    with reported("training") as report:
-        document = study.learning_curve(opened, options, progress=report)
+    with progress_bar("training") as show:
+        document = study.learning_curve(opened, options, on_progress=show)
     with atomic_files(target) as folder:
         write_json(folder / "learning_curve.json", document)
         draw_learning_curve(document, folder / "learning_curve.png")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from padforge.design.common.command_line import out_option, pad_folder
-from padforge.sense.cli.options import FOLDER, read_recording, recording_argument, recording_line, say_note
+from padforge.sense.cli.options import FOLDER, echo_note, read_recording, recording_argument, recording_line
 
 if TYPE_CHECKING:
     from padforge.sense.formats.annotations import ModelFindings
@@ -65,7 +65,7 @@ def import_(file: Path, mapping: str, out: Path | None) -> None:
     folder = out or pad_folder(file) / "recording"
     refuse_existing(folder)
     recording = import_file(file, mapping)
-    say_note(recording, file)
+    echo_note(recording, file)
     if FOUND.items() <= recording.source.items():
         click.echo(f"{file}: does not say when the pad was pressed; presses were found in the readings", err=True)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))
@@ -118,7 +118,9 @@ def _findings(model: Path, recording: "Recording") -> "ModelFindings":
 
     known, faults = examined(model, recording) if has_health(model) else (None, [])
     localizer = LocalizerModel.load(model)
-    found = localizer.predict(recording, fibre_mask=fibre_mask_of(faults, len(recording.down_command), localizer.fibres))
+    found = localizer.predict(
+        recording, fibre_mask=fibre_mask_of(faults, len(recording.down_command), localizer.fibres)
+    )
     depth = found.measures.get("depth_mm")
     unknown = np.full(len(found.r90_mm), np.nan)
     return ModelFindings(

@@ -9,7 +9,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
+from padforge.sense.cli.options import FILE, FOLDER, progress_bar, recording_line, redrawn_lines, typed_keys
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -143,7 +143,7 @@ def _record_with(
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
         return _record_by_hand(setup, resume, virtual_hardware)
-    with reported("presses") as report:
+    with progress_bar("presses") as report:
         how = {"dry": dry_run, "resume": resume, "virtual_hardware": virtual_hardware, "report": report, "say": _warn}
         return operation.record(rig, setup, model, **how)
 
@@ -165,7 +165,7 @@ def _record_by_hand(setup: "RigConfig", resume: bool, emulated: bool) -> "Record
             look, answer = (lambda view: None), list
         page = stack.enter_context(LivePage(0, "hand.html", words.values()))
         _warn(f"page: {page.url} (q ends)")
-        draw, typed = stack.enter_context(drawn_anew()), stack.enter_context(typed_keys())
+        draw, typed = stack.enter_context(redrawn_lines()), stack.enter_context(typed_keys())
         latest = pad = pad_view(setup.pad, str(setup.out), bool(setup.rig.mirrored))
 
         @stack.push

@@ -94,8 +94,8 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     errors = [_error_cells(row, "median_mm", "p95_mm") + cells for row, cells in zip(rows, shares, strict=True)]
     body = [
         paragraph(
-            f"Errors on {document['test_presses']} {presses} never trained on ({split}).{one_network} Every position has"
-            " two radii that ought to hold the true one in 50 % and in 90 % of cases."
+            f"Errors on {document['test_presses']} {presses} never trained on ({split}).{one_network} Every position"
+            " has two radii that ought to hold the true one in 50 % and in 90 % of cases."
         ),
         table(head, errors),
         *_measure_errors(rows),

@@ -353,12 +353,12 @@ def _describe_recording(rows: Rows) -> str:
     errors = _listed([f"{row['mean_mm']:.2f} mm ({_method(row)})" for row in by_compensation])
     return (
         f"{best['recording']}, {best['kind']}: the least error on presses drawn at random is that of {_method(best)}, "
-        f"{best['mean_mm']:.2f} mm (standard deviation over networks {best['std_mm']:.2f} mm), and on the last ones that "
-        f"of {_method(best_last)}, {best_last['mean_last_mm']:.2f} mm. Each compensation with its best filter gives "
-        f"{errors}. With the best filter but without compensation the error is {plain['mean_mm']:.2f} mm, on the last "
-        f"presses {plain['mean_last_mm']:.2f} mm, which is {plain['mean_mm'] - best['mean_mm']:.2f} mm and "
-        f"{plain['mean_last_mm'] - best_last['mean_last_mm']:.2f} mm more than the best. With the best compensation, raw "
-        f"readings give {raw['mean_mm']:.2f} mm, and the best filter, {filtered['filter']}, "
+        f"{best['mean_mm']:.2f} mm (standard deviation over networks {best['std_mm']:.2f} mm), and on the last ones "
+        f"that of {_method(best_last)}, {best_last['mean_last_mm']:.2f} mm. Each compensation with its best filter "
+        f"gives {errors}. With the best filter but without compensation the error is {plain['mean_mm']:.2f} mm, on the "
+        f"last presses {plain['mean_last_mm']:.2f} mm, which is {plain['mean_mm'] - best['mean_mm']:.2f} mm and "
+        f"{plain['mean_last_mm'] - best_last['mean_last_mm']:.2f} mm more than the best. With the best compensation, "
+        f"raw readings give {raw['mean_mm']:.2f} mm, and the best filter, {filtered['filter']}, "
         f"{filtered['mean_mm']:.2f} mm."
     )
 

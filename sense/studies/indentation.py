@@ -40,7 +40,7 @@ INDENTERS = {
     "cone": Indenter("cone", angle_deg=22),
     "flat punch": Indenter("flat", radius=0.44),
 }
-"""Of about the same contact radius at the middle depth, 0.44 grid units, so that they differ by profile, not by size."""
+"""Of about the same contact radius at the middle depth, 0.44 grid units, so that they differ by profile alone."""
 FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}
 """Sides of each polygon; None for a circle."""
 SIZES = np.linspace(0.5, 0.9, 17)
@@ -212,16 +212,16 @@ def _describe_force(indenter: Indenter, settings: Mapping[str, Any], rows: list[
     size = "" if indenter.shape == "cone" else f" of radius {indenter.radius:g} grid units"
     noises = " or ".join(f"{noise:g}" for noise in settings["noise_counts"])
     text = [
-        f"A rigid {form}{size} is pressed {low:g} to {high:g} grid units deep at random positions. The signal of a fibre "
-        "is its lengthening by the deflected surface, read by a 12-bit converter whose full scale is the fibre's largest "
-        f"signal, with noise of {noises} counts. Networks of {settings['hidden']} neurons, of which the mean of "
-        f"{settings['members']} is taken, estimate x, y and depth from the readings' logarithms; they were trained on "
-        f"{settings['presses']} presses and tested on {settings['test']} others."
+        f"A rigid {form}{size} is pressed {low:g} to {high:g} grid units deep at random positions. The signal of a "
+        "fibre is its lengthening by the deflected surface, read by a 12-bit converter whose full scale is the fibre's "
+        f"largest signal, with noise of {noises} counts. Networks of {settings['hidden']} neurons, of which the mean "
+        f"of {settings['members']} is taken, estimate x, y and depth from the readings' logarithms; they were trained "
+        f"on {settings['presses']} presses and tested on {settings['test']} others."
     ]
     for row in rows:
         text.append(
-            f"{row['pad']}, noise of {_counts(row['noise_counts'])}: the error of the depth is {row['depth_mm']:.2f} mm "
-            f"(guessing the middle depth: {row['depth_guessed_mm']:.2f} mm), of the force {row['force_n']:.3f} N or "
+            f"{row['pad']}, noise of {_counts(row['noise_counts'])}: the error of the depth is {row['depth_mm']:.2f} "
+            f"mm (guessing the middle depth: {row['depth_guessed_mm']:.2f} mm), of the force {row['force_n']:.3f} N or "
             f"{row['force_percent']:.1f} % of its range (guessing: {row['force_guessed_percent']:.1f} %). That of the "
             f"position is {row['position_mm']:.2f} mm, {row['position_depth_known_mm']:.2f} mm where the depth is an "
             f"input, and {row['position_one_depth_mm']:.2f} mm where all presses are {(low + high) / 2:g} grid units "
@@ -393,9 +393,9 @@ def _describe_shape(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> 
         f"the surface, and a flat punch of radius {flat.radius:g} grid units, pressed {DEPTHS[0]:g} to {DEPTHS[1]:g} "
         "deep into an elastic half-space. Footprints: circle, square and triangle of equal area, that of a circle of "
         f"{SIZES[0]:g} to {SIZES[-1]:g} grid units radius, of one orientation, under the published contact model. "
-        f"Readings are whole counts of 12 bits with noise of {SHAPE_NOISE_COUNTS:g}. Position, depth and size are drawn "
-        f"for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} is "
-        f"taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
+        f"Readings are whole counts of 12 bits with noise of {SHAPE_NOISE_COUNTS:g}. Position, depth and size are "
+        f"drawn for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} "
+        f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
     ]
     for row in rows:
         text.append(

@@ -1,8 +1,8 @@
 """Learning curve: error against the number of training presses, and what recording more of them would bring.
 
-Localizers are trained on nested shares of the training presses and tested on the same presses. A power law with a floor,
-e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learning scaling is predictable, empirically, 2017)
-and is extrapolated to twice as many presses.
+Localizers are trained on nested shares of the training presses and tested on the same presses. A power law with a
+floor, e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learning scaling is predictable, empirically,
+2017) and is extrapolated to twice as many presses.
 """
 
 from collections.abc import Callable, Mapping, Sequence

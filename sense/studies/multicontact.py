@@ -256,7 +256,7 @@ def _errors_by_distance(errors_mm: Array, distances_mm: Array) -> dict[str, list
 
 
 def _resolution_mm(curve: Mapping[str, list[float]]) -> float | None:
-    """Return the distance from which on the mean error is less than a quarter of it; None if even the farthest is not."""
+    """Return the distance from which on the mean error is less than a quarter of it; None if it never is."""
     resolution = None
     for distance, error in zip(reversed(curve["distance_mm"]), reversed(curve["error_mm"]), strict=True):
         if error >= distance / 4:
@@ -291,8 +291,8 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
                 f"{best['resolution_mm']:.1f} mm on. "
             )
             + f"Of up to {settings['max_contacts']} contacts, read with noise of {settings['noise_counts']:g} of "
-            f"{ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted correctly (always the most frequent "
-            f"number: {counting['majority_percent']:.1f} %)."
+            f"{ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted correctly (always the most "
+            f"frequent number: {counting['majority_percent']:.1f} %)."
         )
     return text
 

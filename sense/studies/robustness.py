@@ -174,9 +174,9 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
     text = [
         f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses of a serpentine, "
         f"another one for every set of up to {most} failed fibres{sample}, and tested on {settings['test']} fresh "
-        f"presses; errors are in grid units ({settings['signals']} signals). Where there are few sets, each was trained "
-        f"several times, so that every mean is of at least {MIN_NETWORKS} networks. The last column is the paper's own "
-        "measure, taken over the serpentine, most of which was trained on."
+        f"presses; errors are in grid units ({settings['signals']} signals). Where there are few sets, each was "
+        f"trained several times, so that every mean is of at least {MIN_NETWORKS} networks. The last column is the "
+        "paper's own measure, taken over the serpentine, most of which was trained on."
     ]
     intact, worst = ({row["pad"]: row for row in rows if row["n_failed"] == level} for level in (0, most))
     for label, row in intact.items():

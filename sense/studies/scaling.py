@@ -182,12 +182,12 @@ def _error_map(grid: int, state: State) -> Array:
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     text = [
-        f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses, for every size of the "
-        f"surface alike, in at most {settings['epochs']} steps. The published method learns the signals of a serpentine "
-        "and is evaluated on it, most of which was trained on; the spread method learns each fibre's share of its "
-        f"family's signal from presses spread evenly, and is evaluated on {settings['test']} fresh ones. The shared "
-        "method learns from the same presses the position in the tile, by one network for all tiles. Errors are in grid "
-        "units."
+        f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses, for every size of "
+        f"the surface alike, in at most {settings['epochs']} steps. The published method learns the signals of a "
+        "serpentine and is evaluated on it, most of which was trained on; the spread method learns each fibre's share "
+        f"of its family's signal from presses spread evenly, and is evaluated on {settings['test']} fresh ones. The "
+        "shared method learns from the same presses the position in the tile, by one network for all tiles. Errors are "
+        "in grid units."
     ]
     for label in settings["pads"]:
         for method in METHODS:

@@ -1,4 +1,4 @@
-"""Frame of all studies: tasks that resume after an interruption, results as table, figure and text, and pads by name."""
+"""Frame of all studies: tasks that resume after an interruption, results as table, figure and text, pads by name."""
 
 import csv
 import hashlib

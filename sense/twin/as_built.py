@@ -226,7 +226,7 @@ class AsBuiltPad:
 
     @classmethod
     def from_plan(cls, plan: PadPlan, fibres: tuple[int, ...], transform: PlanTransform, width: float) -> "AsBuiltPad":
-        """Return a pad as planned, with a Gaussian profile of standard deviation `width`, grid units, and gains of 1."""
+        """Return a pad as planned, with gains of 1 and a Gaussian profile of standard deviation `width`, grid units."""
         step = SPLINE_STEP * width
         distance = np.linspace(0, (N_SPLINES + 1) * step, 100)
         gaussian = np.exp(-0.5 * (distance / width) ** 2)

@@ -1,8 +1,8 @@
 """Search for the wiring of a pad and its rough pose under the arm, without a first guess.
 
-A plan transform is scored by how well the planned fibres' responses under a Gaussian profile correlate with the measured
-ones: the mean over channels of squared correlations of one sign, each channel assigned to another fibre. Transforms on a
-grid are tried, and the best refined by Nelder-Mead.
+A plan transform is scored by how well the planned fibres' responses under a Gaussian profile correlate with the
+measured ones: the mean over channels of squared correlations of one sign, each channel assigned to another fibre.
+Transforms on a grid are tried, and the best refined by Nelder-Mead.
 """
 
 from collections.abc import Callable

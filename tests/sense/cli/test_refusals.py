@@ -125,9 +125,9 @@ SHORT = {
 
 
 @pytest.fixture(scope="module")
-def workshop(few_made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `few` has, and things that are not what they should be."""
-    folder = shutil.copytree(few_made, tmp_path_factory.mktemp("refused") / "workshop")
+    folder = shutil.copytree(few_presses, tmp_path_factory.mktemp("refused") / "workshop")
     (folder / "noise.mat").write_bytes(b"no matlab" * 100)
     (folder / "noise.csv").write_text("a,b\n1,2\n")
     (folder / "noise.txt").write_text("hello")
@@ -159,7 +159,7 @@ def files_of(folder: Path) -> dict[Path, int]:
 
 
 @pytest.mark.parametrize(("words", "said"), [row.split(" | ", 1) for row in ROWS.strip().splitlines()])
-def test_what_cannot_be_done_is_one_line(
+def test_invalid_command_fails_in_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
     monkeypatch.setattr("padforge.sense.localizer.training.STEPS", 15)

@@ -20,7 +20,7 @@ from padforge.sense.settings import RigSettings
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeConverter, Time
 
 
-def test_a_recording_lies_in_the_folder_of_its_pad(padforge_sense) -> None:
+def test_record_writes_into_the_folder_of_the_pad(padforge_sense) -> None:
     assert padforge_sense("record", "--presses", "4")[0] == 0
     assert Recording.open("out/pad/recording").source["rig"]["presses"] == 4
     Morphology.random(2, 3, 1).save(Path("mine/morphology.json"))
@@ -30,7 +30,7 @@ def test_a_recording_lies_in_the_folder_of_its_pad(padforge_sense) -> None:
     assert Recording.open("mine/recording").source["rig"]["seed"] == 7
 
 
-def test_a_twin_is_recorded_as_it_was_wired_and_another_pad_as_planned(padforge_sense) -> None:
+def test_record_of_a_twin_keeps_its_wiring_and_of_another_pad_the_plan(padforge_sense) -> None:
     twin = printed_pad(Morphology.random(2, 3, 5), np.random.default_rng(3))
     twin.save("twin.json")
     assert padforge_sense("record", "--twin", "twin.json", "--presses", "4", "--out", "own")[0] == 0
@@ -54,7 +54,7 @@ PRINTER = (
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
-def test_a_printer_is_practised_on_through_its_drivers(padforge_sense) -> None:
+def test_record_runs_a_virtual_printer(padforge_sense) -> None:
     pytest.importorskip("serial")
     Path("pad.toml").write_text(PRINTER)
     Morphology.straight(2).save("morphology.json")
@@ -73,7 +73,7 @@ def test_a_printer_is_practised_on_through_its_drivers(padforge_sense) -> None:
         ((0.0, 0.05, 150.0), None, 0, "no force stops the arm"),
     ],
 )
-def test_nothing_moves_before_the_tool_is_known(
+def test_record_moves_nothing_before_the_tool_is_known(
     padforge_sense, monkeypatch: pytest.MonkeyPatch, tcp_mm: object, max_force_n: object, code: int, said: str
 ) -> None:
     """The controller has the tip 150 mm from the flange; an arm whose force nobody watches is told."""
@@ -98,7 +98,7 @@ HAND = '[pad]\ngrid = 2\n[rig]\npresses = 2\nreadings_per_press = 10\nport = "/d
 
 
 @pytest.mark.slow
-def test_a_finger_records_through_the_drivers(padforge_sense) -> None:
+def test_record_runs_a_virtual_hand(padforge_sense) -> None:
     """In real time, which the board needs."""
     Path("pad.toml").write_text(HAND)
     by_hand = ("record", "--rig", "hand", "--virtual-hardware", "--out", "rec")
@@ -116,7 +116,7 @@ def test_a_finger_records_through_the_drivers(padforge_sense) -> None:
     assert "never written over" in err
 
 
-def test_each_device_is_looked_over_where_the_other_is_not_there(padforge_sense) -> None:
+def test_doctor_checks_each_device_without_the_other(padforge_sense) -> None:
     Path("rig.toml").write_text(
         '[rig]\nport = "no-such-port"\nprinter_port = "neither"\npad_mm = [0, 0]\ncontact_mm = 9\n'
         "box_mm = [-9, 9, -9, 9, 0, 99]\n"
@@ -128,7 +128,7 @@ def test_each_device_is_looked_over_where_the_other_is_not_there(padforge_sense)
 
 
 @pytest.mark.slow
-def test_the_board_alone_is_looked_over_for_a_hand(padforge_sense) -> None:
+def test_doctor_checks_the_board_alone_for_presses_by_hand(padforge_sense) -> None:
     Path("pad.toml").write_text(HAND)
     code, out, _ = padforge_sense("doctor", "--rig", "hand", "--virtual-hardware")
     assert code == 0
