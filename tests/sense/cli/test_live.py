@@ -99,7 +99,9 @@ def test_live_lines_number_fibres_from_one() -> None:
     assert lines[4] == "fibre 2 was dead"
 
 
-def test_live_shows_depth_and_force_of_models_that_estimate_them(padforge_sense, deep_localizer, deep_recording, views) -> None:
+def test_live_shows_depth_and_force_of_models_that_estimate_them(
+    padforge_sense, deep_localizer, deep_recording, views
+) -> None:
     deep_localizer.save("deep")
     first_presses(deep_recording, 40).save("rec", {})
     words = ("live", "--replay", "rec", "--speed", "1e6", "--port", "0", "--model", "deep")

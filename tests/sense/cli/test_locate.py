@@ -12,7 +12,10 @@ from padforge.sense.localizer.model import LocalizerModel
 
 
 def test_locate_excludes_fibres_by_number(few) -> None:
-    assert few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")[:2] == (0, "60 positions -> places.csv\n")
+    assert few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")[:2] == (
+        0,
+        "60 positions -> places.csv\n",
+    )
     table = np.genfromtxt("places.csv", delimiter=",", names=True)
     assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm")
     assert len(table) == 60

@@ -56,7 +56,9 @@ def stop(done: int, total: int, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SMALLEST)
-def test_run_resumes_every_study_with_the_same_result(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_resumes_every_study_with_the_same_result(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(drift, "MEMBERS", 2)
     monkeypatch.setattr(drift, "FILTERS", {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)})
     for module in (scaling, sensitivity):
