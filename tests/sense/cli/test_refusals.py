@@ -73,13 +73,13 @@ record --out pad.toml/rec                       | pad.toml is a file, expected a
 record --seed 9 --out rec                       | never written over
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
-record --twin twin.json --virtual-hardware       | --twin is of the simulated pad
+record --twin twin.json --virtual-hardware      | --twin is of the simulated pad
 record --twin torn.json                         | torn.json:
 record --twin straight.json                     | straight.json:
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --twin absent.json                       | absent.json:
 record --twin twin.json --morphology large.json | [pad] grid: got 270, input should be less
-record --rig mine --virtual-hardware             | --virtual-hardware: got --rig mine, allowed are simulated, ur5, printer
+record --rig mine --virtual-hardware            | --virtual-hardware: got --rig mine, allowed are simulated, ur5
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
 record --rig ur5 --spec none.toml               | --morphology is needed, of the pad under the arm: there is none at
 record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, the pad has 4 fibres
