@@ -6,17 +6,17 @@ compensation; the network is the published one throughout.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, add_title, style_axes
+from padforge.design.common.plotting import ALARM, CURVES, INK, add_title
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
@@ -32,7 +32,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.filters import running_median, total_variation
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads
+from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -71,16 +71,8 @@ TABLE_III = (
 )
 
 
-@dataclass(frozen=True)
-class PressSplit:
-    """Presses by index.
-
-    Attributes:
-        training: to train on.
-        validation: to stop the training by.
-        test: to test on, drawn at random.
-        last: to test on, the last ones of the recording.
-    """
+class PressSplit(NamedTuple):
+    """Presses by index: to train on, to stop the training by, and to test on, at random and the last ones."""
 
     training: Indices
     validation: Indices
@@ -410,9 +402,8 @@ def _draw_levels(axes: Axes, excerpt: Mapping[str, Any]) -> None:
     times_s, *levels = np.array(excerpt["levels"]).T
     for (name, colour), volts in zip(PHASES[:2], levels, strict=True):
         axes.scatter(times_s / 60, volts, s=2.5, color=colour, label=name, linewidths=0)
-    axes.set(xlabel="time (min)", ylabel="filtered (V)")
-    axes.set_title(f"{excerpt['recording']}, fibre {excerpt['fibre'] + 1}", loc="left", color=INK, fontsize=10)
-    style_axes(axes)
+    title = f"{excerpt['recording']}, fibre {excerpt['fibre'] + 1}"
+    label_axes(axes, title, xlabel="time (min)", ylabel="filtered (V)")
 
 
 def _draw_readings(axes: Axes, excerpt: Mapping[str, Any]) -> None:
@@ -427,8 +418,7 @@ def _draw_readings(axes: Axes, excerpt: Mapping[str, Any]) -> None:
         face = "none" if name == "after" else colour
         marker = {"color": colour, "markerfacecolor": face, "markersize": size, "label": name}
         axes.plot(samples[:, 0] - start, samples[:, 1], "o", **marker)
-    axes.set(xlabel=f"time since {start / 60:.1f} min (s)", ylabel="V")
-    style_axes(axes)
+    label_axes(axes, xlabel=f"time since {start / 60:.1f} min (s)", ylabel="V")
 
 
 def _draw_errors(axes: Axes, label: str, rows: Rows) -> None:
@@ -443,7 +433,5 @@ def _draw_errors(axes: Axes, label: str, rows: Rows) -> None:
             dot: dict[str, Any] = {"fmt": "o", "color": CURVES[number], "markerfacecolor": face, "markersize": 4.5}
             axes.errorbar(means, heights, xerr=stds, elinewidth=1, label=None if part else f"filter: {name}", **dot)
     axes.set_yticks(range(len(compensations)), compensations)
-    axes.set(ylim=(len(compensations) - 0.5, -0.5), xlim=(0, None), xlabel="mean error (mm)")
-    axes.set_title(f"{label}, {rows[0]['kind']}", loc="left", color=INK, fontsize=10)
-    axes.grid(axis="x", color=FAINT, linewidth=0.6)
-    style_axes(axes)
+    limits = {"ylim": (len(compensations) - 0.5, -0.5), "xlim": (0, None)}
+    label_axes(axes, f"{label}, {rows[0]['kind']}", "x", xlabel="mean error (mm)", **limits)

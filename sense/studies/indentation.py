@@ -1,7 +1,6 @@
 """Force and shape: whether the fibres that localize a press also tell how deep and hard it is, and with what object."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, draw_confusions, style_axes
+from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions
 from padforge.design.contact import signals
 from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from padforge.design.morphology import Morphology
@@ -24,6 +23,7 @@ from padforge.sense.studies.study import (
     confusion_matrix,
     describe_pads,
     fit_ensemble,
+    label_axes,
     quantize,
 )
 
@@ -49,23 +49,6 @@ SHAPE_NOISE_COUNTS = 1.0
 SETS = {"indenters": tuple(INDENTERS), "footprints": tuple(FOOTPRINTS)}
 
 
-@dataclass(frozen=True)
-class Training:
-    """Networks of the study of force, and what they are trained and tested on.
-
-    Attributes:
-        presses: training presses.
-        test: test presses.
-        hidden: neurons of a network.
-        epochs: of training.
-    """
-
-    presses: int = 2048
-    test: int = 1024
-    hidden: int = 50
-    epochs: int = 200
-
-
 def log_counts(counts: Array) -> Array:
     """Return logarithms of readings, to which a deeper press adds, as it multiplies all signals."""
     return np.log1p(counts / LOG_SCALE)
@@ -77,7 +60,10 @@ def force_study(
     indenter: Indenter | None = None,
     depths: tuple[float, float] = DEPTHS,
     noise_counts: Sequence[float] = (1.0, 4.0),
-    training: Training | None = None,
+    presses: int = 2048,
+    test: int = 1024,
+    hidden: int = 50,
+    epochs: int = 200,
     seed: int = 0,
 ) -> Study:
     """Estimate position, depth and force of presses of random depth, from the signals of the indentation model.
@@ -89,20 +75,23 @@ def force_study(
         indenter: a sphere of 0.7 grid units if None.
         depths: least and greatest, grid units.
         noise_counts: standard deviations of the readings' noise, in counts of a 12-bit converter.
-        training: networks and presses; the defaults of `Training` if None.
+        presses: training presses.
+        test: test presses.
+        hidden: neurons of a network.
+        epochs: of training.
         seed: of presses, noise and networks.
 
     Raises:
         InputError: depths that the indenter does not allow.
     """
-    indenter, training = indenter or Indenter(), training or Training()
+    indenter = indenter or Indenter()
     indenter.contact_radius(depths)
     middle = float(np.mean(depths))
     cases = (("depth unknown", depths, False), ("depth known", depths, True), ("one depth", (middle, middle), False))
     tasks = [
         Task(
             f"{label}, noise of {_counts(noise)}, {name}",
-            partial(_estimate_depth, pad, indenter, case_depths, is_known, noise, training, seed),
+            partial(_estimate_depth, pad, indenter, case_depths, is_known, noise, presses, test, hidden, epochs, seed),
         )
         for label, pad in pads.items()
         for noise in noise_counts
@@ -115,7 +104,10 @@ def force_study(
         "noise_counts": list(noise_counts),
         "reduced_modulus_kpa": REDUCED_MODULUS_KPA,
         "members": MEMBERS,
-        **asdict(training),
+        "presses": presses,
+        "test": test,
+        "hidden": hidden,
+        "epochs": epochs,
         "seed": seed,
     }
     conclude = partial(_conclude_force, dict(pads), indenter, settings)
@@ -128,7 +120,10 @@ def _estimate_depth(
     depths: tuple[float, float],
     is_known: bool,
     noise_counts: float,
-    training: Training,
+    training: int,
+    test: int,
+    hidden: int,
+    epochs: int,
     seed: int,
 ) -> State:
     """Return x, y and depth of the test presses, "pressed" and "predicted", without the depth where it is known.
@@ -136,16 +131,15 @@ def _estimate_depth(
     The full scale of a fibre is its largest signal in the training presses; shapes (T, 3) or (T, 2), grid units.
     """
     rng = np.random.default_rng([3, seed])
-    presses, count = training.presses, training.presses + training.test
-    positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
-    depth = rng.uniform(*depths, count)
+    positions = fresh_presses(between_fibres(pad.layout), training + test, int(rng.integers(2**32)))
+    depth = rng.uniform(*depths, training + test)
     responses = indented_signals(pad, positions, depth, indenter)
-    inputs = log_counts(quantize(responses, responses[:presses].max(axis=0), noise_counts, rng))
+    inputs = log_counts(quantize(responses, responses[:training].max(axis=0), noise_counts, rng))
     targets = np.column_stack([positions, depth])
     if is_known:
         inputs, targets = np.column_stack([inputs, depth]), positions
-    predict = fit_ensemble(inputs[:presses], targets[:presses], rng, training.hidden, training.epochs)
-    return {"pressed": targets[presses:], "predicted": predict(inputs[presses:])}
+    predict = fit_ensemble(inputs[:training], targets[:training], rng, hidden, epochs)
+    return {"pressed": targets[training:], "predicted": predict(inputs[training:])}
 
 
 def _counts(number: float) -> str:
@@ -252,10 +246,8 @@ def _draw_force(document: Mapping[str, Any]) -> Figure:
             axes.scatter(curve["pressed_mm"], curve["predicted_mm"], label=f"noise {curve['noise_counts']:g}", **dots)
         ends = [min(by_noise[0]["pressed_mm"]), max(by_noise[0]["pressed_mm"])]
         axes.plot(ends, ends, color=INK, linewidth=0.8)
-        axes.set_title(label, loc="left", color=INK, fontsize=10)
-        axes.set(xlabel="true depth (mm)", ylabel="" if column else "predicted depth (mm)")
+        label_axes(axes, label, xlabel="true depth (mm)", ylabel="" if column else "predicted depth (mm)")
         axes.legend(frameon=False, fontsize=8, markerscale=3, handletextpad=0.1)
-        style_axes(axes)
     axes = figure.add_subplot(grid[rows, :])
     for curve in curves:
         colour = CURVES[labels.index(curve["pad"]) % len(CURVES)]
@@ -263,10 +255,8 @@ def _draw_force(document: Mapping[str, Any]) -> Figure:
         name = f"{curve['pad']}, noise {curve['noise_counts']:g}"
         errors = [np.nan if error is None else error for error in curve["bin_position_mm"]]
         axes.plot(curve["bin_depth_mm"], errors, style, color=colour, marker="o", markersize=3.5, label=name)
-    axes.set(ylim=(0, None), xlabel="true depth (mm)", ylabel="mean error of the position (mm)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    label_axes(axes, grid="y", ylim=(0, None), xlabel="true depth (mm)", ylabel="mean error of the position (mm)")
     figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=columns)
-    style_axes(axes)
     add_title(figure, f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits")
     return figure
 

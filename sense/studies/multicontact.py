@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions, style_axes
+from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses
@@ -29,6 +29,7 @@ from padforge.sense.studies.study import (
     confusion_matrix,
     describe_pads,
     fit_ensemble,
+    label_axes,
     quantize,
 )
 
@@ -315,10 +316,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.plot(ends, ends / 2, "--", color=INK, linewidth=0.8, label="midpoint for both")
         axes.plot(ends, ends / 4, ":", color=INK, linewidth=0.8, label="a quarter of the distance")
         axes.set_ylim(0, 1.05 * highest)
-        axes.set_title(label, loc="left", color=INK, fontsize=10)
-        axes.set(xlabel="distance of the two contacts (mm)", ylabel="" if column else "mean error (mm)")
+        ylabel = "" if column else "mean error (mm)"
+        label_axes(axes, label, xlabel="distance of the two contacts (mm)", ylabel=ylabel)
         axes.legend(frameon=False, fontsize=8, loc="upper left")
-        style_axes(axes)
         axes, counts = figure.add_subplot(grid[2, column]), document["confusions"][column]["counts"]
         draw_confusions(axes, counts)
         axes.set(xticks=range(len(counts)), yticks=range(len(counts)))
@@ -340,6 +340,5 @@ def _draw_bars(axes: Any, rows: list[dict[str, Any]], labels: list[str], colours
         bars = axes.bar(x, errors, 0.92 * width, color=colour, label=method)
         axes.bar_label(bars, fmt="%.1f", fontsize=8, color=INK, padding=1)
     axes.set_xticks(range(len(labels)), labels)
-    axes.set_ylabel("mean error, two contacts (mm)")
     axes.legend(frameon=False, fontsize=8, ncols=len(colours), loc="lower left", bbox_to_anchor=(0, 1))
-    style_axes(axes)
+    label_axes(axes, ylabel="mean error, two contacts (mm)")

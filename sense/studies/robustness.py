@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
+from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.contact import grid_positions, signals, signals_quantized
 from padforge.design.morphology import Morphology
@@ -17,7 +17,15 @@ from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from padforge.sense.arrays import Array
-from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map, failed_label
+from padforge.sense.studies.study import (
+    Study,
+    StudyResult,
+    Task,
+    describe_pads,
+    draw_error_map,
+    failed_label,
+    label_axes,
+)
 
 RULES = {"published": signals_quantized, "exact": signals}
 """Signals of sampled fibres, as in the published figures, or exact."""
@@ -213,12 +221,10 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.bar(x, means, 0.9 * width, yerr=stds, color=colour, alpha=0.85, ecolor=INK, label=label)
         axes.scatter(x, [row["max"] for row in rows], marker="_", s=60, color=colour)
     axes.set_xticks(range(levels), [f"{level} failed" if level else "all fibres" for level in range(levels)])
-    axes.set_ylabel("mean error (grid units)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    label_axes(axes, grid="y", ylabel="mean error (grid units)")
     axes.legend(frameon=False, fontsize=8)
     title = "bar: mean over the sets; line: their standard deviation; dash: the worst set"
     axes.set_title(title, loc="left", fontsize=8.5)
-    style_axes(axes)
     highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.99))
     for number, label in enumerate(labels):
         for column, panel in enumerate(panel for panel in document["maps"] if panel["pad"] == label):

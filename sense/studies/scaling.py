@@ -17,14 +17,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
+from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from padforge.sense.arrays import Array
-from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map
+from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map, label_axes
 
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"
@@ -232,9 +232,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
             upper.legend(*axes.get_legend_handles_labels(), frameon=False, **legend)
         axes.set_xticks(grids, [str(grid) for grid in grids])
         axes.xaxis.minorticks_off()
-        axes.set(xlabel="grid", ylabel=name)
-        axes.grid(axis="y", color=FAINT, linewidth=0.6)
-        style_axes(axes)
+        label_axes(axes, grid="y", xlabel="grid", ylabel=name)
     panels = lower.subplots(len(labels), len(grids), squeeze=False)
     highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.98))
     for panel in document["maps"]:

@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
+from padforge.design.common.plotting import CURVES, INK
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact
-from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads
+from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
 
 MEMBERS = 6
 """Networks whose errors are averaged, since that of a single one depends on its first weights."""
@@ -144,11 +144,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
             errors = [_trained_error(rows, label, radius, shape) for radius in radii]
             colour = CURVES[number % len(CURVES)]
             axes.plot(radii, errors, style, color=colour, marker="o", markersize=4, label=f"{label}, D {shape}")
-    axes.set(xticks=radii, ylim=(0, None), ylabel="mean error (grid units)")
+    label_axes(axes, grid="y", xticks=radii, ylim=(0, None), ylabel="mean error (grid units)")
     axes.set_xlabel("size K of the object, trained and tested with (grid units)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    style_axes(axes)
     names = [f"{radius:g}/{shape}" for shape, radius in product(sides, radii)]
     highest = max(row["mean"] for row in rows)
     for number, label in enumerate(labels):
@@ -162,6 +160,5 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.set_yticks(range(len(names)), names if number == 0 else [""] * len(names), fontsize=7)
         axes.set_xlabel("tested with K/D", fontsize=8)
         axes.set_ylabel("trained with K/D" if number == 0 else "", fontsize=8)
-        axes.set_title(label, loc="left", fontsize=9, color=INK)
-        style_axes(axes)
+        label_axes(axes, label)
     return figure

@@ -17,7 +17,7 @@ import numpy as np
 
 from padforge.design.common import files
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
-from padforge.design.common.plotting import INK, save_figure
+from padforge.design.common.plotting import FAINT, INK, save_figure, style_axes
 from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
@@ -317,6 +317,16 @@ def confusion_matrix(true: Indices, predicted: Indices, classes: int) -> State:
 def failed_label(failed: Sequence[int]) -> str:
     """Title of a result without some fibres."""
     return f"without {'+'.join(str(fibre + 1) for fibre in failed)}" if failed else "all fibres"
+
+
+def label_axes(axes: Any, title: str = "", grid: Literal["", "x", "y"] = "", **labels: Any) -> None:
+    """Set limits and labels of axes as `axes.set`, a title, and lines of a grid across one axis."""
+    axes.set(**labels)
+    if title:
+        axes.set_title(title, loc="left", color=INK, fontsize=10)
+    if grid:
+        axes.grid(axis=grid, color=FAINT, linewidth=0.6)
+    style_axes(axes)
 
 
 def draw_error_map(

@@ -5,7 +5,7 @@ import pytest
 
 from padforge.design import InputError, Morphology
 from padforge.design.indentation import Indenter
-from padforge.sense.studies.indentation import FOOTPRINTS, SETS, Training, circumradius, force_study, shape_study
+from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study
 from padforge.sense.studies.study import run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
@@ -16,8 +16,8 @@ MIDDLE_ERROR_MM = UNIT_MM * 0.38
 
 @pytest.fixture(scope="module")
 def force(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    training = Training(presses=300, test=120, hidden=12, epochs=25)
-    return run(force_study(PADS, noise_counts=(1.0, 30.0), training=training), tmp_path_factory.mktemp("force"))
+    study = force_study(PADS, noise_counts=(1.0, 30.0), presses=300, test=120, hidden=12, epochs=25)
+    return run(study, tmp_path_factory.mktemp("force"))
 
 
 @pytest.mark.slow
