@@ -8,15 +8,6 @@ from typing import Any
 import click
 
 from padforge.design.common import command_line as common
-from padforge.design.common.command_line import (
-    json_option,
-    load_spec,
-    out_option,
-    pad_folder,
-    profile_option,
-    show_result,
-    spec_option,
-)
 from padforge.design.common.validation import InputError
 from padforge.sense.cli.options import (
     FEATURES,
@@ -117,23 +108,23 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 @click.option(
     "--exclude-fibres", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1."
 )
-@out_option(what="CSV file for the places, places.csv", file=True)
-@profile_option
+@common.out_option(what="CSV file of positions, places.csv", file=True)
+@common.profile_option
 def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
-    """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
+    """Localize every press of RECORDING, with its uncertainty; no true position is needed.
 
     \b
     padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
-    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
-    of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
+    deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
+    of a model that estimates them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
     from padforge.sense.health.fault_detector import examined, fibre_mask_of, has_health
     from padforge.sense.localizer.model import LocalizerModel, write_localization
 
-    file = out or pad_folder(recording) / "places.csv"
+    file = out or common.pad_folder(recording) / "places.csv"
     localizer = LocalizerModel.load(model)
     failed = fibre_indices(exclude_fibres, localizer.fibres)
     opened = read_recording(recording)
@@ -149,29 +140,29 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
 @click.command()
 @model_option
 @recording_argument
-@json_option
+@common.json_option
 @click.pass_context
 def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
-    """Say which fibres of RECORDING are lost, damaged or drifting, from the readings alone.
+    """Detect failed, damaged and drifting fibres of RECORDING, from the readings alone.
 
     \b
     padforge sense health --model out/pad out/later/recording
 
-    Exit 1 if one is. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0.
+    Exit 1 if there are any. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0.
     """
     from dataclasses import asdict
 
     from padforge.sense.health.fault_detector import examined, fault_lines
 
     opened = read_recording(recording)
-    known, findings = examined(model, opened)
+    health_model, findings = examined(model, opened)
     document = {
         "format": "padforge-findings/2",
         "presses": len(opened.down_command),
-        "dead": list(known.dead),
+        "dead": list(health_model.dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
     }
-    show_result(document, fault_lines(findings, opened.fibres, known.dead), as_json)
+    common.show_result(document, fault_lines(findings, opened.fibres, health_model.dead), as_json)
     context.exit(int(bool(findings)))
 
 
@@ -183,10 +174,10 @@ class Bytes(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         if isinstance(value, int):
             return value
-        found = re.fullmatch(r"(\d{1,9})([kM]?)", value)
-        if found is None:
+        match = re.fullmatch(r"(\d{1,9})([kM]?)", value)
+        if match is None:
             self.fail(f"got {value!r}, expected bytes, as 65536, 64k or 1M", param, ctx)
-        return int(found[1]) * {"": 1, "k": 2**10, "M": 2**20}[found[2]]
+        return int(match[1]) * {"": 1, "k": 2**10, "M": 2**20}[match[2]]
 
 
 @click.command()
@@ -195,8 +186,8 @@ class Bytes(click.ParamType):
 @click.option("--flash", type=Bytes(), default="256k", show_default=True, help="For code and tables of a .h.")
 @click.option("--ram", type=Bytes(), default="64k", show_default=True, help="For the state of a .h.")
 @click.option("--quantize", type=click.Choice(["int8"]), help="Weights of a .h as int8, not float32.")
-@spec_option
-@profile_option
+@common.spec_option
+@common.profile_option
 def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize: str | None, spec: Path | None) -> None:
     """Write the localizer for other machines: OUT is an .onnx, or a .h for microcontrollers.
 
@@ -204,13 +195,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     padforge sense deploy --model out/pad localizer.onnx
     padforge sense deploy --model out/pad out/pad/recording localizer.h --flash 256k --ram 64k
 
-    An .onnx takes readings and when they were of a press, and gives places and radii. It is tried by onnxruntime
-    beside the localizer, on the presses of RECORDING or on some made up, and not written if they differ.
+    An .onnx takes the readings and times of a press, and returns position and radii. It is compared with the localizer
+    by onnxruntime, on the presses of RECORDING or on simulated ones, and not written if they differ.
 
-    A .h is one C99 file that takes reading after reading. It holds a network of its own, as large as --flash and
-    --ram allow, which learns from RECORDING what is known by the end of a press. Presses that the model has not
-    learnt from tell how far off it is, beside the model and, where that looks at the release, one that does not,
-    trained for this. [localizer] says for how long they learn.
+    A .h is one C99 file that takes reading after reading. Its student network, as large as --flash and --ram allow, is
+    trained on RECORDING to localize a press by its end. Its error on presses that the model was not trained on is shown
+    beside those of the model and, where that uses the release, of one trained without it. [localizer] sets how long they
+    are trained.
     """
     from padforge.design.common.files import check_writable, sha256
     from padforge.sense.localizer.model import LocalizerModel
@@ -238,7 +229,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 
     if recording is None:
         raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
-    budget, options = Budget(flash, ram, quantize == "int8"), load_spec(spec).section(LocalizerSettings)
+    budget, options = Budget(flash, ram, quantize == "int8"), common.load_spec(spec).section(LocalizerSettings)
     opened = read_recording(recording)
     with progress_bar("training") as report:
         header = export_header(localizer, digest, path, opened, budget, options, report)
@@ -253,13 +244,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 @common.force_option
 @common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
+    """Adapt a model to a pad that has drifted or was re-made, by 20 to 500 presses of known position in RECORDING.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
 
-    Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
-    if it did not, places are found as before. The old model is written over only where --out says so.
+    Writes a whole model and recalibration.json. Whether it is better is decided by cross-validation; if it is not,
+    predictions stay as they were. The old model is replaced only if --out names its folder.
     """
     from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.formats.import_export import open_recording
@@ -279,8 +270,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
         replaced = target / "localizer.json"
         check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *health_files()], force)
         write_json(folder / "recalibration.json", document)
-        for name, known in health.items():  # it was learnt without places
-            known.save(folder, name)
+        for name, health_model in health.items():  # which does not depend on positions
+            health_model.save(folder, name)
     common.show_result(document, recalibration.recalibration_lines(document), as_json)
 
 

@@ -116,11 +116,11 @@ def drift_study(
     rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": rig_seed})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
     sources |= {label: (lambda recording=recording: recording) for label, recording in recordings.items()}
-    kinds, known = dict.fromkeys(pads, SIMULATED), dict.fromkeys(pads, presses)
+    kinds, n_presses = dict.fromkeys(pads, SIMULATED), dict.fromkeys(pads, presses)
     for label, recording in recordings.items():
         kinds[label] = SIMULATED if recording.source.get("kind") == SIMULATED else "recorded"
-        known[label] = int(recording.known.sum())
-    for label, count in known.items():
+        n_presses[label] = int(recording.known.sum())
+    for label, count in n_presses.items():
         try:
             _split(np.arange(count), test_share, seed)
         except InputError as error:
@@ -146,13 +146,13 @@ def drift_study(
     return Study("drift", "Filters and drift compensation", settings, tasks, conclude, _draw)
 
 
-def _split(known: Indices, share: float, seed: int) -> PressSplit:
+def _split(presses: Indices, share: float, seed: int) -> PressSplit:
     """Split presses of known position: the last ones, then of the others some at random to test and validate on."""
     rng = np.random.default_rng([7, seed])
-    first, last = split_presses(len(known), "chronological", share, rng)
+    first, last = split_presses(len(presses), "chronological", share, rng)
     fitted, test = split_presses(len(first), "random", share, rng)
     training, validation = split_presses(len(fitted), "random", share, rng)
-    return PressSplit(known[fitted[training]], known[fitted[validation]], known[test], known[last])
+    return PressSplit(presses[fitted[training]], presses[fitted[validation]], presses[test], presses[last])
 
 
 def press_levels(readings: Array, down_command: Indices, up_command: Indices) -> Array:

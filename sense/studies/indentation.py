@@ -158,9 +158,9 @@ def _conclude_force(
         unit_mm, force_n = pad.unit_mm, partial(indenter.force_n, unit_mm=pad.unit_mm)
         force_range_n = float(force_n(high) - force_n(low))
         for noise in settings["noise_counts"]:
-            unknown, known, one_depth = next(results), next(results), next(results)
-            depth, predicted = unknown["pressed"][:, 2], np.clip(unknown["predicted"][:, 2], low, high)
-            errors = _position_errors(unknown)
+            depth_unknown, depth_known, one_depth = next(results), next(results), next(results)
+            depth, predicted = depth_unknown["pressed"][:, 2], np.clip(depth_unknown["predicted"][:, 2], low, high)
+            errors = _position_errors(depth_unknown)
             force_error_n = float(np.abs(force_n(predicted) - force_n(depth)).mean())
             rows.append(
                 {
@@ -168,7 +168,7 @@ def _conclude_force(
                     "noise_counts": noise,
                     "position_grid": float(errors.mean()),
                     "position_mm": float(errors.mean() * unit_mm),
-                    "position_depth_known_mm": float(_position_errors(known).mean() * unit_mm),
+                    "position_depth_known_mm": float(_position_errors(depth_known).mean() * unit_mm),
                     "position_one_depth_mm": float(_position_errors(one_depth).mean() * unit_mm),
                     "depth_grid": float(np.abs(predicted - depth).mean()),
                     "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
@@ -346,9 +346,9 @@ def _localize(pad: Morphology, kind: str, training: int, test: int, seed: int, h
     inputs, positions, shape, rng = _simulate_shapes(pad, kind, training + test, training, seed)
     with_shape = np.column_stack([inputs, np.eye(len(SETS[kind]))[shape]])
     errors = {}
-    for name, given, member_rng in zip(("unknown", "known"), (inputs, with_shape), rng.spawn(2), strict=True):
-        predict = fit_ensemble(given[:training], positions[:training], member_rng, hidden, epochs)
-        errors[name] = np.linalg.norm(predict(given[training:]) - positions[training:], axis=1).mean()
+    for name, features, member_rng in zip(("unknown", "known"), (inputs, with_shape), rng.spawn(2), strict=True):
+        predict = fit_ensemble(features[:training], positions[:training], member_rng, hidden, epochs)
+        errors[name] = np.linalg.norm(predict(features[training:]) - positions[training:], axis=1).mean()
     return errors
 
 

@@ -59,8 +59,8 @@ def learning_curve(
     check_type("recording", recording, Recording)
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
-    known = np.flatnonzero(recording.known)
-    training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
+    presses = np.flatnonzero(recording.known)
+    training, test = (presses[part] for part in split_presses(len(presses), options.split, options.test_share, rng))
     if len(training) * SHARES[0] < MIN_PRESSES:
         raise InputError(
             f"recording has {len(training)} presses to train on, "

@@ -125,7 +125,7 @@ def fit_pairs(
     """Fit networks to signals (Q, D) of pairs (Q, 2, 2); the result predicts pairs (T, 2, 2) from signals (T, D)."""
     targets = method.encode(pairs)
     networks = fit_batch(inputs, targets[0], rng.spawn(members), hidden, epochs, alternatives=targets[1:])
-    return lambda given: method.decode(np.stack([network(given) for network in networks]))
+    return lambda features: method.decode(np.stack([network(features) for network in networks]))
 
 
 def multicontact_study(

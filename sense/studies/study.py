@@ -304,7 +304,7 @@ def fit_ensemble(
     from padforge.design.networks import fit_batch
 
     networks = fit_batch(inputs, targets, rng.spawn(members), hidden, epochs)
-    return lambda given: np.mean([network(given) for network in networks], axis=0)
+    return lambda features: np.mean([network(features) for network in networks], axis=0)
 
 
 def confusion_matrix(true: Indices, predicted: Indices, classes: int) -> State:

@@ -289,12 +289,12 @@ class AsBuiltPad:
         by_transform /= unit_mm
         profile = self.values[4:N_SHARED].reshape(2, N_SPLINES)
         volts, jacobians = np.empty((len(positions), len(self.fibres))), []
-        for c, (fibre, (gain, rest, *_)) in enumerate(zip(self.fibres, self.channel_values, strict=True)):
+        for c, (fibre, (gain, rest_v, *_)) in enumerate(zip(self.fibres, self.channel_values, strict=True)):
             elements = self.plan.paths[fibre], self.plan.tangents[fibre], self.plan.lengths[fibre]
             signal, by_profile, by_offset, by_sensitivity, by_position = channel_response(
                 *elements, *self._curves(c), positions, profile, self.step
             )
-            volts[:, c] = rest + gain * signal
+            volts[:, c] = rest_v + gain * signal
             by_shared = [np.einsum("qx,qxp->qp", by_position, by_transform), by_profile.reshape(len(positions), -1)]
             by_curves = [by_offset.reshape(len(positions), -1), by_sensitivity]
             jacobian = np.hstack([*by_shared, np.zeros((len(positions), 2)), *by_curves]) * gain
@@ -326,9 +326,9 @@ class AsBuiltPad:
     def fit_gains(self, responses: Responses) -> "AsBuiltPad":
         """Fit gains and rests alone, by linear least squares, so that a fit of all does not diverge."""
         values, volts = self.values.copy(), self.predict(responses.positions_mm)
-        for channel, (gain, rest, *_) in enumerate(self.channel_values):
+        for channel, (gain, rest_v, *_) in enumerate(self.channel_values):
             valid = responses.valid[:, channel]
-            design_matrix = np.column_stack([(volts[valid, channel] - rest) / gain, np.ones(valid.sum())])
+            design_matrix = np.column_stack([(volts[valid, channel] - rest_v) / gain, np.ones(valid.sum())])
             coefficients = np.linalg.lstsq(design_matrix, responses.volts[valid, channel], rcond=None)[0]
             values[channel_indices(channel)[:2]] = coefficients
         return replace(self, values=values)

@@ -65,11 +65,11 @@ class Priors:
 
     def free_mask(self, channels: int) -> Mask:
         """Return which of `AsBuiltPad.values` are fitted."""
-        own = np.ones((channels, N_CHANNEL), bool)
-        own[:, OFFSET], own[:, SENSITIVITY] = self.lateral_offset_mm > 0, self.log_sensitivity > 0
+        by_channel = np.ones((channels, N_CHANNEL), bool)
+        by_channel[:, OFFSET], by_channel[:, SENSITIVITY] = self.lateral_offset_mm > 0, self.log_sensitivity > 0
         shared = np.ones(N_SHARED, bool)
         shared[4 + N_SPLINES :] = self.angular
-        return np.concatenate([shared, own.ravel()])
+        return np.concatenate([shared, by_channel.ravel()])
 
 
 @dataclass(frozen=True)
