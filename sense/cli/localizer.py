@@ -200,8 +200,8 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 
     A .h is one C99 file that takes reading after reading. Its student network, as large as --flash and --ram allow, is
     trained on RECORDING to localize a press by its end. Its error on presses that the model was not trained on is shown
-    beside those of the model and, where that uses the release, of one trained without it. [localizer] sets how long they
-    are trained.
+    beside those of the model and, where that uses the release, of one trained without it. [localizer] sets how long
+    they are trained.
     """
     from padforge.design.common.files import check_writable, sha256
     from padforge.sense.localizer.model import LocalizerModel
