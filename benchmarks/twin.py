@@ -20,8 +20,9 @@ from padforge.sense.localizer.response_model import RIDGE_POSITION, rbf_features
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.twin.as_built import PadPlan, responses
-from padforge.sense.twin.identification import Identification, identify
+from padforge.sense.twin.as_built import PadPlan
+from padforge.sense.twin.identification import Identification, identify_pad
+from padforge.sense.twin.responses import compute_responses
 
 PRESSES = (150, 300, 600, 1500, 3000)
 TEST = 400
@@ -90,7 +91,9 @@ def printed_pad(
     turn, shift = rng.choice([-3.0, 3.0]), rng.uniform(2, 3, 2) * rng.choice([-1, 1], 2)
     wiring, dead = rng.permutation(fibres), set(rng.choice(fibres, n_dead, replace=False).tolist())
     gains_v = GAIN_V * np.exp(GAIN_SD * rng.standard_normal(fibres))
-    as_built_mm = [plan.to_mm(path) for path in _offset_paths(PadPlan.of(plan), lateral_offset_mm / unit_mm, rng)]
+    as_built_mm = [
+        plan.to_mm(path) for path in _offset_paths(PadPlan.from_morphology(plan), lateral_offset_mm / unit_mm, rng)
+    ]
     channel_fibres = [None if channel in dead else int(fibre) for channel, fibre in enumerate(wiring)]
     low, high = np.array(sensed_rectangle(plan.layout))
     width, height = (unit_mm * (high - low)).tolist()
@@ -111,7 +114,7 @@ def printed_pad(
 def _offset_paths(plan: PadPlan, std: float, rng: np.random.Generator) -> list[Array]:
     """Return paths beside the planned ones, offset by Gaussian processes of a standard deviation; grid units."""
     paths = []
-    for path, length in zip(plan.course, plan.length, strict=True):
+    for path, length in zip(plan.paths, plan.lengths, strict=True):
         arc = np.cumsum(length) - length / 2
         nodes = np.linspace(0, arc[-1], 24)
         covariance = np.exp(-0.5 * ((nodes[:, None] - nodes) / OFFSET_SCALE) ** 2) + 1e-9 * np.eye(len(nodes))
@@ -135,13 +138,13 @@ def recorded(world: str, presses: int) -> Recording:
 
 
 def _identify(world: str, presses: int) -> Identification:
-    return identify(recorded(world, presses), printed(world).morphology)
+    return identify_pad(recorded(world, presses), printed(world).morphology)
 
 
 def _fit_plan(world: str, presses: int) -> Predict:
     """Fit the gains of the plan as designed."""
     pad = printed(world)
-    measured = responses(recorded(world, presses), np.ones(presses, bool))
+    measured = compute_responses(recorded(world, presses), np.ones(presses, bool))
     fibres = [channel.fibre for channel in pad.channels]
 
     def plan_signals(positions_mm: Array) -> Array:
@@ -163,7 +166,7 @@ def _fit_plan(world: str, presses: int) -> Predict:
 
 def _fit_smooth(world: str, presses: int) -> Predict:
     """Fit a smooth function of position by ridge regression on radial basis functions, as the localizer does."""
-    measured = responses(recorded(world, presses), np.ones(presses, bool))
+    measured = compute_responses(recorded(world, presses), np.ones(presses, bool))
     half_mm = max(printed(world).sensed_mm) / 2
     design_matrix, mean = rbf_features(measured.positions_mm / half_mm), measured.volts.mean(axis=0)
     gram = design_matrix.T @ design_matrix + RIDGE_POSITION * np.eye(design_matrix.shape[1])
@@ -179,7 +182,7 @@ def _evaluate(world: str, fitted: Identification | Predict) -> Mapping[str, floa
     true = np.column_stack([channel.gain_v * stretch[:, channel.fibre] for channel in live])
     if not isinstance(fitted, Identification):
         return {"error": _relative_error(fitted(positions_mm)[:, [channel.channel for channel in live]], true)}
-    twin = fitted.twin()
+    twin = fitted.twin
     rows = {channel: row for row, channel in enumerate(fitted.live.tolist())}
     predicted = fitted.fit.pad.predict(positions_mm)
     columns = [predicted[:, rows[c.channel]] if c.channel in rows else np.zeros(TEST) for c in live]

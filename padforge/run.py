@@ -241,7 +241,7 @@ def run_stages(
         options, budget = spec.section(LocalizerSettings, **seed), run.remaining_s(reserve_s=RESERVE_S)
         with training_progress() as report:
             return calibrate_into(
-                recording, out, options, time_budget=budget, progress=report, warn=on_message, force=True
+                recording, out, options, time_budget=budget, on_progress=report, on_message=on_message, force=True
             )
 
     design = cache.get(

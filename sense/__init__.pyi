@@ -32,3 +32,4 @@ from .signals.press_detection import detect_presses as detect_presses
 from .simulation.simulated_recording import simulate as simulate
 from .studies.fibre_loss import fibre_loss_study as fibre_loss_study
 from .studies.learning_curve import learning_curve as learning_curve
+from .twin.identification import identify as identify

@@ -11,7 +11,7 @@ import click
 
 from padforge.design.common.command_line import json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
-from padforge.sense.cli.options import drawn_anew
+from padforge.sense.cli.options import redrawn_lines
 from padforge.sense.cli.rig import rig_option
 
 if TYPE_CHECKING:
@@ -210,7 +210,7 @@ def _show_lines(view: dict[str, Any], events: "Sequence[Event]") -> None:
 @contextmanager
 def _terminal() -> "Iterator[Show]":
     """Yield what draws the view again and again, or prints a line an event where stdout is no terminal."""
-    with drawn_anew() as draw:
+    with redrawn_lines() as draw:
         yield _show_lines if draw is None else lambda view, events: draw(view_lines(view))
 
 

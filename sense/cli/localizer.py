@@ -1,11 +1,4 @@
-"""`padforge sense calibrate` and `evaluate`: learning places, and how well it went.
-
-`padforge sense locate`, `health` and `deploy`: what a recording says of presses and fibres, here and elsewhere.
-
-`padforge sense recalibrate`, `fibre-loss`, `learning-curve`: following a pad; what fibres and presses are worth.
-
-`padforge sense identify`: the edge where a recording becomes a twin.
-"""
+"""Commands of `padforge sense` that fit models to recordings, evaluate and apply them."""
 
 import re
 from functools import partial
@@ -15,15 +8,6 @@ from typing import Any
 import click
 
 from padforge.design.common import command_line as common
-from padforge.design.common.command_line import (
-    json_option,
-    load_spec,
-    out_option,
-    pad_folder,
-    profile_option,
-    show_result,
-    spec_option,
-)
 from padforge.design.common.validation import InputError
 from padforge.sense.cli.options import (
     FEATURES,
@@ -34,18 +18,18 @@ from padforge.sense.cli.options import (
     fibre_indices,
     max_failures_option,
     model_option,
+    progress_bar,
     read_recording,
     recording_argument,
-    reported,
 )
 
 
 @click.command()
 @recording_argument
-@click.option("--method", type=click.Choice(METHODS), help="masked: one network for every loss; or as published.")
-@click.option("--features", type=click.Choice(FEATURES), help="full: press and release; causal: to its end; early.")
+@click.option("--method", type=click.Choice(METHODS), help="ensemble: one localizer for all failures; or as published.")
+@click.option("--features", type=click.Choice(FEATURES), help="Windows of press and release, to its end, of its onset.")
 @click.option(
-    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held back for the test."
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held out for the test."
 )
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
@@ -63,7 +47,7 @@ def calibrate(
     as_json: bool,
     **overrides: Any,
 ) -> None:
-    """Learn places from RECORDING and test on presses held back.
+    """Train a localizer on RECORDING, and test it on held-out presses.
 
     \b
     padforge sense calibrate out/pad/recording --test-split chronological
@@ -81,14 +65,14 @@ def calibrate(
     with locked_folder(folder):
         options = common.load_spec(spec).section(LocalizerSettings, **overrides)
         presses = read_recording(recording)
-        with reported("training") as report:
+        with progress_bar("training") as show:
             document = calibrate_into(
                 presses,
                 folder,
                 options,
                 time_budget=time_budget,
-                progress=report,
-                warn=partial(click.echo, err=True),
+                on_progress=show,
+                on_message=partial(click.echo, err=True),
                 force=force,
             )
     common.show_result(document, calibration_lines(document), as_json)
@@ -101,12 +85,12 @@ def calibrate(
 @common.json_option
 @common.profile_option
 def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
-    """Errors on RECORDING for every set of lost fibres.
+    """Errors on RECORDING for every set of failed fibres.
 
     \b
     padforge sense evaluate --model out/pad out/later/recording --max-failures 1
 
-    Of the recording the model was trained on, only the presses that were held back count.
+    On the recording that the model was trained on, only the held-out presses count.
     """
     from padforge.sense.localizer.evaluation import calibration_lines
     from padforge.sense.localizer.evaluation import evaluate as test
@@ -124,23 +108,23 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 @click.option(
     "--exclude-fibres", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1."
 )
-@out_option(what="CSV file for the places, places.csv", file=True)
-@profile_option
+@common.out_option(what="CSV file of positions, places.csv", file=True)
+@common.profile_option
 def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
-    """Find the place of every press of RECORDING, and how sure it is; no true place is needed.
+    """Localize every press of RECORDING, with its uncertainty; no true position is needed.
 
     \b
     padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
-    deviations), r50_mm, r90_mm (radii that hold the true place in 50 % and 90 % of cases);
-    of a model that has learnt them also depth_mm, depth_r90_mm, force_n, force_r90_n.
+    deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
+    of a model that estimates them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
     from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel, write_localization
 
-    file = out or pad_folder(recording) / "places.csv"
+    file = out or common.pad_folder(recording) / "places.csv"
     localizer = LocalizerModel.load(model)
     failed = fibre_indices(exclude_fibres, localizer.fibres)
     opened = read_recording(recording)
@@ -156,15 +140,15 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
 @click.command()
 @model_option
 @recording_argument
-@json_option
+@common.json_option
 @click.pass_context
 def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
-    """Say which fibres of RECORDING are lost, damaged or drifting, from the readings alone.
+    """Detect failed, damaged and drifting fibres of RECORDING, from the readings alone.
 
     \b
     padforge sense health --model out/pad out/later/recording
 
-    Exit 1 if one is. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0.
+    Exit 1 if there are any. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0.
     """
     from dataclasses import asdict
 
@@ -179,7 +163,7 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
         "dead": list(detector.model_.dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
     }
-    show_result(document, fault_lines(findings, opened.fibres, detector.model_.dead), as_json)
+    common.show_result(document, fault_lines(findings, opened.fibres, detector.model_.dead), as_json)
     context.exit(int(bool(findings)))
 
 
@@ -191,10 +175,10 @@ class Bytes(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         if isinstance(value, int):
             return value
-        found = re.fullmatch(r"(\d{1,9})([kM]?)", value)
-        if found is None:
+        match = re.fullmatch(r"(\d{1,9})([kM]?)", value)
+        if match is None:
             self.fail(f"got {value!r}, expected bytes, as 65536, 64k or 1M", param, ctx)
-        return int(found[1]) * {"": 1, "k": 2**10, "M": 2**20}[found[2]]
+        return int(match[1]) * {"": 1, "k": 2**10, "M": 2**20}[match[2]]
 
 
 @click.command()
@@ -203,8 +187,8 @@ class Bytes(click.ParamType):
 @click.option("--flash", type=Bytes(), default="256k", show_default=True, help="For code and tables of a .h.")
 @click.option("--ram", type=Bytes(), default="64k", show_default=True, help="For the state of a .h.")
 @click.option("--quantize", type=click.Choice(["int8"]), help="Weights of a .h as int8, not float32.")
-@spec_option
-@profile_option
+@common.spec_option
+@common.profile_option
 def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize: str | None, spec: Path | None) -> None:
     """Write the localizer for other machines: OUT is an .onnx, or a .h for microcontrollers.
 
@@ -212,13 +196,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     padforge sense deploy --model out/pad localizer.onnx
     padforge sense deploy --model out/pad out/pad/recording localizer.h --flash 256k --ram 64k
 
-    An .onnx takes readings and when they were of a press, and gives places and radii. It is tried by onnxruntime
-    beside the localizer, on the presses of RECORDING or on some made up, and not written if they differ.
+    An .onnx takes the readings and times of a press, and returns position and radii. It is compared with the localizer
+    by onnxruntime, on the presses of RECORDING or on simulated ones, and not written if they differ.
 
-    A .h is one C99 file that takes reading after reading. It holds a network of its own, as large as --flash and
-    --ram allow, which learns from RECORDING what is known by the end of a press. Presses that the model has not
-    learnt from tell how far off it is, beside the model and, where that looks at the release, one that does not,
-    trained for this. [localizer] says for how long they learn.
+    A .h is one C99 file that takes reading after reading. Its student network, as large as --flash and --ram allow, is
+    trained on RECORDING to localize a press by its end. Its error on presses that the model was not trained on is shown
+    beside those of the model and, where that uses the release, of one trained without it. [localizer] sets how long
+    they are trained.
     """
     from padforge.design.common.files import check_writable, sha256
     from padforge.sense.localizer.model import LocalizerModel
@@ -246,9 +230,9 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 
     if recording is None:
         raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
-    budget, options = Budget(flash, ram, quantize == "int8"), load_spec(spec).section(LocalizerSettings)
+    budget, options = Budget(flash, ram, quantize == "int8"), common.load_spec(spec).section(LocalizerSettings)
     opened = read_recording(recording)
-    with reported("training") as report:
+    with progress_bar("training") as report:
         header = export_header(localizer, digest, path, opened, budget, options, report)
     click.echo("\n".join([*header_lines(header, budget), f"localizer -> {path}"]))
 
@@ -261,13 +245,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 @common.force_option
 @common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Follow a pad that has drifted or was re-made, by the presses of known place in RECORDING: 20 to 500 will do.
+    """Adapt a model to a pad that has drifted or was re-made, by 20 to 500 presses of known position in RECORDING.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
 
-    Writes a whole model and recalibration.json. Whether it got better is told by presses that were left out in turn;
-    if it did not, places are found as before. The old model is written over only where --out says so.
+    Writes a whole model and recalibration.json. Whether it is better is decided by cross-validation; if it is not,
+    predictions stay as they were. The old model is replaced only if --out names its folder.
     """
     from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.formats.import_export import open_recording
@@ -281,7 +265,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     check_writable(target)
     old, opened = LocalizerModel.load(model), open_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
-    with reported("recalibrating") as report:
+    with progress_bar("recalibrating") as report:
         localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
     with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
@@ -295,8 +279,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 
 @click.command("fibre-loss")
 @recording_argument
-@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for every loss.")
-@click.option("--retrain", is_flag=True, help="As published: another network for every set of lost fibres.")
+@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for all failures.")
+@click.option("--retrain", is_flag=True, help="As published: another network for every set of failed fibres.")
 @max_failures_option
 @click.option("--failed", type=FibreNumbers(), default=(), help="Map errors without these fibres too, from 1: as 2,5.")
 @common.seed_option
@@ -314,14 +298,14 @@ def fibre_loss(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Errors on RECORDING for every set of lost fibres, of one network or of networks retrained for each, or both.
+    """Errors on RECORDING for every set of failed fibres, by one network, by networks retrained for each, or by both.
 
     \b
     padforge sense fibre-loss out/pad/recording --model out/pad
 
     Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
-    worst set of each size, and without those fibres that --failed names. Retrained networks that are done are
-    kept when it is broken off, and the same command goes on from them.
+    worst set of each size, and without the fibres of --failed. Finished networks are kept after an interruption, and
+    the same command continues with them.
     """
     from padforge.design.common.files import atomic_files, check_writable, write_json
     from padforge.design.common.parallel import Checkpoints
@@ -337,7 +321,7 @@ def fibre_loss(
     check_writable(target)
     localizer = LocalizerModel.load(model) if model else None
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
-    with reported("networks") as report:
+    with progress_bar("networks") as show:
         document = fibre_loss_study(
             opened,
             localizer,
@@ -345,8 +329,8 @@ def fibre_loss(
             options=options,
             max_failures=max_failures,
             failed=fibre_indices(failed, opened.fibres),
-            keep_in=unfinished,
-            progress=report,
+            checkpoints=unfinished,
+            on_progress=show,
         )
     with atomic_files(target) as folder:
         write_json(folder / "fibre_loss.json", document)
@@ -363,7 +347,7 @@ def fibre_loss(
 @common.out_option()
 @common.json_option
 def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Path | None, as_json: bool) -> None:
-    """Errors by number of presses learnt from, and what recording more of them would bring.
+    """Errors by number of training presses, and what recording more of them would bring.
 
     \b
     padforge sense learning-curve out/pad/recording
@@ -379,8 +363,8 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     target = out or common.pad_folder(recording)
     check_writable(target)
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
-    with reported("training") as report:
-        document = study.learning_curve(opened, options, progress=report)
+    with progress_bar("training") as show:
+        document = study.learning_curve(opened, options, on_progress=show)
     with atomic_files(target) as folder:
         write_json(folder / "learning_curve.json", document)
         draw_learning_curve(document, folder / "learning_curve.png")
@@ -396,7 +380,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 @common.json_option
 @common.profile_option
 def identify(recording: Path, morphology: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Find from RECORDING how a printed pad was laid and wired, and what a press really does to it.
+    """Identify the twin of a printed pad from RECORDING: fibres as built, wiring, pose and sensitivity profile.
 
     \b
     padforge sense identify out/pad/recording --morphology out/pad/morphology.json
@@ -413,11 +397,11 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     with locked_folder(folder), common.progress() as bar:
         task = bar.add_task("identify", total=None, note="")
 
-        def report(what: str, done: int, of: int) -> None:
-            bar.update(task, completed=done, total=of, note=what)
+        def show(what: str, done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total, note=what)
 
         inputs = [path for path in (recording, morphology) if not path.is_dir()]
         document = identify_into(
-            read_recording(recording), pad, folder, seed or 0, inputs=inputs, report=report, force=force
+            read_recording(recording), pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force
         )
     common.show_result(document, identification_lines(document, folder), as_json)

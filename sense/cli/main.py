@@ -1,31 +1,20 @@
-"""`padforge sense`: the edge where recordings come in and places go out."""
+"""`padforge sense`: the command line from recordings to positions."""
 
 import click
 
+from padforge.sense.cli import localizer, recordings, rig
 from padforge.sense.cli.live import live
-from padforge.sense.cli.localizer import (
-    calibrate,
-    deploy,
-    evaluate,
-    fibre_loss,
-    health,
-    identify,
-    learning_curve,
-    locate,
-    recalibrate,
-)
-from padforge.sense.cli.recordings import export, import_
-from padforge.sense.cli.rig import doctor, record
 
 COMMANDS = (
-    *(import_, export, calibrate, evaluate, identify, locate, health, record, doctor, live),
-    *(recalibrate, fibre_loss, learning_curve, deploy),
+    *(recordings.import_, recordings.export, localizer.calibrate, localizer.evaluate, localizer.identify),
+    *(localizer.locate, localizer.health, rig.record, rig.doctor, live, localizer.recalibrate),
+    *(localizer.fibre_loss, localizer.learning_curve, localizer.deploy),
 )
 
 
 @click.group()
 def sense() -> None:
-    """Record presses, learn places from them and find new ones.
+    """Record presses, train a localizer on them and localize new ones.
 
     \b
     padforge sense record --morphology out/pad/morphology.json

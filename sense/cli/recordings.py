@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from padforge.design.common.command_line import out_option, pad_folder
-from padforge.sense.cli.options import FOLDER, read_recording, recording_argument, recording_line, say_note
+from padforge.sense.cli.options import FOLDER, echo_note, read_recording, recording_argument, recording_line
 
 if TYPE_CHECKING:
     from padforge.sense.formats.annotations import ModelAnnotations
@@ -68,7 +68,7 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     folder = out or pad_folder(file) / "recording"
     check_new_folder(folder)
     recording = import_file(file, columns)
-    say_note(recording, file)
+    echo_note(recording, file)
     if PRESSES_DETECTED.items() <= recording.source.items():
         click.echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))

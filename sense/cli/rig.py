@@ -10,7 +10,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import FILE, FOLDER, drawn_anew, recording_line, reported, typed_keys
+from padforge.sense.cli.options import FILE, FOLDER, progress_bar, recording_line, redrawn_lines, typed_keys
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -148,7 +148,7 @@ def _record_with(
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
         return _record_by_hand(config, resume, virtual_hardware)
     opened = _opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)), virtual_hardware)
-    with reported("presses") as on_progress:
+    with progress_bar("presses") as on_progress:
         return operation.record(
             config, opened, model=model, dry=dry_run, resume=resume, on_progress=on_progress, on_message=_warn
         )
@@ -181,7 +181,7 @@ def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -
             board = stack.enter_context(closing(make_board(config.rig, inputs)))
         page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
-        draw, typed = stack.enter_context(drawn_anew()), stack.enter_context(typed_keys())
+        draw, typed = stack.enter_context(redrawn_lines()), stack.enter_context(typed_keys())
         latest = pad = pad_view(config.pad, str(config.out), bool(config.rig.mirrored))
 
         @stack.push

@@ -1,4 +1,4 @@
-"""`padforge study ...`: the paper's figures and tables for any pads, carried further."""
+"""`padforge study ...`: the paper's figures and tables for any pads, and beyond."""
 
 import os
 import sys
@@ -11,6 +11,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
+from padforge.sense.cli.options import max_failures_option
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -30,14 +31,13 @@ def study() -> None:
     padforge study scaling --jobs 2 --out out/study
 
     A PAD is a morphology.json, a published .mat, `square`, `random-N` (N knots a fibre), `optimised` or `optimised-N`
-    (found by a short search) or `genetic-N` (found by the published one); `square@8` has a grid of 8.
-    Each study writes NAME.json, NAME.csv, NAME.png and NAME.md. Broken off, it goes on with --resume.
+    (result of a short search) or `genetic-N` (of the published search); `square@8` has a grid of 8.
+    Each study writes NAME.json, NAME.csv, NAME.png and NAME.md. After an interruption, --resume continues it.
     """
 
 
-def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
-    """A study's command, of pads or what else `of` says: options that all have, and what is done with the study that
-    the decorated function makes of the names given and the seed."""
+def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
+    """Return a decorator that makes the command of a study, with the options of all, from a function to the study."""
 
     def decorate(make: "Callable[..., Study]") -> click.Command:
         @wraps(make)
@@ -58,27 +58,29 @@ def _command(name: str, of: str = "PAD") -> Callable[..., Any]:
             check_writable(out)
             with common.progress() as bar:
                 task = bar.add_task(name, total=None, note="pads")
-                made = make(names, seed=seed or 0, **options)
+                study = make(names, seed=seed or 0, **options)
 
-                def report(done: int, total: int, last: str) -> None:
+                def show(done: int, total: int, last: str) -> None:
                     bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
 
                 try:
                     with cluster(scheduler) as executor:
-                        document = run(made, out, jobs=jobs, executor=executor, resume=resume, progress=report)
+                        document = run(study, out, jobs=jobs, executor=executor, resume=resume, on_progress=show)
                 except KeyboardInterrupt:
                     bar.stop()
-                    print("padforge: interrupted; --resume goes on from what was finished", file=sys.stderr, flush=True)
-                    # At once: threads in the middle of their arithmetic cannot be told to stop, nor be waited for.
+                    print(
+                        "padforge: interrupted; --resume continues with the finished tasks", file=sys.stderr, flush=True
+                    )
+                    # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
                     os._exit(common.INTERRUPTED)
             common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (
-            click.argument("names", metavar=f"[{of}]...", nargs=-1),
+            click.argument("names", metavar=f"[{argument}]...", nargs=-1),
             common.seed_option,
-            click.option("--jobs", type=click.IntRange(1, 256), help="Tasks at once (default: one a core)."),
+            click.option("--jobs", type=click.IntRange(1, 256), help="Parallel tasks (default: one a core)."),
             common.scheduler_option,
-            click.option("--resume", is_flag=True, help="Go on where a study into the same folder was broken off."),
+            click.option("--resume", is_flag=True, help="Continue an interrupted study in the same folder."),
             common.out_option("out/study"),
             common.json_option,
         )
@@ -96,9 +98,7 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
 
 
 @_command("robustness")
-@click.option(
-    "--max-failures", type=click.IntRange(0, 8), default=3, show_default=True, help="Up to so many fibres lost at once."
-)
+@max_failures_option
 @click.option(
     "--signals",
     "rule",
@@ -107,16 +107,18 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
     show_default=True,
     help="Fibres sampled as in the paper, or exact.",
 )
-@click.option("--presses", type=click.IntRange(4), default=1024, show_default=True, help="To train on, a square.")
+@click.option(
+    "--presses", type=click.IntRange(4), default=1024, show_default=True, help="Training presses, a square number."
+)
 @common.spec_option
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
-    """Errors by number of lost fibres, over all sets of them, and maps before and after (figures 3, 4 and 5).
+    """Errors by number of failed fibres, over all sets of them, and error maps (figures 3, 4 and 5).
 
     \b
     padforge study robustness square random-5 --max-failures 2
 
     \b
-    Figures 3 and 4, errors by method, number of knots and lost fibres:
+    Figures 3 and 4, errors by method, number of knots and failed fibres:
     padforge study robustness square random-5 optimised-1 optimised-3 optimised-5 genetic-1 genetic-3 genetic-5
 
     For recordings of a built pad (figures 13 and 14) see `padforge sense fibre-loss`.
@@ -131,7 +133,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
 @_command("sensitivity")
 def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Objects of other sizes and shapes, and other ones in use than in training (figure 6).
+    """Objects of other sizes and shapes, trained with or not (figure 6).
 
     \b
     padforge study sensitivity square
@@ -144,29 +146,25 @@ def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
 @_command("scaling")
 @click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
 def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
-    """Larger surfaces, the pads repeated over them as tiles (figures 7 and 8).
+    """Larger surfaces, with the pads repeated over them as tiles (figures 7 and 8).
 
     \b
     padforge study scaling optimised --grids 4,16,64
     """
     from padforge.sense.studies.scaling import scaling_study
 
-    return scaling_study(_pads(names, seed, ("square", "optimised")), grids=_numbers(grids), seed=seed)
-
-
-def _numbers(text: str) -> tuple[int, ...]:
     try:
-        numbers = tuple(sorted({int(part) for part in text.split(",")}))
+        sizes = tuple(sorted({int(part) for part in grids.split(",")}))
     except ValueError:
-        numbers = ()
-    if not numbers or not 2 <= numbers[0] <= numbers[-1] <= 256:
-        raise InputError(f"grids is {text!r}, expected numbers from 2 to 256 with commas between them")
-    return numbers
+        sizes = ()
+    if not sizes or not 2 <= sizes[0] <= sizes[-1] <= 256:
+        raise InputError(f"grids is {grids!r}, expected numbers from 2 to 256 with commas between them")
+    return scaling_study(_pads(names, seed, ("square", "optimised")), grids=sizes, seed=seed)
 
 
 @_command("force")
 def force(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Depth and force of a press from the signals that locate it, with a model of indentation.
+    """Depth and force of a press from the signals that localize it, by a model of indentation.
 
     \b
     padforge study force square random-5
@@ -178,7 +176,7 @@ def force(names: tuple[str, ...], *, seed: int) -> "Study":
 
 @_command("shape")
 def shape(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Which object was pressed, from the signals that locate it.
+    """Which object was pressed, from the signals that localize it.
 
     \b
     padforge study shape random-5
@@ -188,9 +186,9 @@ def shape(names: tuple[str, ...], *, seed: int) -> "Study":
     return shape_study(_pads(names, seed), seed=seed)
 
 
-@_command("drift", of="PAD_OR_RECORDING")
+@_command("drift", "PAD_OR_RECORDING")
 def drift(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Denoising and drift compensation, on pads as simulated and on recordings; idle shares (figure 12, table III).
+    """Filters and drift compensation, on simulated pads and on recordings; idle shares (figure 12, table III).
 
     \b
     padforge study drift out/pad/recording
@@ -207,7 +205,7 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
 
 @_command("multicontact")
 def multicontact(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Two contacts at once, whichever is named first, and how many there are (figure 9).
+    """Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9).
 
     \b
     padforge study multicontact square

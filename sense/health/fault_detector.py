@@ -34,7 +34,7 @@ from padforge.sense.health.trace_model import (
     extract_trace,
     predict_fibres,
 )
-from padforge.sense.localizer.model_files import files_of, refuse_other_pad
+from padforge.sense.localizer.model_files import files_of, check_same_pad
 from padforge.sense.recording.recording import Recording
 from padforge.sense.signals.press_detection import align_to_detected
 
@@ -356,7 +356,7 @@ class FaultDetector:
         check_type("recording", recording, Recording)
         is_detected = PRESSES_DETECTED.items() <= recording.source.items()
         monitor = FaultMonitor(self.live_model_ if is_detected else self.model_)
-        refuse_other_pad(monitor.model, "health", recording.fibres, recording.rate_hz)
+        check_same_pad(monitor.model, "health", recording.fibres, recording.rate_hz)
         readings, firsts, ends = bound_presses(recording.readings, recording.down_command, recording.up_command)
         faults: list[FibreFault] = []
         for down, up, low, high in zip(recording.down_command, recording.up_command, firsts, ends, strict=True):

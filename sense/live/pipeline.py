@@ -21,7 +21,7 @@ from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import HISTORY, RingBuffer
-from padforge.sense.signals.press_detection import TOUCH_DELAY_S, RELEASE_DELAY_S, PressDetector
+from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
 MAX_SHOWN = 12
 """Latest presses that are shown."""

@@ -1,1 +1,1 @@
-"""Calibrations on paper: charts, and their part of the report."""
+"""Reports of sense: files, figures and sections of the HTML report."""

@@ -245,7 +245,9 @@ class HandSession:
     def _check_detector(self) -> None:
         """Believe the readings if they contradict the detector, and restart it."""
         rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
-        volts = interpolate_gaps(rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]).mean(axis=0)  # the latest
+        volts = interpolate_gaps(rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]).mean(
+            axis=0
+        )  # the latest
         if self._sequence.is_pressed:
             if self._validator.is_untouched(volts, self._baseline, self._sequence.held_s(self._now_s)):
                 self._restart_detector()

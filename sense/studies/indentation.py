@@ -1,10 +1,6 @@
-"""Force: how well the fibres that locate a press also tell how deep, and so how hard, it is.
+"""Force and shape: whether the fibres that localize a press also tell how deep and hard it is, and with what object."""
 
-Shape: whether the fibres that locate a press also tell which object was pressed.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,275 +8,257 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, draw_confusions, style_axes
+from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions
 from padforge.design.contact import signals
 from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fresh_presses
 from padforge.design.settings import Contact, between_fibres
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.studies.study import Findings, Study, Task, described
+from padforge.sense.studies.study import (
+    MEMBERS,
+    Study,
+    StudyResult,
+    Task,
+    confusion_matrix,
+    describe_pads,
+    fit_ensemble,
+    label_axes,
+    quantize,
+)
 
-COUNTS = 2**12 - 1
-"""Full scale of the converter the signals are read with."""
-SOFT = 4.0
-"""Counts below which the logarithm of a reading is bent into a straight line, since there it would be of noise."""
-MEMBERS = 3
-"""Networks whose mean is taken: when one alone ends its training is luck, which would hide what pads differ by."""
-EPOCHS = 200
+LOG_SCALE = 4.0
+"""Counts below which the logarithm of a reading becomes linear, since there it would be one of noise."""
+DEPTHS = (0.1, 0.45)
+"""Least and greatest depth, grid units."""
 BINS = 7
-"""Depths the error of the place is drawn by."""
+"""Depths by which the error of the position is drawn."""
 COLUMNS = 4
-"""Most pads side by side in the figure."""
+"""Pads side by side in the figure of the force."""
+INDENTERS = {
+    "sphere": Indenter("sphere", radius=0.7),
+    "cone": Indenter("cone", angle_deg=22),
+    "flat punch": Indenter("flat", radius=0.44),
+}
+"""Of about the same contact radius at the middle depth, 0.44 grid units, so that they differ by profile alone."""
+FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}
+"""Sides of each polygon; None for a circle."""
+SIZES = np.linspace(0.5, 0.9, 17)
+"""Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""
+SHAPE_NOISE_COUNTS = 1.0
+SETS = {"indenters": tuple(INDENTERS), "footprints": tuple(FOOTPRINTS)}
 
 
-@dataclass(frozen=True)
-class Learning:
-    """How many presses are learnt from and tested on, and the neurons of a network and its epochs of training."""
-
-    presses: int = 2048
-    test: int = 1024
-    hidden: int = 50
-    epochs: int = EPOCHS
-
-
-@dataclass(frozen=True)
-class _ForcePresses:
-    """How presses are made and read; whether networks are given their depth, and so do not find it."""
-
-    indenter: Indenter
-    depths: tuple[float, float]
-    depth_told: bool
-    noise_counts: float
+def log_counts(counts: Array) -> Array:
+    """Return logarithms of readings, to which a deeper press adds, as it multiplies all signals."""
+    return np.log1p(counts / LOG_SCALE)
 
 
 def force_study(
     pads: Mapping[str, Morphology],
     *,
     indenter: Indenter | None = None,
-    depths: tuple[float, float] = (0.1, 0.45),
+    depths: tuple[float, float] = DEPTHS,
     noise_counts: Sequence[float] = (1.0, 4.0),
-    learning: Learning | None = None,
+    presses: int = 2048,
+    test: int = 1024,
+    hidden: int = 50,
+    epochs: int = 200,
     seed: int = 0,
 ) -> Study:
-    """Place, depth and force of presses of random depth, from the signals of the indentation model.
+    """Estimate position, depth and force of presses of random depth, from the signals of the indentation model.
 
-    Not knowing the depth is compared with networks that are told it, and with presses of the middle depth alone.
+    An unknown depth is compared with one that is an input, and with presses of the middle depth alone.
 
     Args:
-        pads: by label. indenter: a sphere of 0.7 grid units if None. depths: least and greatest, grid units.
+        pads: by label.
+        indenter: a sphere of 0.7 grid units if None.
+        depths: least and greatest, grid units.
         noise_counts: standard deviations of the readings' noise, in counts of a 12-bit converter.
-        learning: from how many presses, and by what networks; see `Learning`. seed: of presses, noise and networks.
+        presses: training presses.
+        test: test presses.
+        hidden: neurons of a network.
+        epochs: of training.
+        seed: of presses, noise and networks.
 
     Raises:
-        InputError: depths the indenter does not allow.
+        InputError: depths that the indenter does not allow.
     """
-    indenter, learning = indenter or Indenter(), learning or Learning()
+    indenter = indenter or Indenter()
     indenter.contact_radius(depths)
     middle = float(np.mean(depths))
-    cases = (("depth unknown", depths, False), ("depth told", depths, True), ("one depth", (middle, middle), False))
+    cases = (("depth unknown", depths, False), ("depth known", depths, True), ("one depth", (middle, middle), False))
     tasks = [
         Task(
             f"{label}, noise of {_counts(noise)}, {name}",
-            partial(_found, pad, _ForcePresses(indenter, each, told, noise), learning, seed),
+            partial(_estimate_depth, pad, indenter, case_depths, is_known, noise, presses, test, hidden, epochs, seed),
         )
         for label, pad in pads.items()
         for noise in noise_counts
-        for name, each, told in cases
+        for name, case_depths, is_known in cases
     ]
     settings = {
-        "pads": described(pads),
+        "pads": describe_pads(pads),
         "indenter": {"shape": indenter.shape, "radius": indenter.radius, "angle_deg": indenter.angle_deg},
         "depths": list(depths),
         "noise_counts": list(noise_counts),
         "reduced_modulus_kpa": REDUCED_MODULUS_KPA,
-        "presses": learning.presses,
-        "test": learning.test,
         "members": MEMBERS,
-        "hidden": learning.hidden,
-        "epochs": learning.epochs,
+        "presses": presses,
+        "test": test,
+        "hidden": hidden,
+        "epochs": epochs,
         "seed": seed,
     }
-    conclude = partial(_conclude, dict(pads), indenter, settings)
-    return Study("force", "Depth and force of a press, besides its place", settings, tasks, conclude, _draw)
+    conclude = partial(_conclude_force, dict(pads), indenter, settings)
+    return Study("force", "Depth and force of a press, besides its position", settings, tasks, conclude, _draw_force)
 
 
-def readings(signals: Array, full: Array, noise_counts: float, rng: np.random.Generator) -> Array:
-    """What a 12-bit converter reads: whole counts of (Q, C) signals with noise, 0 and full scale `full` (C,) at most.
+def _estimate_depth(
+    pad: Morphology,
+    indenter: Indenter,
+    depths: tuple[float, float],
+    is_known: bool,
+    noise_counts: float,
+    training: int,
+    test: int,
+    hidden: int,
+    epochs: int,
+    seed: int,
+) -> State:
+    """Return x, y and depth of the test presses, "pressed" and "predicted", without the depth where it is known.
 
-    A fibre without a full scale was never stretched, and reads its noise.
-    """
-    share = np.divide(signals, full, out=np.zeros(signals.shape), where=full > 0)
-    return np.clip(np.rint(COUNTS * share + rng.normal(0, noise_counts, signals.shape)), 0, COUNTS)
-
-
-def magnitudes(read: Array) -> Array:
-    """Logarithms of readings (Q, C) in counts: a deeper press multiplies all signals, and so adds to these."""
-    return np.log1p(read / SOFT)
-
-
-def committee(
-    inputs: Array, targets: Array, rng: np.random.Generator, hidden: int, epochs: int
-) -> Callable[[Array], Array]:
-    """The mean of networks that learnt from (Q, D) inputs and (Q, O) targets, each with its own split and weights."""
-    from padforge.design.networks import fit_batch
-
-    members = fit_batch(inputs, targets, rng.spawn(MEMBERS), hidden, epochs)
-    return lambda given: np.mean([network(given) for network in members], axis=0)
-
-
-def _found(pad: Morphology, made: _ForcePresses, learning: Learning, seed: int) -> State:
-    """The test presses as they were made, "pressed", and as networks find them, "found": (T, 3) x, y, depth.
-
-    The full scale of a fibre is the greatest signal it gave in the presses that were learnt from.
+    The full scale of a fibre is its largest signal in the training presses; shapes (T, 3) or (T, 2), grid units.
     """
     rng = np.random.default_rng([3, seed])
-    presses, count = learning.presses, learning.presses + learning.test
-    places = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
-    deep = rng.uniform(*made.depths, count)
-    signals = indented_signals(pad, places, deep, made.indenter)
-    given = magnitudes(readings(signals, signals[:presses].max(axis=0), made.noise_counts, rng))
-    targets = np.column_stack([places, deep])
-    if made.depth_told:
-        given, targets = np.column_stack([given, deep]), places
-    locate = committee(given[:presses], targets[:presses], rng, learning.hidden, learning.epochs)
-    return {"pressed": targets[presses:], "found": locate(given[presses:])}
+    positions = fresh_presses(between_fibres(pad.layout), training + test, int(rng.integers(2**32)))
+    depth = rng.uniform(*depths, training + test)
+    responses = indented_signals(pad, positions, depth, indenter)
+    inputs = log_counts(quantize(responses, responses[:training].max(axis=0), noise_counts, rng))
+    targets = np.column_stack([positions, depth])
+    if is_known:
+        inputs, targets = np.column_stack([inputs, depth]), positions
+    predict = fit_ensemble(inputs[:training], targets[:training], rng, hidden, epochs)
+    return {"pressed": targets[training:], "predicted": predict(inputs[training:])}
 
 
 def _counts(number: float) -> str:
     return f"{number:g} count" if number == 1 else f"{number:g} counts"
 
 
-def _conclude(
+def _conclude_force(
     pads: Mapping[str, Morphology], indenter: Indenter, settings: Mapping[str, Any], states: list[State]
-) -> Findings:
+) -> StudyResult:
     low, high = settings["depths"]
+    middle = (low + high) / 2
     edges = np.linspace(low, high, BINS + 1)
     rows, curves = [], []
     results = iter(states)
     for label, pad in pads.items():
+        unit_mm, force_n = pad.unit_mm, partial(indenter.force_n, unit_mm=pad.unit_mm)
+        force_range_n = float(force_n(high) - force_n(low))
         for noise in settings["noise_counts"]:
-            unknown, told, fixed = next(results), next(results), next(results)
-            deep, found = unknown["pressed"][:, 2], np.clip(unknown["found"][:, 2], low, high)
-            off = _distances(unknown)
-            force = partial(indenter.force_n, unit_mm=pad.unit_mm)
-            span = float(force(high) - force(low))
+            depth_unknown, depth_known, one_depth = next(results), next(results), next(results)
+            depth, predicted = depth_unknown["pressed"][:, 2], np.clip(depth_unknown["predicted"][:, 2], low, high)
+            errors = _position_errors(depth_unknown)
+            force_error_n = float(np.abs(force_n(predicted) - force_n(depth)).mean())
             rows.append(
                 {
                     "pad": label,
                     "noise_counts": noise,
-                    "place_grid": float(off.mean()),
-                    "place_mm": float(off.mean() * pad.unit_mm),
-                    "place_depth_told_mm": float(_distances(told).mean() * pad.unit_mm),
-                    "place_one_depth_mm": float(_distances(fixed).mean() * pad.unit_mm),
-                    "depth_grid": float(np.abs(found - deep).mean()),
-                    "depth_mm": float(np.abs(found - deep).mean() * pad.unit_mm),
-                    "depth_guessed_mm": float(np.abs(deep - (low + high) / 2).mean() * pad.unit_mm),
-                    "force_n": float(np.abs(force(found) - force(deep)).mean()),
-                    "force_percent": float(100 * np.abs(force(found) - force(deep)).mean() / span),
-                    "force_guessed_percent": float(100 * np.abs(force((low + high) / 2) - force(deep)).mean() / span),
+                    "position_grid": float(errors.mean()),
+                    "position_mm": float(errors.mean() * unit_mm),
+                    "position_depth_known_mm": float(_position_errors(depth_known).mean() * unit_mm),
+                    "position_one_depth_mm": float(_position_errors(one_depth).mean() * unit_mm),
+                    "depth_grid": float(np.abs(predicted - depth).mean()),
+                    "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
+                    "depth_guessed_mm": float(np.abs(depth - middle).mean() * unit_mm),
+                    "force_n": force_error_n,
+                    "force_percent": 100 * force_error_n / force_range_n,
+                    "force_guessed_percent": float(
+                        100 * np.abs(force_n(middle) - force_n(depth)).mean() / force_range_n
+                    ),
                 }
             )
-            own = np.digitize(deep, edges[1:-1])
+            bins = np.digitize(depth, edges[1:-1])
+            means = [errors[bins == bin].mean() * unit_mm if (bins == bin).any() else None for bin in range(BINS)]
             curves.append(
                 {
                     "pad": label,
                     "noise_counts": noise,
-                    "pressed_mm": np.round(deep * pad.unit_mm, 4).tolist(),
-                    "predicted_mm": np.round(found * pad.unit_mm, 4).tolist(),
-                    "middles_mm": ((edges[1:] + edges[:-1]) / 2 * pad.unit_mm).tolist(),
-                    "place_mm": [
-                        float(off[own == bin].mean() * pad.unit_mm) if (own == bin).any() else None
-                        for bin in range(BINS)
-                    ],
+                    "pressed_mm": np.round(depth * unit_mm, 4).tolist(),
+                    "predicted_mm": np.round(predicted * unit_mm, 4).tolist(),
+                    "bin_depth_mm": ((edges[1:] + edges[:-1]) / 2 * unit_mm).tolist(),
+                    "bin_position_mm": [None if mean is None else float(mean) for mean in means],
                 }
             )
-    return Findings(rows, _told(indenter, settings, rows), {"curves": curves})
+    return StudyResult(rows, _describe_force(indenter, settings, rows), {"curves": curves})
 
 
-def _distances(state: State) -> Array:
-    """(T,) how far from the place pressed the place found lies, grid units."""
-    return np.linalg.norm(state["found"][:, :2] - state["pressed"][:, :2], axis=1)
+def _position_errors(state: State) -> Array:
+    """Return the errors of the position (T,), grid units."""
+    return np.linalg.norm(state["predicted"][:, :2] - state["pressed"][:, :2], axis=1)
 
 
-def _told(indenter: Indenter, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe_force(indenter: Indenter, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     low, high = settings["depths"]
     form = f"cone of {indenter.angle_deg:g} degrees" if indenter.shape == "cone" else indenter.shape
     size = "" if indenter.shape == "cone" else f" of radius {indenter.radius:g} grid units"
     noises = " or ".join(f"{noise:g}" for noise in settings["noise_counts"])
     text = [
-        f"A rigid {form}{size} is pressed {low:g} to {high:g} grid units deep at random places. A fibre signals by how "
-        "much the deflected surface lengthens it, read by a 12-bit converter whose full scale is the fibre's greatest "
-        f"signal, with noise of {noises} counts. Networks of {settings['hidden']} neurons, of which the mean of "
-        f"{settings['members']} is taken, give x, y and depth from the readings' logarithms; they learnt from "
-        f"{settings['presses']} presses and were tested on {settings['test']} others."
+        f"A rigid {form}{size} is pressed {low:g} to {high:g} grid units deep at random positions. The signal of a "
+        "fibre is its lengthening by the deflected surface, read by a 12-bit converter whose full scale is the fibre's "
+        f"largest signal, with noise of {noises} counts. Networks of {settings['hidden']} neurons, of which the mean "
+        f"of {settings['members']} is taken, estimate x, y and depth from the readings' logarithms; they were trained "
+        f"on {settings['presses']} presses and tested on {settings['test']} others."
     ]
     for row in rows:
         text.append(
-            f"{row['pad']}, noise of {_counts(row['noise_counts'])}: the depth is found {row['depth_mm']:.2f} mm off "
-            f"(guessing the middle depth: {row['depth_guessed_mm']:.2f} mm), the force {row['force_n']:.3f} N or "
-            f"{row['force_percent']:.1f} % of its range (guessing: {row['force_guessed_percent']:.1f} %). The place is "
-            f"found {row['place_mm']:.2f} mm off, {row['place_depth_told_mm']:.2f} mm by networks that are told the "
-            f"depth, and {row['place_one_depth_mm']:.2f} mm where all presses are {(low + high) / 2:g} grid units deep."
+            f"{row['pad']}, noise of {_counts(row['noise_counts'])}: the error of the depth is {row['depth_mm']:.2f} "
+            f"mm (guessing the middle depth: {row['depth_guessed_mm']:.2f} mm), of the force {row['force_n']:.3f} N or "
+            f"{row['force_percent']:.1f} % of its range (guessing: {row['force_guessed_percent']:.1f} %). That of the "
+            f"position is {row['position_mm']:.2f} mm, {row['position_depth_known_mm']:.2f} mm where the depth is an "
+            f"input, and {row['position_one_depth_mm']:.2f} mm where all presses are {(low + high) / 2:g} grid units "
+            "deep."
         )
     text.append(
-        "Depth and force belong together by the contact mechanics of an elastic half-space of reduced modulus "
+        "Depth and force are related by the contact mechanics of an elastic half-space of reduced modulus "
         f"{settings['reduced_modulus_kpa']:.0f} kPa. A pad a few millimetres thick on a hard table is stiffer than "
-        "that, and silicone creeps: forces of a built pad want a calibration against a load cell."
+        "that, and silicone creeps: forces of a built pad need a calibration against a load cell."
     )
     return text
 
 
-def _draw(document: Mapping[str, Any]) -> Figure:
-    """Depth found against depth pressed for every pad, and the error of the place by depth."""
+def _draw_force(document: Mapping[str, Any]) -> Figure:
+    """Draw predicted against true depth for every pad, and the error of the position by depth."""
     curves, noises = document["curves"], document["settings"]["noise_counts"]
     labels = list(document["settings"]["pads"])
     columns = min(len(labels), COLUMNS)
     rows = -(-len(labels) // columns)
     figure = Figure(figsize=(max(6.4, 2.9 * columns), 3.1 * rows + 3.4), layout="constrained")
     grid = figure.add_gridspec(rows + 1, columns, height_ratios=[1.0] * rows + [1.05])
-    for at, label in enumerate(labels):
-        axes = figure.add_subplot(grid[at // columns, at % columns], aspect="equal")
-        own = [curve for curve in curves if curve["pad"] == label]
-        for curve, colour in reversed(list(zip(own, CURVES[2::-1], strict=False))):
-            name = f"noise {curve['noise_counts']:g}"
-            axes.scatter(
-                curve["pressed_mm"], curve["predicted_mm"], s=3, color=colour, alpha=0.5, linewidths=0, label=name
-            )
-        ends = [min(own[0]["pressed_mm"]), max(own[0]["pressed_mm"])]
+    for number, label in enumerate(labels):
+        row, column = divmod(number, columns)
+        axes = figure.add_subplot(grid[row, column], aspect="equal")
+        by_noise = [curve for curve in curves if curve["pad"] == label]
+        for curve, colour in reversed(list(zip(by_noise, CURVES[2::-1], strict=False))):
+            dots = {"s": 3, "color": colour, "alpha": 0.5, "linewidths": 0}
+            axes.scatter(curve["pressed_mm"], curve["predicted_mm"], label=f"noise {curve['noise_counts']:g}", **dots)
+        ends = [min(by_noise[0]["pressed_mm"]), max(by_noise[0]["pressed_mm"])]
         axes.plot(ends, ends, color=INK, linewidth=0.8)
-        axes.set_title(label, loc="left", color=INK, fontsize=10)
-        axes.set(xlabel="depth pressed (mm)", ylabel="depth found (mm)" if at % columns == 0 else "")
+        label_axes(axes, label, xlabel="true depth (mm)", ylabel="" if column else "predicted depth (mm)")
         axes.legend(frameon=False, fontsize=8, markerscale=3, handletextpad=0.1)
-        style_axes(axes)
     axes = figure.add_subplot(grid[rows, :])
     for curve in curves:
         colour = CURVES[labels.index(curve["pad"]) % len(CURVES)]
         style = ("-", "--", ":", "-.")[noises.index(curve["noise_counts"]) % 4]
         name = f"{curve['pad']}, noise {curve['noise_counts']:g}"
-        errors = [np.nan if error is None else error for error in curve["place_mm"]]
-        axes.plot(curve["middles_mm"], errors, style, color=colour, marker="o", markersize=3.5, label=name)
-    axes.set(ylim=(0, None), xlabel="depth pressed (mm)", ylabel="mean error of the place (mm)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+        errors = [np.nan if error is None else error for error in curve["bin_position_mm"]]
+        axes.plot(curve["bin_depth_mm"], errors, style, color=colour, marker="o", markersize=3.5, label=name)
+    label_axes(axes, grid="y", ylim=(0, None), xlabel="true depth (mm)", ylabel="mean error of the position (mm)")
     figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower left", ncols=columns)
-    style_axes(axes)
     add_title(figure, f"Depth of {document['settings']['test']} presses never trained on; noise in counts of 12 bits")
     return figure
-
-
-INDENTERS = {
-    "sphere": Indenter("sphere", radius=0.7),
-    "cone": Indenter("cone", angle_deg=22),
-    "flat punch": Indenter("flat", radius=0.44),
-}
-"""Of about the same contact radius at the middle depth, 0.44 grid units, so that profiles are told apart, not sizes."""
-DEPTHS = (0.1, 0.45)
-FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}
-"""Sides of each, a circle's None."""
-SIZES = np.linspace(0.5, 0.9, 17)
-"""Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""
-NOISE_COUNTS = 1.0
-SETS = {"indenters": tuple(INDENTERS), "footprints": tuple(FOOTPRINTS)}
 
 
 def shape_study(
@@ -289,28 +267,32 @@ def shape_study(
     presses: int = 4096,
     test: int = 2048,
     hidden: int = 50,
-    epochs: int = EPOCHS,
+    epochs: int = 200,
     seed: int = 0,
 ) -> Study:
-    """Which object was pressed, of indenters of unknown depth and of footprints of unknown size, place unknown too.
+    """Classify the object: indenters of unknown depth, and footprints of unknown size, the position unknown too.
 
-    Indenters follow the indentation model, footprints the published contact model: polygons of one orientation.
+    Indenters follow the indentation model, footprints the published contact: polygons of one orientation.
 
     Args:
-        pads: by label. presses, test: how many are learnt from and tested on, over all shapes of a set.
-        hidden, epochs: of a network. seed: of presses, noise and networks.
+        pads: by label.
+        presses: training presses, over all shapes of a set.
+        test: test presses.
+        hidden: neurons of a network.
+        epochs: of training.
+        seed: of presses, noise and networks.
     """
     tasks = [
-        Task(f"{label}, {of}, {name}", partial(work, _ShapePresses(pad, of, presses, test, seed), hidden, epochs))
+        Task(f"{label}, {kind}, {name}", partial(work, pad, kind, presses, test, seed, hidden, epochs))
         for label, pad in pads.items()
-        for of in SETS
-        for name, work in (("shape", _classified), ("place", _located))
+        for kind in SETS
+        for name, work in (("shape", _classify), ("position", _localize))
     ]
     settings = {
-        "pads": described(pads),
+        "pads": describe_pads(pads),
         "depths": list(DEPTHS),
         "sizes": [float(SIZES[0]), float(SIZES[-1])],
-        "noise_counts": NOISE_COUNTS,
+        "noise_counts": SHAPE_NOISE_COUNTS,
         "presses": presses,
         "test": test,
         "members": MEMBERS,
@@ -318,157 +300,124 @@ def shape_study(
         "epochs": epochs,
         "seed": seed,
     }
-    return Study(
-        "shape",
-        "Shape of what is pressed",
-        settings,
-        tasks,
-        partial(_conclude_shape, dict(pads), settings),
-        _draw_shape,
-    )
+    conclude = partial(_conclude_shape, dict(pads), settings)
+    return Study("shape", "Shape of what is pressed", settings, tasks, conclude, _draw_shape)
 
 
-@dataclass(frozen=True)
-class _ShapePresses:
-    """Presses of a set of shapes on a pad, the last `test` of them to test on.
-
-    Attributes:
-        of: which of SETS. learnt: how many presses to learn from.
-    """
-
-    pad: Morphology
-    of: str
-    learnt: int
-    test: int
-    seed: int
-
-    def made(self) -> tuple[Array, Array, Indices, np.random.Generator]:
-        """What a network is given (Q, C), places (Q, 2), the shape's index (Q,), and what to draw further from."""
-        rng = np.random.default_rng([4, self.seed, list(SETS).index(self.of)])
-        count = self.learnt + self.test
-        places = fresh_presses(between_fibres(self.pad.layout), count, int(rng.integers(2**32)))
-        shape = rng.integers(len(SETS[self.of]), size=count)
-        if self.of == "indenters":
-            given = _indented(self.pad, places, shape, rng.uniform(*DEPTHS, count))
-        else:
-            given = _printed(self.pad, places, shape, rng.integers(len(SIZES), size=count))
-        read = readings(given, given[: self.learnt].max(axis=0), NOISE_COUNTS, rng)
-        return magnitudes(read) if self.of == "indenters" else read, places, shape, rng
-
-
-def _indented(pad: Morphology, places: Array, shape: Indices, depths: Array) -> Array:
-    """(Q, C) signals of indenters."""
-    given = np.empty((len(places), pad.layout.fibres))
-    for index, indenter in enumerate(INDENTERS.values()):
-        own = shape == index
-        given[own] = indented_signals(pad, places[own], depths[own], indenter)
-    return given
-
-
-def _printed(pad: Morphology, places: Array, shape: Indices, size: Indices) -> Array:
-    """(Q, C) signals of footprints, of SIZES[size]."""
-    given = np.empty((len(places), pad.layout.fibres))
-    for index, sides in enumerate(FOOTPRINTS.values()):
-        for each, radius in enumerate(SIZES):
-            own = (shape == index) & (size == each)
-            given[own] = signals(pad, places[own], Contact(radius=radius * circumradius(sides), sides=sides))
-    return given
+def _simulate_shapes(
+    pad: Morphology, kind: str, count: int, training: int, seed: int
+) -> tuple[Array, Array, Indices, np.random.Generator]:
+    """Return network inputs (Q, C), positions (Q, 2), indices of the shapes (Q,), and the generator to go on with."""
+    rng = np.random.default_rng([4, seed, list(SETS).index(kind)])
+    positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
+    shape = rng.integers(len(SETS[kind]), size=count)
+    responses = np.empty((count, pad.layout.fibres))
+    if kind == "indenters":
+        depths = rng.uniform(*DEPTHS, count)
+        for index, indenter in enumerate(INDENTERS.values()):
+            rows = shape == index
+            responses[rows] = indented_signals(pad, positions[rows], depths[rows], indenter)
+    else:
+        size = rng.integers(len(SIZES), size=count)
+        for index, sides in enumerate(FOOTPRINTS.values()):
+            for size_index, radius in enumerate(SIZES):
+                rows = (shape == index) & (size == size_index)
+                contact = Contact(radius=radius * circumradius(sides), sides=sides)
+                responses[rows] = signals(pad, positions[rows], contact)
+    counts = quantize(responses, responses[:training].max(axis=0), SHAPE_NOISE_COUNTS, rng)
+    return log_counts(counts) if kind == "indenters" else counts, positions, shape, rng
 
 
 def circumradius(sides: int | None) -> float:
-    """Of a regular polygon that has the area of a circle of radius 1."""
+    """Return the circumradius of a regular polygon with the area of a circle of radius 1."""
     return 1.0 if sides is None else float(np.sqrt(2 * np.pi / (sides * np.sin(2 * np.pi / sides))))
 
 
-def _classified(presses: _ShapePresses, hidden: int, epochs: int) -> State:
-    """Confusions (K, K) on the test presses: how often shape i, by row, was taken for j."""
-    given, _, shape, rng = presses.made()
-    count = len(SETS[presses.of])
-    name = committee(given[: presses.learnt], np.eye(count)[shape[: presses.learnt]], rng, hidden, epochs)
-    confusions = np.zeros((count, count), dtype=np.int64)
-    np.add.at(confusions, (shape[presses.learnt :], name(given[presses.learnt :]).argmax(axis=1)), 1)
-    return {"confusions": confusions}
+def _classify(pad: Morphology, kind: str, training: int, test: int, seed: int, hidden: int, epochs: int) -> State:
+    """Return the confusions (K, K) of shapes on the test presses."""
+    inputs, _, shape, rng = _simulate_shapes(pad, kind, training + test, training, seed)
+    classes = len(SETS[kind])
+    classify = fit_ensemble(inputs[:training], np.eye(classes)[shape[:training]], rng, hidden, epochs)
+    return confusion_matrix(shape[training:], classify(inputs[training:]).argmax(axis=1), classes)
 
 
-def _located(presses: _ShapePresses, hidden: int, epochs: int) -> State:
-    """Mean error of the place on the test presses, grid units: "unknown", and "known" to networks told the shape."""
-    given, places, shape, rng = presses.made()
-    told = np.column_stack([given, np.eye(len(SETS[presses.of]))[shape]])
+def _localize(pad: Morphology, kind: str, training: int, test: int, seed: int, hidden: int, epochs: int) -> State:
+    """Return mean errors of the position on the test presses, grid units: shape "unknown", or "known" as an input."""
+    inputs, positions, shape, rng = _simulate_shapes(pad, kind, training + test, training, seed)
+    with_shape = np.column_stack([inputs, np.eye(len(SETS[kind]))[shape]])
     errors = {}
-    for name, inputs, draw in zip(("unknown", "known"), (given, told), rng.spawn(2), strict=True):
-        locate = committee(inputs[: presses.learnt], places[: presses.learnt], draw, hidden, epochs)
-        off = locate(inputs[presses.learnt :]) - places[presses.learnt :]
-        errors[name] = np.linalg.norm(off, axis=1).mean()
+    for name, features, member_rng in zip(("unknown", "known"), (inputs, with_shape), rng.spawn(2), strict=True):
+        predict = fit_ensemble(features[:training], positions[:training], member_rng, hidden, epochs)
+        errors[name] = np.linalg.norm(predict(features[training:]) - positions[training:], axis=1).mean()
     return errors
 
 
-def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> Findings:
+def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
     rows, confusions = [], []
     results = iter(states)
     for label, pad in pads.items():
-        for of, shapes in SETS.items():
+        for kind, shapes in SETS.items():
             counts, errors = next(results)["confusions"], next(results)
-            share = np.diag(counts) / np.maximum(counts.sum(axis=1), 1)
-            worst = int(np.argmin(share))
+            recall = np.diag(counts) / np.maximum(counts.sum(axis=1), 1)
+            worst = int(np.argmin(recall))
             rows.append(
                 {
                     "pad": label,
-                    "shapes": of,
+                    "shapes": kind,
                     "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-                    "guessed_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
+                    "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
                     "worst": shapes[worst],
-                    "worst_percent": float(100 * share[worst]),
-                    "place_mm": float(errors["unknown"] * pad.unit_mm),
-                    "place_shape_known_mm": float(errors["known"] * pad.unit_mm),
+                    "worst_percent": float(100 * recall[worst]),
+                    "position_mm": float(errors["unknown"] * pad.unit_mm),
+                    "position_shape_known_mm": float(errors["known"] * pad.unit_mm),
                 }
             )
-            confusions.append({"pad": label, "shapes": of, "names": list(shapes), "counts": counts.tolist()})
-    return Findings(rows, _told_shape(settings, rows), {"confusions": confusions})
+            confusions.append({"pad": label, "shapes": kind, "names": list(shapes), "counts": counts.tolist()})
+    return StudyResult(rows, _describe_shape(settings, rows), {"confusions": confusions})
 
 
-def _told_shape(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe_shape(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     sphere, cone, flat = INDENTERS.values()
     text = [
         f"Indenters: a sphere of radius {sphere.radius:g}, a cone whose flank makes {cone.angle_deg:g} degrees with "
         f"the surface, and a flat punch of radius {flat.radius:g} grid units, pressed {DEPTHS[0]:g} to {DEPTHS[1]:g} "
         "deep into an elastic half-space. Footprints: circle, square and triangle of equal area, that of a circle of "
-        f"{SIZES[0]:g} to {SIZES[-1]:g} grid units radius, always turned the same way, under the published contact "
-        f"model. Readings are whole counts of 12 bits with noise of {NOISE_COUNTS:g}. Place, depth and size are drawn "
-        f"afresh for every press; networks of {settings['hidden']} neurons, of which the mean of "
-        f"{settings['members']} is taken, learnt from {settings['presses']} presses of a set and were tested on "
-        f"{settings['test']} others."
+        f"{SIZES[0]:g} to {SIZES[-1]:g} grid units radius, of one orientation, under the published contact model. "
+        f"Readings are whole counts of 12 bits with noise of {SHAPE_NOISE_COUNTS:g}. Position, depth and size are "
+        f"drawn for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} "
+        f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
     ]
     for row in rows:
         text.append(
-            f"{row['pad']}, {row['shapes']}: {row['accuracy_percent']:.1f} % are named rightly (always naming the most "
-            f"frequent: {row['guessed_percent']:.1f} %), worst the {row['worst']} with {row['worst_percent']:.1f} %. "
-            f"The place is found {row['place_mm']:.2f} mm off; networks that are told the shape find it "
-            f"{row['place_shape_known_mm']:.2f} mm off."
+            f"{row['pad']}, {row['shapes']}: {row['accuracy_percent']:.1f} % are classified correctly (always the most "
+            f"frequent: {row['majority_percent']:.1f} %), worst the {row['worst']} with {row['worst_percent']:.1f} %. "
+            f"The error of the position is {row['position_mm']:.2f} mm, and {row['position_shape_known_mm']:.2f} mm by "
+            "networks with the shape as an input."
         )
-    ratios = [row["place_mm"] / row["place_shape_known_mm"] for row in rows]
-    luck = ", where below 1 is the luck of training" if min(ratios) < 1 else ""
+    ratios = [row["position_mm"] / row["position_shape_known_mm"] for row in rows]
+    chance = ", where below 1 is chance in training" if min(ratios) < 1 else ""
     text.append(
-        f"Not knowing the shape makes the error of the place {min(ratios):.2f} to {max(ratios):.2f} times as much"
-        f"{luck}."
+        f"An unknown shape makes the error of the position {min(ratios):.2f} to {max(ratios):.2f} times as large"
+        f"{chance}."
     )
     return text
 
 
 def _draw_shape(document: Mapping[str, Any]) -> Figure:
-    """The confusion matrices: a column for every pad, a row for every set of shapes, in per cent of each true shape."""
+    """Draw confusion matrices: a column for every pad, a row for every set of shapes."""
     labels = list(document["settings"]["pads"])
     figure = Figure(figsize=(max(6.4, 1.2 + 2.7 * len(labels)), 6.2), layout="constrained")
-    grid = figure.subplots(len(SETS), len(labels), squeeze=False)
-    for each, row in zip(document["confusions"], document["rows"], strict=True):
-        at, column = list(SETS).index(each["shapes"]), labels.index(each["pad"])
-        axes, names = grid[at, column], each["names"]
-        draw_confusions(axes, each["counts"])
+    panels = figure.subplots(len(SETS), len(labels), squeeze=False)
+    for matrix, row in zip(document["confusions"], document["rows"], strict=True):
+        line, column = list(SETS).index(matrix["shapes"]), labels.index(matrix["pad"])
+        axes, names = panels[line, column], matrix["names"]
+        draw_confusions(axes, matrix["counts"])
         axes.set_xticks(range(len(names)), names, fontsize=8, color=INK)
-        shown = names if column == 0 else [""] * len(names)
-        axes.set_yticks(range(len(names)), shown, fontsize=8, color=INK, rotation=90, va="center")
-        axes.set_title(f"{each['pad']}: {row['accuracy_percent']:.0f} %", loc="left", color=INK, fontsize=10)
+        visible = [""] * len(names) if column else names
+        axes.set_yticks(range(len(names)), visible, fontsize=8, color=INK, rotation=90, va="center")
+        axes.set_title(f"{matrix['pad']}: {row['accuracy_percent']:.0f} %", loc="left", color=INK, fontsize=10)
         if column == 0:
             axes.set_ylabel("pressed", color=INK)
-        axes.set_xlabel("found" if at == len(SETS) - 1 else "", color=INK)
+        axes.set_xlabel("predicted" if line == len(SETS) - 1 else "", color=INK)
     add_title(figure, f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on")
     return figure

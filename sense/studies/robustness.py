@@ -1,4 +1,4 @@
-"""Robustness: what is left of a pad's accuracy as fibres are lost (paper, figures 3, 4 and 5)."""
+"""Robustness: accuracy of a pad as fibres are lost, by networks retrained for every set (paper, figures 3, 4 and 5)."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
+from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.contact import grid_positions, signals, signals_quantized
 from padforge.design.morphology import Morphology
@@ -17,17 +17,25 @@ from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from padforge.sense.arrays import Array
-from padforge.sense.studies.study import Findings, Study, Task, described
+from padforge.sense.studies.study import (
+    Study,
+    StudyResult,
+    Task,
+    describe_pads,
+    draw_error_map,
+    failed_label,
+    label_axes,
+)
 
 RULES = {"published": signals_quantized, "exact": signals}
-"""How a pad's signals are made: by sampled fibres, as the published figures were, or exactly."""
-NETWORKS = 16
-"""Least networks of a level: where there are fewer sets of lost fibres, each is trained several times, for what one
-network comes to is luck."""
-MOST_SETS = 1024
-"""Sets of lost fibres of a size that are tried at most; of more, so many are drawn."""
+"""Signals of sampled fibres, as in the published figures, or exact."""
+MIN_NETWORKS = 16
+"""Networks of a level: where there are fewer sets of failed fibres, each is trained several times, since the error of a
+single network depends on its first weights."""
+MAX_SETS = 1024
+"""Sets of failed fibres of a size that are evaluated; of more, a sample is drawn."""
 SIDE = 33
-"""Places along a side of a map of errors."""
+"""Cells along a side of an error map."""
 
 
 def robustness_study(
@@ -41,12 +49,17 @@ def robustness_study(
     test: int = 2000,
     seed: int = 0,
 ) -> Study:
-    """Errors of networks trained afresh for every set of lost fibres, as published, with maps of them over the pad.
+    """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
 
     Args:
-        pads: by label. contact: PUBLISHED_CONTACT if None. rule: of RULES.
-        max_failures: most fibres that fail at once. hidden: neurons of a network.
-        presses: to train on, a square number. test: fresh presses. seed: of presses and networks.
+        pads: by label.
+        contact: PUBLISHED_CONTACT if None.
+        rule: of RULES.
+        max_failures: most fibres that fail at once.
+        hidden: neurons of a network.
+        presses: training presses, a square number.
+        test: fresh presses to test on.
+        seed: of presses and networks.
 
     Raises:
         InputError: `presses` is no square of a number from 2.
@@ -59,16 +72,17 @@ def robustness_study(
         (label, part)
         for label, pad in pads.items()
         for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
-        for part in split_batches(failure_subsets(pad.layout.fibres, level, MOST_SETS))
+        for part in split_batches(failure_subsets(pad.layout.fibres, level, MAX_SETS))
     ]
     tasks = [
         Task(
-            f"{label}, {len(part[0])} lost", partial(_found, pads[label], contact, rule, part, hidden, side, test, seed)
+            f"{label}, {len(part[0])} failed",
+            partial(_evaluate, pads[label], contact, rule, part, hidden, side, test, seed),
         )
         for label, part in parts
     ]
     settings = {
-        "pads": described(pads),
+        "pads": describe_pads(pads),
         "contact": contact.model_dump(mode="json"),
         "signals": rule,
         "max_failures": max_failures,
@@ -78,39 +92,45 @@ def robustness_study(
         "seed": seed,
     }
     conclude = partial(_conclude, dict(pads), parts, settings)
-    return Study("robustness", "Robustness to lost fibres", settings, tasks, conclude, _draw)
+    return Study("robustness", "Robustness to fibre loss", settings, tasks, conclude, _draw)
 
 
-def _found(
-    pad: Morphology, contact: Contact, rule: str, losses: list[FailureSet], hidden: int, side: int, test: int, seed: int
+def _evaluate(
+    pad: Morphology,
+    contact: Contact,
+    rule: str,
+    failures: list[FailureSet],
+    hidden: int,
+    side: int,
+    test: int,
+    seed: int,
 ) -> State:
-    """Mean errors (L,) with each of some losses, grid units: on "fresh" presses, and on "own", those trained on among
-    them; and (L, SIDE^2) errors over the pad, "maps"."""
+    """Compute errors with each of L sets of failed fibres, grid units.
 
-    def answer(places: Array) -> Array:
-        return RULES[rule](pad, places, contact)
+    Returns:
+        Mean errors on "fresh" presses (L,) and on those of the "training" (L,); and "maps" (L, SIDE^2).
+    """
 
-    trial = SimulatedPresses.simulate(pad, side, test, seed, answer)
-    places = grid_positions(between_fibres(pad.layout), SIDE)
-    over = answer(places)
-    repeats = -(-NETWORKS // math.comb(pad.layout.fibres, len(losses[0])))
-    found = [
+    def respond(positions: Array) -> Array:
+        return RULES[rule](pad, positions, contact)
+
+    presses = SimulatedPresses.simulate(pad, side, test, seed, respond)
+    positions = grid_positions(between_fibres(pad.layout), SIDE)
+    responses = respond(positions)
+    repeats = -(-MIN_NETWORKS // math.comb(pad.layout.fibres, len(failures[0])))
+    errors = [
         (
-            trial.test_errors(network, loss).mean(),
-            trial.position_errors(network, loss, trial.train_signals, trial.train_positions).mean(),
-            trial.position_errors(network, loss, over, places),
+            presses.test_errors(network, failed).mean(),
+            presses.position_errors(network, failed, presses.train_signals, presses.train_positions).mean(),
+            presses.position_errors(network, failed, responses, positions),
         )
         for repeat in range(repeats)
-        for network, loss in zip(trial.fit(losses, hidden, repeat), losses, strict=True)
+        for network, failed in zip(presses.fit(failures, hidden, repeat), failures, strict=True)
     ]
-    fresh, own, maps = (np.array(part) for part in zip(*found, strict=True))
-    by_loss = (repeats, len(losses), -1)
-    maps = maps.reshape(by_loss).mean(axis=0).astype(np.float32)
-    return {
-        "fresh": fresh.reshape(by_loss[:2]).mean(axis=0),
-        "own": own.reshape(by_loss[:2]).mean(axis=0),
-        "maps": maps,
-    }
+    fresh, training, maps = (
+        np.array(part).reshape(repeats, len(failures), -1).mean(axis=0) for part in zip(*errors, strict=True)
+    )
+    return {"fresh": fresh[:, 0], "training": training[:, 0], "maps": maps.astype(np.float32)}
 
 
 def _conclude(
@@ -118,13 +138,15 @@ def _conclude(
     parts: list[tuple[str, list[FailureSet]]],
     settings: Mapping[str, Any],
     states: list[State],
-) -> Findings:
+) -> StudyResult:
     rows, maps, by_subset = [], [], []
     for label, pad in pads.items():
-        own = [(part, state) for (name, part), state in zip(parts, states, strict=True) if name == label]
-        losses = [loss for part, _ in own for loss in part]
-        fresh, seen, over = (np.concatenate([state[name] for _, state in own]) for name in ("fresh", "own", "maps"))
-        sizes = np.array([len(loss) for loss in losses])
+        results = [(part, state) for (name, part), state in zip(parts, states, strict=True) if name == label]
+        failures = [failed for part, _ in results for failed in part]
+        fresh, training, errors = (
+            np.concatenate([state[name] for _, state in results]) for name in ("fresh", "training", "maps")
+        )
+        sizes = np.array([len(failed) for failed in failures])
         for level in range(sizes.max() + 1):
             means = fresh[sizes == level]
             rows.append(
@@ -138,90 +160,78 @@ def _conclude(
                     "max": float(means.max()),
                     "mean_mm": float(means.mean() * pad.unit_mm),
                     "max_mm": float(means.max() * pad.unit_mm),
-                    "mean_trained_on": float(seen[sizes == level].mean()),
+                    "mean_trained_on": float(training[sizes == level].mean()),
                 }
             )
-            # The worst set of each level, and where it is worst.
             worst = int(np.flatnonzero(sizes == level)[means.argmax()])
-            shown = np.round(over[worst].reshape(SIDE, SIDE), 3)
             (left, low), (right, high) = between_fibres(pad.layout)
-            told = {"pad": label, "failed": list(losses[worst]), "extent": [left, right, low, high]}
-            maps.append(told | {"errors": shown.tolist()})
+            cells = np.round(errors[worst].reshape(SIDE, SIDE), 3).tolist()
+            extent = [left, right, low, high]
+            maps.append({"pad": label, "failed": list(failures[worst]), "extent": extent, "errors": cells})
         by_subset += [
-            {"pad": label, "failed": list(loss), "mean": float(mean)} for loss, mean in zip(losses, fresh, strict=True)
+            {"pad": label, "failed": list(failed), "mean": float(mean)}
+            for failed, mean in zip(failures, fresh, strict=True)
         ]
-    return Findings(rows, _told(settings, rows), {"maps": maps, "by_subset": by_subset})
+    return StudyResult(rows, _describe(settings, rows), {"maps": maps, "by_subset": by_subset})
 
 
-def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
-    drawn = (
-        f" ({MOST_SETS} of them, drawn at random, where there are more)"
-        if any(row["subsets"] < row["of"] for row in rows)
-        else ""
-    )
+def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+    is_sample = any(row["subsets"] < row["of"] for row in rows)
+    sample = f" ({MAX_SETS} of them, drawn at random, where there are more)" if is_sample else ""
+    most = max(row["n_failed"] for row in rows)
     text = [
-        f"Networks of {settings['hidden']} neurons learnt from {settings['presses']} presses of a serpentine, another "
-        f"one for every set of up to {max(row['n_failed'] for row in rows)} lost fibres{drawn}, and were tested on "
-        f"{settings['test']} fresh "
-        f"presses; errors are in grid units ({settings['signals']} signals). Sets of which there are few were trained "
-        f"several times, so that at least {NETWORKS} networks stand behind each mean. The last column is the paper's "
-        "own measure, taken over the serpentine, most of which was trained on."
+        f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses of a serpentine, "
+        f"another one for every set of up to {most} failed fibres{sample}, and tested on {settings['test']} fresh "
+        f"presses; errors are in grid units ({settings['signals']} signals). Where there are few sets, each was "
+        f"trained several times, so that every mean is of at least {MIN_NETWORKS} networks. The last column is the "
+        "paper's own measure, taken over the serpentine, most of which was trained on."
     ]
-    least, most = (
-        {row["pad"]: row for row in rows if row["n_failed"] == level}
-        for level in (0, max(row["n_failed"] for row in rows))
-    )
-    for label, row in least.items():
-        said = f"{label}: {row['mean']:.3f} with all fibres ({row['mean_mm']:.2f} mm)"
-        if label in most and most[label]["n_failed"] > 0:
-            worst = most[label]
-            said += (
-                f", {worst['mean']:.3f} with {worst['n_failed']} lost ({worst['mean'] / row['mean']:.1f} times as much), "
-                f"{worst['max']:.3f} with the worst {worst['n_failed']}"
+    intact, worst = ({row["pad"]: row for row in rows if row["n_failed"] == level} for level in (0, most))
+    for label, row in intact.items():
+        line = f"{label}: {row['mean']:.3f} with all fibres ({row['mean_mm']:.2f} mm)"
+        if label in worst and most:
+            failed = worst[label]
+            line += (
+                f", {failed['mean']:.3f} with {most} failed ({failed['mean'] / row['mean']:.1f} times as much), "
+                f"{failed['max']:.3f} with the worst {most}"
             )
-        text.append(f"{said}.")
-    if len(most) > 1:
-        order = sorted(most, key=lambda label: most[label]["mean"])
-        worse = most[order[-1]]["mean"] / most[order[0]]["mean"]
+        text.append(f"{line}.")
+    if len(worst) > 1:
+        best, *_, last = sorted(worst, key=lambda label: worst[label]["mean"])
         text.append(
-            f"With {most[order[0]]['n_failed']} lost {order[0]} is the most accurate and {order[-1]} the least, "
-            f"{worse:.1f} times as far off."
+            f"With {most} failed {best} is the most accurate and {last} the least; its error is "
+            f"{worst[last]['mean'] / worst[best]['mean']:.1f} times as large."
         )
     return text
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:
-    """Errors by number of lost fibres, and maps of them before a loss and after the worst ones."""
+    """Draw errors by number of failed fibres, and error maps without the worst sets."""
     labels = list(document["settings"]["pads"])
     levels = 1 + max(row["n_failed"] for row in document["rows"])
     figure = Figure(figsize=(max(7.2, 1.9 * levels), 3.6 + 1.75 * len(labels)), layout="constrained")
     grid = figure.add_gridspec(1 + len(labels), levels, height_ratios=[1.9] + [1.0] * len(labels))
     axes = figure.add_subplot(grid[0, :])
-    wide = 0.8 / len(labels)
-    for place, label in enumerate(labels):
+    width = 0.8 / len(labels)
+    for number, label in enumerate(labels):
         rows = [row for row in document["rows"] if row["pad"] == label]
-        at = np.array([row["n_failed"] for row in rows]) + wide * (place - (len(labels) - 1) / 2)
+        x = np.array([row["n_failed"] for row in rows]) + width * (number - (len(labels) - 1) / 2)
         means, stds = ([row[key] for row in rows] for key in ("mean", "std"))
-        colour = CURVES[place % len(CURVES)]
-        axes.bar(at, means, 0.9 * wide, yerr=stds, color=colour, alpha=0.85, ecolor=INK, label=label)
-        axes.scatter(at, [row["max"] for row in rows], marker="_", s=60, color=colour)
-    axes.set_xticks(range(levels), [f"{level} lost" if level else "all fibres" for level in range(levels)])
-    axes.set_ylabel("mean error (grid units)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+        colour = CURVES[number % len(CURVES)]
+        axes.bar(x, means, 0.9 * width, yerr=stds, color=colour, alpha=0.85, ecolor=INK, label=label)
+        axes.scatter(x, [row["max"] for row in rows], marker="_", s=60, color=colour)
+    axes.set_xticks(range(levels), [f"{level} failed" if level else "all fibres" for level in range(levels)])
+    label_axes(axes, grid="y", ylabel="mean error (grid units)")
     axes.legend(frameon=False, fontsize=8)
-    axes.set_title("bar: mean over the sets; line: their spread; dash: the worst set", loc="left", fontsize=8.5)
-    style_axes(axes)
-    highest = float(np.quantile([each["errors"] for each in document["maps"]], 0.99))
-    for place, label in enumerate(labels):
-        for column, each in enumerate(each for each in document["maps"] if each["pad"] == label):
-            axes = figure.add_subplot(grid[1 + place, column], aspect="equal")
-            picture = axes.imshow(
-                each["errors"], origin="lower", extent=each["extent"], cmap="magma_r", vmin=0, vmax=highest
-            )
-            axes.set(xticks=[], yticks=[])
-            lost = "+".join(str(fibre + 1) for fibre in each["failed"])
-            axes.set_title(f"without {lost}" if lost else "all fibres", fontsize=8, color=INK)
+    title = "bar: mean over the sets; line: their standard deviation; dash: the worst set"
+    axes.set_title(title, loc="left", fontsize=8.5)
+    highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.99))
+    for number, label in enumerate(labels):
+        for column, panel in enumerate(panel for panel in document["maps"] if panel["pad"] == label):
+            axes = figure.add_subplot(grid[1 + number, column], aspect="equal")
+            title = failed_label(panel["failed"])
+            image = draw_error_map(axes, panel["errors"], title, highest, panel["extent"])
             if column == 0:
                 axes.set_ylabel(label, fontsize=8, color=INK)
-                figure.colorbar(picture, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
+                figure.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
     return figure

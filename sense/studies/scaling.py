@@ -1,11 +1,12 @@
-"""Scaling: larger surfaces, located from as many presses by networks as large (paper, figures 7 and 8).
+"""Scaling: larger surfaces, localized from equally many presses by equally large networks (paper, figures 7 and 8).
 
-The paper's way learns from a serpentine of presses, which on the larger grids all lie at the same phase to the fibres,
-and is judged on those presses themselves. Beside it stands a way that is judged on fresh presses: it learns from
-presses spread over the whole surface, and is given what share of its family's signal each fibre has, which makes the
-place an almost linear function of the inputs whatever the size. The third way uses that tiles are alike: where fibres
-signal most tells the tile, and one network, given the fibres of that tile and its neighbours, tells where in the tile.
-All presses teach it whatever tile they are in, so that neither its size nor its error need grow with the surface."""
+The published method learns from a serpentine of presses, which on the larger grids all lie at the same phase to the
+fibres, and is evaluated on those presses themselves. The "spread" method is evaluated on fresh presses: it learns from
+presses spread over the whole surface, and its inputs are each fibre's share of its family's signal, of which the
+position is an almost linear function at any size. The "shared" method uses that tiles are alike: the largest signals
+tell the tile, and one network, given the fibres of that tile and its neighbours, the position in it. It learns from all
+presses, whatever their tile, so neither its size nor its error need grow with the surface.
+"""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -16,33 +17,35 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, FAINT, INK, style_axes
+from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from padforge.sense.arrays import Array
-from padforge.sense.studies.study import Findings, Study, Task, described
+from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map, label_axes
 
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"
-WAYS = (PUBLISHED, SPREAD, SHARED)
+METHODS = (PUBLISHED, SPREAD, SHARED)
 HIDDEN = 70
 EPOCHS = 60
 TEST = 4096
 CELLS = 16
-"""Cells along a side of a map of errors."""
+"""Cells along a side of an error map."""
 
 
 def scaling_study(
     pads: Mapping[str, Morphology], *, grids: Sequence[int] = GRIDS, side: int = 64, seed: int = 0
 ) -> Study:
-    """Errors on surfaces of growing grids, each pad repeated over them as a tile.
+    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile.
 
     Args:
-        pads: tiles by label. grids: sizes of the surfaces, multiples of every tile's.
-        side: of the square of presses, side^2 to learn from. seed: of presses and networks.
+        pads: tiles by label.
+        grids: sizes of the surfaces, multiples of every tile's.
+        side: of the square of presses, side^2 to train on.
+        seed: of presses and networks.
 
     Raises:
         InputError: a tile that is no square of one pitch, or a grid that is no multiple of a tile's.
@@ -53,13 +56,13 @@ def scaling_study(
         for grid in grids:
             if grid % pad.grid:
                 raise InputError(f"grids has {grid}, expected multiples of {pad.grid}, the grid of {label}")
-    cases = [(label, grid, way) for grid in grids[::-1] for label in pads for way in WAYS]
+    cases = [(label, grid, method) for grid in grids[::-1] for label in pads for method in METHODS]
     tasks = [
-        Task(f"{label}, {grid} x {grid}, {way}", partial(_found, pads[label], grid, way, side, seed))
-        for label, grid, way in cases
+        Task(f"{label}, {grid} x {grid}, {method}", partial(_evaluate, pads[label], grid, method, side, seed))
+        for label, grid, method in cases
     ]
     settings = {
-        "pads": described(pads),
+        "pads": describe_pads(pads),
         "grids": list(grids),
         "presses": side**2,
         "hidden": HIDDEN,
@@ -71,34 +74,36 @@ def scaling_study(
 
 
 def spread_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
-    """(side^2, 2) presses, one at random in each of side x side cells of a rectangle, grid units."""
+    """Draw one press in each of side x side cells of a rectangle; shape (side^2, 2), grid units."""
     low, high = np.array(rectangle)
     cells = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
-    places = cells + np.random.default_rng([6, seed]).uniform(size=cells.shape)
-    return low + (high - low) / side * places
+    positions = cells + np.random.default_rng([6, seed]).uniform(size=cells.shape)
+    return low + (high - low) / side * positions
 
 
-def shares(given: Array) -> Array:
-    """(Q, 2M) signals as shares of their family's sum, and the two sums: (Q, 2M + 2); shares of no signal are 0."""
-    families = np.split(given, 2, axis=1)
+def family_shares(responses: Array) -> Array:
+    """Return signals (Q, 2M) as shares of their family's sum, and the two sums; shape (Q, 2M + 2)."""
+    families = np.split(responses, 2, axis=1)
     sums = [family.sum(axis=1, keepdims=True) for family in families]
-    parts = [np.divide(f, s, out=np.zeros_like(f), where=s > 0) for f, s in zip(families, sums, strict=True)]
-    return np.hstack([*parts, *sums])
+    shares = [np.divide(f, s, out=np.zeros_like(f), where=s > 0) for f, s in zip(families, sums, strict=True)]
+    return np.hstack([*shares, *sums])
 
 
-def around(given: Array, tile: int) -> tuple[Array, Array]:
-    """(Q, 6 tile) signals of the fibres of the tile a press is in and of those beside it, and (Q, 2) where that tile
-    begins, grid units.
+def tile_inputs(responses: Array, tile: int) -> tuple[Array, Array]:
+    """Select the signals of the tile of each press and of its neighbours.
 
-    In each family it is the tile whose fibres signal most, and one in the middle where none does; beyond the edge there
-    are no fibres, and no signal.
+    In each family it is the tile with the largest sum of signals, and the middle one if all are 0. Beyond the edge
+    signals are 0.
 
     Args:
-        given: (Q, 2M) signals. tile: fibres a family of a tile.
+        responses: signals; shape (Q, 2M).
+        tile: fibres of a family of a tile.
+
+    Returns:
+        Signals; shape (Q, 6 tile). Origin of the tile, grid units; shape (Q, 2).
     """
     windows, origins = [], []
-    # The vertical fibres tell x, the horizontal ones y.
-    for family in np.split(given, 2, axis=1)[::-1]:
+    for family in np.split(responses, 2, axis=1)[::-1]:  # vertical fibres tell x, horizontal ones y
         sums = family.reshape(len(family), -1, tile).sum(axis=2)
         number = np.where(sums.any(axis=1), sums.argmax(axis=1), sums.shape[1] // 2)
         padded = np.pad(family, ((0, 0), (tile, tile)))
@@ -108,49 +113,49 @@ def around(given: Array, tile: int) -> tuple[Array, Array]:
     return np.hstack(windows), np.column_stack(origins).astype(float)
 
 
-def _found(tile: Morphology, grid: int, way: str, side: int, seed: int) -> State:
-    """Errors (Q,) and places (Q, 2) of the presses that a way is judged on, and how long it learnt."""
+def _evaluate(tile: Morphology, grid: int, method: str, side: int, seed: int) -> State:
+    """Compute errors (Q,) at "positions" (Q, 2), grid units, and the seconds and epochs of the training."""
     pad = tile.tiled(grid // tile.grid) if grid > tile.grid else tile
-    pressed, begin = between_fibres(pad.layout), time.perf_counter()
-    if way == PUBLISHED:
-        learned = judged = training_presses(pressed, side, seed)
+    rectangle, begin = between_fibres(pad.layout), time.perf_counter()
+    if method == PUBLISHED:
+        training = test = training_presses(rectangle, side, seed)
     else:
-        learned, judged = spread_presses(pressed, side, seed), fresh_presses(pressed, TEST, seed)
+        training, test = spread_presses(rectangle, side, seed), fresh_presses(rectangle, TEST, seed)
 
-    def given(places: Array) -> tuple[Array, Array]:
-        """Inputs of the network, and the places (Q, 2) its outputs count from."""
-        found = signals(pad, places, PUBLISHED_CONTACT)
-        if way == SHARED:
-            return around(found, tile.grid)
-        return found if way == PUBLISHED else shares(found), np.zeros((len(places), 2))
+    def network_inputs(positions: Array) -> tuple[Array, Array]:
+        """Return inputs, and the origins (Q, 2) that the outputs count from."""
+        responses = signals(pad, positions, PUBLISHED_CONTACT)
+        if method == SHARED:
+            return tile_inputs(responses, tile.grid)
+        return responses if method == PUBLISHED else family_shares(responses), np.zeros((len(positions), 2))
 
-    inputs, origins = given(learned)
-    told = np.ones(len(learned), dtype=bool)
-    if way == SHARED and grid > tile.grid:
-        # Where a family is silent the tile is unknown; there is nothing to learn from where in a wrong one a press is.
-        told = np.all([part.any(axis=1) for part in np.split(inputs, 2, axis=1)], axis=0)
+    inputs, origins = network_inputs(training)
+    valid = np.ones(len(training), dtype=bool)
+    if method == SHARED and grid > tile.grid:
+        # the tile is unknown where a family is silent, and nothing can be learnt from a position in a wrong one
+        valid = np.all([part.any(axis=1) for part in np.split(inputs, 2, axis=1)], axis=0)
     rng = np.random.default_rng([8, seed])
-    network = fit_batch(inputs[told], (learned - origins)[told], [rng], HIDDEN, EPOCHS)[0]
+    network = fit_batch(inputs[valid], (training - origins)[valid], [rng], HIDDEN, EPOCHS)[0]
     seconds = time.perf_counter() - begin
-    inputs, origins = given(judged)
-    errors = np.linalg.norm(origins + network(inputs) - judged, axis=1)
-    return {"errors": errors, "places": judged, "seconds": np.array(seconds), "epochs": np.array(network.epochs)}
+    inputs, origins = network_inputs(test)
+    errors = np.linalg.norm(origins + network(inputs) - test, axis=1)
+    return {"errors": errors, "positions": test, "seconds": np.array(seconds), "epochs": np.array(network.epochs)}
 
 
 def _conclude(
     pads: Mapping[str, Morphology], cases: list[tuple[str, int, str]], settings: Mapping[str, Any], states: list[State]
-) -> Findings:
+) -> StudyResult:
     rows, maps = [], []
     by_case = dict(zip(cases, states, strict=True))
     for label in pads:
-        for way in WAYS:
+        for method in METHODS:
             for grid in settings["grids"]:
-                state = by_case[label, grid, way]
+                state = by_case[label, grid, method]
                 errors = state["errors"]
                 rows.append(
                     {
                         "pad": label,
-                        "way": way,
+                        "method": method,
                         "grid": grid,
                         "mean": float(errors.mean()),
                         "median": float(np.median(errors)),
@@ -160,89 +165,81 @@ def _conclude(
                         "seconds": round(float(state["seconds"]), 2),
                     }
                 )
-                if way == SPREAD:
-                    maps.append({"pad": label, "grid": grid, "errors": _map(grid, state).tolist()})
-    return Findings(rows, _told(settings, rows), {"maps": maps})
+                if method == SPREAD:
+                    maps.append({"pad": label, "grid": grid, "errors": _error_map(grid, state).tolist()})
+    return StudyResult(rows, _describe(settings, rows), {"maps": maps})
 
 
-def _map(grid: int, state: State) -> Array:
-    """(CELLS, CELLS) mean errors by place."""
+def _error_map(grid: int, state: State) -> Array:
+    """Return mean errors by cell; shape (CELLS, CELLS)."""
     low = 1 if grid > 1 else 0.5
-    cells = np.clip(((state["places"] - low) / max(grid - 1, 1) * CELLS).astype(int), 0, CELLS - 1)
+    cells = np.clip(((state["positions"] - low) / max(grid - 1, 1) * CELLS).astype(int), 0, CELLS - 1)
     total, count = np.zeros((2, CELLS, CELLS))
     np.add.at(total, (cells[:, 1], cells[:, 0]), state["errors"])
     np.add.at(count, (cells[:, 1], cells[:, 0]), 1)
     return np.round(total / np.maximum(count, 1), 4)
 
 
-def _told(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     text = [
-        f"Networks of {settings['hidden']} neurons learnt from {settings['presses']} presses, for every size of the "
-        f"surface alike, in at most {settings['epochs']} steps. The published way learns the signals of a serpentine "
-        "and is judged on it, most of which was trained on; the other one learns each fibre's share of its family's "
-        f"signal from presses spread evenly, and is judged on {settings['test']} fresh ones. The third, shared way "
-        "learns from the same presses where in its tile each is, one network for all tiles. Errors are in grid units."
+        f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses, for every size of "
+        f"the surface alike, in at most {settings['epochs']} steps. The published method learns the signals of a "
+        "serpentine and is evaluated on it, most of which was trained on; the spread method learns each fibre's share "
+        f"of its family's signal from presses spread evenly, and is evaluated on {settings['test']} fresh ones. The "
+        "shared method learns from the same presses the position in the tile, by one network for all tiles. Errors are "
+        "in grid units."
     ]
     for label in settings["pads"]:
-        for way in WAYS:
-            own = [row for row in rows if (row["pad"], row["way"]) == (label, way)]
-            below = [row["grid"] for row in own if row["mean"] < 0.5]
-            reach = (
-                f"below half a grid unit on grids {', '.join(map(str, below))}" if below else "above half throughout"
-            )
-            first, last = own[0], own[-1]
+        for method in METHODS:
+            cases = [row for row in rows if (row["pad"], row["method"]) == (label, method)]
+            below = ", ".join(str(row["grid"]) for row in cases if row["mean"] < 0.5)
+            half = f"below half a grid unit on grids {below}" if below else "above half throughout"
+            first, last = cases[0], cases[-1]
             text.append(
-                f"{label}, {way}: {first['mean']:.3f} at {first['grid']} x {first['grid']} to {last['mean']:.3f} at "
+                f"{label}, {method}: {first['mean']:.3f} at {first['grid']} x {first['grid']} to {last['mean']:.3f} at "
                 f"{last['grid']} x {last['grid']}, {first['percent_of_side']:.2f} % to {last['percent_of_side']:.2f} % "
-                f"of the side; {reach}. The largest took {last['seconds']:.0f} s."
+                f"of the side; {half}. The largest took {last['seconds']:.0f} s."
             )
     grid = max(settings["grids"])
-    judged_alike = (row for row in rows if row["grid"] == grid and row["way"] != PUBLISHED)
-    largest = sorted(judged_alike, key=lambda row: row["mean"])
-    best, worst = largest[0], largest[-1]
+    largest = [row for row in rows if row["grid"] == grid and row["method"] != PUBLISHED]
+    best, *_, worst = sorted(largest, key=lambda row: row["mean"])
     text.append(
-        f"On fresh presses at {grid} x {grid} the best is {best['pad']}, {best['way']}, {best['mean']:.3f} grid units "
-        f"or {best['percent_of_side']:.3f} % of the side off; {worst['pad']}, {worst['way']} is "
-        f"{worst['mean'] / best['mean']:.1f} times as far off."
+        f"On fresh presses at {grid} x {grid} the best is {best['pad']}, {best['method']}, with an error of "
+        f"{best['mean']:.3f} grid units or {best['percent_of_side']:.3f} % of the side; that of {worst['pad']}, "
+        f"{worst['method']} is {worst['mean'] / best['mean']:.1f} times as large."
     )
     return text
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:
-    """Errors and their share of the side by the grid, and maps of errors on fresh presses."""
+    """Draw errors, their share of the side and time by grid, and error maps on fresh presses."""
     grids, labels = document["settings"]["grids"], list(document["settings"]["pads"])
     figure = Figure(figsize=(max(7.2, 1.45 * len(grids)), 3.4 + 1.6 * len(labels)), layout="constrained")
     halves: Any = figure.subfigures(2, 1, height_ratios=[3.2, 1.6 * len(labels)])
     upper, lower = halves
     names = {"mean": "mean error (grid units)", "percent_of_side": "mean error (% of the side)", "seconds": "time (s)"}
-    for place, (key, name) in enumerate(names.items()):
-        axes = upper.add_subplot(1, 3, 1 + place)
+    for index, (key, name) in enumerate(names.items()):
+        axes = upper.add_subplot(1, 3, 1 + index)
         for number, label in enumerate(labels):
-            for way, style in zip(WAYS, (":", "--", "-"), strict=True):
-                own = [row for row in document["rows"] if (row["pad"], row["way"]) == (label, way)]
+            for method, style in zip(METHODS, (":", "--", "-"), strict=True):
+                cases = [row for row in document["rows"] if (row["pad"], row["method"]) == (label, method)]
+                values, name_of = [row[key] for row in cases], f"{label}, {method}"
                 colour = CURVES[number % len(CURVES)]
-                values = [row[key] for row in own]
-                axes.loglog(grids, values, style, color=colour, marker="o", markersize=3.5, label=f"{label}, {way}")
+                axes.loglog(grids, values, style, color=colour, marker="o", markersize=3.5, label=name_of)
         if key == "mean":
             axes.axhline(0.5, color=INK, linewidth=0.8, linestyle="--")
-            curves = axes.get_legend_handles_labels()
-            upper.legend(
-                *curves, frameon=False, fontsize=7, handlelength=3.5, loc="outside upper left", ncols=len(WAYS)
-            )
+            legend = {"fontsize": 7, "handlelength": 3.5, "loc": "outside upper left", "ncols": len(METHODS)}
+            upper.legend(*axes.get_legend_handles_labels(), frameon=False, **legend)
         axes.set_xticks(grids, [str(grid) for grid in grids])
         axes.xaxis.minorticks_off()
-        axes.set(xlabel="grid", ylabel=name)
-        axes.grid(axis="y", color=FAINT, linewidth=0.6)
-        style_axes(axes)
+        label_axes(axes, grid="y", xlabel="grid", ylabel=name)
     panels = lower.subplots(len(labels), len(grids), squeeze=False)
-    highest = float(np.quantile([each["errors"] for each in document["maps"]], 0.98))
-    for each in document["maps"]:
-        row, column = labels.index(each["pad"]), grids.index(each["grid"])
+    highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.98))
+    for panel in document["maps"]:
+        row, column = labels.index(panel["pad"]), grids.index(panel["grid"])
         axes = panels[row, column]
-        picture = axes.imshow(each["errors"], origin="lower", cmap="magma_r", vmin=0, vmax=highest)
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(f"{each['grid']} x {each['grid']}", fontsize=8, color=INK)
+        image = draw_error_map(axes, panel["errors"], f"{panel['grid']} x {panel['grid']}", highest)
         if column == 0:
-            axes.set_ylabel(each["pad"], fontsize=8, color=INK)
-            lower.colorbar(picture, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
+            axes.set_ylabel(panel["pad"], fontsize=8, color=INK)
+            lower.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
     return figure

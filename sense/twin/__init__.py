@@ -1,4 +1,4 @@
-"""The twin: the as-built model of a printed pad, identified from a recording of presses."""
+"""The twin is the as-built model (digital twin) of a printed pad, identified from a recording of presses."""
 
 from pathlib import Path
 

@@ -1,18 +1,11 @@
-"""What one channel answers to presses, and how that changes with all it depends on.
-A fibre is a row of short elements. An element at distance d from the press, whose tangent makes the angle phi with the
-way to the press, counts with (w(d) + v(d) cos 2 phi) times its length and its sensitivity; w and v are sums of uniform
-cubic B-splines mirrored at 0, so that they are smooth at the centre and 0 from their end on.
+"""Parametric model of a pad as built: the responses of its channels to presses anywhere, and their derivatives.
 
-What each channel of a recording answers to each press: one number, with what came before taken off.
-That number scatters, but the other windows of the press, of the probe's sinking in and of its release, tell of the
-place once more. By how much is told by Fisher's information: J' S^-1 J, with J the change of the windows with the
-place by the response model, and S the covariance of what that model leaves of presses it has not seen.
+    volts_c(p) = rest_c + gain_c * sum_i (w(r_i) + v(r_i) cos 2 phi_i) exp(s_c(i)) l_i,    r_i = |x_i + a_c(i) - T(p)|
 
-A pad as it was laid: what each of its channels answers to a press anywhere, fitted to presses.
-    volts_c(p) = rest_c + gain_c * sum_i (w(r_i) + v(r_i) cos 2 phi_i) exp(s_c(i)) l_i,    r_i = x_i + a_c(i) - F(p)
-over the elements i of the fibre that channel c reads: x_i where it was planned, a_c how far beside this it was laid,
-l_i its length as laid, s_c its sensitivity, a_c and s_c smooth curves; F the frame; w the reach, v its dependence on
-the angle between fibre and press.
+over the elements i of the fibre that channel c reads: x_i where it was planned, a_c its lateral offset, l_i its length
+as built, s_c its log-sensitivity, T the plan transform, phi_i the angle between the element and the direction to the
+press, w the sensitivity profile and v its dependence on that angle. w and v are uniform cubic B-splines mirrored at 0,
+smooth at the centre and 0 from their end on; a_c and s_c are cubic B-splines along the fibre.
 """
 
 import math
@@ -21,23 +14,37 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from scipy.interpolate import RegularGridInterpolator
 
 from padforge.design import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
 from padforge.design.twin import PlanTransform
-from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, STEPS, ResponseModel, compute_features, remove_history
-from padforge.sense.recording.recording import Recording
+from padforge.sense.arrays import Array, Indices
+from padforge.sense.twin.responses import Responses
 
-CENTRE = 1e-6
-"""Squared distance below which the way to the press has no direction, squared grid units."""
+EPSILON = 1e-6
+"""Squared distance below which the direction to the press is undefined, squared grid units."""
+N_ELEMENTS = 160
+"""Elements of a fibre."""
+FLAT_TOLERANCE = 1e-3
+"""Tolerance of the polyline that elements lie on, grid units."""
+N_SPLINES = 9
+"""Splines of a profile."""
+SPLINE_STEP = 0.36
+"""Their distance, as a share of the standard deviation of the Gaussian profile that fits best."""
+N_OFFSET, N_SENSITIVITY = 12, 8
+"""Splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity."""
+N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
+"""Parameters that all channels share (transform and two profiles), and those of each channel."""
+OFFSET, SENSITIVITY = slice(2, 2 + 2 * N_OFFSET), slice(2 + 2 * N_OFFSET, N_CHANNEL)
+"""Among the parameters of a channel, those of its lateral offset, x before y, and of its log-sensitivity."""
+SLOPE_STEP_MM = 0.5
+"""Half of the step of the central differences by which slopes over the position are taken."""
 
 
 @njit(cache=True, error_model="numpy")
 def spline_weights(f: float, out: Any) -> None:
-    """Values (4,) of the B-splines centred at -1, 0, 1 and 2 at f in [0, 1), and their derivatives, into out (2, 4)."""
+    """Write values and derivatives at f in [0, 1) of the B-splines centred at -1, 0, 1 and 2 into out (2, 4)."""
     g = 1 - f
     out[0, 0], out[0, 3] = g * g * g / 6, f * f * f / 6
     out[0, 1], out[0, 2] = (3 * f * f * f - 6 * f * f + 4) / 6, (3 * g * g * g - 6 * g * g + 4) / 6
@@ -46,285 +53,169 @@ def spline_weights(f: float, out: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def along_fibre(coefficients: Any, elements: int) -> Any:
-    """Smooth curves over a row of elements, cubic B-splines of (n, J) coefficients from end to end.
+def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
+    """Evaluate cubic B-splines, from end to end of a row of elements.
+
+    Args:
+        coefficients: of n curves; shape (n, J).
+        elements: number of elements F.
 
     Returns:
-        Their values at each element and how they change over it, (2, n, F); the first coefficient that each depends on
-        (F,), and how its value and its change do on four of them (2, F, 4).
+        Values at each element, and their change over it; shape (2, n, F). First coefficient that each element depends
+        on; shape (F,). Derivatives of value and change by that one and the next three; shape (2, F, 4).
     """
     curves, count = coefficients.shape
     pieces = count - 3
-    found, first, share = np.zeros((2, curves, elements)), np.empty(elements, np.int64), np.empty((2, elements, 4))
-    bend = np.empty((2, 4))
+    values, first, basis = np.zeros((2, curves, elements)), np.empty(elements, np.int64), np.empty((2, elements, 4))
+    weights = np.empty((2, 4))
     for i in range(elements):
         x = (i + 0.5) / elements * pieces
         first[i] = min(int(x), pieces - 1)
-        spline_weights(x - first[i], bend)
+        spline_weights(x - first[i], weights)
         for j in range(4):
-            share[0, i, j], share[1, i, j] = bend[0, j], bend[1, j] * pieces / elements
+            basis[0, i, j], basis[1, i, j] = weights[0, j], weights[1, j] * pieces / elements
             for a in range(curves):
-                found[0, a, i] += share[0, i, j] * coefficients[a, first[i] + j]
-                found[1, a, i] += share[1, i, j] * coefficients[a, first[i] + j]
-    return found, first, share
+                values[0, a, i] += basis[0, i, j] * coefficients[a, first[i] + j]
+                values[1, a, i] += basis[1, i, j] * coefficients[a, first[i] + j]
+    return values, first, basis
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def channel_response(
-    course: Any, tangent: Any, length: Any, aside: Any, sensitivity: Any, places: Any, profile: Any, step: float
+    path: Any,
+    tangent: Any,
+    length: Any,
+    lateral_offset: Any,
+    log_sensitivity: Any,
+    positions: Any,
+    profile: Any,
+    step: float,
 ) -> Any:
-    """Signals of one fibre for presses, and their derivatives.
+    """Compute the responses of one fibre, and their derivatives; grid units.
 
     Args:
-        course, tangent: (F, 2) planned elements, evenly spaced along the fibre, and their unit tangents.
-        length: (F,) of the elements.
-        aside: (2, J) coefficients of how far each lies beside its plan in x and in y, which also stretches it.
-        sensitivity: (1, J') coefficients of the logarithm of how much an element counts.
-        places: (Q, 2). profile: (2, K) coefficients of w and of v, whose splines are `step` apart.
+        path: middles of the planned elements, evenly spaced along the fibre; shape (F, 2).
+        tangent: unit tangents; shape (F, 2).
+        length: lengths; shape (F,).
+        lateral_offset: spline coefficients of the offset in x and in y, which also stretches the fibre; shape (2, J).
+        log_sensitivity: spline coefficients; shape (1, J').
+        positions: presses; shape (Q, 2).
+        profile: coefficients of w and of v; shape (2, K).
+        step: distance of the splines of the profile.
 
     Returns:
-        Signals (Q,), and their derivatives by profile (Q, 2, K), aside (Q, 2, J), sensitivity (Q, J'), place (Q, 2).
+        Responses (Q,), and their derivatives by profile (Q, 2, K), lateral offset (Q, 2, J), log-sensitivity (Q, J')
+        and position (Q, 2).
     """
-    elements, splines, presses = len(course), profile.shape[1], len(places)
+    elements, splines, presses = len(path), profile.shape[1], len(positions)
     end = (splines + 1) * step
-    signal, by_profile, by_place = np.zeros(presses), np.zeros((presses, 2, splines)), np.zeros((presses, 2))
-    by_aside, by_sensitivity = np.zeros((presses, 2, aside.shape[1])), np.zeros((presses, sensitivity.shape[1]))
-    (off, off_first, off_share), here = along_fibre(aside, elements), np.empty((2, 4))
-    gain, gain_first, gain_share = along_fibre(sensitivity, elements)
+    signal, by_profile, by_position = np.zeros(presses), np.zeros((presses, 2, splines)), np.zeros((presses, 2))
+    by_offset = np.zeros((presses, 2, lateral_offset.shape[1]))
+    by_sensitivity = np.zeros((presses, log_sensitivity.shape[1]))
+    (offset, offset_first, offset_basis), near = evaluate_along_fibre(lateral_offset, elements), np.empty((2, 4))
+    log_gain, gain_first, gain_basis = evaluate_along_fibre(log_sensitivity, elements)
     for i in range(elements):
-        at_x, at_y = course[i, 0] + off[0, 0, i], course[i, 1] + off[0, 1, i]
-        tx, ty = length[i] * tangent[i, 0] + off[1, 0, i], length[i] * tangent[i, 1] + off[1, 1, i]
-        laid = math.sqrt(tx * tx + ty * ty)
-        tx, ty = tx / laid, ty / laid
-        factor, counts = math.exp(gain[0, 0, i]), math.exp(gain[0, 0, i]) * laid
+        at_x, at_y = path[i, 0] + offset[0, 0, i], path[i, 1] + offset[0, 1, i]
+        tx, ty = length[i] * tangent[i, 0] + offset[1, 0, i], length[i] * tangent[i, 1] + offset[1, 1, i]
+        built_length = math.sqrt(tx * tx + ty * ty)
+        tx, ty = tx / built_length, ty / built_length
+        gain = math.exp(log_gain[0, 0, i])
+        weighted_length = gain * built_length
         for q in range(presses):
-            x, y = at_x - places[q, 0], at_y - places[q, 1]
+            x, y = at_x - positions[q, 0], at_y - positions[q, 1]
             square = x * x + y * y
             if square >= end * end:
                 continue
-            far = math.sqrt(square)
+            distance = math.sqrt(square)
             along = x * tx + y * ty
-            double = 2 * along * along / (square + CENTRE) - 1
-            piece = int(far / step)
-            spline_weights(far / step - piece, here)
-            weight, rate, turning = 0.0, 0.0, 0.0
+            cos_2phi = 2 * along * along / (square + EPSILON) - 1
+            piece = int(distance / step)
+            spline_weights(distance / step - piece, near)
+            weight, slope, angular = 0.0, 0.0, 0.0
             for j in range(4):
-                k = abs(piece + j - 1)
+                k = abs(piece + j - 1)  # mirrored at 0
                 if k < splines:
-                    weight += here[0, j] * (profile[0, k] + double * profile[1, k])
-                    rate += here[1, j] * (profile[0, k] + double * profile[1, k])
-                    turning += here[0, j] * profile[1, k]
-                    by_profile[q, 0, k] += counts * here[0, j]
-                    by_profile[q, 1, k] += counts * here[0, j] * double
-            signal[q] += counts * weight
-            pull = counts * rate / (step * max(far, 1e-9))
-            twist = counts * turning * 4 * along / (square + CENTRE)
-            shrink = pull - twist * along / (square + CENTRE)
+                    weight += near[0, j] * (profile[0, k] + cos_2phi * profile[1, k])
+                    slope += near[1, j] * (profile[0, k] + cos_2phi * profile[1, k])
+                    angular += near[0, j] * profile[1, k]
+                    by_profile[q, 0, k] += weighted_length * near[0, j]
+                    by_profile[q, 1, k] += weighted_length * near[0, j] * cos_2phi
+            signal[q] += weighted_length * weight
+            radial = weighted_length * slope / (step * max(distance, 1e-9))
+            twist = weighted_length * angular * 4 * along / (square + EPSILON)
+            by_square = radial - twist * along / (square + EPSILON)
             for axis in range(2):
-                aim, way = (tx, x) if axis == 0 else (ty, y)
-                moved = shrink * way + twist * aim
-                stretched = factor * weight * aim + twist * (way - along * aim) / laid
-                by_place[q, axis] -= moved
+                t, r = (tx, x) if axis == 0 else (ty, y)
+                by_shift = by_square * r + twist * t
+                by_stretch = gain * weight * t + twist * (r - along * t) / built_length
+                by_position[q, axis] -= by_shift
                 for j in range(4):
-                    by_aside[q, axis, off_first[i] + j] += moved * off_share[0, i, j] + stretched * off_share[1, i, j]
+                    by_offset[q, axis, offset_first[i] + j] += (
+                        by_shift * offset_basis[0, i, j] + by_stretch * offset_basis[1, i, j]
+                    )
             for j in range(4):
-                by_sensitivity[q, gain_first[i] + j] += counts * weight * gain_share[0, i, j]
-    return signal, by_profile, by_aside, by_sensitivity, by_place
-
-
-ALIKE = 0.15
-"""Share of its depth by which another press may differ that counts as deep as one."""
-HELD = 3
-"""First window of the press that counts as held: the tip has come to rest in the silicone."""
-HOLD = np.array([(end - first) * (k >= HELD) for k, (first, end) in enumerate(DOWN)], float)
-HOLD /= HOLD.sum()
-"""(9,) what makes one number of the windows of a press."""
-
-
-@dataclass(frozen=True)
-class Responses:
-    """Answers of C channels to Q presses of known places.
-
-    Attributes:
-        positions_mm: (Q, 2) as the arm counts. volts: (Q, C) mean while held minus the rest before, as it would be after
-            the channel's usual history. there: (Q, C) whether the channel gave enough readings.
-    """
-
-    positions_mm: Array
-    volts: Array
-    there: Mask
-
-    def __len__(self) -> int:
-        return len(self.positions_mm)
-
-    def of(self, rows: Indices, channels: Indices | slice = slice(None)) -> "Responses":
-        """Those of some presses and channels."""
-        return Responses(self.positions_mm[rows], self.volts[rows][:, channels], self.there[rows][:, channels])
-
-    @property
-    def spread(self) -> Array:
-        """(C,) variance of each channel's answers; 1 where it gave none."""
-        counts = np.maximum(self.there.sum(axis=0), 1)
-        mean = np.where(self.there, self.volts, 0).sum(axis=0) / counts
-        squares = np.where(self.there, (self.volts - mean) ** 2, 0).sum(axis=0) / counts
-        return np.where(squares > 0, squares, 1.0)
-
-    def explained(self, predicted: Array) -> Array:
-        """(C,) share of the variance of the answers that a prediction (Q, C) explains."""
-        counts = np.maximum(self.there.sum(axis=0), 1)
-        left = np.where(self.there, (self.volts - predicted) ** 2, 0).sum(axis=0) / counts
-        return 1 - left / self.spread
-
-
-def of_one_depth(recording: Recording) -> Recording:
-    """The recording, the places of presses unknown that are not about as deep as most: a deeper one gives more.
-
-    They stay in what came before the others. Where no depth is known, all are taken to be alike.
-    """
-    actual_depths_mm = np.where(recording.has_position, recording.actual_depths_mm, np.nan)
-    known = np.sort(actual_depths_mm[actual_depths_mm > 0])[::-1]
-    if not len(known):
-        return recording
-    as_deep = np.searchsorted(-known, -(1 - ALIKE) * known, "right")
-    deeper = np.searchsorted(-known, -(1 + ALIKE) * known, "left")
-    usual = known[np.argmax(as_deep - deeper)]  # the deepest of the most common, as it is heard best
-    alike = np.abs(actual_depths_mm - usual) <= ALIKE * usual
-    return replace(recording, presses_mm=np.where(alike[:, None], recording.presses_mm, np.nan))
-
-
-def responses(recording: Recording, learnt: Mask) -> Responses:
-    """The answers to all presses of known places.
-
-    Args:
-        learnt: (Q,) of these presses, those from which is learnt what of its history a channel still shows.
-    """
-    known = recording.has_position
-    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
-    places = recording.presses_mm[known]
-    about = _about(places)
-    model = ResponseModel.fit(about[learnt], inputs.windows[learnt], inputs.history[learnt], inputs.fibre_mask[learnt])
-    windows = remove_history(inputs.windows, inputs.history, model.memory, model.usual)
-    return Responses(places, windows @ HOLD, inputs.fibre_mask)
-
-
-def information(recording: Recording, channels: Indices) -> Array:
-    """(C',) 1/mm^2, what all windows of a press tell of its place: Fisher's information, mean over all places.
-
-    Args:
-        channels: (C',) which ones, each by the presses in which it gave enough readings.
-    """
-    known = recording.has_position
-    inputs = compute_features(
-        recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
-    )
-    places = _about(recording.presses_mm[known])
-    side_mm = np.ptp(recording.presses_mm[known], axis=0).max()
-    told = []
-    for channel in channels.tolist():
-        there = inputs.fibre_mask[:, channel]
-        told.append(_told(places[there], inputs.windows[there, channel], inputs.history[there, channel]))
-    return np.array(told) * (2 / side_mm) ** 2
-
-
-def _told(places: Array, windows: Array, history: Array) -> float:
-    """Fisher's information, of places (Q, 2) within [-1, 1], in windows (Q, F) V after a history (Q, J) V.
-
-    Of two response models, each of half the presses, what is left over of the other half and the product of their
-    slopes are taken: noise that a model takes for a slope is not in the other one.
-    """
-    windows, history, fibre_mask = windows[:, None], history[:, None], np.ones((len(places), 1), bool)
-    grid, odd = np.linspace(-1, 1, STEPS + 1), np.arange(len(places)) % 2 == 1
-    left, tables = np.empty_like(windows), []
-    for seen in (odd, ~odd):
-        model = ResponseModel.fit(places[seen], windows[seen], history[seen], fibre_mask[seen])
-        expected = RegularGridInterpolator((grid, grid), model.table)(places[~seen])
-        left[~seen] = remove_history(windows[~seen], history[~seen], model.memory, model.usual) - expected
-        tables.append(model.table[:, :, 0])
-    precision, told = np.linalg.pinv(np.cov(left[:, 0].T), hermitian=True), 0.0  # short presses have readings twice
-    for axis in (0, 1):
-        one, other = (np.asarray(np.gradient(table, 2 / STEPS, axis=axis)) for table in tables)
-        told += float(np.einsum("xyf,fg,xyg->xy", one, precision, other).mean())
-    return max(told, 0.0)
-
-
-def _about(positions_mm: Array) -> Array:
-    """(Q, 2) places to the square [-1, 1] about all of them."""
-    middle = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
-    return (positions_mm - middle) / np.abs(positions_mm - middle).max()
-
-
-ELEMENTS = 160
-"""Elements of a fibre."""
-FLAT = 1e-3
-"""Tolerance of the polyline they lie on, grid units."""
-SPLINES = 9
-"""Splines of the reach."""
-NARROW = 0.36
-"""Their distance, as a share of the standard deviation of the Gaussian reach that fits best."""
-STEP_MM = 0.5
-"""Half of the way over which is told how volts change with the place."""
-ASIDE, SENSITIVITY = 12, 8
-"""Splines of a fibre's way beside its plan, and of its sensitivity."""
-SHARED, OWN = 4 + 2 * SPLINES, 2 + 2 * ASIDE + SENSITIVITY
-"""Values that all channels share: the frame's, and two profiles; and those of each channel."""
-AWAY, COUNTS = slice(2, 2 + 2 * ASIDE), slice(2 + 2 * ASIDE, OWN)
-"""Of the values of a channel those of its way beside the plan, in x and then in y, and of its sensitivity."""
+                by_sensitivity[q, gain_first[i] + j] += weighted_length * weight * gain_basis[0, i, j]
+    return signal, by_profile, by_offset, by_sensitivity, by_position
 
 
 @dataclass(frozen=True)
 class PadPlan:
-    """Elements of F a fibre, evenly spaced along each.
+    """Planned fibres, cut into N_ELEMENTS elements that are evenly spaced along each; grid units.
 
     Attributes:
-        course: (C, F, 2) their middles. tangent: (C, F, 2) of unit length. length: (C, F). layout: as of the
-            morphology.
+        paths: middles of the elements; shape (fibres, N_ELEMENTS, 2).
+        tangents: unit tangents; shape (fibres, N_ELEMENTS, 2).
+        lengths: shape (fibres, N_ELEMENTS).
+        layout: as of the morphology.
     """
 
-    course: Array
-    tangent: Array
-    length: Array
+    paths: Array
+    tangents: Array
+    lengths: Array
     layout: Layout
 
     @classmethod
-    def of(cls, pad: Morphology) -> "PadPlan":
-        """Of a morphology."""
-        course, tangent, length = [], [], []
-        for line in flatten(pad, FLAT):
-            run = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
-            ends = np.linspace(0, run[-1], ELEMENTS + 1)
-            points = np.column_stack([np.interp(ends, run, line[:, axis]) for axis in range(2)])
-            along = np.diff(points, axis=0)
-            size = np.hypot(*along.T)
-            course.append((points[:-1] + points[1:]) / 2)
-            tangent.append(along / size[:, None])
-            length.append(size)
-        return cls(np.array(course), np.array(tangent), np.array(length), pad.layout)
+    def from_morphology(cls, pad: Morphology) -> "PadPlan":
+        """Cut the fibres of a morphology into elements."""
+        paths, tangents, lengths = [], [], []
+        for line in flatten(pad, FLAT_TOLERANCE):
+            arc = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
+            ends = np.linspace(0, arc[-1], N_ELEMENTS + 1)
+            points = np.column_stack([np.interp(ends, arc, line[:, axis]) for axis in range(2)])
+            step = np.diff(points, axis=0)
+            size = np.hypot(*step.T)
+            paths.append((points[:-1] + points[1:]) / 2)
+            tangents.append(step / size[:, None])
+            lengths.append(size)
+        return cls(np.array(paths), np.array(tangents), np.array(lengths), pad.layout)
 
     def to_grid(self, positions_mm: Array) -> Array:
-        """(Q, 2) mm on the plan, from its middle, to grid units from its corner."""
+        """Convert positions (Q, 2) on the plan from mm from its middle to grid units from its corner."""
         return positions_mm / self.unit_mm + self.middle
 
     @property
     def unit_mm(self) -> float:
-        """A grid unit, mm."""
+        """Grid unit, mm."""
         return self.layout.unit_mm
 
     @property
     def middle(self) -> Array:
-        """(2,) of the pad, grid units from its corner."""
+        """Middle of the pad, grid units from its corner; shape (2,)."""
         return np.array(self.layout.extent) / 2
 
 
 @dataclass(frozen=True)
-class LaidPad:
-    """A fitted pad of C channels.
+class AsBuiltPad:
+    """Parameters of a pad of C channels.
 
     Attributes:
-        plan: what was planned. fibres: (C,) which one each channel reads.
-        mirrored: whether the frame is. step: distance of the splines of the reach, grid units.
-        values: (SHARED + C OWN,) all that is fitted: turn (rad), shift (mm), scale; splines of w and of v; then for
-            each channel gain (V a grid unit), rest (V), splines of the way aside (grid units, in x, then in y) and of
-            the sensitivity.
+        plan: the planned fibres.
+        fibres: index of the fibre that each channel reads; C of them.
+        mirrored: whether the plan transform is.
+        step: distance of the splines of the profiles, grid units.
+        values: all parameters: turn (rad), shift (mm) and scale; splines of w and of v; then for each channel gain (V
+            per grid unit), rest (V), splines of the lateral offset (grid units, x before y) and of the
+            log-sensitivity; shape (N_SHARED + C N_CHANNEL,).
     """
 
     plan: PadPlan
@@ -334,150 +225,155 @@ class LaidPad:
     values: Array
 
     @classmethod
-    def on_plan(cls, plan: PadPlan, fibres: tuple[int, ...], frame: PlanTransform, width: float) -> "LaidPad":
-        """A pad that lies as planned, with a Gaussian reach of standard deviation `width` and gains of 1."""
-        step = NARROW * width
-        distance = np.linspace(0, (SPLINES + 1) * step, 100)
-        reach = np.linalg.lstsq(_splines(distance / step), np.exp(-0.5 * (distance / width) ** 2), rcond=None)[0]
-        values = np.zeros(SHARED + len(fibres) * OWN)
-        values[:4] = np.radians(frame.turn_deg), *frame.shift_mm, frame.scale
-        values[4 : 4 + SPLINES] = reach
-        values[SHARED::OWN] = 1.0
-        return cls(plan, fibres, frame.mirrored, step, values)
+    def from_plan(cls, plan: PadPlan, fibres: tuple[int, ...], transform: PlanTransform, width: float) -> "AsBuiltPad":
+        """Return a pad as planned, with gains of 1 and a Gaussian profile of standard deviation `width`, grid units."""
+        step = SPLINE_STEP * width
+        distance = np.linspace(0, (N_SPLINES + 1) * step, 100)
+        gaussian = np.exp(-0.5 * (distance / width) ** 2)
+        values = np.zeros(N_SHARED + len(fibres) * N_CHANNEL)
+        values[:4] = np.radians(transform.turn_deg), *transform.shift_mm, transform.scale
+        values[4 : 4 + N_SPLINES] = np.linalg.lstsq(_profile_basis(distance / step), gaussian, rcond=None)[0]
+        values[N_SHARED::N_CHANNEL] = 1.0
+        return cls(plan, fibres, transform.mirrored, step, values)
 
     @property
-    def frame(self) -> PlanTransform:
-        """How it lay."""
+    def transform(self) -> PlanTransform:
+        """Plan transform: how the pad lay under the arm."""
         turn, x, y, scale = self.values[:4].tolist()
         return PlanTransform(self.mirrored, (float(np.degrees(turn)) + 180) % 360 - 180, (x, y), scale)
 
     @property
-    def end(self) -> float:
-        """Distance at which a press is felt no more, grid units."""
-        return (SPLINES + 1) * self.step
+    def max_distance(self) -> float:
+        """Distance from which on a press is not felt, grid units."""
+        return (N_SPLINES + 1) * self.step
 
     @property
-    def own(self) -> Array:
-        """(C, OWN) the values of each channel."""
-        return self.values[SHARED:].reshape(-1, OWN)
+    def channel_values(self) -> Array:
+        """Parameters of each channel; shape (C, N_CHANNEL)."""
+        return self.values[N_SHARED:].reshape(-1, N_CHANNEL)
 
-    def weights(self, distance: Array) -> Array:
-        """(2, n) w and v at distances (n,), grid units."""
-        return self.values[4:SHARED].reshape(2, SPLINES) @ _splines(distance / self.step).T
+    @property
+    def rest_v(self) -> Array:
+        """Response of each channel far from any fibre, V; shape (C,)."""
+        return self.channel_values[:, 1]
 
-    def course(self, channel: int) -> tuple[Array, Array]:
-        """(F, 2) elements of the fibre that a channel reads as laid, grid units, and how much each counts (F,)."""
-        aside, sensitivity = self._curves(channel)
-        off, uneven = along_fibre(aside, ELEMENTS)[0][0], along_fibre(sensitivity, ELEMENTS)[0][0]
-        return self.plan.course[self.fibres[channel]] + off.T, np.exp(uneven[0])
+    def profile(self, distance: Array) -> Array:
+        """Evaluate w and v at distances (n,) in grid units; shape (2, n)."""
+        return self.values[4:N_SHARED].reshape(2, N_SPLINES) @ _profile_basis(distance / self.step).T
+
+    def path(self, channel: int) -> tuple[Array, Array]:
+        """Return the middles (N_ELEMENTS, 2), grid units, and sensitivities (N_ELEMENTS,) of a channel's fibre."""
+        lateral_offset, log_sensitivity = self._curves(channel)
+        offset = evaluate_along_fibre(lateral_offset, N_ELEMENTS)[0][0]
+        log_gain = evaluate_along_fibre(log_sensitivity, N_ELEMENTS)[0][0]
+        return self.plan.paths[self.fibres[channel]] + offset.T, np.exp(log_gain[0])
 
     def _curves(self, channel: int) -> tuple[Array, Array]:
-        """(2, ASIDE) and (1, SENSITIVITY) coefficients."""
-        own = self.own[channel]
-        return own[AWAY].reshape(2, ASIDE), own[None, COUNTS]
+        """Return the coefficients of lateral offset (2, N_OFFSET) and log-sensitivity (1, N_SENSITIVITY)."""
+        values = self.channel_values[channel]
+        return values[OFFSET].reshape(2, N_OFFSET), values[None, SENSITIVITY]
 
     def predict(self, positions_mm: Array) -> Array:
-        """(Q, C) volts for presses (Q, 2) mm as the arm counts."""
-        return self.parts(positions_mm)[0]
+        """Predict the responses (Q, C), V, to presses (Q, 2), mm in the arm's frame."""
+        return self.predict_with_jacobian(positions_mm)[0]
 
-    def steepness(self, positions_mm: Array) -> Array:
-        """(C,) V^2/mm^2, squares of how volts change with the place, mean over places (Q, 2) mm as the arm counts."""
-        steps = STEP_MM * np.eye(2)
-        rates = [
-            (self.predict(positions_mm + step) - self.predict(positions_mm - step)) / (2 * STEP_MM) for step in steps
+    def predict_with_jacobian(self, positions_mm: Array) -> tuple[Array, list[Array]]:
+        """Predict responses (Q, C), and return for each channel their derivatives (Q, N_SHARED + N_CHANNEL)."""
+        transform, unit_mm = self.transform, self.plan.unit_mm
+        positions = np.ascontiguousarray(self.plan.to_grid(transform.to_plan(positions_mm)))
+        rotated = transform.rotate(positions_mm)
+        by_transform = np.zeros((len(positions), 2, 4))  # of positions, by turn, shift and scale
+        by_transform[:, 0, 0], by_transform[:, 1, 0] = -transform.scale * rotated[:, 1], transform.scale * rotated[:, 0]
+        by_transform[:, 0, 1] = by_transform[:, 1, 2] = 1
+        by_transform[:, :, 3] = rotated
+        by_transform /= unit_mm
+        profile = self.values[4:N_SHARED].reshape(2, N_SPLINES)
+        volts, jacobians = np.empty((len(positions), len(self.fibres))), []
+        for c, (fibre, (gain, rest_v, *_)) in enumerate(zip(self.fibres, self.channel_values, strict=True)):
+            elements = self.plan.paths[fibre], self.plan.tangents[fibre], self.plan.lengths[fibre]
+            signal, by_profile, by_offset, by_sensitivity, by_position = channel_response(
+                *elements, *self._curves(c), positions, profile, self.step
+            )
+            volts[:, c] = rest_v + gain * signal
+            by_shared = [np.einsum("qx,qxp->qp", by_position, by_transform), by_profile.reshape(len(positions), -1)]
+            by_curves = [by_offset.reshape(len(positions), -1), by_sensitivity]
+            jacobian = np.hstack([*by_shared, np.zeros((len(positions), 2)), *by_curves]) * gain
+            jacobian[:, N_SHARED], jacobian[:, N_SHARED + 1] = signal, 1.0
+            jacobians.append(jacobian)
+        return volts, jacobians
+
+    def residuals(self, responses: Responses) -> Responses:
+        """Return the residuals of responses."""
+        return replace(responses, volts=responses.volts - self.predict(responses.positions_mm))
+
+    def mean_squared_slope(self, positions_mm: Array) -> Array:
+        """Return the squared slope of each channel over the position, mean over positions (Q, 2); V^2/mm^2; (C,)."""
+        slopes = [
+            (self.predict(positions_mm + step) - self.predict(positions_mm - step)) / (2 * SLOPE_STEP_MM)
+            for step in SLOPE_STEP_MM * np.eye(2)
         ]
-        return np.sum(np.square(rates), axis=0).mean(axis=0)
+        return np.sum(np.square(slopes), axis=0).mean(axis=0)
 
-    def with_gains(self, presses: Responses) -> "LaidPad":
-        """The same pad with the gains and rests that go best with answers: a fit begins near enough not to run away."""
-        values, signals = self.values.copy(), self.predict(presses.positions_mm)
-        for channel, own in enumerate(self.own):
-            there = presses.there[:, channel]
-            known = np.column_stack([(signals[there, channel] - own[1]) / own[0], np.ones(there.sum())])
-            found = np.linalg.lstsq(known, presses.volts[there, channel], rcond=None)[0]
-            values[own_values(channel)[:2]] = found
+    def with_values(self, values: Array) -> "AsBuiltPad":
+        """Return the pad of other parameters, with w scaled to 1 at its largest and gains to match."""
+        pad = replace(self, values=values.copy())
+        largest = np.abs(pad.profile(np.linspace(0, self.max_distance, 101))[0]).max()
+        if largest > 0:
+            pad.values[4:N_SHARED] /= largest
+            pad.values[N_SHARED::N_CHANNEL] *= largest
+        return pad
+
+    def fit_gains(self, responses: Responses) -> "AsBuiltPad":
+        """Fit gains and rests alone, by linear least squares, so that a fit of all does not diverge."""
+        values, volts = self.values.copy(), self.predict(responses.positions_mm)
+        for channel, (gain, rest_v, *_) in enumerate(self.channel_values):
+            valid = responses.valid[:, channel]
+            design_matrix = np.column_stack([(volts[valid, channel] - rest_v) / gain, np.ones(valid.sum())])
+            coefficients = np.linalg.lstsq(design_matrix, responses.volts[valid, channel], rcond=None)[0]
+            values[channel_indices(channel)[:2]] = coefficients
         return replace(self, values=values)
 
-    def remove_history(self) -> "LaidPad":
-        """The same pad, with what all its fibres have in common of their ways beside the plan told by the frame."""
+    def align_transform(self) -> "AsBuiltPad":
+        """Move the rotation and shift that all lateral offsets have in common into the plan transform."""
         low, high = sensed_rectangle(self.plan.layout)
-        planned = np.concatenate([self.plan.course[fibre] for fibre in self.fibres])
-        laid = np.concatenate([self.course(channel)[0] for channel in range(len(self.fibres))])
+        planned = np.concatenate([self.plan.paths[fibre] for fibre in self.fibres])
+        built = np.concatenate([self.path(channel)[0] for channel in range(len(self.fibres))])
         within = ((planned >= low) & (planned <= high)).all(axis=1)
-        turn = _turn_between(laid[within], planned[within])
+        # 1. rotation and shift that bring the fibres as built closest to the plan
+        turn = _best_rotation(built[within], planned[within])
         rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-        moved = laid @ rotation
-        shift = (planned - moved)[within].mean(axis=0)
-        aside = (moved + shift - planned).reshape(len(self.fibres), ELEMENTS, 2)
-        basis = along_fibre(np.eye(ASIDE), ELEMENTS)[0][0].T
-        coefficients = np.linalg.lstsq(basis, aside.transpose(1, 0, 2).reshape(ELEMENTS, -1), rcond=None)[0]
+        rotated = built @ rotation
+        shift = (planned - rotated)[within].mean(axis=0)
+        # 2. splines of the offsets that remain
+        offset = (rotated + shift - planned).reshape(len(self.fibres), N_ELEMENTS, 2)
+        basis = evaluate_along_fibre(np.eye(N_OFFSET), N_ELEMENTS)[0][0].T
+        coefficients = np.linalg.lstsq(basis, offset.transpose(1, 0, 2).reshape(N_ELEMENTS, -1), rcond=None)[0]
+        # 3. the transform rotates about the middle of the pad, step 1 about its corner
         values, middle = self.values.copy(), self.plan.middle
         values[0] += turn
-        # the frame turns about the middle of the pad, the courses about its corner
-        off = middle[0] * (rotation.sum(axis=0) - 1) + (middle[1] - middle[0]) * (rotation[1] - [0, 1])
-        values[1:3] = values[1:3] @ rotation + self.plan.unit_mm * (off + shift)
-        own = values[SHARED:].reshape(-1, OWN)
-        own[:, AWAY] = coefficients.reshape(ASIDE, len(self.fibres), 2).transpose(1, 2, 0).reshape(len(own), -1)
+        centring = middle[0] * (rotation.sum(axis=0) - 1) + (middle[1] - middle[0]) * (rotation[1] - [0, 1])
+        values[1:3] = values[1:3] @ rotation + self.plan.unit_mm * (centring + shift)
+        rows = values[N_SHARED:].reshape(-1, N_CHANNEL)
+        rows[:, OFFSET] = coefficients.reshape(N_OFFSET, len(self.fibres), 2).transpose(1, 2, 0).reshape(len(rows), -1)
         return replace(self, values=values)
 
-    def left_over(self, presses: Responses) -> Responses:
-        """What this pad does not explain of answers."""
-        return replace(presses, volts=presses.volts - self.predict(presses.positions_mm))
 
-    def parts(self, positions_mm: Array) -> tuple[Array, list[Array]]:
-        """Volts (Q, C), and for each channel their derivatives (Q, SHARED + OWN) by the shared values and its own."""
-        places, by_frame = self._placed(positions_mm)
-        profile = self.values[4:SHARED].reshape(2, SPLINES)
-        volts, rates = np.empty((len(places), len(self.fibres))), []
-        for c, (fibre, own) in enumerate(zip(self.fibres, self.own, strict=True)):
-            elements = self.plan.course[fibre], self.plan.tangent[fibre], self.plan.length[fibre]
-            signal, by_profile, by_aside, by_sensitivity, by_place = channel_response(
-                *elements, *self._curves(c), places, profile, self.step
-            )
-            volts[:, c] = own[1] + own[0] * signal
-            by_shared = [np.einsum("qx,qxp->qp", by_place, by_frame), by_profile.reshape(len(places), -1)]
-            by_curves = [by_aside.reshape(len(places), -1), by_sensitivity]
-            bent = np.hstack([*by_shared, np.zeros((len(places), 2)), *by_curves]) * own[0]
-            bent[:, SHARED], bent[:, SHARED + 1] = signal, 1.0
-            rates.append(bent)
-        return volts, rates
-
-    def at(self, values: Array) -> "LaidPad":
-        """The pad of other `values`, its reach scaled to 1 at its largest."""
-        moved = replace(self, values=values.copy())
-        largest = np.abs(moved.weights(np.linspace(0, self.end, 101))[0]).max()
-        if largest > 0:
-            moved.values[4:SHARED] /= largest
-            moved.values[SHARED::OWN] *= largest
-        return moved
-
-    def _placed(self, positions_mm: Array) -> tuple[Array, Array]:
-        """Places (Q, 2) in grid units of the plan, and their derivatives (Q, 2, 4) by turn, shift and scale."""
-        frame, unit_mm = self.frame, self.plan.unit_mm
-        turned = frame.rotate(positions_mm)
-        by = np.zeros((len(positions_mm), 2, 4))
-        by[:, 0, 0], by[:, 1, 0] = -frame.scale * turned[:, 1], frame.scale * turned[:, 0]
-        by[:, 0, 1] = by[:, 1, 2] = 1
-        by[:, :, 3] = turned
-        return np.ascontiguousarray(self.plan.to_grid(frame.to_plan(positions_mm))), by / unit_mm
+def channel_indices(channel: int) -> Indices:
+    """Return the indices (N_CHANNEL,) of a channel's parameters in `AsBuiltPad.values`."""
+    return N_SHARED + channel * N_CHANNEL + np.arange(N_CHANNEL)
 
 
-def _turn_between(points: Array, others: Array) -> float:
-    """The angle by which points (n, 2), turned about their middle, lie closest to others (n, 2)."""
-    a, b = points - points.mean(axis=0), others - others.mean(axis=0)
+def _best_rotation(points: Array, targets: Array) -> float:
+    """Return the angle by which points (n, 2), rotated about their middle, lie closest to targets (n, 2)."""
+    a, b = points - points.mean(axis=0), targets - targets.mean(axis=0)
     return float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
 
 
-def own_values(channel: int) -> Indices:
-    """Where the gain, rest and splines of a channel lie in `LaidPad.values`."""
-    return SHARED + channel * OWN + np.arange(OWN)
-
-
-def _splines(at: Array) -> Array:
-    """(n, SPLINES) the splines of a profile, mirrored at 0, at distances (n,) in steps."""
-    out = np.zeros((len(at), SPLINES))
-    for k in range(SPLINES):
+def _profile_basis(distance: Array) -> Array:
+    """Evaluate the splines of a profile, mirrored at 0, at distances (n,) in steps; shape (n, N_SPLINES)."""
+    basis = np.zeros((len(distance), N_SPLINES))
+    for k in range(N_SPLINES):
         for centre in {k, -k}:
-            far = np.abs(at - centre)
-            out[:, k] += np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, np.maximum(2 - far, 0) ** 3 / 6)
-    return out
+            far = np.abs(distance - centre)
+            basis[:, k] += np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, np.maximum(2 - far, 0) ** 3 / 6)
+    return basis

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-STAGES = ("design", "fabricate")
+STAGES = ("design", "fabricate", "sense")
 
 
 @cache

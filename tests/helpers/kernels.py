@@ -84,12 +84,12 @@ def sense_kernels() -> None:
         RigSettings,
         calibrate,
         detect_presses,
+        identify,
         running_median,
         simulate,
         total_variation,
     )
     from padforge.sense.deploy.streaming import ThresholdDetector
-    from padforge.sense.twin.identification import identify
 
     recording = simulate(Morphology.straight(2), RigSettings(presses=60))
     total_variation(recording.readings, 2.0)

@@ -76,7 +76,7 @@ def contacts_document() -> dict:
 
 def study_document() -> dict:
     return {
-        "format": "padforge-study-drift/1",
+        "format": "padforge-study-drift/2",
         "title": "Drift",
         "text": ["First.", "Second."],
         "rows": [{"pad": "square", "error": 1.25, "kept": True}, {"pad": "ours", "error": None, "kept": False}],

@@ -35,7 +35,7 @@ MOST_PAGE_BYTES = 8_000_000
 def test_every_stage_has_a_linked_section(page: Path) -> None:
     text = page.read_text()
     titles = re.findall(r'<h2 id="(.*?)">(.*?)</h2>', text)
-    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Contact model"]
+    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Contact model"]
     assert [title for _, title in titles] == [*names, "Studies", "Provenance"]
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
     assert text.count("data:image/") == 5  # plan, mould, tracks, which way round, and the study's figure
@@ -115,8 +115,11 @@ def test_report_names_worst_failures(page: Path) -> None:
 
 
 def test_fibre_loss_study_replaces_errors_of_calibration(pad: Path) -> None:
-    ways = {"one network": errors({(): 1.0, (0,): 7.5, (1,): 3.0}), "retrained": errors({(): 1.0, (0,): 2, (1,): 8.5})}
-    document = {"format": "padforge-fibre-loss/2", "ways": ways, "test_presses": 9, "provenance": provenance("x")}
+    methods = {
+        "one network": errors({(): 1.0, (0,): 7.5, (1,): 3.0}),
+        "retrained": errors({(): 1.0, (0,): 2, (1,): 8.5}),
+    }
+    document = {"format": "padforge-fibre-loss/3", "methods": methods, "test_presses": 9, "provenance": provenance("x")}
     written(pad / "fibre_loss.json", document)
     text = write_report(pad).read_text()
     assert "of one fibre, 1 (7.50 mm)" in text
@@ -194,16 +197,16 @@ DAMAGED = {
     "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}', "{", "[]"],
     "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
     "calibration.json": ['{"format": "padforge-calibration/2", "errors": []}'],
-    "fibre_loss.json": ['{"format": "padforge-fibre-loss/2", "ways": {"x": {"by_subset": [{"failed": [1]}]}}}'],
+    "fibre_loss.json": ['{"format": "padforge-fibre-loss/3", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
     "recording/start.json": ['{"format": "padforge-recording/2", "fibres": 4}'],
     "mould.stl": ["solid nothing", ""],
     "mould.png": ["", "no picture"],
     "design.svg": ["<svg", ""],
     "studies/drift.json": [
         "{",
-        '{"format": "padforge-study-drift/1"}',
-        '{"format": "padforge-study-drift/1", "title": "a", "text": "b", "rows": []}',
-        '{"format": "padforge-study-drift/1", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}',
+        '{"format": "padforge-study-drift/2"}',
+        '{"format": "padforge-study-drift/2", "title": "a", "text": "b", "rows": []}',
+        '{"format": "padforge-study-drift/2", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}',
     ],
 }
 
@@ -256,9 +259,9 @@ def test_report_shows_depth_and_force(pad: Path) -> None:
     start["source"]["rig"]["depths_mm"] = [0.5, 5.0]
     (pad / "recording" / "start.json").write_text(json.dumps(start))
     lines = [
-        {"event": "down_command", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
+        {"event": "started", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
         {"event": "done", "press": 0, "reading": 2, "at_mm": [0, 0, 0.45], "force_n": 1.25},
-        {"event": "down_command", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
+        {"event": "started", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
         {"event": "done", "press": 1, "reading": 4, "at_mm": [0, 0, 4.95]},
     ]
     journal = "".join(json.dumps(line) + "\n" for line in lines)

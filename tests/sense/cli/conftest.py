@@ -24,7 +24,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
-    """Run `padforge sense ...` in a folder with a pad.toml; gives exit code, stdout and stderr."""
+    """Run `padforge sense ...` in a folder with a pad.toml; returns exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     Path("pad.toml").write_text(SPEC)
 
@@ -38,35 +38,35 @@ def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
     return run
 
 
-def made(folder: Path, presses: int) -> Path:
-    """A folder with a recording `rec` of so many presses, and `model`, quickly calibrated by it."""
+def make_model(folder: Path, presses: int) -> Path:
+    """Make a recording `rec`, and `model`, quickly calibrated on it."""
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(trace_model, "MAX_STEPS", 80):
+    with mock.patch.object(trace_model, "MOST_STEPS", 80):
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 
 
 @pytest.fixture(scope="session")
-def few_made(once: Once) -> Path:
-    return once("few presses and their model", lambda folder: made(folder, 60))
+def few_presses(once: Once) -> Path:
+    return once("few presses and their model", lambda folder: make_model(folder, 60))
 
 
 @pytest.fixture(scope="session")
-def enough_made(once: Once) -> Path:
-    return once("enough presses and their model", lambda folder: made(folder, 360))
+def enough_presses(once: Once) -> Path:
+    return once("enough presses and their model", lambda folder: make_model(folder, 360))
 
 
 @pytest.fixture
-def few(padforge_sense: Run, few_made: Path) -> Run:
+def few(padforge_sense: Run, few_presses: Path) -> Run:
     """As `padforge_sense`, in a folder with `rec` of 60 presses and `model`."""
-    shutil.copytree(few_made, Path(), dirs_exist_ok=True)
+    shutil.copytree(few_presses, Path(), dirs_exist_ok=True)
     return padforge_sense
 
 
 @pytest.fixture
-def enough(padforge_sense: Run, enough_made: Path) -> Run:
-    """As `few`, with presses enough for health to be learnt."""
-    shutil.copytree(enough_made, Path(), dirs_exist_ok=True)
+def enough(padforge_sense: Run, enough_presses: Path) -> Run:
+    """As `few`, with enough presses to learn health from."""
+    shutil.copytree(enough_presses, Path(), dirs_exist_ok=True)
     return padforge_sense

@@ -14,7 +14,7 @@ def files_in(folder: str) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in Path(folder).iterdir() if path.is_file()}
 
 
-def test_a_recording_is_learnt_from_and_evaluated(few) -> None:
+def test_calibrate_writes_a_document_that_evaluate_agrees_with(few) -> None:
     code, out, _ = few("calibrate", "rec", "--test-split", "chronological", "--out", "new", "--json")
     assert code == 0
     document = json.loads(out)
@@ -23,41 +23,41 @@ def test_a_recording_is_learnt_from_and_evaluated(few) -> None:
     assert document["test"]["press"] == list(range(51, 60))
     for name in ("error_map.png", "error_by_loss.png"):
         assert Path("new", name).read_bytes()[:4] == b"\x89PNG"
-    for lost, levels in (("0", 1), ("2", 3), ("8", 4)):  # of 4 fibres one is left
-        code, out, _ = few("evaluate", "--model", "new", "rec", "--max-failures", lost, "--json")
+    for max_failures, levels in (("0", 1), ("2", 3), ("8", 4)):  # of 4 fibres one is left
+        code, out, _ = few("evaluate", "--model", "new", "rec", "--max-failures", max_failures, "--json")
         assert code == 0
         assert json.loads(out)["errors"] == document["errors"][:levels]
 
 
-def test_results_go_to_the_folder_of_the_pad_and_replace_a_model_in_use_by_force_alone(few) -> None:
+def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
     before = files_in("model")
     assert few("calibrate", "rec", "--seed", "5")[0] == 0
     assert json.loads(Path("calibration.json").read_text())["provenance"]["seed"] == 5
     assert files_in("model") == before
-    made_by = json.loads(Path("localizer.json").read_text())["provenance"]
-    Path("fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": made_by}}}))
+    provenance = json.loads(Path("localizer.json").read_text())["provenance"]
+    Path("fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": provenance}}}))
     assert few("calibrate", "rec", "--seed", "5")[0] == 0  # the same again
     assert few("calibrate", "rec")[0] == 2
     assert few("calibrate", "rec", "--force")[0] == 0
 
 
-def test_interrupted_training_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextmanager
-    def reported(name: str) -> Iterator[object]:
-        def report(done: int, total: int) -> None:
+    def progress_bar(name: str) -> Iterator[object]:
+        def interrupt(done: int, total: int) -> None:
             assert name == "training"
             raise KeyboardInterrupt
 
-        yield report
+        yield interrupt
 
-    monkeypatch.setattr(padforge.sense.cli.localizer, "reported", reported)
+    monkeypatch.setattr(padforge.sense.cli.localizer, "progress_bar", progress_bar)
     code, _, err = few("calibrate", "rec", "--out", "new")
     assert code == 130
     assert "interrupted" in err
     assert not Path("new").exists()
 
 
-def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibrate_that_fails_at_its_last_figure_changes_nothing(few, monkeypatch: pytest.MonkeyPatch) -> None:
     before = files_in("model")
 
     def full(document: object, path: Path) -> None:
@@ -70,7 +70,7 @@ def test_a_calibration_that_fails_at_its_last_figure_changes_nothing(few, monkey
     assert files_in("model") == before
 
 
-def test_a_torn_recording_is_said_to_be_one(few) -> None:
+def test_evaluate_warns_of_a_torn_recording(few) -> None:
     content = Path("rec/readings.bin").read_bytes()
     Path("rec/readings.bin").write_bytes(content[:-100])
     code, _, err = few("evaluate", "--model", "model", "rec", "--max-failures", "0")
@@ -78,15 +78,15 @@ def test_a_torn_recording_is_said_to_be_one(few) -> None:
     assert "last 1 presses are left out" in err
 
 
-def test_errors_of_depth_and_force_are_listed(padforge_sense, deep_localizer, deep_recording) -> None:
+def test_evaluate_lists_errors_of_depth_and_force(padforge_sense, deep_localizer, deep_recording) -> None:
     deep_localizer.save("model")
     deep_recording.save("rec", {})
     words = ("evaluate", "--model", "model", "rec", "--max-failures", "1")
     lines = padforge_sense(*words)[1].splitlines()
     rows = json.loads(padforge_sense(*words, "--json")[1])["errors"]
     depth = lines.index("error of depth in mm")
-    shown = [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]]
-    assert shown == [round(row["depth_mean_mm"], 2) for row in rows]
+    means = [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]]
+    assert means == [round(row["depth_mean_mm"], 2) for row in rows]
     assert lines.index("error of force in N") == depth + 4 == len(lines) - 4
 
 

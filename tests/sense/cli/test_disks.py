@@ -32,7 +32,7 @@ def full_disk(limit: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_all_or_nothing_is_left(few, name: str) -> None:
+def test_command_on_a_full_disk_leaves_all_or_nothing(few, name: str) -> None:
     """Where a model was it stays; whatever the limit, nothing is left of what did not fit."""
     sense.export_csv(sense.Recording.open("rec"), "whole.csv")
     out, words = Path("model" if name == "calibrate" else "out"), COMMANDS[name].split()
@@ -55,7 +55,7 @@ def test_all_or_nothing_is_left(few, name: str) -> None:
         assert len(sense.Recording.open("out/rec").down_command) == 60
 
 
-def test_two_imports_into_one_folder_leave_one_of_them_whole(few) -> None:
+def test_parallel_imports_into_one_folder_leave_one_recording(few) -> None:
     sense.export_csv(sense.Recording.open("rec"), "whole.csv")
     line = [sys.executable, "-m", "padforge", "sense", "import", "whole.csv", "--out", "out/rec"]
     running = [subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) for _ in range(2)]

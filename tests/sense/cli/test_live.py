@@ -39,7 +39,7 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     return views
 
 
-def test_a_recording_is_shown(replay, views: list[dict]) -> None:
+def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     code, out, err = replay("--json")
     assert code == 0, err
     assert "http://127.0.0.1:" in err
@@ -57,7 +57,7 @@ def test_a_recording_is_shown(replay, views: list[dict]) -> None:
     assert len(plain.splitlines()) == len(told)
 
 
-def test_other_programs_are_told_what_they_ask_for(replay) -> None:
+def test_live_sends_to_tcp_and_osc(replay) -> None:
     token = "a word of sixteen"
     code, _, err = replay("--tcp", "0", "--osc", "127.0.0.1:9", "--host", "127.0.0.1", "--token", token)
     assert code == 0, err
@@ -72,7 +72,7 @@ LOST = RigFault("stale", "the board does not send", "reset it")
     ("error", "code", "said"),
     [(KeyboardInterrupt(), 130, "interrupted"), (LOST, 1, "padforge: the board does not send; reset it")],
 )
-def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch, error, code: int, said: str) -> None:
+def test_live_shows_a_rig_until_it_ends(padforge_sense, model, views, monkeypatch, error, code: int, said: str) -> None:
     """As the pad lay when the model was learnt: a holder had said how, so that `[rig]` leaves it open."""
     board, told = Mock(read=Mock(side_effect=error)), Mock()
     board.connect.return_value = {"channels": 4, "rate_hz": 13.3}
@@ -90,7 +90,7 @@ def test_a_rig_is_shown_until_it_ends(padforge_sense, model, views, monkeypatch,
     assert {view["mirrored"] for view in views} == {True}
 
 
-def test_a_terminal_shows_fibres_by_their_numbers() -> None:
+def test_live_lines_number_fibres_from_one() -> None:
     """From 1, as the page does, and faults are told."""
     fibres = [{"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (None, "dead"))]
     lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "faults": ["fibre 2 was dead"]})
@@ -99,7 +99,9 @@ def test_a_terminal_shows_fibres_by_their_numbers() -> None:
     assert lines[4] == "fibre 2 was dead"
 
 
-def test_depth_and_force_are_told_where_they_were_learnt(padforge_sense, deep_localizer, deep_recording, views) -> None:
+def test_live_shows_depth_and_force_of_models_that_estimate_them(
+    padforge_sense, deep_localizer, deep_recording, views
+) -> None:
     deep_localizer.save("deep")
     first_presses(deep_recording, 40).save("rec", {})
     words = ("live", "--replay", "rec", "--speed", "1e6", "--port", "0", "--model", "deep")

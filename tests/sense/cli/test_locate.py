@@ -11,19 +11,22 @@ from padforge.sense import Recording
 from padforge.sense.localizer.model import LocalizerModel
 
 
-def test_places_without_the_fibres_masked(few) -> None:
-    """A mask names fibres as people count them; arrays count from 0."""
-    assert few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")[:2] == (0, "60 places -> places.csv\n")
+def test_locate_excludes_fibres_by_number(few) -> None:
+    assert few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")[:2] == (
+        0,
+        "60 positions -> places.csv\n",
+    )
     table = np.genfromtxt("places.csv", delimiter=",", names=True)
-    assert table.dtype.names == ("press", "x_mm", "y_mm", "sd_x_mm", "sd_y_mm", "r50_mm", "r90_mm")
+    assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm")
     assert len(table) == 60
     assert (table["r50_mm"] < table["r90_mm"]).all()
-    found = LocalizerModel.load("model").predict(Recording.open("rec"), (0, 3))
-    np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), found.positions_mm, atol=1e-4)
+    prediction = LocalizerModel.load("model").predict(Recording.open("rec"), (0, 3))
+    positions_mm = np.column_stack([table["x_mm"], table["y_mm"]])
+    np.testing.assert_allclose(positions_mm, prediction.positions_mm, atol=1e-4)
 
 
-def test_a_fibre_found_at_fault_is_left_out(enough) -> None:
-    """A fibre reads one value from the 60th of the last 120 presses on: health names it, and places do without it."""
+def test_locate_excludes_a_faulty_fibre(enough) -> None:
+    """A fibre is stuck from the 60th of the last 120 presses on."""
     code, out, _ = enough("health", "--model", "model", "rec")
     assert (code, out.strip()) == (0, "sound fibres: 1, 2, 3, 4")
     whole = Recording.open("rec")
@@ -49,12 +52,12 @@ def test_a_fibre_found_at_fault_is_left_out(enough) -> None:
     assert places[:60] != masked[:60]
 
 
-def test_too_few_presses_for_health_are_said_to_be_and_leave_no_older_one(enough) -> None:
+def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model(enough) -> None:
     assert Path("model/health.json").exists()
     enough("record", "--presses", "50", "--out", "short")
     code, _, err = enough("calibrate", "short", "--out", "model")
     assert (code, err.count("\n")) == (0, 1)
-    assert "no watch is kept on the fibres' health" in err
+    assert "the health of the fibres is not monitored" in err
     assert not list(Path("model").glob("health.*"))
 
 

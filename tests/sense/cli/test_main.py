@@ -12,7 +12,7 @@ from padforge.design import Morphology
 from padforge.sense.cli.options import typed_keys
 
 
-def test_importing_takes_no_torch() -> None:
+def test_import_loads_neither_torch_nor_matplotlib() -> None:
     modules = (
         "padforge.sense, padforge.sense.cli.main, padforge.sense.settings, padforge.sense.localizer.model,"
         " padforge.sense.localizer.calibration"
@@ -42,15 +42,15 @@ def with_needs(library, found):
                 with_needs(name(need), found)
     return found
 
-KEPT = with_needs("padforge", set())
-GONE = {module for module, by in packages_distributions().items() if not {name(each) for each in by} & KEPT}
+INSTALLED = with_needs("padforge", set())
+MISSING = {module for module, by in packages_distributions().items() if not {name(each) for each in by} & INSTALLED}
 
 class Bare(MetaPathFinder):
     def find_spec(self, fullname, path, target=None):
-        if fullname.partition(".")[0] in GONE:
+        if fullname.partition(".")[0] in MISSING:
             raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
 
-assert {"torch", "matplotlib", "build123d", "shapely"} <= GONE and "numpy" not in GONE
+assert {"torch", "matplotlib", "build123d", "shapely"} <= MISSING and "numpy" not in MISSING
 sys.meta_path.insert(0, Bare())
 from padforge.cli import main
 ends = []
@@ -66,7 +66,7 @@ print(json.dumps(ends))
 """padforge as it is without any of its extras: runs command lines, and prints their exit codes, stdout and stderr."""
 
 
-def test_places_are_found_without_what_only_other_jobs_need(few) -> None:
+def test_locate_works_without_optional_libraries(few) -> None:
     lines = (
         "sense locate --model model rec",
         "sense evaluate --model model rec --max-failures 1",
@@ -76,7 +76,7 @@ def test_places_are_found_without_what_only_other_jobs_need(few) -> None:
     )
     done = subprocess.run([sys.executable, "-c", BARE, *lines], capture_output=True, text=True, check=True)
     located, evaluated, shown, calibrated, run = json.loads(done.stdout)
-    assert located == [0, "60 places -> places.csv\n", ""]
+    assert located == [0, "60 positions -> places.csv\n", ""]
     assert evaluated[::2] == [0, ""]
     assert "mean" in evaluated[1]
     assert shown[0] == 0, shown[2]
@@ -88,7 +88,7 @@ def test_places_are_found_without_what_only_other_jobs_need(few) -> None:
 
 
 @pytest.mark.parametrize("words", ["record --rig ur5", "record --virtual-hardware", "doctor"])
-def test_a_rig_where_none_can_run_is_one_line(padforge_sense, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
+def test_rig_commands_fail_on_windows_in_one_line(padforge_sense, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
     Morphology.straight(4).save("morphology.json")
     monkeypatch.setattr("platform.system", lambda: "Windows")
     code, out, err = padforge_sense(*words.split(), "--morphology", "morphology.json")
@@ -97,7 +97,7 @@ def test_a_rig_where_none_can_run_is_one_line(padforge_sense, monkeypatch: pytes
 
 
 @pytest.mark.skipif(os.name != "posix", reason="keys are read of POSIX terminals alone")
-def test_keys_are_read_as_they_are_typed_and_the_terminal_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_typed_keys_reads_keys_and_restores_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     import termios
 
     ours, theirs = os.openpty()

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from padforge.sense import Recording, export_csv
 
 
-def test_csv_comes_in(padforge_sense, brief: Recording) -> None:
+def test_import_reads_csv(padforge_sense, brief: Recording) -> None:
     export_csv(brief, "r.csv")
     code, out, _ = padforge_sense("import", "r.csv")
     assert code == 0
@@ -20,7 +20,7 @@ def test_csv_comes_in(padforge_sense, brief: Recording) -> None:
     assert set(start["provenance"]["inputs"]) == {"r.csv"}
 
 
-def test_what_a_lab_has_comes_in_by_a_mapping(padforge_sense) -> None:
+def test_import_maps_columns(padforge_sense) -> None:
     rows = [f"{100 * i};{1 + i % 7:d},5;2;{i // 10 + 1};0;{int(i % 10 > 5)}" for i in range(30)]
     Path("lab.txt").write_text("# bench 2\nt_ms;ch1;ch2;X;Y;down\n" + "\n".join(rows))
     mapping = "time=t_ms:ms,fibres=ch*,x=X:cm,y=Y,press=down"
@@ -32,7 +32,7 @@ def test_what_a_lab_has_comes_in_by_a_mapping(padforge_sense) -> None:
     assert recording.source["mapping"] == mapping
 
 
-def test_what_a_file_lacks_at_its_end_is_said(padforge_sense, recording: Recording) -> None:
+def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:
     content = {"voltage": recording.readings[:391], "tim": recording.times_s[None, :391]}
     scipy.io.savemat("cut.mat", content | {"pos": recording.presses_mm[:10].T})
     note = "cut.mat: the last of 10 presses is left out, with 31 of 40 readings\n"
@@ -54,7 +54,7 @@ def topics(path: str) -> dict[str, int]:
         return {channel.topic: counts[number] for number, channel in summary.channels.items()}
 
 
-def test_a_bag_goes_out_with_what_a_model_says_and_comes_back(few) -> None:
+def test_export_writes_a_bag_with_predictions_that_import_reads(few) -> None:
     assert few("export", "rec", "r.mcap", "--model", "model") == (0, "rec -> r.mcap\n", "")
     recording = Recording.open("rec")
     assert topics("r.mcap") == {
@@ -71,12 +71,12 @@ def test_a_bag_goes_out_with_what_a_model_says_and_comes_back(few) -> None:
     assert few("locate", "--model", "model", "r.mcap", "--out", "places.csv")[0] == 0
 
 
-def test_health_is_told_where_a_model_knows_it(enough) -> None:
+def test_export_writes_faults_of_models_with_health(enough) -> None:
     assert enough("export", "rec", "r.mcap", "--model", "model")[0] == 0
     assert topics("r.mcap")["/pad/health"] >= 1
 
 
-def test_a_dataset_is_a_folder_that_the_format_names(few) -> None:
+def test_export_writes_a_lerobot_dataset(few) -> None:
     assert few("export", "rec", "set", "--format", "lerobot", "--model", "model")[:2] == (0, "rec -> set\n")
     info = json.loads(Path("set/meta/info.json").read_text())
     assert info["total_episodes"] == 60

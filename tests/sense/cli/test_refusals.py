@@ -73,13 +73,13 @@ record --out pad.toml/rec                       | pad.toml is a file, expected a
 record --seed 9 --out rec                       | never written over
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
-record --twin twin.json --virtual-hardware       | --twin is of the simulated pad
+record --twin twin.json --virtual-hardware      | --twin is of the simulated pad
 record --twin torn.json                         | torn.json:
 record --twin straight.json                     | straight.json:
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --twin absent.json                       | absent.json:
 record --twin twin.json --morphology large.json | [pad] grid: got 270, input should be less
-record --rig mine --virtual-hardware             | --virtual-hardware: got --rig mine, allowed are simulated, ur5, printer
+record --rig mine --virtual-hardware            | --virtual-hardware: got --rig mine, allowed are simulated, ur5
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
 record --rig ur5 --spec none.toml               | --morphology is needed, of the pad under the arm: there is none at
 record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, the pad has 4 fibres
@@ -125,9 +125,9 @@ SHORT = {
 
 
 @pytest.fixture(scope="module")
-def workshop(few_made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `few` has, and things that are not what they should be."""
-    folder = shutil.copytree(few_made, tmp_path_factory.mktemp("refused") / "workshop")
+    folder = shutil.copytree(few_presses, tmp_path_factory.mktemp("refused") / "workshop")
     (folder / "noise.mat").write_bytes(b"no matlab" * 100)
     (folder / "noise.csv").write_text("a,b\n1,2\n")
     (folder / "noise.txt").write_text("hello")
@@ -159,7 +159,7 @@ def files_of(folder: Path) -> dict[Path, int]:
 
 
 @pytest.mark.parametrize(("words", "said"), [row.split(" | ", 1) for row in ROWS.strip().splitlines()])
-def test_what_cannot_be_done_is_one_line(
+def test_invalid_command_fails_in_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
     monkeypatch.setattr("padforge.sense.localizer.training.FINE_TUNING_STEPS", 15)

@@ -1,4 +1,4 @@
-"""Lost fibres: one test for both ways, and resumed work is the same work."""
+"""Fibre loss: one test for both methods, and resumed work is the same work."""
 
 import errno
 import json
@@ -14,59 +14,60 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings as Options
-from padforge.sense.studies import fibre_loss as fibre_loss_figure
-from padforge.sense.studies import fibre_loss as loss_study
-from padforge.sense.studies.fibre_loss import MANY, ONE, fibre_loss_study
+from padforge.sense.studies import fibre_loss
+from padforge.sense.studies.fibre_loss import ONE, RETRAINED, fibre_loss_study
 from tests.helpers.door import Ended, call
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A published network of three neurons, and a coarse map of the answers, which is not what is tested."""
-    monkeypatch.setattr("padforge.sense.localizer.training.PUBLISHED_HIDDEN", 3)
-    monkeypatch.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
+    """A published network of three neurons, and a coarse response model, which are not what is tested."""
+    monkeypatch.setattr("padforge.sense.localizer.training.HIDDEN", 3)
+    monkeypatch.setattr("padforge.sense.localizer.response_model.BUMPS", 7)
 
 
-def mean_of(part: dict) -> float:
+def mean_of_map(part: dict) -> float:
     cells = part["by_position"]
     return float(np.average([cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells]))
 
 
-def test_one_network_is_judged_as_by_evaluate(localizer: LocalizerModel, recording: Recording) -> None:
+def test_study_of_a_localizer_agrees_with_evaluate(localizer: LocalizerModel, recording: Recording) -> None:
     document, expected = (
         fibre_loss_study(recording, localizer, max_failures=2),
         evaluate(localizer, recording, (0, 1, 2)),
     )
-    assert list(document["ways"]) == [ONE]
-    way = document["ways"][ONE]
-    assert (way["errors"], way["by_subset"]) == (expected["errors"], expected["by_subset"])
-    assert way["maps"][0] == {"failed": [], "by_position": expected["by_position"]}
+    assert list(document["methods"]) == [ONE]
+    method = document["methods"][ONE]
+    assert (method["errors"], method["by_subset"]) == (expected["errors"], expected["by_subset"])
+    assert method["maps"][0] == {"failed": [], "by_position": expected["by_position"]}
     worst = max((each for each in expected["by_subset"] if len(each["failed"]) == 2), key=lambda each: each["mean_mm"])
-    assert way["maps"][2]["failed"] == worst["failed"]
-    assert mean_of(way["maps"][2]) == pytest.approx(worst["mean_mm"])
+    assert method["maps"][2]["failed"] == worst["failed"]
+    assert mean_of_map(method["maps"][2]) == pytest.approx(worst["mean_mm"])
     assert document["test_presses"] == expected["test_presses"]
 
 
-def test_both_ways_stand_side_by_side_and_a_chosen_set_is_mapped(
-    localizer: LocalizerModel, recording: Recording
-) -> None:
-    """Of more fibres, too, than are lost in the errors."""
+def test_study_compares_both_methods_and_maps_a_chosen_set(localizer: LocalizerModel, recording: Recording) -> None:
     document = fibre_loss_study(recording, localizer, retrain=True, max_failures=1, failed=(3, 1, 3))
     plain = fibre_loss_study(recording, localizer, retrain=True, max_failures=1)
-    assert list(document["ways"]) == [ONE, MANY]
-    for name, way in document["ways"].items():
-        assert [row["subsets"] for row in way["errors"]] == [1, 4]
-        assert [each["failed"] for each in way["by_subset"]] == [[], [0], [1], [2], [3]]
-        *worst, chosen = way["maps"]
+    assert list(document["methods"]) == [ONE, RETRAINED]
+    for name, method in document["methods"].items():
+        assert [row["subsets"] for row in method["errors"]] == [1, 4]
+        assert [each["failed"] for each in method["by_subset"]] == [[], [0], [1], [2], [3]]
+        *worst, chosen = method["maps"]
         assert chosen["failed"] == [1, 3]
-        assert {**way, "maps": worst} == plain["ways"][name]
+        assert {**method, "maps": worst} == plain["methods"][name]
     assert document["test_presses"] == len(localizer.test)
     assert document["training_presses"] == 300 - len(localizer.test)
     json.dumps(document, allow_nan=False)
-    assert len(loss_study.fibre_loss_lines(document)) == 6
+    assert len(fibre_loss.fibre_loss_lines(document)) == 6
     expected = evaluate(localizer, recording, (2,))["by_subset"]
     (mean_mm,) = (each["mean_mm"] for each in expected if each["failed"] == [1, 3])
-    assert mean_of(document["ways"][ONE]["maps"][-1]) == pytest.approx(mean_mm)
+    assert mean_of_map(document["methods"][ONE]["maps"][-1]) == pytest.approx(mean_mm)
+
+
+def test_study_rejects_fibres_that_cannot_fail(localizer: LocalizerModel, recording: Recording) -> None:
+    with pytest.raises(InputError, match="neither a localizer nor retraining"):
+        fibre_loss_study(recording)
     for failed, message in (
         ((4,), "failed fibre is 4, allowed is a whole number from 0 to 3"),
         ((0, 1, 2, 3), "failed are all 4 fibres, at least one must be left"),
@@ -75,61 +76,59 @@ def test_both_ways_stand_side_by_side_and_a_chosen_set_is_mapped(
             fibre_loss_study(recording, localizer, failed=failed)
 
 
-def test_a_retrained_network_is_not_told_of_its_test_nor_of_lost_fibres(recording: Recording) -> None:
-    def retrained(changed: Recording) -> dict:
-        return fibre_loss_study(changed, retrain=True, max_failures=1)["ways"][MANY]
+def test_retraining_ignores_failed_fibres_and_test_positions(recording: Recording) -> None:
+    def retrain(changed: Recording) -> dict:
+        return fibre_loss_study(changed, retrain=True, max_failures=1)["methods"][RETRAINED]
 
-    plain = retrained(recording)
-    spoilt = recording.readings.copy()
-    spoilt[:, 2] = np.random.default_rng(1).uniform(0, 3, len(spoilt))
-    deaf = retrained(replace(recording, readings=spoilt))
-    for each, other in zip(plain["by_subset"], deaf["by_subset"], strict=True):
+    plain = retrain(recording)
+    readings = recording.readings.copy()
+    readings[:, 2] = np.random.default_rng(1).uniform(0, 3, len(readings))
+    noisy = retrain(replace(recording, readings=readings))
+    for each, other in zip(plain["by_subset"], noisy["by_subset"], strict=True):
         assert (each["mean_mm"] == other["mean_mm"]) == (each["failed"] == [2])
     test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
     far = recording.presses_mm.copy()
-    far[test] = 2e4  # whoever had learnt from one of them would find all of it elsewhere
-    moved = retrained(replace(recording, presses_mm=far))
+    far[test] = 2e4  # a network trained on one of them would predict far positions
+    moved = retrain(replace(recording, presses_mm=far))
     centre = np.hypot(*(2e4 - recording.presses_mm[test]).T).mean()
     assert moved["errors"][0]["mean_mm"] == pytest.approx(centre, abs=30)
 
 
-def stop_at(number: int) -> Callable[[int, int], None]:
-    def interrupted(done: int, total: int) -> None:
+def interrupt_at(number: int) -> Callable[[int, int], None]:
+    def interrupt(done: int, total: int) -> None:
         if done == number:
             raise KeyboardInterrupt
 
-    return interrupted
+    return interrupt
 
 
 @pytest.fixture
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
-    """The sets of lost fibres that networks have been trained for since."""
-    real, trained = loss_study.train_without, []
+    """The sets of failed fibres that networks are trained for."""
+    train_without, trained = fibre_loss.train_without, []
 
-    def counted(lost: tuple[int, ...], *rest: object) -> object:
-        trained.append(lost)
-        return real(lost, *rest)  # type: ignore[arg-type]
+    def record(failed: tuple[int, ...], *arguments: object) -> object:
+        trained.append(failed)
+        return train_without(failed, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(loss_study, "train_without", counted)
+    monkeypatch.setattr(fibre_loss, "train_without", record)
     return trained
 
 
-def test_broken_off_work_goes_on_and_gives_the_same(recording: Recording, tmp_path: Path, trained: list) -> None:
-    wanted = {"retrain": True, "max_failures": 1, "failed": (0, 1)}
-    whole = fibre_loss_study(recording, **wanted)
-    kept = tmp_path / "unfinished"
+def test_study_resumes_with_the_same_result(recording: Recording, tmp_path: Path, trained: list) -> None:
+    options = {"retrain": True, "max_failures": 1, "failed": (0, 1)}
+    complete = fibre_loss_study(recording, **options)
+    checkpoints = tmp_path / "unfinished"
     with pytest.raises(KeyboardInterrupt):
-        fibre_loss_study(recording, **wanted, keep_in=kept, progress=stop_at(2))
-    finished = len(list(kept.glob("start_*.npz")))
+        fibre_loss_study(recording, **options, checkpoints=checkpoints, on_progress=interrupt_at(2))
+    finished = len(list(checkpoints.glob("start_*.npz")))
     assert finished >= 2
     with pytest.raises(InputError, match="begun with fibre-loss"):
-        fibre_loss_study(recording, retrain=True, max_failures=1, options=Options(seed=1), keep_in=kept)
+        fibre_loss_study(recording, retrain=True, max_failures=1, options=Options(seed=1), checkpoints=checkpoints)
     trained.clear()
     for _ in range(2):
-        assert fibre_loss_study(recording, **wanted, keep_in=kept) == whole
+        assert fibre_loss_study(recording, **options, checkpoints=checkpoints) == complete
         assert len(trained) == 6 - finished
-    with pytest.raises(InputError, match="neither a localizer nor retraining"):
-        fibre_loss_study(recording)
 
 
 @pytest.fixture
@@ -140,52 +139,60 @@ def here(localizer: LocalizerModel, recording: Recording, tmp_path: Path, monkey
     monkeypatch.chdir(tmp_path)
 
 
-def loss(*arguments: str) -> Ended:
+def call_fibre_loss(*arguments: str) -> Ended:
     return call("sense", "fibre-loss", "rec", *arguments)
 
 
 @pytest.mark.usefixtures("here")
-def test_the_command_writes_a_document_and_a_figure() -> None:
-    ended = loss("--model", "model", "--retrain", "--max-failures", "1", "--failed", "2,4", "--out", "out", "--json")
-    assert (ended.code, json.loads(ended.out)["ways"][ONE]["maps"][-1]["failed"]) == (0, [1, 3])
+def test_fibre_loss_command_writes_document_and_figure() -> None:
+    ended = call_fibre_loss(
+        "--model", "model", "--retrain", "--max-failures", "1", "--failed", "2,4", "--out", "out", "--json"
+    )
+    assert (ended.code, json.loads(ended.out)["methods"][ONE]["maps"][-1]["failed"]) == (0, [1, 3])
     assert json.loads(ended.out) == json.loads(Path("out", "fibre_loss.json").read_text())
     assert Path("out", "fibre_loss.png").read_bytes()[:4] == b"\x89PNG"
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
-    for arguments, said in (
+
+
+@pytest.mark.usefixtures("here")
+def test_fibre_loss_command_fails_in_one_line() -> None:
+    for arguments, message in (
         (("--out", "other"), "neither --model nor --retrain"),
         (("--model", "model", "--failed", "5"), "padforge: fibre 5: no such fibre, allowed are 1 to 4\n"),
     ):
-        ended = loss(*arguments)
+        ended = call_fibre_loss(*arguments)
         assert (ended.code, ended.out, ended.err.count("\n")) == (2, "", 1)
-        assert said in ended.err
+        assert message in ended.err
     assert not Path("other").exists()
 
 
 @pytest.mark.usefixtures("here")
-def test_networks_are_kept_until_the_result_is_written(trained: list, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fibre_loss_command_keeps_networks_until_the_result_is_written(
+    trained: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     command = ("--retrain", "--max-failures", "1", "--out", "out")
     with monkeypatch.context() as broken:
         broken.setattr("padforge.sense.studies.fibre_loss.draw_fibre_loss", full)
-        ended = loss(*command)
+        ended = call_fibre_loss(*command)
     assert (ended.code, len(trained)) == (2, 5), ended
     assert len(list(Path("out", "unfinished").glob("start_*.npz"))) == 5
     assert not Path("out", "fibre_loss.json").exists()
-    ended = loss(*command)
+    ended = call_fibre_loss(*command)
     assert (ended.code, len(trained)) == (0, 5), ended
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
 
 
-def test_maps_of_errors_have_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Figure] = []
-    monkeypatch.setattr(fibre_loss_figure, "save_figure", lambda figure, path: drawn.append(figure))
+def test_draw_fibre_loss_has_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Figure] = []
+    monkeypatch.setattr(fibre_loss, "save_figure", lambda figure, path: figures.append(figure))
     errors = {"errors": [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}], "by_subset": [{"failed": [], "mean_mm": 1.0}]}
     cells = [{"x_mm": 0.0, "y_mm": y_mm, "mean_mm": mean_mm} for y_mm, mean_mm in ((-5.0, 1.0), (5.0, 9.0))]
-    ways = {"one network": errors | {"maps": [{"failed": [], "by_position": cells}]}}
-    fibre_loss_figure.draw_fibre_loss({"ways": ways, "test_presses": 2}, Path("none.png"))
-    (image,) = (image for axes in drawn[0].axes for image in axes.images)
+    methods = {"one network": errors | {"maps": [{"failed": [], "by_position": cells}]}}
+    fibre_loss.draw_fibre_loss({"methods": methods, "test_presses": 2}, Path("none.png"))
+    (image,) = (image for axes in figures[0].axes for image in axes.images)
     assert image.origin == "lower"
     assert np.asarray(image.get_array())[-1, 0] == 9.0
     assert image.get_extent()[3] > 5

@@ -1,4 +1,4 @@
-"""Learning curves: the power law is found again, forecasts follow, and broken off it ends at once."""
+"""Learning curves: the power law is recovered, the forecast follows, and an interrupt ends it at once."""
 
 import json
 from collections.abc import Iterator
@@ -22,30 +22,30 @@ QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
 
 @settings(max_examples=20)
 @given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
-def test_a_power_law_is_found_again(floor: float, factor: float, exponent: float) -> None:
+def test_fit_power_law_recovers_power_laws(floor: float, factor: float, exponent: float) -> None:
     presses = np.array([50.0, 100, 200, 400, 800])
     errors = power_law(presses, (floor, factor, exponent))
-    found = fit_power_law(presses, errors)
-    ahead = np.array([1600.0])
-    np.testing.assert_allclose(power_law(ahead, found), power_law(ahead, (floor, factor, exponent)), rtol=1e-3)
+    target = np.array([1600.0])
+    forecast = power_law(target, fit_power_law(presses, errors))
+    np.testing.assert_allclose(forecast, power_law(target, (floor, factor, exponent)), rtol=1e-3)
 
 
 @settings(max_examples=20)
 @given(errors=st.lists(st.floats(0.1, 10), min_size=5, max_size=5))
-def test_a_fit_never_rises_with_more_presses(errors: list[float]) -> None:
+def test_fit_power_law_never_rises(errors: list[float]) -> None:
     presses = np.array([50.0, 100, 200, 400, 800])
     fit = fit_power_law(presses, np.array(errors))
-    along = power_law(np.geomspace(50, 3200, 9), fit)
-    assert (np.diff(along) <= 1e-9).all()
+    errors_ahead = power_law(np.geomspace(50, 3200, 9), fit)
+    assert (np.diff(errors_ahead) <= 1e-9).all()
     assert min(fit) >= 0
 
 
 @pytest.fixture(scope="module", autouse=True)
 def quick() -> Iterator[None]:
-    """Few resamplings, and a coarse map of the answers."""
+    """Few resamplings, and a coarse response model."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("padforge.sense.studies.learning_curve.DRAWS", 40)
-        patched.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
+        patched.setattr("padforge.sense.studies.learning_curve.RESAMPLINGS", 40)
+        patched.setattr("padforge.sense.localizer.response_model.BUMPS", 7)
         yield
 
 
@@ -54,37 +54,45 @@ def document(recording: Recording) -> dict[str, Any]:
     return learning_curve(recording, QUICK)
 
 
-def test_it_is_said_what_more_presses_would_bring(
-    document: dict[str, Any], recording: Recording, tmp_path: Path
-) -> None:
+def test_learning_curve_forecasts_twice_as_many_presses(document: dict[str, Any]) -> None:
     assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
     assert all(0.02 < point["standard_error_mm"] / point["mean_mm"] < 0.2 for point in document["points"])
-    ahead = document["forecast"]
-    assert ahead["presses"] == 510
-    assert 0 < ahead["low_mm"] <= ahead["mean_mm"] <= ahead["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
-    assert "255 more presses" in document["advice"]
+    forecast = document["forecast"]
+    assert forecast["presses"] == 510
+    assert (
+        0 < forecast["low_mm"] <= forecast["mean_mm"] <= forecast["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
+    )
+    assert "255 more training presses" in document["advice"]
     assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
     json.dumps(document, allow_nan=False)
+
+
+def test_learning_curve_command_writes_document_and_figure(
+    document: dict[str, Any], recording: Recording, tmp_path: Path
+) -> None:
     recording.save(tmp_path / "rec", {})
     (tmp_path / "pad.toml").write_text("[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\n")
     ended = called("sense", "learning-curve", "rec", "--out", "out", "--json", cwd=tmp_path)
-    found = json.loads(ended.out)
-    assert (ended.code, found) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))
-    assert found | {"provenance": None} == json.loads(json.dumps(document)) | {"provenance": None}
+    written = json.loads(ended.out)
+    assert (ended.code, written) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))
+    assert written | {"provenance": None} == json.loads(json.dumps(document)) | {"provenance": None}
     assert (tmp_path / "out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_curve_of_too_few_presses_is_refused_and_one_broken_off_ends_at_once(recording: Recording) -> None:
-    places = recording.presses_mm.copy()
-    places[100:] = np.nan
-    with pytest.raises(InputError, match="85 presses to learn from, expected at least 160"):
-        learning_curve(replace(recording, presses_mm=places), QUICK)
-    long, heard = QUICK.model_copy(update={"epochs": 1000}), []
+def test_learning_curve_rejects_too_few_presses(recording: Recording) -> None:
+    positions_mm = recording.presses_mm.copy()
+    positions_mm[100:] = np.nan
+    with pytest.raises(InputError, match="85 presses to train on, expected at least 160"):
+        learning_curve(replace(recording, presses_mm=positions_mm), QUICK)
 
-    def interrupted(done: int, total: int) -> None:
-        heard.append(done / total)
+
+def test_interrupt_ends_a_learning_curve_at_once(recording: Recording) -> None:
+    long, shares = QUICK.model_copy(update={"epochs": 1000}), []
+
+    def interrupt(done: int, total: int) -> None:
+        shares.append(done / total)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        learning_curve(recording, long, progress=interrupted)
-    assert max(heard) < 0.5
+        learning_curve(recording, long, on_progress=interrupt)
+    assert max(shares) < 0.5

@@ -1,4 +1,4 @@
-"""Several contacts at once, in small: pairs without an order are found better, and as well whichever is named first."""
+"""Several contacts at once, in small: targets without an order localize pairs better, whichever comes first."""
 
 import numpy as np
 import pytest
@@ -6,21 +6,21 @@ import pytest
 from padforge.design import Morphology, signals
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.studies.multicontact import (
-    COUNTED,
+    COUNTING,
     LABELLED,
-    WAYS,
-    learnt,
+    METHODS,
+    fit_pairs,
     moments,
     multicontact_study,
-    pairs_of_moments,
+    pairs_from_moments,
     unordered_distances,
 )
 from padforge.sense.studies.study import run
 
 PAD = Morphology.random(4, 3, 0)
 PADS = {"square": Morphology.straight(4), "random": PAD}
-BAR = 0.7
-"""Of the error of fixed labels, what that of a free order may be at most."""
+MAX_RATIO = 0.7
+"""Largest error of targets without an order, as a share of that of fixed labels."""
 
 
 @pytest.fixture(scope="module")
@@ -30,63 +30,63 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 @pytest.fixture
-def places() -> np.ndarray:
+def pairs() -> np.ndarray:
     return np.random.default_rng(1).uniform(1, 4, (400, 2, 2))
 
 
 @pytest.mark.slow
-def test_pairs_without_an_order_are_found_better_than_those_of_fixed_labels_and_are_counted(document: dict) -> None:
-    rows = {(row["pad"], row["way"]): row for row in document["rows"]}
-    assert list(rows) == [(label, way) for label in PADS for way in [*WAYS, COUNTED]]
+def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(document: dict) -> None:
+    rows = {(row["pad"], row["method"]): row for row in document["rows"]}
+    assert list(rows) == [(label, method) for label in PADS for method in [*METHODS, COUNTING]]
     assert len({tuple(row) for row in document["rows"]}) == 1
     for label, pad in PADS.items():
         labelled = rows[label, LABELLED]
         assert labelled["of_fixed_labels"] == 1
         assert labelled["error_mm"] <= labelled["error_by_labels_mm"]
-        for way in ("free", "moments"):
-            row = rows[label, way]
-            assert 0 < row["error_grid"] < BAR * labelled["error_grid"]
+        for method in ("free", "moments"):
+            row = rows[label, method]
+            assert 0 < row["error_grid"] < MAX_RATIO * labelled["error_grid"]
             assert row["of_fixed_labels"] == pytest.approx(row["error_grid"] / labelled["error_grid"])
             assert row["error_mm"] == pytest.approx(pad.pitch_mm * row["error_grid"])
-            assert row["error_mm"] < row["midpoint_named_mm"]
+            assert row["error_mm"] < row["midpoint_error_mm"]
             assert row["error_by_labels_mm"] is None
-    located = [row for row in document["rows"] if row["way"] != COUNTED]
+    located = [row for row in document["rows"] if row["method"] != COUNTING]
     for row, curve in zip(located, document["curves"], strict=True):
-        assert (row["pad"], row["way"]) == (curve["pad"], curve["way"])
-        assert curve["apart_mm"] == sorted(curve["apart_mm"])
+        assert (row["pad"], row["method"]) == (curve["pad"], curve["method"])
+        assert curve["distance_mm"] == sorted(curve["distance_mm"])
         assert np.mean(curve["error_mm"]) == pytest.approx(row["error_mm"], rel=0.05)
-        assert np.mean(curve["apart_mm"]) / 2 == pytest.approx(row["midpoint_named_mm"], rel=0.05)
-        if row["told_apart_from_mm"] is not None:
-            at = curve["apart_mm"].index(row["told_apart_from_mm"])
-            assert np.all(np.array(curve["error_mm"]) < np.array(curve["apart_mm"]) / 4, where=np.arange(16) >= at)
-    counted = [row for row in document["rows"] if row["way"] == COUNTED]
-    for row, each in zip(counted, document["confusions"], strict=True):
-        counts = np.array(each["counts"])
+        assert np.mean(curve["distance_mm"]) / 2 == pytest.approx(row["midpoint_error_mm"], rel=0.05)
+        if row["resolution_mm"] is not None:
+            at = curve["distance_mm"].index(row["resolution_mm"])
+            assert np.all(np.array(curve["error_mm"]) < np.array(curve["distance_mm"]) / 4, where=np.arange(16) >= at)
+    counted = [row for row in document["rows"] if row["method"] == COUNTING]
+    for row, matrix in zip(counted, document["confusions"], strict=True):
+        counts = np.array(matrix["counts"])
         assert counts.shape == (4, 4)
         assert counts.sum() == 300
         assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 300)
-        assert row["accuracy_percent"] > row["guessed_percent"] + 30
+        assert row["accuracy_percent"] > row["majority_percent"] + 30
         assert row["error_mm"] is None
 
 
-def test_errors_and_moments_do_not_depend_on_which_contact_is_named_first(places: np.ndarray) -> None:
-    found = np.random.default_rng(2).uniform(1, 4, places.shape)
-    off = unordered_distances(found, places)
-    np.testing.assert_allclose(unordered_distances(found[:, ::-1], places), off)
-    np.testing.assert_allclose(unordered_distances(found, places[:, ::-1]), off)
-    as_named = [np.linalg.norm(each - places, axis=2).mean(axis=1) for each in (found, found[:, ::-1])]
-    np.testing.assert_allclose(off, np.minimum(*as_named))
-    np.testing.assert_array_equal(moments(places), moments(places[:, ::-1]))
-    assert unordered_distances(pairs_of_moments(moments(places)), places).max() < 1e-7
+def test_unordered_distances_and_moments_do_not_depend_on_the_order(pairs: np.ndarray) -> None:
+    predicted = np.random.default_rng(2).uniform(1, 4, pairs.shape)
+    errors = unordered_distances(predicted, pairs)
+    np.testing.assert_allclose(unordered_distances(predicted[:, ::-1], pairs), errors)
+    np.testing.assert_allclose(unordered_distances(predicted, pairs[:, ::-1]), errors)
+    both = [np.linalg.norm(order - pairs, axis=2).mean(axis=1) for order in (predicted, predicted[:, ::-1])]
+    np.testing.assert_allclose(errors, np.minimum(*both))
+    np.testing.assert_array_equal(moments(pairs), moments(pairs[:, ::-1]))
+    assert unordered_distances(pairs_from_moments(moments(pairs)), pairs).max() < 1e-7
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_what_is_learnt_without_an_order_does_not_depend_on_it(way: str, places: np.ndarray) -> None:
-    given = signals(PAD, places)
-    turned = np.where(np.random.default_rng(3).random((len(places), 1, 1)) < 0.5, places, places[:, ::-1])
+@pytest.mark.parametrize("method", METHODS)
+def test_fit_pairs_does_not_depend_on_the_order_except_for_fixed_labels(method: str, pairs: np.ndarray) -> None:
+    inputs = signals(PAD, pairs)
+    shuffled = np.where(np.random.default_rng(3).random((len(pairs), 1, 1)) < 0.5, pairs, pairs[:, ::-1])
     with one_torch_thread():
-        found, again = (
-            learnt(WAYS[way], given, each, np.random.default_rng(0), members=2, hidden=8, epochs=10)(given)
-            for each in (places, turned)
+        first, second = (
+            fit_pairs(METHODS[method], inputs, order, np.random.default_rng(0), members=2, hidden=8, epochs=10)(inputs)
+            for order in (pairs, shuffled)
         )
-    assert np.allclose(found, again, atol=1e-6) == (way != LABELLED)
+    assert np.allclose(first, second, atol=1e-6) == (method != LABELLED)

@@ -1,4 +1,4 @@
-"""The study of robustness, and what its files say; that it goes on where it was broken off."""
+"""The study of robustness, and its files."""
 
 import csv
 import json
@@ -20,42 +20,40 @@ from padforge.sense.studies.study import Study, load_pads, run
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 
 
-def small(**options) -> Study:
-    return robustness_study(PADS, max_failures=2, hidden=10, presses=144, test=300, **options)
-
-
-def least(pads: Mapping[str, Morphology], test: int = 20, contact: Contact | None = None) -> Study:
-    """Two tasks a pad, of hardly any work."""
+def tiny(pads: Mapping[str, Morphology], test: int = 20, contact: Contact | None = None) -> Study:
+    """Two tasks a pad, of little work."""
     return robustness_study(pads, max_failures=1, hidden=4, presses=16, test=test, contact=contact)
 
 
 @pytest.fixture(scope="module")
-def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("robustness")
-    return folder, run(small(), folder)
+    return folder, run(robustness_study(PADS, max_failures=2, hidden=10, presses=144, test=300), folder)
 
 
-def rows_of(document: dict, **wanted) -> list[dict]:
-    return [row for row in document["rows"] if wanted.items() <= row.items()]
+def select_rows(document: dict, **values) -> list[dict]:
+    return [row for row in document["rows"] if values.items() <= row.items()]
 
 
-def test_robustness_tells_the_errors_of_every_set_of_lost_fibres_and_its_files_say_the_same(
-    studied: tuple[Path, dict],
-) -> None:
-    folder, document = studied
+def test_study_evaluates_every_set_of_failed_fibres(results: tuple[Path, dict]) -> None:
+    document = results[1]
     assert [(row["pad"], row["n_failed"], row["subsets"]) for row in document["rows"]] == [
-        (pad, lost, sets) for pad in PADS for lost, sets in ((0, 1), (1, 4), (2, 6))
+        (pad, n_failed, sets) for pad in PADS for n_failed, sets in ((0, 1), (1, 4), (2, 6))
     ]
     for pad in PADS:
-        none, one, two = rows_of(document, pad=pad)
-        assert none["mean"] < one["mean"] < two["mean"] <= two["max"]
-        assert none["mean_mm"] == pytest.approx(11.25 * none["mean"])
-        by_subset = [each for each in document["by_subset"] if each["pad"] == pad and len(each["failed"]) == 2]
-        assert two["mean"] == pytest.approx(np.mean([each["mean"] for each in by_subset]))
-        worst = max(by_subset, key=lambda each: each["mean"])
-        assert [each["failed"] for each in document["maps"] if each["pad"] == pad][2] == worst["failed"]
-    # A map of the square grid without both horizontal fibres: off by the height, which nothing tells any more.
-    assert rows_of(document, pad="square", lost=2)[0]["max"] > 0.2
+        intact, one, two = select_rows(document, pad=pad)
+        assert intact["mean"] < one["mean"] < two["mean"] <= two["max"]
+        assert intact["mean_mm"] == pytest.approx(11.25 * intact["mean"])
+        by_subset = [row for row in document["by_subset"] if row["pad"] == pad and len(row["failed"]) == 2]
+        assert two["mean"] == pytest.approx(np.mean([row["mean"] for row in by_subset]))
+        worst = max(by_subset, key=lambda row: row["mean"])
+        assert [panel["failed"] for panel in document["maps"] if panel["pad"] == pad][2] == worst["failed"]
+    # without both horizontal fibres the height is unknown
+    assert select_rows(document, pad="square", n_failed=2)[0]["max"] > 0.2
+
+
+def test_study_writes_the_same_numbers_into_all_files(results: tuple[Path, dict]) -> None:
+    folder, document = results
     assert json.loads((folder / "robustness.json").read_text()) == json.loads(json.dumps(document))
     with (folder / "robustness.csv").open() as file:
         table = list(csv.DictReader(file))
@@ -66,41 +64,40 @@ def test_robustness_tells_the_errors_of_every_set_of_lost_fibres_and_its_files_s
 
 
 @pytest.mark.slow
-def test_published_errors_are_reproduced(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Mean errors with all fibres and with one lost, as measured by others with the same protocol."""
-    monkeypatch.setattr(robustness, "NETWORKS", 4)
+def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mean errors with all fibres and with one failed, measured by others with the same protocol."""
+    monkeypatch.setattr(robustness, "MIN_NETWORKS", 4)
     expected = {"square_grid_cir": (0.217, 0.216), "5para_dis": (0.065, 0.099), "20para": (0.056, 0.080)}
     pads = load_pads(tuple(str(published / f"{name}.mat") for name in expected), 0)
     document = run(robustness_study(pads, max_failures=1), tmp_path)
     for name, errors in expected.items():
-        assert [row["mean"] for row in rows_of(document, pad=name)] == pytest.approx(errors, rel=0.15)
+        assert [row["mean"] for row in select_rows(document, pad=name)] == pytest.approx(errors, rel=0.15)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_cluster_that_loses_a_worker_finds_the_same(tmp_path: Path) -> None:
-    """Its only one: another is started in its place, and goes on."""
+def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
-    study = least({"a": Morphology.straight(1), "b": Morphology.random(1, 1)})
-    here = run(study, tmp_path / "here")
+    study = tiny({"a": Morphology.straight(1), "b": Morphology.random(1, 1)})
+    expected = run(study, tmp_path / "local")
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
     ):
         victim = next(iter(client.run(os.getpid).values()))
 
-        def progress(done: int, total: int, name: str) -> None:
+        def kill(done: int, total: int, name: str) -> None:
             if done == 1:
                 os.kill(victim, signal.SIGKILL)
 
         executor = client.get_executor(pure=False, retries=10)
-        there = run(study, tmp_path / "there", executor=cast(Executor, executor), progress=progress)
+        document = run(study, tmp_path / "cluster", executor=cast(Executor, executor), on_progress=kill)
         with pytest.raises(ProcessLookupError):
             os.kill(victim, 0)
-    assert there["rows"] == here["rows"]
+    assert document["rows"] == expected["rows"]
 
 
-def test_any_name_of_a_file_will_do(tmp_path: Path) -> None:
+def test_study_escapes_names_of_files(tmp_path: Path) -> None:
     names = ("_under", "a$\\frac$", "pi|pe <b>", b"\xff".decode(errors="surrogateescape"))
     paths = [tmp_path / name / "morphology.json" for name in names]
     for path in paths:
@@ -109,18 +106,18 @@ def test_any_name_of_a_file_will_do(tmp_path: Path) -> None:
     document = run(robustness_study(pads, max_failures=0, hidden=5, presses=16, test=20), tmp_path / "out")
     assert [row["pad"] for row in document["rows"]] == list(pads)
     assert len(pads) == len(names)
-    for table in (tmp_path / "out" / "robustness.md").read_text().splitlines()[-len(names) :]:
-        assert table.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
-        assert "<b>" not in table
+    for line in (tmp_path / "out" / "robustness.md").read_text().splitlines()[-len(names) :]:
+        assert line.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
+        assert "<b>" not in line
 
 
-def test_a_pad_that_no_press_touches_is_studied_and_maps_are_as_wide_as_what_is_pressed(
-    tmp_path: Path,
-) -> None:
-    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
-    document = run(least(PADS, test=300, contact=Contact(radius=1e-6)), tmp_path)
-    # Nothing is told, so the middle of the pad is the best guess: half a grid unit off each way at most.
+def test_study_of_a_pad_without_signals_guesses_the_middle(tmp_path: Path) -> None:
+    document = run(tiny(PADS, test=300, contact=Contact(radius=1e-6)), tmp_path)
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
+
+
+def test_maps_cover_the_pressed_rectangle(tmp_path: Path) -> None:
+    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
     pad = Morphology.straight((3, 2), (8.0, 15.0))
     document = run(robustness_study({"tall": pad}, max_failures=0, hidden=4, presses=16, test=10), tmp_path)
     left, right, low, high = document["maps"][0]["extent"]

@@ -1,4 +1,4 @@
-"""What every study shares: pads by name, one run at a time in a folder, resumed work, all results or none."""
+"""The frame of all studies: pads by name, one run at a time in a folder, resumed work, all results or none."""
 
 import json
 import os
@@ -19,20 +19,30 @@ from padforge.design.optimize.search import SearchResult
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift, scaling, sensitivity
-from padforge.sense.studies.indentation import Learning, force_study, shape_study
+from padforge.sense.studies.indentation import force_study, shape_study
 from padforge.sense.studies.multicontact import multicontact_study
 from padforge.sense.studies.robustness import robustness_study
-from padforge.sense.studies.study import Findings, Study, Task, described, load_pads, run, study_lines
+from padforge.sense.studies.study import (
+    ADC_COUNTS,
+    Study,
+    StudyResult,
+    Task,
+    describe_pads,
+    load_pads,
+    quantize,
+    run,
+    study_lines,
+)
 from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
-LEAST: dict[str, Callable[[], Study]] = {
+SMALLEST: dict[str, Callable[[], Study]] = {
     "robustness": lambda: robustness_study(PADS, max_failures=1, hidden=4, presses=16, test=20),
     "drift": lambda: drift.drift_study(
         *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
         **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},
     ),
-    "force": lambda: force_study(PADS, noise_counts=(1.0,), learning=Learning(60, 40, hidden=4, epochs=3)),
+    "force": lambda: force_study(PADS, noise_counts=(1.0,), presses=60, test=40, hidden=4, epochs=3),
     "shape": lambda: shape_study(PADS, presses=100, test=60, hidden=4, epochs=3),
     "multicontact": lambda: multicontact_study(PADS, presses=100, test=60, hidden=5, members=2, epochs=3),
     "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
@@ -45,8 +55,10 @@ def stop(done: int, total: int, name: str) -> None:
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("name", LEAST)
-def test_a_study_broken_off_ends_the_same(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", SMALLEST)
+def test_run_resumes_every_study_with_the_same_result(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(drift, "MEMBERS", 2)
     monkeypatch.setattr(drift, "FILTERS", {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)})
     for module in (scaling, sensitivity):
@@ -55,114 +67,95 @@ def test_a_study_broken_off_ends_the_same(name: str, tmp_path: Path, monkeypatch
     monkeypatch.setattr(scaling, "EPOCHS", 8)
     monkeypatch.setattr(sensitivity, "SIDE", 8)
     monkeypatch.setattr(sensitivity, "MEMBERS", 2)
-    whole = run(LEAST[name](), tmp_path / "whole", jobs=1)
-    study = replace(LEAST[name](), draw=lambda document: Figure())
+    complete = run(SMALLEST[name](), tmp_path / "complete", jobs=1)
+    study = replace(SMALLEST[name](), draw=lambda document: Figure())
     with pytest.raises(KeyboardInterrupt):
-        run(study, tmp_path / "broken", jobs=1, progress=stop)
-    seen: list[int] = []
-    again = run(study, tmp_path / "broken", resume=True, progress=lambda done, total, name: seen.append(done))
-    assert seen[0] >= 2
-    for row in (*whole["rows"], *again["rows"]):
+        run(study, tmp_path / "interrupted", jobs=1, on_progress=stop)
+    progress: list[int] = []
+    resumed = run(study, tmp_path / "interrupted", resume=True, on_progress=lambda done, *_: progress.append(done))
+    assert progress[0] >= 2
+    for row in (*complete["rows"], *resumed["rows"]):
         for seconds in ("seconds", "seconds_per_10000"):
             row.pop(seconds, None)
-    assert again == whole
-    stem = whole["format"].removeprefix("padforge-study-").removesuffix("/1")
+    assert resumed == complete
+    stem = complete["format"].removeprefix("padforge-study-").removesuffix("/2")
     names = [f"{stem}.{end}" for end in ("csv", "json", "md", "png")]
-    assert sorted(path.name for path in (tmp_path / "whole").iterdir()) == names
-    assert (tmp_path / "whole" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
-    json.dumps(whole, allow_nan=False)
-    assert len({tuple(row) for row in whole["rows"]}) == 1
-    lines = study_lines(whole)
-    assert len(lines) == 1 + len(whole["rows"]) + 1 + len(whole["text"])
-    assert all(any(label in line for line in lines) for label in ("square", "random") if label in str(whole["rows"]))
+    assert sorted(path.name for path in (tmp_path / "complete").iterdir()) == names
+    assert (tmp_path / "complete" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
+    json.dumps(complete, allow_nan=False)
+    assert len({tuple(row) for row in complete["rows"]}) == 1
+    lines = study_lines(complete)
+    assert len(lines) == 1 + len(complete["rows"]) + 1 + len(complete["text"])
+    assert all(any(label in line for line in lines) for label in ("square", "random") if label in str(complete["rows"]))
 
 
-def one(
-    name: str = "x", seed: int = 0, make: Callable[[], dict] = lambda: {"a": np.ones(1)}, tasks: str = "a"
-) -> Study:
-    conclude = lambda states: Findings([{"a": 1}], [])  # noqa: E731
-    return Study(name, "X", {"seed": seed}, [Task(task, make) for task in tasks], conclude, lambda document: Figure())
+def tiny(seed: int = 0, compute: Callable[[], dict] = lambda: {"a": np.ones(1)}, tasks: str = "a") -> Study:
+    conclude = lambda states: StudyResult([{"a": 1}], [])  # noqa: E731
+    return Study("x", "X", {"seed": seed}, [Task(task, compute) for task in tasks], conclude, lambda document: Figure())
 
 
-def test_a_folder_in_which_a_study_is_at_work_or_one_of_other_settings_was_broken_off_is_refused(
-    tmp_path: Path,
-) -> None:
-    def meet() -> dict:
-        with pytest.raises(InputError, match="a x study is at work there"):
-            run(one(), tmp_path)
+def test_run_rejects_a_folder_of_a_running_study_or_of_other_settings(tmp_path: Path) -> None:
+    def run_again() -> dict:
+        with pytest.raises(InputError, match="a x study is running there"):
+            run(tiny(), tmp_path)
         return {}
 
-    run(one(make=meet), tmp_path)
+    run(tiny(compute=run_again), tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
     with pytest.raises(KeyboardInterrupt):
-        run(one(tasks="abc"), tmp_path, jobs=1, progress=stop)
-    others = (one(seed=1, tasks="abc"), one(tasks="abcd"), one(tasks="bac"))
-    for other, said in zip(others, ("begun with x seed 0, now 1", *["begun with x tasks"] * 2), strict=True):
-        with pytest.raises(InputError, match=said):
+        run(tiny(tasks="abc"), tmp_path, jobs=1, on_progress=stop)
+    others = (tiny(seed=1, tasks="abc"), tiny(tasks="abcd"), tiny(tasks="bac"))
+    for other, message in zip(others, ("begun with x seed 0, now 1", *["begun with x tasks"] * 2), strict=True):
+        with pytest.raises(InputError, match=message):
             run(other, tmp_path, resume=True)
 
 
-def test_a_lock_that_goes_while_it_is_taken_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who had it may come to the end between the opening of its file and the lock on that."""
+def test_run_rejects_a_lock_that_is_removed_while_it_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run that held it may end between the opening of its file and the lock on that."""
     monkeypatch.setattr("padforge.design.common.files.lock", lambda file, busy: (tmp_path / ".x.lock").unlink())
-    with pytest.raises(InputError, match="a x study is at work there"):
-        run(one(), tmp_path)
+    with pytest.raises(InputError, match="a x study is running there"):
+        run(tiny(), tmp_path)
 
 
-def test_a_system_that_keeps_what_is_open_is_no_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows removes no lock while it is held."""
-    unlink = Path.unlink
-
-    def kept(path: Path, missing_ok: bool = False) -> None:
-        if path.suffix == ".lock":
-            raise PermissionError(13, "in use")
-        unlink(path, missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", kept)
-    run(one(), tmp_path)
-    run(one(), tmp_path)
-    assert (tmp_path / "x.json").exists()
-
-
-def test_a_figure_that_fails_leaves_no_half_of_the_results(tmp_path: Path) -> None:
+def test_run_leaves_nothing_if_the_figure_or_the_document_fails(tmp_path: Path) -> None:
     def draw(document: object) -> Figure:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run(replace(one(tasks=""), draw=draw), tmp_path)
-    unwritable = Findings([{"a": 1}], [], {"map": object()})
+        run(replace(tiny(tasks=""), draw=draw), tmp_path)
+    unwritable = StudyResult([{"a": 1}], [], {"map": object()})
     with pytest.raises(TypeError, match="JSON"):
-        run(replace(one(tasks=""), conclude=lambda states: unwritable), tmp_path)
+        run(replace(tiny(tasks=""), conclude=lambda states: unwritable), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
-def test_a_lock_that_is_no_file_is_neither_waited_for_nor_followed(tmp_path: Path) -> None:
+def test_run_rejects_a_lock_that_is_no_file(tmp_path: Path) -> None:
     (tmp_path / "mine").touch()
     for make in (os.mkfifo, lambda lock: lock.symlink_to(tmp_path / "mine")):
         make(tmp_path / ".x.lock")
         with pytest.raises(InputError, match=r"\.x\.lock: is no file"):
-            run(one(), tmp_path)
+            run(tiny(), tmp_path)
         (tmp_path / ".x.lock").unlink()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["robustness", "nowhere.json"], "nowhere.json: no such file, and none of square, optimised, random-N"),
-        (["robustness", "square", "square"], "one called square is there already"),
+        (["robustness", "square", "square"], "another one is called square"),
         (["robustness", "square", "--presses", "1000"], "presses is 1000, allowed is a square number from 4"),
         (["robustness", "square@0"], "square@0: no such file"),
         (["scaling", "square", "--grids", "4,x"], "grids is '4,x', expected numbers from 2 to 256"),
         (["scaling", "square@3", "--grids", "4"], "grids has 4, expected multiples of 3"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(arguments: list[str], said: str, tmp_path: Path) -> None:
-    assert said in refused("study", *arguments, "--out", "out", cwd=tmp_path)
+def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
+    assert message in refused("study", *arguments, "--out", "out", cwd=tmp_path)
 
 
 @pytest.mark.slow
-def test_an_interrupt_ends_at_once_and_keeps_what_was_finished(tmp_path: Path) -> None:
+def test_interrupt_ends_a_study_at_once_and_keeps_finished_tasks(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "padforge", "study", "robustness", "square@6", "--presses", "256"]
     study = subprocess.Popen(
@@ -178,16 +171,16 @@ def test_an_interrupt_ends_at_once_and_keeps_what_was_finished(tmp_path: Path) -
             time.sleep(0.1)
         study.send_signal(signal.SIGINT)
         begin = time.monotonic()
-        _, said = study.communicate(timeout=60)
+        _, err = study.communicate(timeout=60)
     finally:
         study.kill()
     assert study.returncode == 130
-    assert said == "padforge: interrupted; --resume goes on from what was finished\n"
+    assert err == "padforge: interrupted; --resume continues with the finished tasks\n"
     assert time.monotonic() - begin < 30
     assert list(out.glob("robustness-unfinished/start_*.npz"))
 
 
-def test_pads_are_told_by_file_or_by_name_and_described(tmp_path: Path) -> None:
+def test_load_pads_by_file_or_name(tmp_path: Path) -> None:
     winding = Morphology.random(2, 3, 0)
     path = tmp_path / "mine" / "morphology.json"
     path.parent.mkdir()
@@ -202,24 +195,35 @@ def test_pads_are_told_by_file_or_by_name_and_described(tmp_path: Path) -> None:
         winding.save(path)
     # no label is a formula of a spreadsheet
     assert list(load_pads([str(path) for path in paths], seed=0)) == ["x", "1+1", "mine"]
-    told = described({"square": Morphology.straight(2), "wide": Morphology.straight((1, 3), (8.0, 15.0))})
-    assert (told["square"]["grid"], told["square"]["pitch_mm"]) == (2, 11.25)
-    assert (told["wide"]["fibres"], told["wide"]["pitch_mm"]) == ([1, 3], (8.0, 15.0))
 
 
-def test_pads_are_searched_for_with_so_many_knots_by_either_method(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_describe_pads_states_grid_or_fibres_and_pitch() -> None:
+    described = describe_pads({"square": Morphology.straight(2), "wide": Morphology.straight((1, 3), (8.0, 15.0))})
+    assert (described["square"]["grid"], described["square"]["pitch_mm"]) == (2, 11.25)
+    assert (described["wide"]["fibres"], described["wide"]["pitch_mm"]) == ([1, 3], (8.0, 15.0))
 
-    def remembered(pad: PadSettings, contact: Contact, settings: SearchSettings) -> SearchResult:
-        asked.append((pad.grid, settings.method, settings.knots, settings.seed))
+
+def test_load_pads_searches_with_the_given_knots_by_either_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    requests = []
+
+    def record(pad: PadSettings, contact: Contact, settings: SearchSettings) -> SearchResult:
+        requests.append((pad.grid, settings.method, settings.knots, settings.seed))
         return SearchResult(Morphology.straight(pad.grid), {}, [], "start 1", {})
 
-    monkeypatch.setattr("padforge.design.optimize.search.search", remembered)
+    monkeypatch.setattr("padforge.design.optimize.search.search", record)
     names = ("optimised", "optimised-5", "genetic-1@2", "optimised-30@3")
     assert tuple(load_pads(names, seed=4)) == names
-    assert asked == [(4, "descent", 21, 4), (4, "descent", 5, 4), (2, "genetic", 1, 4), (3, "descent", 30, 4)]
+    assert requests == [(4, "descent", 21, 4), (4, "descent", 5, 4), (2, "genetic", 1, 4), (3, "descent", 30, 4)]
     with pytest.raises(InputError, match="genetic search knots: got 65"):
         load_pads(("genetic-65",), seed=0)
     for name in ("genetic", "optimised-0", "square-5"):
         with pytest.raises(InputError, match="none of square, optimised, random-N, optimised-N, genetic-N"):
             load_pads((name,), seed=0)
+
+
+def test_quantize_gives_whole_counts_up_to_full_scale() -> None:
+    signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 2.0, 0.0]])
+    counts = quantize(signals, np.array([0.5, 1.0, 0.0]), 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, ADC_COUNTS, 0]])
+    noisy = quantize(np.full((4000, 1), 0.5), np.ones(1), 4.0, np.random.default_rng(0))
+    assert noisy.std() == pytest.approx(4, rel=0.1)

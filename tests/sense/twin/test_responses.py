@@ -1,4 +1,4 @@
-"""How much presses tell of their place, against what is known of a simulated pad."""
+"""Responses, their noise and their information, against what is known of a simulated pad."""
 
 from dataclasses import replace
 
@@ -8,13 +8,13 @@ import pytest
 from padforge.design import Morphology, Twin
 from padforge.design.twin import TwinReadings
 from padforge.sense import Recording, RigSettings, simulate
-from padforge.sense.twin.as_built import information, of_one_depth, responses
+from padforge.sense.twin.responses import Responses, compute_responses, fisher_information, fit_gp, select_one_depth
 
 QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
 
 
-def known_information(twin: Twin, positions_mm: np.ndarray) -> np.ndarray:
-    """(C',) 1/mm^2 of the live channels: squares of how answers change with the place, over their noise."""
+def exact_information(twin: Twin, positions_mm: np.ndarray) -> np.ndarray:
+    """Squared slope of the responses of live channels over their noise variance; (C',) 1/mm^2."""
     live = [channel for channel in twin.channels if channel.fibre is not None]
     steps = [
         twin.as_built_stretch(positions_mm + step) - twin.as_built_stretch(positions_mm - step)
@@ -26,7 +26,7 @@ def known_information(twin: Twin, positions_mm: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def noisy(printed: Twin) -> Twin:
-    """As noisy as pads are that were built, which is more than what the response model smooths away.
+    """As noisy as built pads are, which is more than what the response model smooths away.
 
     Where channels of less noise smooth the slopes, information comes out too low, where they have more too high.
     """
@@ -39,39 +39,59 @@ def recording(noisy: Twin) -> Recording:
     return simulate(noisy, RigSettings(presses=800, creep=0, seed=1))
 
 
-def test_presses_tell_what_their_answers_tell_of_channels_that_are_there(noisy: Twin, recording: Recording) -> None:
+def test_fisher_information_agrees_with_the_simulated_pad(noisy: Twin, recording: Recording) -> None:
     live = np.flatnonzero([channel.fibre is not None for channel in noisy.channels])
-    found = information(recording, live)
-    known = known_information(noisy, recording.presses_mm[:200])
-    assert found.sum() == pytest.approx(known.sum(), rel=0.2)
-    assert found == pytest.approx(known, rel=0.6)
+    information, exact = fisher_information(recording, live), exact_information(noisy, recording.presses_mm[:200])
+    assert information.sum() == pytest.approx(exact.sum(), rel=0.2)
+    assert information == pytest.approx(exact, rel=0.6)
+
+
+def test_fisher_information_ignores_presses_without_readings(noisy: Twin, recording: Recording) -> None:
     channel = next(c.channel for c in noisy.channels if c.fibre is not None)
     readings = np.array(recording.readings)
     readings[: recording.down_command[300], channel] = np.nan
     presses = {name: getattr(recording, name) for name in ("presses_mm", "down_command", "up_command")}
-    spoilt = Recording(readings, recording.times_s, **presses)
-    only = np.array([channel])
-    assert information(spoilt, only) == pytest.approx(information(recording, only), rel=0.35)
+    partial, channels = Recording(readings, recording.times_s, **presses), np.array([channel])
+    assert fisher_information(partial, channels) == pytest.approx(fisher_information(recording, channels), rel=0.35)
 
 
-def test_an_answer_is_what_is_held_less_the_rest_and_short_presses_tell_of_their_places_too() -> None:
-    """Readings of 2 V, of 5 V while the tip comes to rest, and of 3 V then."""
+def test_fisher_information_of_short_presses_is_finite() -> None:
+    recording = simulate(Morphology.random(2, 3, seed=0), RigSettings(presses=120, readings_per_press=8, seed=0))
+    information = fisher_information(recording, np.arange(recording.fibres))
+    assert np.isfinite(information).all()
+    assert (information > 0).any()
+
+
+def test_response_is_the_held_level_minus_the_rest() -> None:
+    """Readings of 2 V at rest, of 5 V while the tip comes to rest, and of 3 V then."""
     recording = simulate(Morphology.straight(2), RigSettings(presses=80, seed=0))
     readings = np.full_like(recording.readings, 2.0)
     for down, up in zip(recording.down_command, recording.up_command, strict=True):
         readings[down : down + 4], readings[down + 4 : up] = 5.0, 3.0
-    found = responses(replace(recording, readings=readings), np.arange(80) < 60)
-    np.testing.assert_allclose(found.volts, 1.0, atol=0.02)  # of which memory takes a little
-    recording = simulate(Morphology.random(2, 3, seed=0), RigSettings(presses=120, readings_per_press=8, seed=0))
-    found = information(recording, np.arange(recording.fibres))
-    assert np.isfinite(found).all()
-    assert (found > 0).any()
+    responses = compute_responses(replace(recording, readings=readings), np.arange(80) < 60)
+    np.testing.assert_allclose(responses.volts, 1.0, atol=0.02)  # of which history takes a little
 
 
-def test_presses_as_deep_as_most_are_kept_the_deeper_of_two_kinds_and_all_of_unknown_depth() -> None:
+def test_select_one_depth_keeps_the_most_common_and_all_of_unknown_depth() -> None:
     recording = simulate(Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)))
-    kept = of_one_depth(recording)
-    assert kept.presses_mm[kept.has_position].tolist() == recording.presses_mm[2::3].tolist()
+    selected = select_one_depth(recording)
+    assert selected.presses_mm[selected.has_position].tolist() == recording.presses_mm[2::3].tolist()
     unknown = replace(recording, depths_mm=np.full(9, np.nan))
-    assert of_one_depth(unknown) is unknown
-    assert of_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).has_position.all()
+    assert select_one_depth(unknown) is unknown
+    assert select_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).has_position.all()
+
+
+def test_fit_gp_separates_noise_from_a_function_of_position_and_ignores_invalid_responses():
+    positions_mm = np.random.default_rng(0).uniform(-20, 20, (500, 2))
+    noise = np.random.default_rng(1).standard_normal((500, 2))
+    function = 3 * np.sin(positions_mm[:, 0] / 9) + np.cos(positions_mm[:, 1] / 7)
+    volts = np.column_stack([function + 0.2 * noise[:, 0], noise[:, 1]])
+    gp = fit_gp(Responses(positions_mm, volts, np.ones((500, 2), bool)), 10)
+    assert gp.noise == pytest.approx([0.2, 1.0], rel=0.12)
+    assert gp.log_bayes_factor[0] > 100
+    assert gp.log_bayes_factor[1] < 5
+    valid = np.column_stack([np.arange(500) % 2 == 1, np.arange(500) < 9])
+    gp = fit_gp(Responses(positions_mm, np.where(valid, volts, 1e6), valid), 10)
+    assert gp.noise[0] == pytest.approx(0.2, rel=0.15)
+    assert np.isnan(gp.noise[1])
+    assert gp.log_bayes_factor[1] == 0

@@ -1,0 +1,214 @@
+"""Responses of the channels to presses at known positions, and what they say without a model of the pad.
+
+A response is one number for a press and a channel: the mean while the tip rests in the silicone, minus the rest before,
+with what the channel's history adds taken off. All other windows of a press carry information on its position too; how
+much is Fisher's information J' S^-1 J, with J the slope of the windows over the position by the response model and S
+the covariance of its residuals on presses that it was not fitted to.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+
+from padforge.sense.arrays import Array, Indices, Mask
+from padforge.sense.localizer.features import DOWN, compute_features
+from padforge.sense.localizer.response_model import GRID_CELLS, ResponseModel, remove_history
+from padforge.sense.recording.recording import Recording
+
+DEPTH_TOLERANCE = 0.15
+"""Share of its depth by which another press may differ that counts as equally deep."""
+FIRST_HELD = 3
+"""First window of the press that counts as held: the tip has come to rest in the silicone."""
+HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(DOWN)], float)
+HOLD /= HOLD.sum()
+"""Weights of the windows of a press in its response; shape (9,)."""
+GP_WIDTHS = (0.4, 0.8)
+"""Standard deviations of the Gaussian kernels that are tried, grid units."""
+GP_PRESSES = 800
+"""Presses that a Gaussian process is fitted to, at most: it takes the eigenvalues of a matrix of that size."""
+GP_RATIOS = np.append(0.0, np.geomspace(1e-2, 1e4, 61))
+"""Variances of the function that are tried, as multiples of that of the noise."""
+MIN_GP_PRESSES = 10
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Responses of C channels to Q presses.
+
+    Attributes:
+        positions_mm: in the arm's frame; shape (Q, 2).
+        volts: shape (Q, C).
+        valid: whether the channel gave enough readings; shape (Q, C).
+    """
+
+    positions_mm: Array
+    volts: Array
+    valid: Mask
+
+    def __len__(self) -> int:
+        return len(self.positions_mm)
+
+    def select(self, rows: Indices, channels: Indices | slice = slice(None)) -> "Responses":
+        """Return the responses of some channels to some presses."""
+        return Responses(self.positions_mm[rows], self.volts[rows][:, channels], self.valid[rows][:, channels])
+
+    @property
+    def variance(self) -> Array:
+        """Variance of each channel's responses; shape (C,); 1 where there are none."""
+        counts = np.maximum(self.valid.sum(axis=0), 1)
+        mean = np.where(self.valid, self.volts, 0).sum(axis=0) / counts
+        variance = np.where(self.valid, (self.volts - mean) ** 2, 0).sum(axis=0) / counts
+        return np.where(variance > 0, variance, 1.0)
+
+    def explained_variance(self, predicted: Array) -> Array:
+        """Return the share of each channel's variance (C,) that a prediction (Q, C) explains."""
+        counts = np.maximum(self.valid.sum(axis=0), 1)
+        unexplained = np.where(self.valid, (self.volts - predicted) ** 2, 0).sum(axis=0) / counts
+        return 1 - unexplained / self.variance
+
+
+def select_one_depth(recording: Recording) -> Recording:
+    """Keep the positions of presses of the most common depth only, since a deeper one responds more.
+
+    The others stay in the history of those that follow. Where no depth is known, all are taken to be equal.
+    """
+    depths_mm = np.where(recording.has_position, recording.actual_depths_mm, np.nan)
+    ordered = np.sort(depths_mm[depths_mm > 0])[::-1]
+    if not len(ordered):
+        return recording
+    last = np.searchsorted(-ordered, -(1 - DEPTH_TOLERANCE) * ordered, "right")
+    first = np.searchsorted(-ordered, -(1 + DEPTH_TOLERANCE) * ordered, "left")
+    usual = ordered[np.argmax(last - first)]  # the deepest of the most common, whose responses are largest
+    equal = np.abs(depths_mm - usual) <= DEPTH_TOLERANCE * usual
+    return replace(recording, presses_mm=np.where(equal[:, None], recording.presses_mm, np.nan))
+
+
+def compute_responses(recording: Recording, training: Mask) -> Responses:
+    """Compute the responses to all presses of known position.
+
+    Args:
+        recording: readings and presses.
+        training: of these presses, those that the effect of a channel's history is fitted to; shape (Q,).
+    """
+    known = recording.has_position
+    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
+    positions_mm = recording.presses_mm[known]
+    normalized = _normalize(positions_mm)
+    model = ResponseModel.fit(
+        normalized[training], inputs.windows[training], inputs.history[training], inputs.fibre_mask[training]
+    )
+    windows = remove_history(inputs.windows, inputs.history, model.history_coef, model.history_mean_v)
+    return Responses(positions_mm, windows @ HOLD, inputs.fibre_mask)
+
+
+def fisher_information(recording: Recording, channels: Indices) -> Array:
+    """Compute the Fisher information on the position in all windows of a press, mean over the pressed area.
+
+    Args:
+        recording: readings and presses.
+        channels: indices; shape (C',). Each counts by the presses in which it gave enough readings.
+
+    Returns:
+        Trace of the information of each channel, 1/mm^2; shape (C',).
+    """
+    known = recording.has_position
+    inputs = compute_features(
+        recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
+    )
+    positions = _normalize(recording.presses_mm[known])
+    side_mm = np.ptp(recording.presses_mm[known], axis=0).max()
+    information = []
+    for channel in channels.tolist():
+        valid = inputs.fibre_mask[:, channel]
+        information.append(
+            _channel_information(positions[valid], inputs.windows[valid, channel], inputs.history[valid, channel])
+        )
+    return np.array(information) * (2 / side_mm) ** 2
+
+
+def _channel_information(positions: Array, windows: Array, history: Array) -> float:
+    """Return the trace of the Fisher information of one channel.
+
+    Two response models are fitted to half the presses each. Residuals are those on the other half, and slopes of the
+    two are multiplied: noise that one model takes for a slope is not in the other.
+
+    Args:
+        positions: within [-1, 1]; shape (Q, 2).
+        windows: V; shape (Q, F).
+        history: V; shape (Q, J).
+    """
+    windows, history, fibre_mask = windows[:, None], history[:, None], np.ones((len(positions), 1), bool)
+    grid, odd = np.linspace(-1, 1, GRID_CELLS + 1), np.arange(len(positions)) % 2 == 1
+    residual, tables = np.empty_like(windows), []
+    for half in (odd, ~odd):
+        model = ResponseModel.fit(positions[half], windows[half], history[half], fibre_mask[half])
+        expected = RegularGridInterpolator((grid, grid), model.table)(positions[~half])
+        residual[~half] = (
+            remove_history(windows[~half], history[~half], model.history_coef, model.history_mean_v) - expected
+        )
+        tables.append(model.table[:, :, 0])
+    # pseudo-inverse, since short presses have the same reading in two windows
+    precision, trace = np.linalg.pinv(np.cov(residual[:, 0].T), hermitian=True), 0.0
+    for axis in (0, 1):
+        first, second = (np.asarray(np.gradient(table, 2 / GRID_CELLS, axis=axis)) for table in tables)
+        trace += float(np.einsum("xyf,fg,xyg->xy", first, precision, second).mean())
+    return max(trace, 0.0)
+
+
+def _normalize(positions_mm: Array) -> Array:
+    """Return positions (Q, 2) in the square [-1, 1] about all of them."""
+    middle = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
+    return (positions_mm - middle) / np.abs(positions_mm - middle).max()
+
+
+class GpFit(NamedTuple):
+    """Gaussian process over the position, for each channel.
+
+    Attributes:
+        noise: standard deviation of what no smooth function of position explains; shape (C,); NaN where too few
+            presses are valid.
+        log_bayes_factor: log-likelihood of a smooth function minus that of noise alone; shape (C,).
+    """
+
+    noise: np.ndarray
+    log_bayes_factor: np.ndarray
+
+
+def fit_gp(responses: Responses, unit_mm: float) -> GpFit:
+    """Fit a Gaussian process to each channel, by maximum likelihood over kernel width and signal-to-noise ratio.
+
+    Args:
+        responses: of any kind, such as residuals.
+        unit_mm: grid unit, mm.
+    """
+    positions = responses.positions_mm[:GP_PRESSES] / unit_mm
+    squares = ((positions[:, None, :] - positions) ** 2).sum(axis=2)
+
+    @cache  # most channels are valid in the same presses
+    def eigen(valid: bytes, width: float) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.frombuffer(valid, bool)
+        return np.linalg.eigh(np.exp(squares[np.ix_(rows, rows)] * (-0.5 / width**2)))
+
+    channels = responses.volts.shape[1]
+    noise, log_bayes_factor = np.full(channels, np.nan), np.zeros(channels)
+    for channel in range(channels):
+        valid = np.ascontiguousarray(responses.valid[:GP_PRESSES, channel])
+        if valid.sum() < MIN_GP_PRESSES:
+            continue
+        volts = responses.volts[:GP_PRESSES, channel][valid]
+        fits = [_fit_ratio(*eigen(valid.tobytes(), width), volts - volts.mean()) for width in GP_WIDTHS]
+        noise[channel], log_bayes_factor[channel] = max(fits, key=lambda fit: fit[1])
+    return GpFit(noise, log_bayes_factor)
+
+
+def _fit_ratio(eigenvalues: np.ndarray, eigenvectors: np.ndarray, volts: np.ndarray) -> tuple[float, float]:
+    """Return the noise and the log Bayes factor of the most likely of GP_RATIOS."""
+    projected = (eigenvectors.T @ volts) ** 2
+    variances = 1 + GP_RATIOS[:, None] * np.maximum(eigenvalues, 0)
+    noise_var = np.maximum((projected / variances).mean(axis=1), 1e-300)
+    log_likelihood = -0.5 * (len(volts) * np.log(noise_var) + np.log(variances).sum(axis=1))
+    best = int(np.argmax(log_likelihood))
+    return float(np.sqrt(noise_var[best])), float(log_likelihood[best] - log_likelihood[0])

@@ -1,0 +1,126 @@
+"""The parametric model of a pad: derivatives against differences, closed forms, transform and path."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from padforge.design.twin import PlanTransform
+from padforge.sense.twin.as_built import (
+    N_CHANNEL,
+    N_OFFSET,
+    N_SHARED,
+    OFFSET,
+    AsBuiltPad,
+    PadPlan,
+    channel_indices,
+    channel_response,
+    evaluate_along_fibre,
+)
+from padforge.sense.twin.responses import Responses
+
+from .conftest import PLAN
+
+F, J, K, STEP = 60, 7, 6, 0.25
+POSITIONS_MM = np.random.default_rng(2).uniform(-10, 10, (40, 2))
+
+
+@pytest.fixture
+def pad() -> AsBuiltPad:
+    plan = PadPlan.from_morphology(PLAN)
+    pad = AsBuiltPad.from_plan(plan, (2, 0, 3), PlanTransform(True, 4.0, (1.0, -2.0), 0.95), 0.5)
+    return replace(pad, values=pad.values + 0.03 * np.random.default_rng(0).standard_normal(pad.values.size))
+
+
+def test_jacobian_and_slope_agree_with_differences(pad):
+    jacobians = pad.predict_with_jacobian(POSITIONS_MM)[1]
+    for index in range(len(pad.values)):
+        step = np.zeros(len(pad.values))
+        step[index] = 1e-6
+        ahead, behind = (replace(pad, values=pad.values + sign * step).predict(POSITIONS_MM) for sign in (1, -1))
+        slope = (ahead - behind) / 2e-6
+        for channel in range(3):
+            columns = np.concatenate([np.arange(N_SHARED), channel_indices(channel)])
+            derivative = jacobians[channel][:, columns == index].sum(axis=1)
+            assert slope[:, channel] == pytest.approx(derivative, abs=1e-6)
+    squared, mm = np.zeros((40, 3)), 1e-3
+    for step in mm * np.eye(2):
+        squared += ((pad.predict(POSITIONS_MM + step) - pad.predict(POSITIONS_MM)) / mm) ** 2
+    assert pad.mean_squared_slope(POSITIONS_MM) == pytest.approx(squared.mean(axis=0), rel=0.05)
+
+
+def test_with_values_scales_the_profile_to_one_and_keeps_predictions(pad):
+    values = pad.values.copy()
+    values[4:N_SHARED] *= 3
+    scaled = pad.with_values(values)
+    assert np.abs(scaled.profile(np.linspace(0, scaled.max_distance, 101))[0]).max() == pytest.approx(1)
+    assert scaled.predict(POSITIONS_MM) == pytest.approx(replace(pad, values=values).predict(POSITIONS_MM))
+
+
+def test_fit_gains_recovers_gains_and_rests(pad):
+    responses = Responses(POSITIONS_MM, pad.predict(POSITIONS_MM), np.ones((40, 3), bool))
+    values = pad.values.copy()
+    values[N_SHARED:].reshape(-1, N_CHANNEL)[:, :2] = [1.0, 0.0]
+    fitted = replace(pad, values=values).fit_gains(responses)
+    assert fitted.channel_values[:, :2] == pytest.approx(pad.channel_values[:, :2])
+
+
+def test_align_transform_moves_common_offsets_into_the_transform(pad):
+    values = pad.values.copy()
+    values[N_SHARED:].reshape(-1, N_CHANNEL)[:, OFFSET] = np.repeat([0.2, -0.1], N_OFFSET)
+    shifted = replace(pad, values=values)
+    aligned = shifted.align_transform()
+    assert np.abs(aligned.channel_values[:, OFFSET]).max() < 1e-6
+    assert aligned.predict(POSITIONS_MM) == pytest.approx(shifted.predict(POSITIONS_MM), abs=1e-9)
+    shift_mm = [1.0 - 0.2 * PLAN.unit_mm, -2.0 + 0.1 * PLAN.unit_mm]
+    assert aligned.transform.shift_mm == pytest.approx(shift_mm, abs=0.5)
+    volts = pad.predict(POSITIONS_MM)  # offsets that have a rotation in common
+    assert pad.align_transform().predict(POSITIONS_MM) == pytest.approx(volts, abs=0.02 * np.ptp(volts))
+
+
+@pytest.fixture
+def fibre() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(1)
+    x = np.linspace(0, 4, F + 1)
+    line = np.column_stack([x, 0.4 * np.sin(2 * x)])
+    step = np.diff(line, axis=0)
+    length = np.hypot(*step.T)
+    return {
+        "path": (line[1:] + line[:-1]) / 2,
+        "tangent": step / length[:, None],
+        "length": length,
+        "lateral_offset": 0.1 * rng.standard_normal((2, J)),
+        "log_sensitivity": 0.2 * rng.standard_normal((1, J)),
+        "positions": np.column_stack([rng.uniform(0, 4, 9), rng.uniform(-1, 1, 9)]),
+        "profile": rng.standard_normal((2, K)),
+    }
+
+
+def test_channel_response_moves_with_the_fibre_and_ends_with_the_profile(fibre):
+    moved = {**fibre, "lateral_offset": np.tile([[0.3], [-0.2]], J)}
+    back = {**fibre, "lateral_offset": np.zeros((2, J)), "positions": fibre["positions"] - [0.3, -0.2]}
+    assert channel_response(**moved, step=STEP)[0] == pytest.approx(channel_response(**back, step=STEP)[0], abs=1e-12)
+    far = {**back, "positions": np.array([[2.0, 0.4 + 0.5 + (K + 1) * STEP]])}
+    assert not any(np.any(part) for part in channel_response(**far, step=STEP))
+
+
+def test_channel_response_grows_with_the_length_of_a_stretched_fibre(fibre):
+    straight = {**fibre, "path": np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])}
+    straight |= {
+        "tangent": np.tile([1.0, 0.0], (F, 1)),
+        "length": np.full(F, 1 / F),
+        "log_sensitivity": np.zeros((1, J)),
+    }
+    straight |= {"profile": np.ones((2, K)) * [[1.0], [0.0]], "positions": np.array([[0.5, 0.0]])}
+    stretched = {**straight, "lateral_offset": np.vstack([0.1 * (np.arange(J) - 1) / (J - 3), np.zeros(J)])}
+    plain = {**straight, "lateral_offset": np.zeros((2, J))}
+    # within one step of the press all splines of weight 1 add up to 1, so the response is the length
+    assert channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
+    assert channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
+
+
+def test_evaluate_along_fibre_reproduces_constants_and_lines():
+    (value, change), _, _ = evaluate_along_fibre(np.array([np.full(J, 2.0), np.arange(J, dtype=float)]), F)
+    assert value[0] == pytest.approx(2.0)
+    assert change[0] == pytest.approx(0.0, abs=1e-12)
+    assert np.diff(value[1]) == pytest.approx(change[1][0])
