@@ -243,22 +243,6 @@ def test_judging_a_huge_pad_looks_at_a_draw_of_windows_and_of_presses():
     assert large * 97 == pytest.approx(small * 5, rel=0.02)
 
 
-def test_places_far_apart_on_a_large_pad_may_not_look_alike():
-    """Fibres that fold back answer alike at places more than a window apart: which a window alone does not see."""
-    pad = Morphology.straight(PadSettings(grid=8).layout)
-    search, size, contact = SearchSettings(max_failures=0), PadSettings(grid=8), Contact()
-    usual = expected_errors(pad, contact, search, size)[0]
-
-    def folded(positions):
-        """What every fibre answers where the right half of the pad is the left one mirrored."""
-        mirrored = np.where(positions[:, :1] > 4.5, [[9.0, 0.0]] + positions * [[-1.0, 1.0]], positions)
-        return relative_stretch(pad, mirrored, contact)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "relative_stretch", lambda pad, positions, contact: folded(np.asarray(positions)))
-        assert expected_errors(pad, contact, search, size)[0] > 4 * usual
-
-
 @pytest.mark.parametrize("counts", [(4, 4), (3, 12), pytest.param((8, 8), marks=pytest.mark.slow)])
 def test_straight_fibres_err_no_less_with_fibres_failed_and_more_where_responses_scatter_more(counts):
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
