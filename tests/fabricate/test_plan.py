@@ -32,13 +32,6 @@ def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
         assert curves.buffer(0.2 - tolerance_mm, quad_segs=16).intersection(inside).within(ridge)
 
 
-@pytest.mark.slow
-def test_published_curves_within_the_tolerance(published):
-    pad = Morphology.load(published / "20para.mat")
-    for fibre, line in enumerate(Plan(pad).lines):
-        assert shapely.distance(shapely.points(exact_fibre(pad, fibre, 0.02)), line).max() < 0.0025
-
-
 @pytest.mark.parametrize("border_mm", [0.0, 3.0])
 def test_ridges_run_into_the_walls_at_both_ends(border_mm):
     plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": border_mm}))

@@ -14,14 +14,13 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.checks.plan_checks import check_mould, check_plan
 from padforge.fabricate.export import build
-from padforge.fabricate.fibre_placement.toolpath import mirror_x, plan_toolpath
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
 from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
 from padforge.fabricate.outputs.pictures import WALL, mould_relief
 from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, FibreSettings, MouldSettings
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings, FibreSettings, MouldSettings
 
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
 
@@ -192,20 +191,3 @@ def test_a_pad_without_crossings_has_a_page(tmp_path):
     document = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
     assert document["crossings"]["gap_mm"] is None
     assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(("bend_mm", "acceleration", "least_mm_s"), [(3.0, 100.0, 10.0), (1.0, 25.0, 5.0)])
-def test_toolpath_follows_leads_and_slows_in_tight_bends(bend_mm, acceleration, least_mm_s):
-    """The root of acceleration times radius, 17 and 5 mm/s, of which the feed is at most 10 mm/s."""
-    own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(min_bend_radius_mm=bend_mm))
-    own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
-    plan = Plan(PAD, own)
-    strokes = [stroke for step in plan_toolpath(plan, 0.3) for stroke in step.strokes]
-    for stroke in strokes:
-        line = shapely.LineString(mirror_x(stroke.positions_mm))
-        assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
-        places = np.asarray(shapely.points(mirror_x(stroke.positions_mm)))
-        places = places[shapely.within(places, plan.silicone)]
-        assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
-    assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)
-    assert strokes[0].feeds_mm_s.max() == 10.0

@@ -20,7 +20,6 @@ from padforge.fabricate.cad.model import (
     FIT_TOLERANCES_MM,
     CadModel,
     assemble,
-    build_body_model,
     build_models,
     build_mould,
     build_mould_model,
@@ -240,33 +239,23 @@ def test_a_small_pitch_is_no_matter_without_a_second_mould():
     assert made.shape.is_valid
 
 
-@pytest.mark.parametrize("failure", [None, Standard_Failure(""), ValueError("")])
-def test_mould_models_are_built_with_finer_curves_until_solids_are_valid(monkeypatch, failure):
-    tries, build, valid = [], of_model.fill_cells, of_model.is_valid
+@pytest.mark.parametrize(("failures", "fit_mm"), [(1, FIT_TOLERANCES_MM[1]), (1000, None)])
+def test_build_mould_model_fits_finer_curves_until_solids_are_valid(monkeypatch, failures, fit_mm):
+    """Planted: the kernel fails at the first tries."""
+    build, tries = of_model.build_solids, []
 
-    def fill(plan, fit_mm, wells):
-        tries.append(fit_mm)
-        if failure and len(tries) <= failures:
-            monkeypatch.setattr(of_model, "build_solids", lambda *_: (_ for _ in ()).throw(failure))
-        else:
-            monkeypatch.setattr(of_model, "build_solids", solids)
-        return build(plan, fit_mm, wells)
+    def fail_first(*arguments):
+        tries.append(arguments)
+        if len(tries) <= failures:
+            raise Standard_Failure("")
+        return build(*arguments)
 
-    solids = of_model.build_solids
-    monkeypatch.setattr(of_model, "fill_cells", fill)
-    if failure is None:
-        monkeypatch.setattr(of_model, "is_valid", lambda shape: len(tries) > failures and valid(shape))
-    failures = 1
-    assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == FIT_TOLERANCES_MM[1]
-    failures = 1000
-    with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
-        build_mould_model(Plan(Morphology.straight(1)), "second")
-
-
-def test_an_invalid_body_is_named(monkeypatch):
-    monkeypatch.setattr(of_model, "is_valid", lambda shape: False)
-    with pytest.raises(InputError, match="lid: the CAD kernel finds the solid invalid; leave step out"):
-        build_body_model(lid_body(Plan(Morphology.straight(1))), "lid")
+    monkeypatch.setattr(of_model, "build_solids", fail_first)
+    if fit_mm:
+        assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == fit_mm
+    else:
+        with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
+            build_mould_model(Plan(Morphology.straight(1)), "second")
 
 
 def test_a_mild_pad_is_a_small_file_of_true_curves(tmp_path):

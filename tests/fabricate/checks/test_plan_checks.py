@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shapely
 
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import beziers, cubic
@@ -13,7 +12,6 @@ from padforge.design.settings import RulesSettings
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS
 from padforge.fabricate.checks.plan_checks import check, check_plan, compute_bending_strains
-from padforge.fabricate.checks.surface import find_thin_patches
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -184,12 +182,6 @@ class TestSilicone:
         assert finding.measured == pytest.approx(gap_mm, abs=max(0.015, 0.02 * gap_mm))
         assert all(abs(y) < gap_mm for _, y in finding.positions_mm)
         assert bool(finding.positions_mm) == (status != "pass")
-
-    @pytest.mark.parametrize(("length", "patches"), [(0.02, 0), (0.05, 1)])
-    def test_find_thin_patches_ignores_specks(self, length, patches):
-        """A peg 0.3 mm wide on a block: 0.006 and 0.015 mm² of it are thinner than 0.4 mm."""
-        block, peg = shapely.box(0, 0, 10, 5), shapely.box(4, 5, 4.3, 5 + length)
-        assert len(find_thin_patches(shapely.union(block, peg), 0.4, shapely.box(-1, -1, 11, 11))) == patches
 
     @pytest.mark.parametrize(
         ("width", "length", "status"), [(0.2, 2.0, "pass"), (0.4, 2.0, "warn"), (0.4, None, "off")]

@@ -150,9 +150,3 @@ def test_dispenser_tip_fails_if_wider_than_a_track(tip, mould, status):
     assert (found.status, found.measured) == (status, tip)
     assert bool(found.positions_mm) == (status == "fail")
     assert all(max(map(abs, place)) < EDGE - 29 for place in found.positions_mm)  # leads lie outside
-
-
-def test_default_needle_passes_the_checks():
-    found = findings(pad=Morphology.random(3, 5, seed=4))
-    assert {finding.status for finding in found.values()} == {"pass"}
-    assert 0.38 < float(str(found["dispenser_tip"].limit)) <= 0.4

@@ -182,17 +182,3 @@ def test_pictures_are_small(tmp_path, published):
     draw_tracks(plan, tmp_path / "tracks")
     draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
-
-
-DRAWINGS = {
-    "mesh": lambda path: draw_findings(np.eye(3), [[0, 1, 2]], MARKED, path),
-    "mould": lambda path: draw_mould(PLAN, MARKED, path),
-    "tracks": lambda path: draw_tracks(PLAN, path),
-}
-
-
-@pytest.mark.parametrize("name", ["mesh", *(pytest.param(n, marks=pytest.mark.slow) for n in ("mould", "tracks"))])
-def test_pictures_are_reproducible(tmp_path, name):
-    for file in ("first", "second"):
-        DRAWINGS[name](tmp_path / file)
-    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()
