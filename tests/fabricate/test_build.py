@@ -140,19 +140,6 @@ def test_step_reads_back_as_a_valid_solid_of_the_meshes_volume(built):
     assert found["message"].endswith("curves within 2 µm")
 
 
-@pytest.mark.parametrize("size", [(1, 2), pytest.param((2, 12), marks=pytest.mark.slow)])
-def test_cad_limits_grow_with_the_mesh_tolerance(tmp_path, size):
-    """What chords take away of the volume grows with the tolerance."""
-    settings = with_settings({"tolerance_mm": 0.099, "ridge_width_mm": 1.2})
-    (found,) = (
-        finding
-        for finding in build(Morphology.random(*size, seed=0), tmp_path, ["step"], settings)["findings"]
-        if finding["name"] == "cad_solid"
-    )
-    assert found["limit"] == pytest.approx([9.9 * 5e-4, 9.9 * 5e-3])
-    assert (5e-4 if size == (2, 12) else 0) < found["measured"][0] < found["limit"][0]
-
-
 def test_document_has_sizes_frame_findings_and_crossings(built, tmp_path):
     _, document = built
     assert document["format"] == "padforge-fabrication/2"

@@ -60,13 +60,13 @@ def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_mould_of_a_wild_pad_is_closed(kind):
+def test_mould_of_wild_pads_is_closed(kind):
     require_closed(wild(kind), {"border_mm": 1.0})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("key", [*KINDS, *ENDS])
-def test_check_judges_every_plan_in_plain_words(key):
+def test_check_of_extreme_plans_is_finite_or_refused(key):
     for value in ENDS.get(key, [None]):
         pad = wild(key) if value is None else Morphology.random(1, 3, seed=1)
         try:
@@ -78,6 +78,6 @@ def test_check_judges_every_plan_in_plain_words(key):
 
 
 @pytest.mark.parametrize("key", ENDS)
-def test_settings_at_their_ends_give_a_closed_mould_or_one_line(key):
+def test_mould_of_extreme_settings_is_closed_or_refused(key):
     for value in ENDS[key]:
         require_closed(Morphology.random(1, 1, seed=1), {key: value})

@@ -44,7 +44,7 @@ def test_tray_has_the_width_and_height_of_the_pad():
     assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
 
 
-def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
+def test_keep_out_is_a_pillar_of_the_mould():
     with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
     found = {finding.name: finding for finding in check_mould(with_hole)[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
@@ -55,7 +55,7 @@ def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
     assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
 
 
-def test_a_keep_out_at_the_edge_joins_the_wall():
+def test_keep_out_at_the_edge_joins_the_wall():
     notch = ((20.0, 20.0), (28.0, 20.0), (28.0, 30.0), (20.0, 30.0))
     plan = Plan(Morphology.straight((1, 1), (28.0, 30.0)), settings(PAD, keep_out_mm=(notch,)))
     rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
@@ -187,7 +187,7 @@ def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
     assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
 
 
-def test_a_pad_without_crossings_has_a_page(tmp_path):
+def test_laying_page_of_a_pad_without_crossings(tmp_path):
     document = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
     assert document["crossings"]["gap_mm"] is None
     assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")

@@ -136,9 +136,3 @@ def test_ambiguity_map_shows_where_presses_are_alike():
     assert values[4] == pytest.approx(0, abs=1e-9)
     assert values[:4] == pytest.approx(np.linspace(0.8, 0.2, 4), rel=1e-6)  # half of the way to the other side
     assert values[5:] == pytest.approx(values[:4][::-1])
-
-
-def test_ambiguity_map_without_signals_is_the_mean_distance():
-    presses = np.array([[9.0, 9.0], [10.0, 9.0]])
-    values = ambiguity_map(Morphology.straight(1), presses, Contact(), (1, 0), 0.05)
-    assert values == pytest.approx(np.full((2, 2), 0.5))

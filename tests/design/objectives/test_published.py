@@ -40,15 +40,6 @@ def test_information_measures_are_within_bounds(seed, count, columns, scale):
         assert joint_entropy(levels) == pytest.approx(expected, abs=1e-9)
 
 
-def test_joint_entropy_is_that_of_rows():
-    bits = np.array([[a, b] for a in (0, 1) for b in (0, 1)] * 5, dtype=float)
-    assert joint_entropy(bits) == pytest.approx(2)
-    assert joint_entropy(np.arange(49.0)[:, None]) == pytest.approx(np.log2(49))
-    assert joint_entropy(np.ones((10, 3))) == 0
-    rows = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
-    assert joint_entropy(rows) == pytest.approx(3 * np.log2(5) / 5 + 2 * np.log2(2.5) / 5)
-
-
 def test_published_sharpness_has_closed_forms():
     ramp = np.arange(6.0)[:, None]
     assert published_sharpness(ramp) == 0

@@ -28,13 +28,6 @@ def test_score_evaluates_the_sensed_area():
     assert beyond["published_objective"] == published_terms(pad)[0].objective  # a measured contact has none of its own
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
-def test_score_joint_entropy_of_published_pads_is_saturated(published, name):
-    terms = score(Morphology.load(published / f"{name}.mat"), max_failures=0)
-    assert terms["published_joint_entropy"] == pytest.approx(math.log2(49))
-
-
 def test_score_joint_entropy_saturates_before_those_of_families():
     """49 presses give no more than log2 49 bits, and straight fibres have them."""
     pad = Morphology.straight(4)

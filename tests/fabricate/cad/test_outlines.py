@@ -78,7 +78,7 @@ def deviation(plan: Plan, level: int, fit_mm: float = FIT_MM) -> tuple[float, in
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
-def test_a_circle_is_two_arcs(clockwise):
+def test_ring_curves_of_a_circle_are_two_arcs(clockwise):
     drawn = ring(shapely.Point(3, 4).buffer(2.0, quad_segs=FINE))
     pieces = list(ring_curves(drawn[::-1] if clockwise else drawn, {}, FIT_MM))
     assert len(pieces) == 2
@@ -90,7 +90,7 @@ def test_a_circle_is_two_arcs(clockwise):
 
 
 @pytest.mark.parametrize("corners", [3, 4, 5, 12])
-def test_a_polygon_is_its_edges(corners):
+def test_ring_curves_of_a_polygon_are_its_edges(corners):
     polygon = shapely.Point(0, 0).buffer(5.0).boundary.interpolate(np.arange(corners) / corners, normalized=True)
     drawn = shapely.Polygon(polygon.tolist())
     pieces = list(ring_curves(ring(drawn), {}, FIT_MM))
@@ -100,7 +100,7 @@ def test_a_polygon_is_its_edges(corners):
     assert sorted(turns(pieces)) == pytest.approx([360 / corners] * corners, abs=0.5)
 
 
-def test_a_smooth_ring_that_is_no_circle_is_splines_that_close():
+def test_ring_curves_of_an_ellipse_are_closed_splines():
     t = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
     drawn = np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1)
     pieces = list(ring_curves(drawn, {}, FIT_MM))
@@ -114,7 +114,7 @@ def test_a_smooth_ring_that_is_no_circle_is_splines_that_close():
 
 
 @pytest.mark.parametrize(("knots", "seed"), [(1, 0), (8, 2), pytest.param(20, 3, marks=pytest.mark.slow)])
-def test_walls_close_and_turn_at_real_corners_only(knots, seed):
+def test_track_outlines_close_and_turn_at_corners_only(knots, seed):
     plan = Plan(Morphology.random(1, knots, seed), with_settings({"border_mm": 2.0}))
     for level in range(2):
         for pieces in walls(plan, level):
@@ -137,7 +137,7 @@ def test_walls_close_and_turn_at_real_corners_only(knots, seed):
         (1, 8, 5, {"tolerance_mm": 0.05}),
     ],
 )
-def test_walls_are_half_a_width_from_the_exact_fibres(grid, knots, seed, mould):
+def test_track_outlines_are_half_a_width_from_exact_fibres(grid, knots, seed, mould):
     plan = Plan(Morphology.random(grid, knots, seed), with_settings(mould))
     for level in range(len(plan.heights_mm)):
         off, count = deviation(plan, level)
@@ -145,13 +145,13 @@ def test_walls_are_half_a_width_from_the_exact_fibres(grid, knots, seed, mould):
         assert count > 500
 
 
-def test_finer_walls_are_nearer():
+def test_track_outlines_with_a_finer_fit_are_nearer():
     plan = Plan(Morphology.random(1, 3, seed=6))
     assert deviation(plan, 0, fit_mm=1e-4)[0] < 5e-4
 
 
 @pytest.mark.parametrize("far", [[19, 5], [10, 10, 10], [25]])
-def test_a_spline_strays_nowhere_along_far_vertices(far):
+def test_fit_spline_stays_near_sparse_vertices(far):
     """A bend of 3 mm radius, drawn finely, and a run out of it that hardly bends, of few vertices."""
     angle = np.linspace(0, 0.3, 10)
     bend = 3 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)

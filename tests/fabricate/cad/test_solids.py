@@ -55,7 +55,7 @@ def kinds(solid: Solid) -> dict[str, int]:
     return {name: names.count(name) for name in sorted(set(names))}
 
 
-def test_what_is_drawn_as_an_ellipse_has_walls_of_splines():
+def test_build_solids_of_an_ellipse_has_spline_walls():
     """Over half of its outline the walls of a block that it overlaps rise higher."""
     t = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
     ellipse = shapely.Polygon(np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1))
@@ -68,7 +68,7 @@ def test_what_is_drawn_as_an_ellipse_has_walls_of_splines():
     assert kinds(solid)["EXTRUSION"] >= 2
 
 
-def test_steps_share_their_edges():
+def test_build_solids_of_steps_share_edges():
     """A tower on a plate: no face where they meet, one ring of walls from either height to the next."""
     (solid,) = built([shapely.box(0, 0, 4, 4), disc(2, 2, 1)], lambda within: {0: None, 1: 1.0, 2: 3.0}[len(within)])
     assert solid.is_valid
@@ -79,7 +79,7 @@ def test_steps_share_their_edges():
 
 @pytest.mark.parametrize("apart", [0.0, 1e-7, -1e-5, -1e-3])
 @pytest.mark.parametrize("other", [shapely.box(-5, -5, 5, 0), disc(0, -1.5, 1.5)], ids=["a line", "a circle"])
-def test_a_circle_that_touches(other, apart):
+def test_build_solids_of_touching_circles(other, apart):
     """It comes no nearer than a grid's step, or overlaps in next to nothing."""
     found = built([other, disc(0, 1 + apart, 1.0)], lambda within: sum(1.0 + 2 * k for k in within) or None)
     assert all(solid.is_valid for solid in found)
@@ -108,7 +108,7 @@ def bowl_drawn(*areas: BaseGeometry) -> Subdivision:
 
 
 @pytest.mark.parametrize(("x", "y"), [(2.5, 0.3), (3.0, 0.0), (2.9, 1.9)])
-def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
+def test_build_solids_on_flared_walls(x, y):
     """It ends where the wall comes out of its top; wherever it stands, its volume is that above what is below."""
     round_ = disc(x, y, 0.5)
     drawing = bowl_drawn(round_)
@@ -125,7 +125,7 @@ def test_a_drum_that_stands_partly_on_walls_that_lean(x, y):
     assert solid.volume == pytest.approx(np.maximum(3.0 - BOWL.heights(places), 0).sum() * 1e-6, rel=1e-3)
 
 
-def test_a_curve_that_strays_past_its_top_on_a_wall_ends_at_it():
+def test_build_solids_end_curves_at_their_top():
     """Drawn, the drum stays below its top where two walls meet; its own curve crosses their crease a little above."""
     walls = replace(BOWL, hollows=np.array([[-3.0, -2.0, 3.0, 2.0], [-1.0, -2.0, 1.0, 4.0]]))
     short, astray = 1e-4, 3e-4
@@ -150,7 +150,7 @@ def test_a_curve_that_strays_past_its_top_on_a_wall_ends_at_it():
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))
 @settings(max_examples=4)
-def test_any_drums_and_blocks(seed, count):
+def test_build_solids_of_random_areas_match_cell_volumes(seed, count):
     rng = np.random.default_rng(seed)
     areas = [disc(*row) for row in rng.uniform([0, 0, 0.3], [4, 4, 1.5], (count, 3))]
     areas += [shapely.box(*low, *(low + size)) for low, size in rng.uniform(0.2, 3, (2, 2, 2))]
@@ -176,7 +176,7 @@ def test_any_drums_and_blocks(seed, count):
         (Prism(shapely.box(0, 0, 3, 3) - shapely.box(1, 1, 2, 2), 0, 2), 16, {"PLANE": 10}),
     ],
 )
-def test_a_prism_is_a_solid_of_true_faces(prism, volume, faces):
+def test_prism_solids_have_true_faces(prism, volume, faces):
     (solid,) = prism_solids([prism])
     assert solid.is_valid
     assert solid.volume == pytest.approx(volume, rel=1e-9)
@@ -185,7 +185,7 @@ def test_a_prism_is_a_solid_of_true_faces(prism, volume, faces):
     assert pytest.approx((prism.bottom_mm, prism.top_mm), abs=1e-6) == (box.min.Z, box.max.Z)
 
 
-def test_a_lid_with_pins_and_spout_has_the_volume_that_arithmetic_gives():
+def test_body_solid_of_a_lid_has_closed_form_volume():
     everything = {"pins": True, "lid": True, "spout": True, "border_mm": 1.0}
     plan = Plan(Morphology.straight(1), with_settings(everything))
     flare = 6 * math.tan(math.radians(30))
