@@ -73,15 +73,6 @@ def test_primal_and_dual_equations_match_the_jacobian(inputs, hidden, outputs):
         torch.testing.assert_close(projected.mT @ alone.targets.ravel(), -slope[network], atol=1e-6, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("samples", "hidden"), [(300, 4), (40, 30)])
-def test_jacobian_product_is_the_gradient_of_the_projected_loss(samples, hidden):
-    weights, x, y = network_parts(1, 3, hidden, 2, samples)
-    weights.requires_grad_()
-    fit = ProjectedFit.solve(weights, x, y[:, 0])
-    (slope,) = torch.autograd.grad(fit.loss.sum(), weights)
-    torch.testing.assert_close(slope.flatten(1), 2 * jacobian_product(x, fit, fit.error), atol=1e-6, rtol=1e-6)
-
-
 def test_fit_batch_trains_networks_independently():
     rng = np.random.default_rng(8)
     inputs = rng.uniform(-1, 1, (3, 200, 2))

@@ -186,12 +186,7 @@ def zeros(count: int) -> bytes:
 FIELDS = element(5, struct.pack("<i", 8)), element(1, b"field\0\0\0")
 BOMBS = {
     "cells": (variable(1, (MUCH, 1)), "voltage is a cell array, expected a full matrix"),
-    "packed cells": (packed(variable(1, (MUCH, 1))), "voltage is a cell array, expected a full matrix"),
-    "structures": (variable(2, (MUCH, 1), *FIELDS), "voltage is a structure, expected a full matrix"),
     "packed structures": (packed(variable(2, (MUCH, 1), *FIELDS)), "voltage is a structure, expected a full matrix"),
-    "text": (variable(4, (MUCH, 1), element(4, b"")), "voltage is text, expected a full matrix"),
-    "sparse": (variable(5, (MUCH, MUCH)), "voltage is a sparse matrix, expected a full matrix"),
-    "numbers": (variable(6, (MUCH, 1), element(9, bytes(8))), f"voltage claims {MUCH} values in 8 bytes"),
     "packed numbers": (
         packed(variable(6, (MUCH, MUCH), element(9, bytes(8)))),
         f"voltage claims {MUCH**2} values in 8 bytes",
