@@ -1,5 +1,6 @@
-"""The genetic search: its objective, its origin, and the published result."""
+"""The genetic search: its objective, resuming, its origin, and the published result."""
 
+import numpy as np
 import pytest
 
 from padforge.design.objectives.published import published_objective, published_presses, published_terms
@@ -11,9 +12,9 @@ PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
 
 
-def bred(generations, search=SMALL, origin=None, pad=PAD):
+def bred(generations, search=SMALL, origin=None, state=None, pad=PAD):
     """A search after so many generations, and its best objective after each."""
-    breeding = GeneticSearch(SearchProblem(pad, (CONTACT,), search, RulesSettings(), origin))
+    breeding = GeneticSearch(SearchProblem(pad, (CONTACT,), search, RulesSettings(), origin), state)
     objectives = []
     for _ in range(generations):
         breeding.advance()
@@ -38,6 +39,24 @@ def test_genetic_search_minimises_the_objective_of_its_settings(asked):
     others = {name: asked[name] for name in asked if name != "presses"}
     assert published_terms(breeding.morphology(), CONTACT, presses, **others)[0].objective == objectives[-1]
     assert published_objective(breeding.morphology(), CONTACT) != objectives[-1]
+
+
+@pytest.mark.parametrize("broken_at", [0, 1, 4])
+def test_genetic_search_resumes_bit_for_bit(broken_at, tmp_path):
+    unbroken, objectives = bred(4)
+    broken = bred(broken_at)[0]
+    state = broken.state()
+    np.savez(tmp_path / "state.npz", allow_pickle=False, **state)
+    broken.advance()
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as saved:
+        assert all(np.array_equal(saved[name], state[name]) for name in state)  # what follows does not touch it
+        resumed, further = bred(4 - broken_at, state=saved)
+    assert (resumed.step, further) == (4, objectives[broken_at:])
+    assert resumed.morphology() == unbroken.morphology()
+    first, second = unbroken.state(), resumed.state()
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], strict=True)
 
 
 def test_genetic_search_keeps_or_improves_its_origin():
