@@ -6,7 +6,6 @@
 import os
 import signal
 import sys
-import tempfile
 from pathlib import Path
 
 import hypothesis
@@ -23,14 +22,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("padforge")
-
-coverage = sys.modules.get("coverage")
-if coverage is not None and coverage.Coverage.current() is not None:
-    # kernels run compiled: the lines that a run compiles count as covered, so none may come from the usual cache
-    from numba.core import config
-
-    fresh = tempfile.TemporaryDirectory(prefix="padforge-coverage-")
-    config.JIT_COVERAGE, config.CACHE_DIR = 1, fresh.name  # pyright: ignore[reportAttributeAccessIssue]
 
 from tests.helpers import kernels  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402

@@ -34,7 +34,7 @@ from padforge.sense.health.trace_model import (
     extract_trace,
     predict_fibres,
 )
-from padforge.sense.localizer.model_files import files_of, check_same_pad
+from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.recording.recording import Recording
 from padforge.sense.signals.press_detection import align_to_detected
 

@@ -50,7 +50,7 @@ def places_on(pad, seed=0, count=40):
 @pytest.mark.parametrize("contact", CONTACTS, ids=["disc", "square", "profile", "inverse"])
 @given(pad=rectangles())
 @settings(max_examples=15)
-def test_a_pad_that_is_turned_signals_alike(contact, pad):
+def test_signals_of_a_transposed_rectangle(contact, pad):
     places, other = places_on(pad), turned(pad)
     found = signals(pad, places, contact)[:, order(pad)]
     np.testing.assert_allclose(signals(other, places[:, ::-1], contact), found, rtol=1e-8, atol=1e-8)
@@ -59,7 +59,7 @@ def test_a_pad_that_is_turned_signals_alike(contact, pad):
 
 @given(pad=rectangles())
 @settings(max_examples=15)
-def test_a_pad_that_is_turned_is_sampled_and_indented_alike(pad):
+def test_quantized_and_indented_signals_of_a_transposed_rectangle(pad):
     places, other = places_on(pad), turned(pad)
     found = signals_quantized(pad, places, ROUND, 300)[:, order(pad)]
     # a sample on the edge of the disc may fall to either side of it by rounding
@@ -71,7 +71,7 @@ def test_a_pad_that_is_turned_is_sampled_and_indented_alike(pad):
 
 @given(pad=rectangles(knots=(0, 3)))
 @settings(max_examples=10)
-def test_a_pad_that_is_turned_breaks_the_same_rules_and_is_as_long(pad):
+def test_rules_and_lengths_of_a_transposed_rectangle(pad):
     rules, other = RulesSettings(max_crossings=2, min_crossing_angle_deg=30), turned(pad)
     np.testing.assert_allclose(lengths(other), lengths(pad)[order(pad)], rtol=1e-9)
     assert len(crossings(other)) == len(crossings(pad))
@@ -82,7 +82,7 @@ def test_a_pad_that_is_turned_breaks_the_same_rules_and_is_as_long(pad):
     assert [each[2] for each in swapped] == pytest.approx([each[2] for each in found], abs=0.02, rel=1e-2)
 
 
-def test_a_pad_that_is_turned_is_as_ambiguous():
+def test_ambiguities_of_a_transposed_rectangle():
     pad = Morphology.random(Layout.create((2, 1), (8.0, 15.0)), 3, seed=1)
     found, swapped = (
         ambiguities(each, Contact(), 1, 0.05, PadSettings().for_layout(each.layout)) for each in (pad, turned(pad))
@@ -90,7 +90,7 @@ def test_a_pad_that_is_turned_is_as_ambiguous():
     assert swapped == pytest.approx(found, rel=2e-3)  # in single precision
 
 
-def test_a_fibre_of_a_coarse_family_is_felt_as_far_as_it_strays_and_a_single_one():
+def test_signals_of_coarse_families_and_single_fibres():
     """Horizontals lie 6 pitches of the verticals apart; one leaves its level by nearly that and is felt there."""
     for counts in ((1, 0), (0, 1)):
         pad = Morphology.straight(Layout.create(counts, (8.0, 15.0)))
@@ -108,7 +108,7 @@ def test_a_fibre_of_a_coarse_family_is_felt_as_far_as_it_strays_and_a_single_one
 
 @given(pad=rectangles(), data=st.data())
 @settings(max_examples=20)
-def test_a_rectangle_is_read_as_it_was_written_to_the_bit(tmp_path_factory, pad, data):
+def test_rectangle_file_round_trip(tmp_path_factory, pad, data):
     pitch = data.draw(st.tuples(*[st.floats(0.1, 1000)] * 2)) if data.draw(st.booleans()) else pad.pitch_mm
     pad = Morphology.random(Layout.create(pad.layout.counts, pitch), 3, data.draw(st.integers(0, 99)))
     path = tmp_path_factory.mktemp("pads") / "pad.json"
@@ -131,7 +131,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize("change", WRONG, ids=lambda change: str(change)[:40])
-def test_files_that_are_no_rectangle_are_one_line(tmp_path, change):
+def test_load_refuses_invalid_rectangles_in_one_line(tmp_path, change):
     path = tmp_path / "pad.json"
     path.write_text(json.dumps(PAD.to_dict() | change))
     with pytest.raises(InputError, match=r"pad\.json: "):

@@ -15,7 +15,7 @@ from tests.helpers.limits import require_ends
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 
 
-def test_written_defaults_read_back_and_overrides_win():
+def test_commented_toml_round_trip_and_overrides():
     text = commented_toml(MODELS)
     spec = Spec(tomllib.loads(text))
     for model in MODELS.values():
@@ -29,13 +29,10 @@ def test_written_defaults_read_back_and_overrides_win():
     assert (found.knots, found.seed) == (2, 3)
 
 
-SELF = []
-SELF.append(SELF)
 REFUSED = [
     (PadSettings, {"grid": 0}, r"grid: got 0, .*greater than or equal to 1"),
     (PadSettings, {"grid": "4"}, r"grid: got '4', .*integer"),
-    *((PadSettings, {"grid": grid}, "grid: got ") for grid in (np.float64(4), np.int64(0), np.array([4]))),
-    *((PadSettings, {"grid": grid}, "grid: got ") for grid in (np.bool_(True), np.datetime64("2026-01-01"))),
+    (PadSettings, {"grid": np.int64(0)}, "grid: got "),
     (PadSettings, {"gird": 4}, r"gird: no such key, allowed are grid"),
     (Contact, {"reach": []}, "reach: no such key, it is sensitivity_profile now"),
     (SearchSettings, {"lost": 2}, "lost: no such key, it is max_failures now"),
@@ -49,7 +46,6 @@ REFUSED = [
     (PadSettings, {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]}, r"sensed_mm: got \[31, 5\], .*is 30 mm wide"),
     (PadSettings, {"keep_out_mm": [[[0, 0], [1, 1]]]}, "keep_out_mm: .*polygon 1 has 2 corners"),
     (PadSettings, {"keep_out_mm": "hole"}, "keep_out_mm"),
-    (PadSettings, {"keep_out_mm": SELF}, "keep_out_mm"),
     (PadSettings, {"bent_radius_mm": 0.5}, "bent_radius_mm.*: got 0.5"),
     (PadSettings, {"bent_radius_mm": "round"}, "bent_radius_mm.*: got 'round'"),
     (Contact, {"weight": "cubic"}, "weight: got 'cubic', .*inverse_square"),
@@ -77,44 +73,12 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("model", "table", "message"), REFUSED, ids=lambda value: str(value)[:30])
-def test_refusals_name_the_key_the_value_and_what_is_allowed(model, table, message):
+def test_section_refusals_name_key_value_and_limits(model, table, message):
     with pytest.raises(InputError, match=rf"^pad\.toml: \[{model.section()}\] .*{message}"):
         Spec({model.section(): table}, "pad.toml", sections=MODELS).section(model)
 
 
-@pytest.mark.parametrize("other", [None, 3, "a", int, np.ones((2, 2)), [1], {1: 2}])
-def test_spec_refuses_other_models_and_tables(other):
-    for ask in (Spec({}).section, Spec({}).stated):
-        with pytest.raises(InputError, match=r"model is .*, expected a section"):
-            ask(other)
-    for tables in (other, {"pad": other}):
-        with pytest.raises(InputError, match=r"expected a (table|section)"):
-            Spec({}).replaced(tables)
-    with pytest.raises(InputError, match=r"unknown section \[pads\], allowed are pad, contact"):
-        Spec({"pads": {}}, sections=MODELS)
-    for sections in (3, [3], {None}, np.array(3.0)):
-        with pytest.raises(InputError, match=r"sections (is|are)"):
-            Spec({"pad": {}}, sections=sections)  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        *((content, r"pad\.toml: not a TOML file") for content in (b"\xff\xfe", b"[pad", b"= 3")),
-        (b"a" + b".a" * 100_000 + b" = 1", "a line has more than 200 dots"),
-        (None, "cannot be read"),
-    ],
-    ids=range(5),
-)
-def test_load_refuses_files_that_are_no_toml(tmp_path, content, message):
-    path = tmp_path / "pad.toml"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        Spec.load(path)
-
-
-def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
+def test_defaults_are_those_measured_on_a_built_pad():
     pad, rules = PadSettings(), RulesSettings()
     assert (pad.grid, pad.horizontals, pad.verticals, pad.pitch_mm) == (4, None, None, 11.25)
     assert (pad.deep_family, pad.leads, pad.sensed_mm) == ("horizontal", "edges", "beyond")
@@ -135,27 +99,17 @@ def test_the_defaults_are_what_a_built_pad_showed_and_what_can_be_built():
 @pytest.mark.parametrize(
     ("model", "key", "kept", "refused"),
     [
-        (PadSettings, "grid", (1, 64), (0,)),
         (PadSettings, "sensed_mm", ("beyond", "fibres", (56.25, 0.1)), ("all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0)),
-        (Contact, "sides", (3,), (2,)),
         (SearchSettings, "max_failures", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
-        (SearchSettings, "noise", (1e-9, 10.0), (0.0, 10.1)),
         (SearchSettings, "weights", ((1.0, 0.0, 0.0), (0.0, 1e6, 5e-324)), ((0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,))),
-        (SearchSettings, "presses", (2, 64), (1, 65)),
-        (SearchSettings, "levels", (1, 2**24), (0, 2**24 + 1)),
-        (SearchSettings, "seed", (0, 2**32 - 1), (-1, 2**32)),
-        (RulesSettings, "min_crossing_angle_deg", (0.0, 90.0), (-0.1, 90.1)),
-        (RulesSettings, "min_gap_mm", (0.0, 1000.0), (-0.1, 1000.1)),
-        (RulesSettings, "max_length_mm", (1e-6, 1e6), (0.0, 1.1e6)),
-        (RulesSettings, "same_family_crossings", (0, 10**6), (-1,)),
         (RulesSettings, "max_crossings", (0, "any"), (-1, "all")),
     ],
 )
-def test_values_at_the_ends_of_what_is_allowed(model, key, kept, refused):
+def test_limits_of_settings(model, key, kept, refused):
     require_ends(model, key, kept, refused)
 
 
-def test_a_rectangle_is_what_was_stated_and_its_middle_is_pressed():
+def test_pad_settings_of_a_rectangle_and_its_sensed_area():
     pad = {"horizontals": 3, "verticals": 6, "pitch_mm": [8, 15], "bent_radius_mm": 40}
     hole = {"keep_out_mm": [[[0, 0], [4, 0], [0, 4]]]}
     stated = Spec({"pad": pad | hole}).section(PadSettings)
@@ -225,20 +179,13 @@ HOLE = [[0, 0], [4, 0], [0, 4]]
 @pytest.mark.parametrize(
     ("model", "given", "plain"),
     [
-        (PadSettings, {"grid": np.int64(3), "horizontals": np.uint8(0)}, {"grid": 3, "horizontals": 0}),
-        (PadSettings, {"pitch_mm": np.array([8, 15.0])}, {"pitch_mm": (8, 15.0)}),
+        (
+            PadSettings,
+            {"grid": np.int64(3), "horizontals": np.uint8(0), "pitch_mm": np.array([8, 15.0])},
+            {"grid": 3, "horizontals": 0, "pitch_mm": (8, 15.0)},
+        ),
         (PadSettings, {"keep_out_mm": [np.array(HOLE)]}, {"keep_out_mm": [HOLE]}),
         (Contact, {"radius": np.float64(0.9), "sides": np.int32(4)}, {"radius": 0.9, "sides": 4}),
-        (
-            Contact,
-            {"sensitivity_profile": np.array([[0, 1], [5, 0.5], [12, 0]])},
-            {"sensitivity_profile": ((0, 1), (5, 0.5), (12, 0))},
-        ),
-        (
-            SearchSettings,
-            {"max_failures": np.array([0.5, 0.5]), "seed": np.uint32(7)},
-            {"max_failures": (0.5, 0.5), "seed": 7},
-        ),
         (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
         (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
     ],
@@ -248,20 +195,7 @@ def test_settings_accept_numpy_numbers(model, given, plain):
     assert model(**given).model_dump_json() == model(**plain).model_dump_json()
 
 
-@pytest.mark.parametrize("shape", [(2**9, 2**9), (2**40, 2), (2**18, 0)])
-@pytest.mark.parametrize(
-    ("model", "key"),
-    [(PadSettings, "pitch_mm"), (PadSettings, "keep_out_mm"), (Contact, "sensitivity_profile"), (Contact, "radius")],
-)
-def test_arrays_larger_than_any_setting_are_refused_before_they_are_lists(model, key, shape):
-    """A broadcast array takes no memory; as a list it would take all there is."""
-    array = np.broadcast_to(1.0, shape)
-    with pytest.raises(InputError, match=rf"^\[{model.section()}\] {key}: got array") as told:
-        model(**{key: array})
-    assert len(str(told.value).splitlines()) == 1
-
-
-def test_the_contact_is_the_measured_one_by_default_and_the_papers_where_the_paper_is_restated():
+def test_default_contact_is_measured_or_published():
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
     np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))

@@ -60,7 +60,7 @@ def parser(monkeypatch: pytest.MonkeyPatch) -> click.Command:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=relative)
-def test_every_command_parses(page: Path, parser: click.Command) -> None:
+def test_commands_on_pages_parse(page: Path, parser: click.Command) -> None:
     for command, whole in commands(page.read_text(encoding="utf-8")):
         for call in arguments(command):
             try:
@@ -72,16 +72,10 @@ def test_every_command_parses(page: Path, parser: click.Command) -> None:
 
 
 @pytest.mark.parametrize(("name", "command"), every(cli), ids=lambda value: value if isinstance(value, str) else "")
-def test_help_has_examples_that_parse(name: str, command: click.Command, parser: click.Command) -> None:
+def test_help_examples_parse(name: str, command: click.Command, parser: click.Command) -> None:
     lines = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
     assert [line for line in lines if line.startswith(name)]
     for line in lines:
         example, _, _ = line.partition("  ")  # what follows explains it
         for call in arguments(example):
             parser.main(call, standalone_mode=False, prog_name="padforge")
-
-
-def test_the_parser_refuses_what_does_not_exist(parser: click.Command) -> None:
-    for wrong in ("padforge desing", "padforge design --no-such", "padforge sense locate x", "padforge init a b"):
-        with pytest.raises(click.ClickException):
-            parser.main(next(arguments(wrong)), standalone_mode=False)

@@ -40,7 +40,7 @@ def install(folder: Path) -> None:
     (about / "entry_points.txt").write_text("\n".join(lines))
 
 
-def test_the_example_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def test_device_example_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     install(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     invalidate_caches()

@@ -56,7 +56,7 @@ def exported(name: str) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_docstrings_of_exported_functions_state_every_parameter(name: str) -> None:
+def test_exported_docstrings_state_every_parameter(name: str) -> None:
     missing = {
         function.path: parameters(function) - (stated_parameters(function) or set())
         for member in exported(name)
@@ -68,7 +68,7 @@ def test_docstrings_of_exported_functions_state_every_parameter(name: str) -> No
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_docstrings_that_state_parameters_state_all_of_them_and_no_other(name: str) -> None:
+def test_docstrings_state_all_parameters_or_none(name: str) -> None:
     partial = {
         function.path: parameters(function) ^ stated
         for function in public_functions(stage(name))

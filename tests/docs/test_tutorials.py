@@ -107,7 +107,7 @@ def designed(once: Once) -> tuple[Path, str]:
 @pytest.mark.parametrize(
     "page", [pytest.param(page, marks=pytest.mark.xdist_group(page.stem), id=page.stem) for page in TUTORIALS]
 )
-def test_the_tutorials_do_as_they_say(page: Path, designed: tuple[Path, str], tmp_path: Path) -> None:
+def test_tutorials_print_what_they_show(page: Path, designed: tuple[Path, str], tmp_path: Path) -> None:
     if page == TUTORIALS[0]:
         wrong = designed[1]
     else:

@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import pytest
 from click.testing import CliRunner
@@ -109,31 +107,6 @@ def test_the_spec_shapes_the_mould(morphology, tmp_path):
     document = json.loads(result.stdout)
     assert document["sizes"]["pad_mm"] == 3 * 11.25 + 2 * 1.5
     assert set(document["provenance"]["inputs"]) == {"morphology.json", "pad.toml"}
-
-
-@pytest.mark.parametrize("commands", [3, pytest.param(5, marks=pytest.mark.slow)])
-def test_imports_stay_light_without_step_and_png(morphology, tmp_path, commands):
-    """One after the other in one process, each with more behind it than the one before."""
-    always = ["build123d", "OCP", "torch", "matplotlib"]
-    light = [
-        ("import padforge.fabricate", [*always, "trimesh", "manifold3d", "shapely", "pydantic"]),
-        ("import padforge.fabricate.cli", [*always, "trimesh", "manifold3d", "shapely", "numpy", "pydantic"]),
-        ("import padforge.fabricate.settings", [*always, "trimesh", "manifold3d", "shapely", "numpy"]),
-        ("from padforge.fabricate import build; import padforge.design", [*always, "trimesh"]),
-        (
-            f"padforge.fabricate.build(padforge.design.Morphology.load({str(morphology)!r}), "
-            f"{str(tmp_path)!r}, ['stl', 'svg'])",
-            always,
-        ),
-    ]
-    code = (
-        "import sys\n"
-        f"for command, heavy in {light[:commands]}:\n"
-        "    exec(command)\n"
-        "    print(*(f'{command} loads {name}' for name in heavy if name in sys.modules))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.split() == []
 
 
 def test_check_draws_a_picture_of_the_findings(morphology, tmp_path):

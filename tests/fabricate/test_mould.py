@@ -137,14 +137,6 @@ def test_holder_fits_the_pad_with_its_leads(mould):
         height_at(read, inside, -inside)  # where fibres 1 and 4 start, as the pad lies
 
 
-def test_bed_frame_agrees_with_the_sizes():
-    plan = Plan(Morphology.straight(2), with_settings({"border_mm": 1.0}, printer={"bed_mm": [300.0, 200.0, 100.0]}))
-    frame = bed_frame(plan)
-    assert (frame["centre_mm"], frame["angle_deg"], frame["mirrored"]) == ([150.0, 100.0], 0.0, True)
-    assert frame["pad_mm"] == sizes(plan)["pad_mm"]
-    assert frame["surface_mm"] == sizes(plan)["tray_height_mm"]
-
-
 def test_ridges_run_to_the_end_of_their_slots():
     plan = Plan(Morphology.straight(1, pitch_mm=10.0), with_settings({"number_mm": 0.0, "border_mm": 1.0}))
     read = as_read(mould_body(plan))

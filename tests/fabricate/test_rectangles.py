@@ -14,14 +14,13 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.checks.plan_checks import check_mould, check_plan
 from padforge.fabricate.export import build
-from padforge.fabricate.fibre_placement.toolpath import mirror_x, plan_toolpath
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
 from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
 from padforge.fabricate.outputs.pictures import WALL, mould_relief
 from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, FibreSettings, MouldSettings
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings, FibreSettings, MouldSettings
 
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
 
@@ -45,7 +44,7 @@ def test_tray_has_the_width_and_height_of_the_pad():
     assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
 
 
-def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
+def test_keep_out_is_a_pillar_of_the_mould():
     with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
     found = {finding.name: finding for finding in check_mould(with_hole)[-1]}
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
@@ -56,7 +55,7 @@ def test_a_keep_out_is_a_pillar_and_a_hole_in_the_casting():
     assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
 
 
-def test_a_keep_out_at_the_edge_joins_the_wall():
+def test_keep_out_at_the_edge_joins_the_wall():
     notch = ((20.0, 20.0), (28.0, 20.0), (28.0, 30.0), (20.0, 30.0))
     plan = Plan(Morphology.straight((1, 1), (28.0, 30.0)), settings(PAD, keep_out_mm=(notch,)))
     rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
@@ -188,24 +187,7 @@ def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
     assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
 
 
-def test_a_pad_without_crossings_has_a_page(tmp_path):
+def test_laying_page_of_a_pad_without_crossings(tmp_path):
     document = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
     assert document["crossings"]["gap_mm"] is None
     assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(("bend_mm", "acceleration", "least_mm_s"), [(3.0, 100.0, 10.0), (1.0, 25.0, 5.0)])
-def test_toolpath_follows_leads_and_slows_in_tight_bends(bend_mm, acceleration, least_mm_s):
-    """The root of acceleration times radius, 17 and 5 mm/s, of which the feed is at most 10 mm/s."""
-    own = replace(settings(PAD, leads="one side"), fibre=FibreSettings(min_bend_radius_mm=bend_mm))
-    own = replace(own, dispenser=DispenserSettings(acceleration_mm_s2=acceleration))
-    plan = Plan(PAD, own)
-    strokes = [stroke for step in plan_toolpath(plan, 0.3) for stroke in step.strokes]
-    for stroke in strokes:
-        line = shapely.LineString(mirror_x(stroke.positions_mm))
-        assert line.length == pytest.approx(plan.lengths_mm[stroke.fibre] + 60, rel=1e-3)
-        places = np.asarray(shapely.points(mirror_x(stroke.positions_mm)))
-        places = places[shapely.within(places, plan.silicone)]
-        assert shapely.distance(plan.lines[stroke.fibre], places).max() < 0.01
-    assert strokes[0].feeds_mm_s.min() in (least_mm_s, least_mm_s - 1)
-    assert strokes[0].feeds_mm_s.max() == 10.0

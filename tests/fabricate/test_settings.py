@@ -42,32 +42,19 @@ FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
         ("mould", {"ridge_width": 1.0}, ("[mould] ridge_width", "no such key", "ridge_width_mm")),
         ("mould", {"wall_mm": 0.1}, ("[mould] wall_mm", "0.1", "greater than or equal to 0.8")),
         ("mould", {"floor_mm": "2"}, ("[mould] floor_mm", "'2'", "number")),
-        ("mould", {"floor_mm": 0.0}, ("[mould] floor_mm", "0.0")),
-        ("mould", {"silicone_mm": 0.0}, ("[mould] silicone_mm", "0.0")),
-        ("mould", {"silicone_mm": math.inf}, ("[mould] silicone_mm", "inf")),
-        ("mould", {"wall_draft_deg": -1.0}, ("[mould] wall_draft_deg", "-1.0")),
-        ("mould", {"ridge_draft_deg": -1.0}, ("[mould] ridge_draft_deg", "-1.0")),
         ("mould", {"ridge_draft_deg": math.nan}, ("[mould] ridge_draft_deg", "nan")),
         ("mould", {"levels": "three"}, ("[mould] levels", "'three'")),
         ("printer", {"bed_mm": [100.0, 100.0]}, ("[printer] bed_mm", "at least 3")),
         ("printer", {"layer_mm": 0.0}, ("[printer] layer_mm", "0.0", "greater than or equal to 0.01")),
         ("dispenser", BOX, ("[dispenser] box_mm", "5.0", "from low to high")),
-        ("dispenser", {"arm_pose": [0.0, 1.0]}, ("[dispenser] arm_pose", "1.0")),
         ("dispenser", {"arm_pose": "known"}, ("[dispenser] arm_pose", "'known'")),
         ("dispenser", FAR, ("[dispenser] arm_pose", "400.0", "10")),
-        ("silicone", {"density_g_per_ml": 0.0}, ("[silicone] density_g_per_ml: got ",)),
         ("silicone", {"parts": [1.0, 0.0]}, ("[silicone] parts.1: got ",)),
-        ("silicone", {"parts": [1.0]}, ("[silicone] parts.1: got ",)),
         ("silicone", {"shrinkage": 0.3}, ("[silicone] shrinkage: got ",)),
-        ("silicone", {"shrinkage": -0.01}, ("[silicone] shrinkage: got ",)),
-        ("silicone", {"cure_h": math.nan}, ("[silicone] cure_h: got ",)),
         ("silicone", {"name": "a | b"}, ("[silicone] name: got ",)),
         ("silicone", {"name": "Ecoflex 00-31"}, (f"'Ecoflex 00-31', allowed are {', '.join(SILICONES)}", NEEDED)),
         ("fibre", {"name": "yarn"}, (f"'yarn', allowed are {', '.join(FIBRES)}; or", "own with diameter_mm set")),
-        ("fibre", {"diameter_mm": 11.0}, ("[fibre] diameter_mm: got ",)),
         ("fibre", {"ohm_per_mm": "unknown"}, ("[fibre] ohm_per_mm: got ",)),
-        ("fibre", {"min_bend_radius_mm": -1.0}, ("[fibre] min_bend_radius_mm: got ",)),
-        ("fibre", {"name": ""}, ("[fibre] name: got ",)),
         ("fibre", {"name": "two\nlines"}, ("[fibre] name: got ",)),
     ],
 )
@@ -84,9 +71,7 @@ def test_invalid_keys_are_refused_in_one_line(section, keys, parts):
     [
         ({"ridge_width_mm": 12.0}, 11.25, "[mould] ridge_width_mm: got 12, allowed is less than the pitch, 11.25 mm"),
         ({"spout": True}, 11.25, "[mould] spout: "),
-        ({"exit_width_mm": 11.0}, 11.25, "[mould] exit_width_mm: "),
         ({"exit_width_mm": 0.3}, 11.25, "[mould] exit_width_mm: "),
-        ({}, 0.1, "[mould] ridge_width_mm: got 0.4, allowed is less than the pitch, 0.1 mm"),
         ({}, 3.0, "[mould] exit_width_mm: "),
         (
             {"shallow_ridge_height_mm": 1.2},
@@ -138,12 +123,6 @@ def test_shrinkage_compensated_keeps_whole_layers(layer_mm, shrinkage):
         assert height * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), abs=layer_mm / 2)
 
 
-def test_shrinkage_compensated_scales_heights_between_layers():
-    asked = with_settings({"silicone_mm": 5.55, "shallow_ridge_height_mm": 0.45}, silicone={"shrinkage": 0.1})
-    for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
-        assert getattr(asked.shrinkage_compensated().mould, key) * 0.9 == pytest.approx(getattr(asked.mould, key))
-
-
 PUBLISHED_MOULD = """
 mould = { floor_mm = 2.0, wall_mm = 2.0, wall_draft_deg = 2.0, silicone_mm = 6.0, border_mm = 0.0, ridge_width_mm = 0.4,
   ridge_draft_deg = 0.0, deep_ridge_height_mm = 1.2, shallow_ridge_height_mm = 0.4, levels = "as_needed",
@@ -157,13 +136,6 @@ def test_defaults_are_those_of_the_published_pads():
     published = tomllib.loads(re.sub(r"\n  ", " ", PUBLISHED_MOULD))
     assert MouldSettings().model_dump() == published["mould"]
     assert PrinterSettings().model_dump() == published["printer"]
-
-
-def test_numpy_numbers_are_accepted():
-    assert Spec({}).section(MouldSettings, wall_mm=np.int64(3)) == MouldSettings(wall_mm=3)
-    assert Spec({}).section(PrinterSettings, bed_mm=np.array([200, 210, 220])) == PrinterSettings(
-        bed_mm=[200, 210, 220]
-    )
 
 
 @pytest.mark.parametrize(

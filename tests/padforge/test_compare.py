@@ -39,24 +39,20 @@ def test_compare_designs_every_variant_in_its_folder(tmp_path):
     assert (pad.layout.counts, pad.pitch_mm) == ((1, 1), (8.0, 12.0))
 
 
-def test_variants_have_distinct_folders_inside_comparison(tmp_path):
-    for name in ("a b.json", "a-b.json"):
-        Morphology.straight(1).save(tmp_path / name)
-    result = called("design", "compare", "a b.json", "a-b.json", cwd=tmp_path)
+@pytest.mark.parametrize(("names", "line"), [(("a b", "a-b"), "a-b: two pads"), (("one", "ONE"), "one: two pads")])
+def test_compare_refuses_pads_of_one_folder(tmp_path, names, line):
+    """The latter are two files here, and one folder on macOS and Windows."""
+    for name in names:
+        Morphology.straight(1).save(tmp_path / f"{name}.json")
+    result = called("design", "compare", *(f"{name}.json" for name in names), cwd=tmp_path)
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "a-b: two pads have this name" in result.err
-    assert comparison.Variant("..", Spec({})).folder == "pad"
+    assert f"{line} have this name" in result.err
 
 
-def test_variant_folders_are_valid_on_every_system(tmp_path):
-    names = ["con", "AUX.v2", "lpt1", "console", "comb"]
+def test_variant_folders_are_valid_on_every_system():
+    names = ["..", "con", "AUX.v2", "lpt1", "console", "comb"]
     folders = [comparison.Variant(name, Spec({})).folder for name in names]
-    assert folders == ["pad-con", "pad-AUX.v2", "pad-lpt1", "console", "comb"]
-    for name in ("one.json", "ONE.json"):  # two files here, and one folder on macOS and Windows
-        Morphology.straight(1).save(tmp_path / name)
-    result = called("design", "compare", "one.json", "ONE.json", cwd=tmp_path)
-    assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "one: two pads have this name" in result.err
+    assert folders == ["pad", "pad-con", "pad-AUX.v2", "pad-lpt1", "console", "comb"]
 
 
 def test_interrupt_ends_whole_comparison(tmp_path, monkeypatch):

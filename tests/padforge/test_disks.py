@@ -127,8 +127,8 @@ def test_read_only_folder_is_refused_in_one_line(room: Path, name: str):
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
 def test_kill_while_writing_leaves_one_mould(room: Path, ending: signal.Signals):
     child = start(room, *COMMANDS["fabricate"])
-    down_command = time.monotonic()
-    while not litter(room / "pad") and child.poll() is None and time.monotonic() < down_command + 60:
+    deadline = time.monotonic() + 60
+    while not litter(room / "pad") and child.poll() is None and time.monotonic() < deadline:
         time.sleep(0.0005)
     child.send_signal(ending)
     _, err = child.communicate(timeout=60)

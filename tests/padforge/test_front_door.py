@@ -24,10 +24,16 @@ def test_help_imports_no_heavy_library() -> None:
     assert not modules & {"torch", "build123d", "OCP", "numpy", "numba", "pydantic", "matplotlib", "shapely"}
 
 
-def test_design_works_without_torch_and_without_cad() -> None:
+def test_stages_import_only_what_they_need(tmp_path: Path) -> None:
     modules = loaded_by("from padforge import design; design.signals(design.Morphology.straight(1), [[1, 1]])")
     assert "numba" in modules
     assert not modules & {"torch", "build123d", "OCP"}
+    modules = loaded_by("import padforge.fabricate.cli")
+    assert not modules & {"torch", "build123d", "OCP", "matplotlib", "trimesh", "manifold3d", "numpy", "pydantic"}
+    build = f"padforge.build(padforge.Morphology.straight(1), {str(tmp_path)!r}, ['stl', 'svg'])"
+    modules = loaded_by(f"import padforge; {build}")
+    assert "manifold3d" in modules
+    assert not modules & {"torch", "build123d", "OCP", "matplotlib"}
 
 
 def test_bench_of_a_wheel_is_refused_in_one_line() -> None:

@@ -14,8 +14,6 @@ from padforge.design.common import profiling
 from padforge.design.optimize.search import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
-from padforge.sense import RigSettings, calibrate, simulate
-from padforge.sense.settings import LocalizerSettings
 
 
 @pytest.fixture
@@ -135,14 +133,6 @@ def test_only_requested_formats_are_written(tmp_path):
     assert profile.counts["formats"] == [2, 8]
     assert {"write tracks.svg", "write tracks.dxf"} <= set(profile.seconds)
     assert not {"CAD solid", "write mould.stl"} & set(profile.seconds)
-
-
-def test_calibration_has_profile_stages():
-    recording = simulate(Morphology.straight(2), RigSettings(presses=40, seed=0))
-    options = LocalizerSettings(members=2, hidden=8, epochs=10, batch=16, max_failures=1)
-    with profiling.profiled() as profile:
-        calibrate(recording, options)
-    assert {"train", "evaluate"} <= set(profile.seconds)
 
 
 @pytest.mark.slow

@@ -283,18 +283,3 @@ def test_find_dependents_ignores_other_files(folder: Path, content: str) -> None
     (folder / ".unfinished-set-0").mkdir()
     document(folder / ".unfinished-set-0" / "start.json", {PAD: files.sha256(folder / PAD)})
     assert files.find_dependents(folder / PAD) == before
-
-
-def test_check_replaceable_refuses_without_force(folder: Path) -> None:
-    other = document(folder / "new" / PAD, ["another"])
-    for by in (other, {"command": "another"}):
-        line = r"morphology.json: fabrication.json, .* and recording were made from it; .* another --out, .* --force$"
-        with pytest.raises(InputError, match=line):
-            files.check_replaceable(folder / PAD, by, remade=["design.json"])
-        files.check_replaceable(folder / PAD, by, force=True)
-        files.check_replaceable(folder / "contacts.json", by)
-        files.check_replaceable(folder / "none.json", by)
-    same = folder / "new" / PAD
-    same.write_bytes((folder / PAD).read_bytes())
-    files.check_replaceable(folder / PAD, same)
-    files.check_replaceable(folder / PAD, {"command": PAD})

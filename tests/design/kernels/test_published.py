@@ -32,7 +32,7 @@ def test_quantized_signals_are_the_published_samples(published, name, contact):
 
 
 @pytest.mark.parametrize("pitch_mm", [4.0, 11.25, 25.0, (100.0, 8.0), (8.0, 100.0)])
-def test_a_measured_press_is_as_wide_in_mm_on_pads_of_any_pitch(pitch_mm):
+def test_signals_are_as_wide_in_mm_at_any_pitch(pitch_mm):
     """A straight fibre right under it signals the integral of a Gaussian of 6.2 mm, one beside it the lesser."""
     pad = Morphology.straight(9, pitch_mm)
     for offset_mm in (0.0, 4.0):
@@ -75,7 +75,7 @@ def oracle(pad, presses, contact, samples):
 
 @given(contacts, st.integers(1, 4), st.integers(0, 8), SEEDS)
 @settings(max_examples=40)
-def test_culled_sums_equal_the_full_scan(contact, grid, knots, seed):
+def test_quantized_signals_equal_the_full_scan(contact, grid, knots, seed):
     rng = np.random.default_rng(seed)
     pad = Morphology.random(grid, knots, rng)
     presses = rng.uniform(-1, grid + 2, (5, 2))
@@ -83,7 +83,7 @@ def test_culled_sums_equal_the_full_scan(contact, grid, knots, seed):
     np.testing.assert_allclose(signals_quantized(pad, presses, contact, 300), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_a_population_is_its_members_one_by_one_and_the_serpentine_fills_its_rectangle():
+def test_quantized_signals_of_a_population_and_serpentine_presses():
     pads = [Morphology.random(3, 2, seed) for seed in range(3)]
     presses = np.random.default_rng(0).uniform(0, 4, (24, 2))
     batch = signals_quantized(np.stack([pad.knots for pad in pads]), presses)

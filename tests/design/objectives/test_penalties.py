@@ -43,7 +43,7 @@ def slanting(shift):
     return Morphology(np.concatenate([knots[:, :1], inner, knots[:, -1:]], axis=1))
 
 
-def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
+def test_vanishing_penalties_imply_kept_rules():
     """On random gentle pads; those with a penalty are only counted, so that the test is seen to look at both kinds."""
     rng, rules = np.random.default_rng(0), RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70)
     assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
@@ -61,7 +61,7 @@ def test_where_the_penalties_vanish_with_a_margin_the_exact_check_passes():
     assert 2 < passed < 14
 
 
-def test_the_soft_number_of_crossings_is_the_number_of_crossings():
+def test_max_crossings_penalty_counts_crossings():
     """The share by which it is above 9, the fewest that 3 + 3 fibres have."""
     rules = NONE.model_copy(update={"max_crossings": 9})
     for seed in range(3):
@@ -71,7 +71,7 @@ def test_the_soft_number_of_crossings_is_the_number_of_crossings():
         assert 9 * (found(pad, rules)["max_crossings"] + 1) == pytest.approx(number, rel=0.25)
 
 
-def test_no_margin_asks_for_fewer_crossings_than_a_pad_must_have():
+def test_max_crossings_penalty_never_asks_for_fewer_than_the_families_have():
     """Else a repair, whose margin grows, bends fibres for what cannot be."""
     straight, rules = Morphology.straight(2), NONE.model_copy(update={"max_crossings": 4})
     pad = Morphology(refine(straight.knots, 6, straight.layout))  # its samples are denser, so the soft number is exact
@@ -80,18 +80,24 @@ def test_no_margin_asks_for_fewer_crossings_than_a_pad_must_have():
 
 
 @pytest.mark.parametrize(
-    "rules",
+    ("pad", "rules", "tolerance"),
     [
-        RulesSettings(min_bend_radius_mm=4, min_gap_mm=9),
-        NONE.model_copy(update={"max_crossings": 4, "min_crossing_angle_deg": 60}),
+        (Morphology.random(2, 3, seed=5), RulesSettings(min_bend_radius_mm=4, min_gap_mm=9), 0.02),
+        (
+            Morphology.random(2, 3, seed=5),
+            NONE.model_copy(update={"max_crossings": 4, "min_crossing_angle_deg": 60}),
+            0.02,
+        ),
+        # the middle of a stretch in common moves as well, which the gradient leaves out
+        (slanting(2.0), NONE.model_copy(update={"max_common_track_mm": 1.6}), 0.1),
     ],
 )
-def test_the_gradient_is_that_of_finite_differences(rules):
+def test_penalty_gradients_match_finite_differences(pad, rules, tolerance):
     """Along random directions, since a search follows it; kinks (a nearest sample that changes) are rare."""
-    travel, cross = axes(Morphology.random(2, 3, seed=5))
+    travel, cross = axes(pad)
 
     def total(cross):
-        return torch.stack(list(penalties(travel, cross, PadSettings(grid=2), rules).values())).sum()
+        return torch.stack(list(penalties(travel, cross, PadSettings(grid=pad.grid), rules).values())).sum()
 
     total(cross).backward()
     step = 1e-6 * torch.tensor(np.random.default_rng(4).standard_normal(cross.shape))
@@ -99,11 +105,11 @@ def test_the_gradient_is_that_of_finite_differences(rules):
     with torch.no_grad():
         ahead, behind = total(cross + step), total(cross - step)
     assert cross.grad is not None
-    assert (ahead - behind).item() / 2 == pytest.approx((cross.grad * step).sum().item(), rel=2e-2)
+    assert (ahead - behind).item() / 2 == pytest.approx((cross.grad * step).sum().item(), rel=tolerance)
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.25])
-def test_a_fibre_too_long_costs_the_share_by_which_it_is(margin):
+def test_max_length_penalty_is_the_relative_excess(margin):
     """All fibres of the grid are 56.25 mm long; one alone counts by its share of the pad."""
     limit = NONE.model_copy(update={"max_length_mm": 45.0})
     assert found(Morphology.straight(4), limit, margin)["max_length_mm"] == pytest.approx(1.25 * margin - 1)
@@ -114,7 +120,7 @@ def test_a_fibre_too_long_costs_the_share_by_which_it_is(margin):
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.2])
-def test_a_grid_too_narrow_costs_by_a_closed_form(margin):
+def test_min_gap_penalty_of_a_narrow_grid_has_a_closed_form(margin):
     """A sample nearer by the share c costs c + 10 c^2; in a row of four the outer two have one neighbour, not two."""
     close = 1 - 11.25 / (15.0 * margin)
     terms = found(Morphology.straight(4), NONE.model_copy(update={"min_gap_mm": 15.0}), margin)
@@ -145,7 +151,7 @@ def dense(pad, fibre):
 
 @pytest.mark.parametrize("bent_radius_mm", [None, 30.0])
 @pytest.mark.parametrize("margin", [1.0, 1.3])
-def test_a_bend_costs_what_its_windows_turn_too_far(margin, bent_radius_mm):
+def test_min_bend_radius_penalty_integrates_the_excess_turn(margin, bent_radius_mm):
     """Against the mean over the pad's fibres of the integral along each, in shares of the size of the pad.
 
     A pad worn bent turns its fibres out of the plan as well, at right angles to how they turn in it.
@@ -166,7 +172,7 @@ def test_a_bend_costs_what_its_windows_turn_too_far(margin, bent_radius_mm):
 
 @pytest.mark.parametrize(("rise", "costs"), [(0.5, False), (0.6, True)])
 @pytest.mark.parametrize(("fibre", "end"), [(0, 0), (0, -1), (5, 0), (5, -1)])
-def test_a_fibre_that_meets_its_lead_at_more_than_half_a_radian_costs(rise, costs, fibre, end):
+def test_min_bend_radius_penalty_includes_lead_kinks(rise, costs, fibre, end):
     """It climbs straight from its end on, for 4 mm, and leads go straight on."""
     knots = np.repeat(Morphology.straight(4).knots[:, :1], 5, axis=1)
     at = np.array([0, 0.4, 0.8, 1.4, 5])
@@ -178,7 +184,7 @@ def test_a_fibre_that_meets_its_lead_at_more_than_half_a_radian_costs(rise, cost
 
 
 @pytest.mark.parametrize(("cross", "travel", "fibre"), [(1.9, 0.3, 0), (3.0, 4.6, 5)])
-def test_a_fibre_steep_beside_its_wall_costs_by_how_steep_and_how_long(cross, travel, fibre):
+def test_border_penalty_integrates_excess_slope_beside_the_wall(cross, travel, fibre):
     pad, zone_mm = bent(cross, travel, fibre), 9.0
     arc, _, slope, at = dense(pad, fibre)
     beside = (at < zone_mm / pad.unit_mm) | (at > pad.grid + 1 - zone_mm / pad.unit_mm)
@@ -188,7 +194,7 @@ def test_a_fibre_steep_beside_its_wall_costs_by_how_steep_and_how_long(cross, tr
     assert found(pad, rules)["border_mm"] == pytest.approx(expected, rel=0.05)
 
 
-def test_a_slanting_crossing_costs_the_share_its_angle_falls_short():
+def test_min_crossing_angle_penalty_is_the_relative_shortfall():
     """Two fibres that swing by a slope of 1.5 cross at 33.7 degrees, and the other three pairs more steeply."""
     swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
     pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
@@ -200,7 +206,7 @@ def test_a_slanting_crossing_costs_the_share_its_angle_falls_short():
     assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(0, abs=0.01)
 
 
-def test_a_stretch_too_long_costs_by_how_near_it_is_at_two_places_as_far_apart_as_is_allowed():
+def test_max_common_track_penalty_has_a_closed_form():
     """The horizontal is straight: half the limit from where they cross it is off by that times the sine."""
     pad, limit = slanting(2.0), NONE.model_copy(update={"max_common_track_mm": 1.6})
     sine = np.sin(np.arctan(0.4 / 3.0))  # half-way between turning points a PCHIP is half as steep again
@@ -211,23 +217,7 @@ def test_a_stretch_too_long_costs_by_how_near_it_is_at_two_places_as_far_apart_a
     assert found(pad, limit.model_copy(update={"max_common_track_mm": 7.0}))["max_common_track_mm"] == 0
 
 
-def test_the_gradient_of_a_stretch_too_long_is_that_of_finite_differences():
-    """The cross coordinates of either fibre turn it about where they cross."""
-    rules, size = NONE.model_copy(update={"max_common_track_mm": 1.6}), PadSettings()
-    travel, cross = axes(slanting(2.0))
-    penalties(travel, cross, size, rules)["max_common_track_mm"].backward()
-    assert cross.grad is not None
-    tolerance = 0.02 * cross.grad.abs().max().item()  # the middle of a stretch moves a little as well
-    for fibre, knot in ((4, 1), (4, 2), (1, 1), (1, 2)):
-        step = torch.zeros_like(cross)
-        step[fibre, knot] = 1e-4
-        with torch.no_grad():
-            moved = (penalties(travel, cross + sign * step, size, rules) for sign in (1, -1))
-            ahead, behind = (terms["max_common_track_mm"].item() for terms in moved)
-        assert (ahead - behind) / 2e-4 == pytest.approx(cross.grad[fibre, knot].item(), rel=0.1, abs=tolerance)
-
-
-def test_crossings_of_a_family_beyond_those_allowed_are_counted():
+def test_same_family_crossings_penalty_counts_the_excess():
     """A fibre that swings over two others and back crosses four times; the count is soft, what is made of it is not."""
 
     def penalty(allowed, margin=1.0):
@@ -241,19 +231,8 @@ def test_crossings_of_a_family_beyond_those_allowed_are_counted():
     assert penalty(6, margin=2.0) == pytest.approx((count - 3) / 3)
 
 
-def test_only_rules_that_may_be_broken_are_computed():
-    always = {"same_family_crossings", "max_length_mm"}
-    assert set(found(Morphology.straight(2), NONE)) == always
-    assert set(found(Morphology.straight(1), NONE)) == {"max_length_mm"}
-    wide = NONE.model_copy(update={"min_bend_radius_mm": 1.0, "min_gap_mm": 1.0})
-    assert set(found(Morphology.straight(2), wide)) == {*always, "min_bend_radius_mm", "min_gap_mm"}
-    folded = NONE.model_copy(update={"min_bend_radius_mm": 1.0, "min_gap_mm": 1.1})
-    assert set(found(Morphology.straight(2), folded)) == {*always, "min_bend_radius_mm", "min_gap_mm", "folds"}
-    assert set(found(Morphology.straight(1), folded)) == {"max_length_mm", "min_bend_radius_mm", "folds"}
-
-
 @pytest.mark.parametrize("margin", [1.0, 1.5])
-def test_folds_cost_by_how_near_the_points_of_a_fibre_come_to_what_is_far_along_it(margin):
+def test_folds_penalty_matches_dense_distances(margin):
     """Against the nearest of many points of SciPy's curve that lie half a turn of a gap away or more."""
     knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [1.1, 1.9], [1.2, 1.0], [2, 1.0]])
     straight = np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=-1)

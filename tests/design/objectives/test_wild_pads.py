@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from padforge.design import Contact, Morphology
-from padforge.design.morphology import assemble_knots
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.published import disorder_area, published_terms
 from padforge.design.objectives.rules import check_rules
@@ -13,9 +12,9 @@ from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import Parametrization
 from padforge.design.report import draw_plan
 from padforge.design.settings import PadSettings, RulesSettings
+from tests.design.wild_pads import KINDS, wild_knots
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-KINDS = ["random", "steps", "lattice", "border", "alike", "edge", "needles", "level", "no knots"]
 CONTACTS = [
     Contact(),
     Contact(radius=1e-9, sides=None),
@@ -36,25 +35,8 @@ RULES = [
 
 def wild_pad(kind, seed):
     rng = np.random.default_rng(seed)
-    grid, count = 1 + seed % 2, 0 if kind == "no knots" else rng.integers(1, 7)
-    size = grid + 1.0
-    inner = rng.uniform(0, size, (2 * grid, count, 2))
-    levels = np.arange(1, grid + 1)[:, None]
-    if kind == "steps":  # all knots of a fibre at one place along it, which the constructor moves next to each other
-        inner[:grid, :, 0], inner[grid:, :, 1] = rng.uniform(0, size, 2)
-    elif kind == "lattice":
-        inner = np.round(2 * inner) / 2
-    elif kind == "border":
-        inner[:grid, :, 1], inner[grid:, :, 0] = rng.choice([0, size], (2, grid, count))
-    elif kind == "alike":
-        inner[:grid], inner[grid:] = inner[0], inner[grid]
-    elif kind == "edge":
-        inner = rng.choice([0.0, 1e-9, size], inner.shape)
-    elif kind == "needles":
-        inner[:grid, :, 0] = inner[grid:, :, 1] = rng.uniform(0, grid) + 1e-9 * np.arange(count)
-    elif kind == "level":
-        inner[:grid, :, 1], inner[grid:, :, 0] = levels + rng.normal(0, 1e-12, (grid, count)), levels
-    return Morphology(assemble_knots(inner), rng.choice([0.1, 11.25, 1000.0]))
+    count = 0 if kind == "no knots" else int(rng.integers(1, 7))
+    return Morphology(wild_knots(kind, 1 + seed % 2, count, rng), rng.choice([0.1, 11.25, 1000.0]))
 
 
 @pytest.fixture(params=[0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
@@ -62,9 +44,9 @@ def seed(request):
     return request.param
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_wild_pad_has_a_finite_score_and_is_checked_and_drawn(kind, seed):
-    seed = 10 * seed + KINDS.index(kind)
+@pytest.mark.parametrize("kind", [*KINDS, "no knots"])
+def test_score_rules_and_plan_of_wild_pads_are_finite(kind, seed):
+    seed = 10 * seed + [*KINDS, "no knots"].index(kind)
     pad, contact, rules = wild_pad(kind, seed), CONTACTS[seed % 5], RULES[seed % 3]
     terms = score(pad, contact, seed % 9, (1e-9, 0.1, 10.0)[seed % 3], rules)
     assert np.isfinite([*terms.values()]).all()
@@ -78,8 +60,8 @@ def test_a_wild_pad_has_a_finite_score_and_is_checked_and_drawn(kind, seed):
     assert pad.tiled(2).grid == 2 * pad.grid
 
 
-@pytest.mark.parametrize("kind", KINDS[:-1])
-def test_penalties_of_a_wild_pad_and_their_gradients_are_finite(kind, seed):
+@pytest.mark.parametrize("kind", KINDS)
+def test_penalties_and_gradients_of_wild_pads_are_finite(kind, seed):
     pad = wild_pad(kind, seed)
     for rules in RULES:
         fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.01)

@@ -1,4 +1,4 @@
-"""The gradient search: its free variables, the courses it begins with, and that steps and repair keep to the rules."""
+"""The gradient search: its free variables, initial paths, and steps and repair within the rules."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def finished(search, rules, start=0):
 
 @settings(max_examples=30)
 @given(st.integers(1, 5), st.integers(1, 9), st.integers(0, 99))
-def test_variables_of_a_pad_give_back_its_knots(grid, knots, seed):
+def test_parametrization_restores_knots(grid, knots, seed):
     pad = Morphology.random(grid, knots, seed)
     back = Morphology(Parametrization.from_knots(pad.knots, pad.layout, 1e-3).knots())
     clear = (pad.knots > 0.006 * (grid + 1)) & (pad.knots < 0.994 * (grid + 1))  # others are moved off the border
@@ -61,7 +61,7 @@ def test_variables_of_a_pad_give_back_its_knots(grid, knots, seed):
 
 @settings(max_examples=20)
 @given(st.integers(1, 20), st.integers(0, 99))
-def test_more_knots_leave_the_old_ones_and_keep_to_the_curve(more, seed):
+def test_refine_keeps_knots_and_curve(more, seed):
     pad = Morphology.random(3, 4, seed)
     finer = refine(pad.knots, 4 + more, pad.layout)
     assert finer.shape == (6, 6 + more, 2)
@@ -72,7 +72,7 @@ def test_more_knots_leave_the_old_ones_and_keep_to_the_curve(more, seed):
         assert new[:, 1 - axis] == pytest.approx(curve(new[:, axis]), abs=1e-12)
 
 
-def test_the_lengths_by_which_responses_are_divided_are_those_of_the_curves():
+def test_arc_lengths_match_lengths():
     pad = Morphology.random((2, 3), 5, seed=1, pitch_mm=(8.0, 15.0))
     travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
     assert arc_lengths(travel, cross, pchip_slopes(travel, cross)).numpy() == pytest.approx(lengths(pad), rel=1e-3)
@@ -80,7 +80,7 @@ def test_the_lengths_by_which_responses_are_divided_are_those_of_the_curves():
 
 @pytest.mark.parametrize("knots", [1, 2, 6, 7, 20, 64])
 @pytest.mark.parametrize("rules", [RulesSettings(), FREE])
-def test_every_start_is_a_pad_of_as_many_knots_and_depends_on_its_generator(knots, rules):
+def test_initial_paths_are_a_pad_and_depend_on_the_generator(knots, rules):
     for grid, start in ((1, 0), (4, 0), (8, ZIGZAG_START)):
         pad = PadSettings(grid=grid)
         courses = [initial_paths(pad, rules, knots, None, start, np.random.default_rng(seed)) for seed in (0, 1)]
@@ -88,7 +88,7 @@ def test_every_start_is_a_pad_of_as_many_knots_and_depends_on_its_generator(knot
         assert not np.array_equal(courses[0], courses[1])
 
 
-def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
+def test_initial_paths_from_an_origin_are_it_and_near_it():
     origin = Morphology.random(4, 5, seed=3)
     courses = [
         initial_paths(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start))
@@ -101,7 +101,7 @@ def test_the_first_start_from_a_pad_is_that_pad_and_the_next_are_near_it():
 
 
 @pytest.mark.parametrize(("contact", "gentle"), [(Contact(), True), (PUBLISHED_CONTACT, False)])
-def test_starts_have_nearly_straight_fibres_but_for_a_zigzag_or_the_other_way_round(contact, gentle):
+def test_starts_are_nearly_straight_or_zigzag_by_contact(contact, gentle):
     """Within a tenth of a grid unit or so, and clear of the slopes without a gradient of fibres that are quite so."""
     starts = [begun(SearchSettings(), RulesSettings(), start, None, PadSettings(), contact) for start in range(5)]
     offsets = [np.abs(start.fibres.knots()[:4, :, 1] - np.arange(1, 5)[:, None]) for start in starts]
@@ -109,14 +109,14 @@ def test_starts_have_nearly_straight_fibres_but_for_a_zigzag_or_the_other_way_ro
     assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
 
 
-def test_a_border_wider_than_the_pad_leaves_the_knots_in_the_middle():
+def test_border_wider_than_the_pad_leaves_knots_in_the_middle():
     rules = RulesSettings(border_mm=400)
     pad = Morphology.random(4, 5)
     knots = Parametrization.from_knots(pad.knots, pad.layout, border_width(PadSettings(), rules)).knots()
     assert "border_mm" in {violation.rule for violation in check_rules(Morphology(knots), rules)}
 
 
-def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit():
+def test_gradient_search_resumes_bit_for_bit():
     """Before the first step, amid the steps, before the repair and in it."""
     asked = SearchSettings(knots=3, steps=10, max_failures=1), RulesSettings(max_length_mm=34)
     unbroken = begun(*asked)
@@ -133,7 +133,7 @@ def test_broken_off_and_resumed_is_as_unbroken_bit_for_bit():
             np.testing.assert_array_equal(first[name], second[name], strict=True)
 
 
-def test_an_early_end_leaves_the_repair_alone():
+def test_finish_skips_to_the_repair():
     run = begun(SearchSettings(knots=3, steps=1000, max_failures=1), RulesSettings(max_length_mm=34))
     advance(run, 3)
     run.finish()
@@ -156,14 +156,14 @@ def usual():
         pytest.param({"min_crossing_angle_deg": 50.0}, marks=pytest.mark.slow),
     ],
 )
-def test_each_further_rule_is_kept(rules, usual):
+def test_gradient_search_keeps_each_rule(rules, usual):
     """By steps and repair alone: a whole search would hand back straight fibres in place of what breaks a rule."""
     asked = RulesSettings(**rules)
     assert check_rules(usual, asked) != []
     assert check_rules(finished(BRIEF, asked), asked) == []
 
 
-def test_several_contacts_serve_both_better_than_one_alone():
+def test_gradient_search_for_several_contacts_serves_each():
     large = Contact(radius=1.2)
     one = BRIEF.model_copy(update={"steps": 30, "max_failures": 0, "knots": 4})
     for_one, for_both = (finished(each, FREE) for each in (one, one.model_copy(update={"contacts": (large,)})))
@@ -172,7 +172,7 @@ def test_several_contacts_serve_both_better_than_one_alone():
 
 
 @pytest.mark.slow
-def test_descent_beats_the_square_grid_within_the_rules():
+def test_gradient_search_beats_straight_fibres_within_the_rules():
     asked = PUBLISHED_SEARCH.model_copy(update={"knots": 9, "starts": 1, "steps": 60, "max_failures": 1})
     found = search(PUBLISHED_PAD, PUBLISHED_CONTACT, asked)
     pads = found.morphology, Morphology.straight(4)

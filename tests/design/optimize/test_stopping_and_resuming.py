@@ -32,7 +32,7 @@ class KilledError(Exception):
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
+def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
     settings = SMALL.model_copy(update={"method": method})
     unbroken, kills = search(PAD, None, settings, FREE), 0
@@ -59,7 +59,7 @@ def test_broken_off_anywhere_and_resumed_is_as_unbroken(method, tmp_path):
     assert (resumed.morphology, resumed.history) == (unbroken.morphology, unbroken.history)
 
 
-def test_states_stay_until_they_are_cleared_and_only_those_of_this_search_are_taken(tmp_path):
+def test_checkpoints_of_other_searches_are_refused_and_stay_until_cleared(tmp_path):
     folder, quick = tmp_path / "search", SMALL.model_copy(update={"starts": 1, "steps": 2})
     run, path = SearchOptions(keep_in=folder, resume=True), folder / "start_0000.npz"
     first = search(PAD, None, quick, FREE, run=run)
@@ -79,7 +79,7 @@ def test_states_stay_until_they_are_cleared_and_only_those_of_this_search_are_ta
     assert not list(tmp_path.iterdir())
 
 
-def test_no_files_of_others_are_removed(tmp_path):
+def test_checkpoints_remove_no_files_of_others(tmp_path):
     about = '{"format": "somebody/1"}'
     names = ["search.json", "start_0.npz", "start_0000.npz", "start_0_notes.npz", "other"]
     for name in names:
@@ -94,7 +94,7 @@ def test_no_files_of_others_are_removed(tmp_path):
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_ctrl_c_keeps_the_best_so_far(method):
+def test_search_returns_the_best_so_far_on_ctrl_c(method):
     """The signal comes from the first report; what was found by then is returned, and says so."""
     settings = SMALL.model_copy(update={"method": method, "steps": 100_000, "generations": 100_000})
     result = search(PAD, None, settings, run=SearchOptions(lambda *progress: signal.raise_signal(signal.SIGINT)))
@@ -103,17 +103,13 @@ def test_ctrl_c_keeps_the_best_so_far(method):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_time_budget_ends_it_with_the_best_so_far():
-    result = search(PAD, None, SMALL.model_copy(update={"steps": 1_000_000}), run=SearchOptions(time_budget=0.3))
-    assert result.stopped == "out of time"
-    assert result.violations == []
-    assert result.seconds < 30
-
-
-def test_a_search_out_of_time_before_its_first_step_gives_its_fibres():
-    result = search(PAD, None, SMALL, run=SearchOptions(time_budget=1e-6))
-    assert result.stopped == "out of time"
+@pytest.mark.parametrize("time_budget", [0.3, 1e-6])
+def test_search_within_a_time_budget_returns_the_best_so_far(time_budget):
+    """Also where it ends before the first step."""
+    result = search(PAD, None, SMALL.model_copy(update={"steps": 10**6}), run=SearchOptions(time_budget=time_budget))
+    assert (result.stopped, result.violations) == ("out of time", [])
     assert result.morphology.knots.shape == (2, 5, 2)
+    assert result.seconds < 30
 
 
 class Hung(Executor):
@@ -125,7 +121,7 @@ class Hung(Executor):
         return future
 
 
-def test_the_deadline_holds_on_an_executor_that_hangs(monkeypatch):
+def test_time_budget_holds_on_an_executor_that_hangs(monkeypatch):
     monkeypatch.setattr(stopping, "GRACE_S", 0.1)
     result = search(PAD, None, SMALL, run=SearchOptions(time_budget=0.1, executor=Hung()))
     assert result.stopped == "out of time"
@@ -133,7 +129,7 @@ def test_the_deadline_holds_on_an_executor_that_hangs(monkeypatch):
 
 
 @POSIX
-def test_the_second_ctrl_c_leaves_an_executor_that_hangs_behind():
+def test_second_ctrl_c_abandons_an_executor_that_hangs():
     timers = [threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)) for after in (0.2, 0.4)]
     for timer in timers:
         timer.start()
@@ -141,7 +137,7 @@ def test_the_second_ctrl_c_leaves_an_executor_that_hangs_behind():
 
 
 @POSIX
-def test_a_hangup_that_is_ignored_as_under_nohup_ends_nothing(monkeypatch):
+def test_command_ignores_a_hangup_under_nohup(monkeypatch):
     @click.command()
     def work():
         signal.raise_signal(signal.SIGHUP)
@@ -198,7 +194,7 @@ def wait_for_state(folder, process, later_than=0):
 
 @pytest.mark.slow
 @POSIX
-def test_a_search_killed_and_then_interrupted_resumes_to_the_same_file(tmp_path, monkeypatch):
+def test_design_killed_and_then_interrupted_resumes_to_the_same_file(tmp_path, monkeypatch):
     """A kill leaves states alone, Ctrl-C the best so far as well; what goes on from both ends as if unbroken."""
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     unbroken.mkdir()
@@ -224,7 +220,7 @@ def test_a_search_killed_and_then_interrupted_resumes_to_the_same_file(tmp_path,
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys):
+def test_absent_scheduler_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr(computing, "SCHEDULER_S", 0.2)
     assert design_here(tmp_path, monkeypatch, "--scheduler", "tcp://127.0.0.1:9") == 2
@@ -235,7 +231,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_cluster_that_loses_a_worker_finds_the_same_pad():
+def test_search_on_a_cluster_that_loses_a_worker_finds_the_same_pad():
     """Its only one: another is started in its place, and goes on."""
     distributed = pytest.importorskip("distributed")
     here = search(PAD, None, SMALL, FREE)

@@ -31,7 +31,7 @@ def kept_off(*polygons, counts=(3, 6), pitch_mm=(8.0, 15.0)):
     return PadSettings(keep_out_mm=polygons, **Layout.create(counts, pitch_mm).settings)
 
 
-def test_the_distance_of_straight_fibres_to_a_square_is_exact_and_presses_lie_in_no_keep_out():
+def test_keep_out_distances_and_free_presses_are_exact():
     """Horizontals of this pad run at y = -15, 0 and 15 mm, verticals 8 mm apart from x = -20 mm."""
     size = kept_off(square(1.0, 7.0, 4.0))
     found = check_rules(Morphology.straight(size.layout), only(keep_out_mm=5.9), size)
@@ -65,7 +65,7 @@ def test_the_distance_of_straight_fibres_to_a_square_is_exact_and_presses_lie_in
         (((-28, -30), (28, -30), (28, 30), (-28, 30)), "keep_out_mm covers all that is pressed"),
     ],
 )
-def test_keep_outs_that_leave_no_room_or_are_none_are_refused_in_one_line(polygon, message):
+def test_keep_outs_without_room_are_refused_in_one_line(polygon, message):
     def use():
         size = kept_off(tuple((float(x), float(y)) for x, y in polygon))
         free_presses(size)
@@ -81,7 +81,7 @@ def penalty(pad, size, cross=None, clearance=3.0):
     return penalties(travel, own if cross is None else cross, size, only(keep_out_mm=clearance))["keep_out_mm"]
 
 
-def test_the_penalty_of_a_keep_out_vanishes_with_the_clearance_and_has_a_true_gradient():
+def test_keep_out_penalty_vanishes_with_clearance_and_has_its_gradient():
     size = kept_off(square(2.0, 6.0, 9.0))
     assert penalty(Morphology.straight(size.layout), size, clearance=1.0).item() > 0
     free = Morphology.straight(size.layout)
@@ -96,7 +96,7 @@ def test_the_penalty_of_a_keep_out_vanishes_with_the_clearance_and_has_a_true_gr
     assert (ahead - behind) / 2 == pytest.approx((cross.grad * step).sum().item(), rel=1e-3)
 
 
-def test_straight_fibres_bow_around_a_keep_out_within_the_rules_and_stay_in_order():
+def test_straight_paths_pass_keep_outs_within_the_rules():
     size, rules = kept_off(square(2.0, 1.0, 10.0)), RulesSettings()
     assert check_rules(Morphology.straight(size.layout), rules, size)
     pad = Morphology.from_layout(straight_paths(size, rules, 21), size.layout)
@@ -109,7 +109,7 @@ def test_straight_fibres_bow_around_a_keep_out_within_the_rules_and_stay_in_orde
 
 @given(st.integers(0, 99), st.floats(-8, 8), st.floats(-8, 8), st.sampled_from([6.0, 25.0]))
 @settings(max_examples=12)
-def test_fibres_that_pass_keep_outs_keep_the_order_they_had(seed, x, y, side):
+def test_pass_keep_outs_keeps_the_order_of_fibres(seed, x, y, side):
     size, rng = kept_off(square(x, y, side), square(-x, 2.0, 3.0)), np.random.default_rng(seed)
     course = straight_paths(PadSettings().for_layout(size.layout), RulesSettings(), 12)
     lifts = 0.3 * rng.standard_normal(12)
@@ -121,7 +121,7 @@ def test_fibres_that_pass_keep_outs_keep_the_order_they_had(seed, x, y, side):
     np.testing.assert_array_equal(pass_keep_outs(course, size, RulesSettings(enforce=False)), course)
 
 
-def test_helices_and_arcs_on_a_cylinder_are_as_curved_as_in_space():
+def test_bend_radius_on_a_cylinder_matches_curves_in_space():
     """A line at the angle a to x on a cylinder of radius R is a helix of radius R / cos(a)^2.
 
     At the top of an arc, which runs along x there, the curvature is the root of 1 / r^2 + 1 / R^2.
@@ -146,7 +146,7 @@ def test_helices_and_arcs_on_a_cylinder_are_as_curved_as_in_space():
     assert rolled == pytest.approx(turned, rel=1e-3)
 
 
-def test_a_bent_pad_bends_fibres_that_run_around_it():
+def test_min_bend_radius_of_a_bent_pad():
     rules, pad = only(min_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
     assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
     found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))

@@ -20,7 +20,6 @@ from padforge.fabricate.cad.model import (
     FIT_TOLERANCES_MM,
     CadModel,
     assemble,
-    build_body_model,
     build_models,
     build_mould,
     build_mould_model,
@@ -53,7 +52,7 @@ def judged(plan: Plan, **wells) -> CadModel:
 
 
 @pytest.mark.parametrize(("draft_deg", "deep"), [(0.0, "horizontal"), (0.0, "vertical"), (20.0, "horizontal")])
-def test_a_straight_pad_has_the_volumes_and_contact_that_arithmetic_gives(draft_deg, deep):
+def test_mould_model_of_a_straight_pad_has_closed_form_volumes(draft_deg, deep):
     settings = with_settings(PLAIN | {"wall_draft_deg": draft_deg}, pad={"deep_family": deep})
     plan = Plan(Morphology.straight(2), settings)
     slope = math.tan(math.radians(draft_deg))
@@ -75,7 +74,7 @@ def test_a_straight_pad_has_the_volumes_and_contact_that_arithmetic_gives(draft_
     assert model.contact_mm2 == pytest.approx(footprint + crossings + ends, rel=1e-6)
 
 
-def test_the_walls_of_a_curved_fibre_are_as_long_as_its_exact_offsets():
+def test_mould_model_walls_are_as_long_as_exact_offsets():
     """Where a bend is wider than half the track, the offsets to the left and right are together as long as two fibres.
 
     So are each by itself where a fibre leaves the pad as it came: what one gains in a bend the other loses.
@@ -97,7 +96,7 @@ def test_the_walls_of_a_curved_fibre_are_as_long_as_its_exact_offsets():
     ("pad", "mould"),
     [(SOFT, {}), pytest.param(Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8}, marks=pytest.mark.slow)],
 )
-def test_edges_of_tracks_are_half_a_width_from_the_exact_fibres(pad, mould):
+def test_mould_model_edges_are_half_a_width_from_exact_fibres(pad, mould):
     """Thousands of places on the kernel's own curves, on the floor, against scipy's own PCHIP."""
     plan = Plan(pad, with_settings(PLAIN | mould))
     points = []
@@ -150,7 +149,7 @@ RARE = {*SETTINGS, *ODD} - {*[*SETTINGS, *ODD][::3], NARROW}
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=[pytest.mark.slow] if case in RARE else []) for case in [*SETTINGS, *ODD]]
 )
-def test_models_are_valid_and_as_large_as_their_meshes(case):
+def test_mould_models_are_valid_and_match_their_meshes(case):
     pad, mould = ODD.get(case) or (Morphology.random(1, 3, seed=5), SETTINGS[case])
     model = judged(Plan(pad, with_settings(mould)))
     assert case in ODD or model.fit_mm == FIT_TOLERANCES_MM[0]
@@ -163,17 +162,17 @@ INVALID = pytest.mark.xfail(raises=InputError, reason="one piece of a track is i
 @pytest.mark.parametrize(
     ("grid", "knots", "seed"), [(5, 8, 0), (4, 20, 4), (4, 20, 41), pytest.param(3, 20, 9, marks=INVALID)]
 )
-def test_dense_pads(grid, knots, seed):
+def test_mould_models_of_dense_pads_match_their_meshes(grid, knots, seed):
     judged(Plan(Morphology.random(grid, knots, seed)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
-def test_published_pads(published, name):
+def test_mould_models_of_published_pads_match_their_meshes(published, name):
     judged(Plan(Morphology.load(published / f"{name}.mat")))
 
 
-def test_the_second_mould_has_its_wells():
+def test_mould_model_has_wells():
     plan = conductive_plan(Plan(SOFT, with_settings({"conductive": True, "pins": True})))
     model = judged(plan, wells=well_outlines(plan, sides=512))
     plain = build_mould_model(plan, "mould")
@@ -184,7 +183,7 @@ def test_the_second_mould_has_its_wells():
     assert sum(face.area for face in round_) == pytest.approx(2 * (2 * math.pi * 1.5 - 2 * 0.4) * 0.4, rel=0.01)
 
 
-def test_parts_are_named_coloured_touch_and_do_not_overlap():
+def test_mould_model_parts_are_named_coloured_and_disjoint():
     model = build_mould_model(Plan(SOFT, with_settings({"pins": True})), "mould")
     assert model.shape.label == "mould"
     children = list(model.shape.children)
@@ -199,7 +198,7 @@ def test_parts_are_named_coloured_touch_and_do_not_overlap():
     assert [child.label for child in without.children] == ["tray", "horizontal tracks", "vertical tracks"]
 
 
-def test_the_mould_is_that_of_silicone_that_shrinks():
+def test_mould_model_is_compensated_for_shrinkage():
     plan = Plan(SOFT, with_settings(silicone={"shrinkage": 0.02}))
     model = judged(plan)
     for shape in (model.shape, build_mould(SOFT, plan.settings)):
@@ -209,7 +208,7 @@ def test_the_mould_is_that_of_silicone_that_shrinks():
         )
 
 
-def test_all_that_is_printed_stands_side_by_side_with_the_lid_on():
+def test_assemble_places_bodies_side_by_side():
     settings = with_settings({"lid": True, "pins": True, "spout": True, "holder": True, "conductive": True})
     plan = Plan(SOFT, settings)
     wells = conductive_plan(plan)
@@ -231,7 +230,7 @@ def test_all_that_is_printed_stands_side_by_side_with_the_lid_on():
     assert CadModel(whole).shape.is_valid
 
 
-def test_a_small_pitch_is_no_matter_without_a_second_mould():
+def test_build_models_needs_no_room_for_absent_wells():
     """Wells would find no room there, but nobody asked for any."""
     plan = Plan(Morphology.straight(1, pitch_mm=5.0))
     with pytest.raises(InputError, match="exit_width_mm"):
@@ -240,36 +239,26 @@ def test_a_small_pitch_is_no_matter_without_a_second_mould():
     assert made.shape.is_valid
 
 
-@pytest.mark.parametrize("failure", [None, Standard_Failure(""), ValueError("")])
-def test_mould_models_are_built_with_finer_curves_until_solids_are_valid(monkeypatch, failure):
-    tries, build, valid = [], of_model.fill_cells, of_model.is_valid
+@pytest.mark.parametrize(("failures", "fit_mm"), [(1, FIT_TOLERANCES_MM[1]), (1000, None)])
+def test_build_mould_model_fits_finer_curves_until_solids_are_valid(monkeypatch, failures, fit_mm):
+    """Planted: the kernel fails at the first tries."""
+    build, tries = of_model.build_solids, []
 
-    def fill(plan, fit_mm, wells):
-        tries.append(fit_mm)
-        if failure and len(tries) <= failures:
-            monkeypatch.setattr(of_model, "build_solids", lambda *_: (_ for _ in ()).throw(failure))
-        else:
-            monkeypatch.setattr(of_model, "build_solids", solids)
-        return build(plan, fit_mm, wells)
+    def fail_first(*arguments):
+        tries.append(arguments)
+        if len(tries) <= failures:
+            raise Standard_Failure("")
+        return build(*arguments)
 
-    solids = of_model.build_solids
-    monkeypatch.setattr(of_model, "fill_cells", fill)
-    if failure is None:
-        monkeypatch.setattr(of_model, "is_valid", lambda shape: len(tries) > failures and valid(shape))
-    failures = 1
-    assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == FIT_TOLERANCES_MM[1]
-    failures = 1000
-    with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
-        build_mould_model(Plan(Morphology.straight(1)), "second")
+    monkeypatch.setattr(of_model, "build_solids", fail_first)
+    if fit_mm:
+        assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == fit_mm
+    else:
+        with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
+            build_mould_model(Plan(Morphology.straight(1)), "second")
 
 
-def test_an_invalid_body_is_named(monkeypatch):
-    monkeypatch.setattr(of_model, "is_valid", lambda shape: False)
-    with pytest.raises(InputError, match="lid: the CAD kernel finds the solid invalid; leave step out"):
-        build_body_model(lid_body(Plan(Morphology.straight(1))), "lid")
-
-
-def test_a_mild_pad_is_a_small_file_of_true_curves(tmp_path):
+def test_step_file_of_a_mild_pad_is_small_and_curved(tmp_path):
     """What a CAD user opens."""
     pad = mild_pad(1, 8, seed=2)
     plan = Plan(pad)

@@ -8,51 +8,10 @@ from build123d import Color, Cylinder, Location, Solid, Vector, import_step
 
 from padforge.fabricate.cad.step_file import CadPart, deduplicate, export_xcaf, write_step
 
-HEAD = "ISO-10303-21;\nHEADER;\nFILE_NAME('a','2000-01-01T00:00:00',(''),(''),'','','');\nENDSEC;\n"
-
-
-TAIL = "\nEND-ISO-10303-21;\n"
-
-
-def step(*entities: str) -> str:
-    lines = "".join(f"#{number} = {entity};\n" for number, entity in enumerate(entities, 1))
-    return f"{HEAD}DATA;\n{lines}ENDSEC;{TAIL}"
-
 
 def entities(text: str) -> dict[str, str]:
     data = text.partition("DATA;\n")[2].rpartition("ENDSEC;")[0]
     return dict(re.findall(r"^(#\d+)=(.*);$", data, re.MULTILINE))
-
-
-def test_deduplicate_keeps_geometry_once_and_in_few_digits():
-    text = deduplicate(
-        step(
-            "CARTESIAN_POINT('',(0.123456789,-1.E-09,2.))",
-            "CARTESIAN_POINT('',(0.12345678,0.,2.))",
-            "DIRECTION('',(0.,0.,1.))",
-            "DIRECTION('',(0.,0.,1.))",
-            "VECTOR('',#3,1.)",
-            "VECTOR('',#4,1.)",
-            "LINE('',#1,#5)",
-            "LINE('',#2,\n  #6)",
-            "EDGE_CURVE('',#10,#10,#7,.T.)",
-            "VERTEX_POINT('',#1)",
-            "EDGE_CURVE('',#10,#10,#8,.T.)",
-            "PRODUCT('vertical tracks','vertical tracks','',(#4))",
-        )
-    )
-    assert text.startswith(HEAD)
-    assert text.endswith(TAIL)
-    assert list(entities(text).values()) == [
-        "CARTESIAN_POINT('',(0.123457,0.,2.))",
-        "DIRECTION('',(0.,0.,1.))",
-        "VECTOR('',#2,1.)",
-        "LINE('',#1,#3)",
-        "EDGE_CURVE('',#6,#6,#4,.T.)",
-        "VERTEX_POINT('',#1)",
-        "EDGE_CURVE('',#6,#6,#4,.T.)",
-        "PRODUCT('vertical tracks','vertical tracks','',(#2))",
-    ]
 
 
 def assembly() -> CadPart:

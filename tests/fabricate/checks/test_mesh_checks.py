@@ -8,7 +8,7 @@ from manifold3d import Manifold, OpType
 
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
-from padforge.fabricate.checks.surface import TriangleMesh, compute_min_width, fill_outline, find_narrow_parts
+from padforge.fabricate.checks.surface import TriangleMesh
 from padforge.fabricate.settings import PrinterSettings
 from tests.fabricate.checks.trays import CROSS, FLOOR, block, check_body, failures, has_position_near, line, prism, tray
 
@@ -166,40 +166,3 @@ class TestLeaks:
             slot = prism(line((6, 2), (14, 2), width=3.0), low, high)
             solid = Manifold.batch_boolean([tray(draft_deg=0), foot], OpType.Add) - slot
             assert check_body(solid)["tight"].status == status
-
-
-@pytest.mark.parametrize(("height", "rise"), [(1.9e-3, 1.0), (0.9e-3, 0.0)])
-def test_needles_have_no_normal(height, rise):
-    mesh = TriangleMesh.weld([[0, 0, 0], [2, 0, 0], [1, height, 0]], [[0, 1, 2]])
-    assert mesh.normal_z.tolist() == [rise]
-    slanted = TriangleMesh.weld([[0, 0, 0], [2, 0, 0], [0, 3, 4]], [[0, 1, 2]])
-    assert slanted.normal_z == pytest.approx([0.6])
-    assert slanted.areas == pytest.approx([5])
-
-
-class TestAreas:
-    bar = shapely.box(0, 0, 10, 0.3)
-    block = shapely.box(0, 0, 10, 5)
-
-    def test_find_narrow_parts_measures_a_bar(self):
-        (part,), width = find_narrow_parts(self.bar, 0.4)
-        assert part.area == pytest.approx(self.bar.area, rel=1e-3)
-        assert width == pytest.approx(0.3, abs=0.011)
-        assert len(find_narrow_parts(self.bar, 0.31)[0]) == len(find_narrow_parts(self.block, 4.9)[0]) == 0
-        assert compute_min_width(self.block, 1.0) == pytest.approx(5, rel=0.03)
-
-    @pytest.mark.parametrize(("neck", "narrow"), [(0.7, False), (1.5, True)])
-    def test_find_narrow_parts_ignores_tips(self, neck, narrow):
-        """A peg 0.3 wide on a block: the tip of it up to twice the least width long, a thin wall beyond."""
-        peg = shapely.union(self.block, shapely.box(4, 5, 4.3, 5 + neck))
-        assert bool(len(find_narrow_parts(peg, 0.4)[0])) == narrow
-
-    def test_find_narrow_parts_finds_bridges(self):
-        bridge = shapely.union_all([self.block, shapely.box(4, 5, 4.3, 5.5), shapely.box(0, 5.5, 10, 9)])
-        assert len(find_narrow_parts(bridge, 0.4)[0]) == 1
-
-    @pytest.mark.parametrize(("slot", "closed"), [(1.9, True), (2.1, False)])
-    def test_fill_outline_closes_slots_of_two_millimetres(self, slot, closed):
-        ring = shapely.box(-10, -10, 10, 10).difference(shapely.box(-8, -8, 8, 8))
-        cut = ring.difference(shapely.box(5, -slot / 2, 20, slot / 2))
-        assert fill_outline(cut).contains(shapely.Point(0, 0)) == closed

@@ -142,14 +142,6 @@ def test_only_failures_and_warnings_are_marked(mould_picture):
     assert all(count > 0 for count in marked(*MARKED))
 
 
-@pytest.mark.slow
-def test_checks_have_different_marks(mould_picture):
-    place = (0.0, 4.0)
-    both = [finding("fail", place), finding("fail", place, name="bend")]
-    same = [finding("fail", place, place), finding("fail", name="bend")]
-    assert has_colour(mould_picture(*both), ALARM).sum() > 1.3 * has_colour(mould_picture(*same), ALARM).sum()
-
-
 def test_tracks_have_fibres_and_crossings_of_one_family(tmp_path):
     for name, plan in (("crossed", PLAN), ("level", Plan(level_pad(1.0, 2.0)))):
         draw_tracks(plan, tmp_path / name)
@@ -182,17 +174,3 @@ def test_pictures_are_small(tmp_path, published):
     draw_tracks(plan, tmp_path / "tracks")
     draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
-
-
-DRAWINGS = {
-    "mesh": lambda path: draw_findings(np.eye(3), [[0, 1, 2]], MARKED, path),
-    "mould": lambda path: draw_mould(PLAN, MARKED, path),
-    "tracks": lambda path: draw_tracks(PLAN, path),
-}
-
-
-@pytest.mark.parametrize("name", ["mesh", *(pytest.param(n, marks=pytest.mark.slow) for n in ("mould", "tracks"))])
-def test_pictures_are_reproducible(tmp_path, name):
-    for file in ("first", "second"):
-        DRAWINGS[name](tmp_path / file)
-    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, import_mat
-from padforge.sense.health.fault_detector import FibreFault, fibre_mask_of
+from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer.calibration import calibrate_scales, known_measures, split_presses, unlearnt_lines
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.network import predict_members
@@ -191,7 +191,7 @@ def test_calibrate_reports_divergence(recording: Recording, monkeypatch: pytest.
 def test_predict_masks_a_fault_from_its_first_press(localizer: LocalizerModel, recording: Recording) -> None:
     whole, without = (localizer.predict(recording, lost).positions_mm for lost in ((), (1,)))
     found = localizer.predict(
-        recording, fibre_mask=fibre_mask_of([FibreFault(9, 5, (1,), "weak", 6.0)], len(recording.down_command), 4)
+        recording, fibre_mask=mask_faults([FibreFault(9, 5, (1,), "weak", 6.0)], len(recording.down_command), 4)
     ).positions_mm
     assert (np.abs(whole - without).max(axis=1) > 1e-3)[:10].all()
     np.testing.assert_allclose(found[:5], whole[:5], atol=1e-4)

@@ -1,7 +1,7 @@
 """The estimator: fitted to recordings and arrays, within scikit-learn's tools, and read back from files."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarr
     missing = x[200:].copy()
     missing[:, 1] = np.nan
     assert np.array_equal(fitted.predict(missing).positions_mm, fitted.predict(x[200:], [1]).positions_mm)
-    again = clone(fitted).fit(x[:200], y[:200])
+    again = cast("Localizer", clone(fitted)).fit(x[:200], y[:200])
     assert np.array_equal(again.predict(x).positions_mm, fitted.predict(x).positions_mm)
 
 

@@ -100,9 +100,9 @@ def test_presses_that_another_program_has_just_made_count(folder: Path, monkeypa
         monkeypatch.undo()
         with Recorder.resume(folder) as another:
             another.append([another.last_s + 1], np.zeros((1, another.fibres)))
-            another.begin((0, 0), another.readings, press=9999)
+            another.begin((0, 0), another.n_readings, press=9999)
             another.append([another.last_s + 1], np.zeros((1, another.fibres)))
-            another.finish(another.readings)
+            another.finish(another.n_readings)
 
     monkeypatch.setattr("padforge.sense.recording.run_directory.lock", last_made)
     with Recorder.resume(folder) as recorder:

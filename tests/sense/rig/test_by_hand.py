@@ -320,8 +320,8 @@ class Inverted(PressDetector):
         super().__init__(fibres)
         self._reading, self._inverted, self._touched = 0, False, list[int]()
 
-    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
-        events = super().feed(times_s, readings)
+    def update(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
+        events = super().update(times_s, readings)
         self._reading += 1
         self._touched += [event.reading for event in events if event.down]
         if Inverted.once and len(self._touched) == 8 and self._reading == self._touched[-1] + 5:
@@ -400,8 +400,8 @@ def test_session_raises_a_full_disk(hands, monkeypatch: pytest.MonkeyPatch) -> N
 class Resting(Finger):
     """Leaves the hand on the pad at its third press, for long."""
 
-    def _touch(self, at_s: float) -> tuple[np.ndarray, float]:
-        place, depth = super()._touch(at_s)
+    def _touch(self, time_s: float) -> tuple[np.ndarray, float]:
+        place, depth = super()._touch(time_s)
         if len(self.strokes) == 3 and self.strokes[2].up_s < np.inf:
             self.strokes[2].up_s = self.strokes[2].down_s + 10.0
         return place, depth
