@@ -33,7 +33,10 @@ def test_parse_columns_reads_names_and_units() -> None:
         ColumnEntry("fibres", "ü", 1e-6),
         *(ColumnEntry("x", "px", 10), ColumnEntry("y", "py", None), ColumnEntry("press", "contact", None)),
     ]
-    units = ["time=t:min,fibres=c:V,positions=p:um,depth=d:m,force=f:mN", "time=t:us,fibres=c:mV,reached=r:mm,force=f:N"]
+    units = [
+        "time=t:min,fibres=c:V,positions=p:um,depth=d:m,force=f:mN",
+        "time=t:us,fibres=c:mV,reached=r:mm,force=f:N",
+    ]
     factors = [[entry.factor for entry in parse_columns(each)] for each in units]
     assert factors == [[60, 1, 1e-3, 1000, 1e-3], [1e-6, 1e-3, 1, 1]]
 
@@ -121,7 +124,10 @@ def test_assemble_recording_accepts_fibres_as_rows_or_columns() -> None:
     one = assembled(COMMANDS | {"fibres": VOLTS[:, 0], "time": TIMES[None]})
     assert np.array_equal(one.readings, VOLTS[:, :1])
     arrays = [(ColumnEntry("time", ""), TIMES), (ColumnEntry("fibres", ""), VOLTS[:, 1])]
-    arrays += [(ColumnEntry("fibres", "", 2.0), VOLTS.T), *((ColumnEntry(name, ""), COMMANDS[name]) for name in COMMANDS)]
+    arrays += [
+        (ColumnEntry("fibres", "", 2.0), VOLTS.T),
+        *((ColumnEntry(name, ""), COMMANDS[name]) for name in COMMANDS),
+    ]
     several = assemble_recording(Path("f"), arrays, {})
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
 
@@ -175,7 +181,10 @@ def test_assemble_recording_detects_presses_in_the_readings(recording: Recording
         (COMMANDS | {"positions": np.ones((3, 2))}, "positions are 3, expected one for each of 2 presses or 12"),
         (COMMANDS | {"positions": np.ones((2, 2, 2))}, r"positions have shape \(2, 2, 2\)"),
         (COMMANDS | {"x": np.ones(2), "y": np.ones(3)}, "x has 2 values and y 3"),
-        ({"positions": np.where(np.arange(24).reshape(12, 2) == 6, 1.0, np.nan)}, "positions have one of x and y in row 3"),
+        (
+            {"positions": np.where(np.arange(24).reshape(12, 2) == 6, 1.0, np.nan)},
+            "positions have one of x and y in row 3",
+        ),
         ({}, "has no press"),
     ],
 )

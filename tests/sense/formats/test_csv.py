@@ -116,7 +116,10 @@ def test_import_csv_by_columns_of_measures(tmp_path: Path) -> None:
     ("mapping", "message"),
     [
         ("time=note,fibres=ch*", "line 3 holds no numbers .could not convert string to float: 'begin'"),
-        ("time=t_ms,fibres=ch*,down_command=px,up_command=py", "mapping has 'down_command=px'.* one of time, fibres, x, y, depth"),
+        (
+            "time=t_ms,fibres=ch*,down_command=px,up_command=py",
+            "mapping has 'down_command=px'.* one of time, fibres, x, y, depth",
+        ),
         ("time=px,fibres=ch*:mV", "times do not ascend"),
         ("time=t_ms,fibres=c*:mV,press=ch2", "press is nowhere 0"),
     ],
@@ -130,9 +133,7 @@ def test_import_csv_refuses_columns_that_do_not_fit(tmp_path: Path, mapping: str
 MEASURED = ("depth_mm", "reached_mm", "force_n")
 
 
-def test_export_csv_round_trip_and_columns_of_measures(
-    brief: Recording, tmp_path: Path
-) -> None:
+def test_export_csv_round_trip_and_columns_of_measures(brief: Recording, tmp_path: Path) -> None:
     count = len(brief.down_command)
     forces = np.where(np.arange(count) < 9, np.nan, 2.5)
     for change, columns in (

@@ -126,7 +126,10 @@ def test_import_hdf5_by_columns(tmp_path: Path) -> None:
     lab(tmp_path)
     present = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     for mapping, reason in (
-        ("", f"format is None, expected 'padforge-hdf5/2'; columns (--columns) say what other datasets hold, {present}"),
+        (
+            "",
+            f"format is None, expected 'padforge-hdf5/2'; columns (--columns) say what other datasets hold, {present}",
+        ),
         ("time=/s,fibres=data/volts", "time is 's', expected one of 'data/volts', 'note'"),
         ("time=t,fibres=data", "fibres is 'data', expected one of"),
         ("time=t,fibres=note", "note holds object values, expected an array of real numbers"),

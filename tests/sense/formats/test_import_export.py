@@ -32,10 +32,10 @@ def test_export_file_round_trip_with_missing_values(eight: Recording, tmp_path: 
         eight.save(tmp_path / name, {})
     else:
         export_file(eight, tmp_path / name)
-    found = open_recording(tmp_path / name)
-    assert found == eight
-    assert found.digest == eight.digest
-    assert found.has_position.sum() == 7
+    imported = open_recording(tmp_path / name)
+    assert imported == eight
+    assert imported.digest == eight.digest
+    assert imported.has_position.sum() == 7
 
 
 def unrelated(folder: Path) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, import_bag
 from padforge.sense.formats import ros_bag
 
-from .foreign import STORE, array, channel, chunk, make, mcap_file, message, record, text, write_bag
+from .foreign import STORE, array, channel, chunk, make, mcap_file, message, record, write_bag
 
 FLOATS = "std_msgs/msg/Float64MultiArray"
 MAX_PEAK_BYTES = 2**30
