@@ -132,7 +132,9 @@ def _read_storage(
     return (_read_mcap if path.suffix.lower() == ".mcap" else _read_sqlite)(path, is_selected)
 
 
-def _read_mcap(path: Path, is_selected: Callable[[str, str, str], bool]) -> Generator[tuple[str, int, bytes], None, None]:
+def _read_mcap(
+    path: Path, is_selected: Callable[[str, str, str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
     from rosbags.rosbag2 import storage_mcap
 
     storage = storage_mcap.McapReader(path)
@@ -185,7 +187,9 @@ def _bounded(compression: str) -> Callable[[bytes, int], bytes]:
     return decompress
 
 
-def _read_sqlite(path: Path, is_selected: Callable[[str, str, str], bool]) -> Generator[tuple[str, int, bytes], None, None]:
+def _read_sqlite(
+    path: Path, is_selected: Callable[[str, str, str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
     with closing(sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)) as database:
         _check_tables(database, path.stat().st_size)
         topics = {

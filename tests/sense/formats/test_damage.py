@@ -28,7 +28,7 @@ def stored(eight: Recording, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         scipy.io.savemat(folder / name, published, do_compression=name == "packed.mat")
     for export, name in ((export_csv, "r.csv"), (export_hdf5, "r.h5"), (export_bag, "r.mcap")):
         export(eight, folder / name)
-    messages = [("/pad/readings", 0.1 * at, array("Float64MultiArray", np.array([1.0, at % 8 / 8]))) for at in range(60)]
+    messages = [("/pad/readings", i / 10, array("Float64MultiArray", np.array([1.0, i % 8 / 8]))) for i in range(60)]
     messages += [("/pad/pressed", 2.0, make("Bool", True)), ("/pad/pressed", 4.0, make("Bool", False))]
     write_bag(folder / "bag", messages, packed=True).rename(folder / "packed.mcap")
     write_bag(folder / "bag2", messages, "sqlite3").rename(folder / "plain.db3")
