@@ -228,8 +228,8 @@ def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mappin
         return values[np.clip((down + up) // 2, 0, len(times) - 1)]
 
     measures: dict[str, Any] = {MEASURES[name]: at_presses(name, columns[name]) for name in MEASURES if name in columns}
-    at = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
-    return Recording(readings, times, np.where(at == UNKNOWN, np.nan, at), down, up, source, **measures)
+    presses_mm = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
+    return Recording(readings, times, np.where(presses_mm == UNKNOWN, np.nan, presses_mm), down, up, source, **measures)
 
 
 def _scaled(entry: ColumnEntry, array: NDArray[Any]) -> Array:

@@ -83,9 +83,9 @@ def import_hdf5(path: str | Path, columns: str = "") -> Recording:
             arrays = [(entry, file.read(file.names[i])) for entry, indices in matched for i in indices]
         return assemble_recording(path, arrays, {"kind": "hdf5", "file": path.name, "columns": columns})
     with open_hdf5(path) as file:
-        if (found := file.read_text("format")) != FORMAT:
+        if (file_format := file.read_text("format")) != FORMAT:
             raise InputError(
-                f"format is {found!r}, expected {FORMAT!r}; columns (--columns) say what other datasets hold, "
+                f"format is {file_format!r}, expected {FORMAT!r}; columns (--columns) say what other datasets hold, "
                 f"there are {join_names(file.names)}"
             )
         content: dict[str, Any] = {attribute: file.read(name) for name, attribute in _DATASETS.items()}

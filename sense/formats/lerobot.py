@@ -121,7 +121,7 @@ def _write(
     ends = np.cumsum(lengths)
     starts = ends - lengths
     frame_bytes = sum(values[:1].nbytes for values in columns.values())
-    files = (ends - 1) * frame_bytes // (FILE_MB * 2**20)
+    files = (ends - 1) * frame_bytes // int(FILE_MB * 2**20)
     table = pa.table({name: _to_arrow(values) for name, values in columns.items()})
     for number in np.unique(files):
         in_file = np.flatnonzero(files == number)

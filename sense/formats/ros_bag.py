@@ -7,7 +7,7 @@ opened read-only, and must consist of plain tables that hold no more than the fi
 
 import re
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -116,7 +116,7 @@ def _one_line_errors(path: Path) -> Iterator[None]:
 
 def _read_storage(
     path: Path, types: dict[str, str], is_wanted: Callable[[str], bool]
-) -> Iterator[tuple[str, int, bytes]]:
+) -> Generator[tuple[str, int, bytes], None, None]:
     """Yield topic, stamp and content of the messages asked for, and add the types of all topics."""
 
     def is_selected(name: str, msgtype: str, encoding: str) -> bool:
@@ -132,7 +132,9 @@ def _read_storage(
     return (_read_mcap if path.suffix.lower() == ".mcap" else _read_sqlite)(path, is_selected)
 
 
-def _read_mcap(path: Path, is_selected: Callable[[str, str, str], bool]) -> Iterator[tuple[str, int, bytes]]:
+def _read_mcap(
+    path: Path, is_selected: Callable[[str, str, str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
     from rosbags.rosbag2 import storage_mcap
 
     storage = storage_mcap.McapReader(path)
@@ -185,7 +187,9 @@ def _bounded(compression: str) -> Callable[[bytes, int], bytes]:
     return decompress
 
 
-def _read_sqlite(path: Path, is_selected: Callable[[str, str, str], bool]) -> Iterator[tuple[str, int, bytes]]:
+def _read_sqlite(
+    path: Path, is_selected: Callable[[str, str, str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
     with closing(sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)) as database:
         _check_tables(database, path.stat().st_size)
         topics = {

@@ -122,8 +122,8 @@ def import_bag(path: str | Path, columns: str = "") -> Recording:
 
 def _import_exported(store: "Typestore", path: Path) -> Recording:
     """Read a bag that was exported: exactly as it was if all messages still agree, else as the messages say."""
-    own = (READINGS, PRESSED, PLACE, REACHED, FORCE)
-    raw, types = read_bag(path, {*own, RECORDING}.__contains__)
+    number_topics = (READINGS, PRESSED, PLACE, REACHED, FORCE)
+    raw, types = read_bag(path, {*number_topics, RECORDING}.__contains__)
     if READINGS not in raw:
         raise InputError(
             f"{path}: has no topic {READINGS}; columns (--columns) say what other topics hold, "
@@ -134,7 +134,7 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {TOPICS[name].msgtype}")
-        topics = {name: decode(store, raw[name], TOPICS[name].paths) for name in own if name in raw}
+        topics = {name: decode(store, raw[name], TOPICS[name].paths) for name in number_topics if name in raw}
         if RECORDING in raw:
             if (recording := _restore(decode_text(store, raw[RECORDING]), topics)) is not None:
                 return recording

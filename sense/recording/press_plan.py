@@ -157,7 +157,8 @@ def sample_uniform(corners_mm: Array, count: int, rng: np.random.Generator, is_p
 def _grid(corners_mm: Array, count: int, serpentine: bool) -> tuple[Array, Indices]:
     """Return at least `count` positions (Q, 2) of a grid row by row, and the index of the depth of each (Q,)."""
     low, high = corners_mm
-    n_columns, n_rows = _grid_shape(*(high - low).tolist(), count)
+    width, height = (high - low).tolist()
+    n_columns, n_rows = _grid_shape(width, height, count)
     x = np.linspace(low[0], high[0], n_columns) if n_columns > 1 else corners_mm[:, 0].mean(keepdims=True)
     y = np.linspace(low[1], high[1], n_rows) if n_rows > 1 else corners_mm[:, 1].mean(keepdims=True)
     columns = np.tile(np.arange(n_columns), (n_rows, 1))

@@ -30,7 +30,7 @@ import rec --out r                              | rec: ends in '', allowed are .
 import noise.csv --columns time=t,fibres=b --out r  | noise.csv: time is 't', expected one of 'a', 'b'
 export rec set --model model                    | allowed are .csv, .h5, .mcap, or --format lerobot
 export rec r.bag --model model                  | allowed are .csv, .h5, .mcap, or --format lerobot
-export rec r.h5 --model model                   | r.h5: what a model says can be written as .mcap or lerobot only
+export rec r.h5 --model model                   | r.h5: predictions of a model can be written as .mcap or lerobot only
 export rec pad.toml/r.csv                       | pad.toml
 export rec model --format lerobot               | model: exists and is not empty
 calibrate . --out m                             | .: no recording, expected a folder with start.json

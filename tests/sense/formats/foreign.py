@@ -1,4 +1,4 @@
-"""Bags as others make them, by rosbags and by hand."""
+"""Bags of other programs, written by rosbags and by hand."""
 
 import struct
 from collections.abc import Iterable, Sequence
@@ -12,11 +12,11 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 PACKAGES = ("std_msgs", "geometry_msgs", "builtin_interfaces")
 MAGIC = b"\x89MCAP0\r\n"
 Message = tuple[str, float, Any]
-"""Topic, time in s and content."""
+"""Topic, time in s and message."""
 
 
 def make(kind: str, *fields: Any) -> Any:
-    """A message of a type, by its short name, with the values of its fields."""
+    """Make a message of a type, by its short name."""
     name = next(f"{package}/msg/{kind}" for package in PACKAGES if f"{package}/msg/{kind}" in STORE.types)
     return STORE.types[name](*fields)
 
@@ -39,7 +39,7 @@ def wrench(x: float, y: float, z: float) -> Any:
 
 
 def write_bag(folder: Path, messages: Iterable[Message], plugin: str = "mcap", packed: bool = False) -> Path:
-    """Write a rosbag2 folder of messages; its file."""
+    """Write a rosbag2 folder of messages; return its file."""
     opened = Writer(folder, version=8, storage_plugin=StoragePlugin[plugin.upper()])
     if packed:
         opened.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -53,7 +53,6 @@ def write_bag(folder: Path, messages: Iterable[Message], plugin: str = "mcap", p
 
 
 def record(code: int, body: bytes) -> bytes:
-    """A record of an MCAP file."""
     return struct.pack("<BQ", code, len(body)) + body
 
 
@@ -61,23 +60,23 @@ def text(value: str) -> bytes:
     return struct.pack("<I", len(value.encode())) + value.encode()
 
 
-def chunk(content: bytes, packing: str = "", size: int | None = None, checksum: int = 0) -> bytes:
-    """A chunk that says it holds `size` bytes."""
+def chunk(content: bytes, compression: str = "", size: int | None = None, checksum: int = 0) -> bytes:
+    """Make a chunk that claims `size` bytes."""
     claimed = len(content) if size is None else size
     return record(
-        6, struct.pack("<QQQI", 0, 0, claimed, checksum) + text(packing) + struct.pack("<Q", len(content)) + content
+        6, struct.pack("<QQQI", 0, 0, claimed, checksum) + text(compression) + struct.pack("<Q", len(content)) + content
     )
 
 
 def mcap_file(path: Path, records: Sequence[bytes]) -> Path:
-    """An MCAP file of these records."""
+    """Write an MCAP file of these records."""
     footer = record(2, bytes(20))
     path.write_bytes(MAGIC + record(1, text("ros2") + text("by hand")) + b"".join(records) + footer + MAGIC)
     return path
 
 
 def channel(number: int, topic: str, kind: str, encoding: str = "cdr") -> bytes:
-    """The records of a schema and a channel."""
+    """Make the records of a schema and a channel."""
     schema = record(3, struct.pack("<H", number) + text(kind) + text("ros2msg") + text(""))
     return schema + record(4, struct.pack("<HH", number, number) + text(topic) + text(encoding) + struct.pack("<I", 0))
 

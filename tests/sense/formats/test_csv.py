@@ -1,4 +1,4 @@
-"""Recordings as CSV, of padforge and of other programs: every number comes back, and other tables are refused."""
+"""Recordings from and to CSV."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +19,7 @@ def lines(rows: list[str], header: str = "time_s,a,b,x_mm,y_mm") -> str:
 FINE = ["0,1,2,,", "1,1,2,3,4", "2,1,2,3,4", "3,1,2,,", "4,1,2,-1,0", "5,1,2,,"]
 
 
-def test_unknown_places_and_missing_readings_are_told_by_their_cells(tmp_path: Path) -> None:
-    """A press lasts while its place stands on the line."""
+def test_import_csv_reads_unknown_positions_and_missing_readings(tmp_path: Path) -> None:
     rows = ["0,1,2,,", "1,,2,?,?", "2,nan,2,?,?", "3,1,2,,", "4,1,2,-1,0", "5,1,,,", "6,1,2,?,?", "7,1,2,,", ""]
     (tmp_path / "r.csv").write_text(lines(rows))
     recording = import_csv(tmp_path / "r.csv")
@@ -31,17 +30,17 @@ def test_unknown_places_and_missing_readings_are_told_by_their_cells(tmp_path: P
 
 
 @pytest.mark.parametrize("header", ["time_s,a,b,c,d", "time_s,a,b,c,d,x_mm,y_mm"])
-def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_path: Path, header: str) -> None:
+def test_import_csv_detects_presses_without_positions(recording: Recording, tmp_path: Path, header: str) -> None:
     table = np.column_stack([recording.times_s, recording.readings])
     end = ",," if "x_mm" in header else ""
     rows = [",".join(map(str, row)) + end for row in table[:1000].tolist()]
     (tmp_path / "r.csv").write_text(lines(rows, header))
-    found = import_csv(tmp_path / "r.csv")
-    assert not found.has_position.any()
-    assert len(found.down_command) == 25
-    assert np.abs(found.down_command - recording.down_command[:25]).max() <= 3
-    export_csv(found, tmp_path / "again.csv")
-    assert import_csv(tmp_path / "again.csv") == found
+    detected = import_csv(tmp_path / "r.csv")
+    assert not detected.has_position.any()
+    assert len(detected.down_command) == 25
+    assert np.abs(detected.down_command - recording.down_command[:25]).max() <= 3
+    export_csv(detected, tmp_path / "again.csv")
+    assert import_csv(tmp_path / "again.csv") == detected
 
 
 @pytest.mark.parametrize(
@@ -61,12 +60,12 @@ def test_presses_are_found_where_no_line_has_a_place(recording: Recording, tmp_p
         (lines([*FINE, ",1,2,,"]), r"times hold NaN.*row 6"),
         (lines([*FINE, "6,1,1e999,,"]), r"readings hold infinity.*row 6"),
         (lines([*FINE, "", "6,1,2,,"]), "line 8 has 0 values, expected 5"),
-        (lines(["0,1", "1,1"], "time_s,a"), "has no press: no place or number tells one, and none is found"),
+        (lines(["0,1", "1,1"], "time_s,a"), "has no press: no position or number tells of one, and none is detected"),
         (lines(["0,1,,1"], "time_s,x_mm,y_mm,a"), "line 2 has one of x_mm and y_mm"),
         (lines(FINE, "\x00" * 500), r"header is '\\x00.{0,40}', expected time_s"),
     ],
 )
-def test_other_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_import_csv_refuses_other_tables(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "r.csv").write_text(text)
     with pytest.raises(InputError, match=rf"r\.csv: .*{message}") as refused:
         import_csv(tmp_path / "r.csv")
@@ -84,7 +83,7 @@ t_ms;ch1;ch2;note;px;py;contact
 """
 
 
-def test_a_mapping_tells_what_other_columns_hold_in_any_unit_and_by_names_with_separators(tmp_path: Path) -> None:
+def test_import_csv_by_columns(tmp_path: Path) -> None:
     (tmp_path / "lab.csv").write_text(LAB)
     mapping = "time=t_ms:ms,fibres=ch*:mV,x=px:cm,y=py:cm,press=contact"
     recording = import_csv(tmp_path / "lab.csv", mapping)
@@ -92,19 +91,25 @@ def test_a_mapping_tells_what_other_columns_hold_in_any_unit_and_by_names_with_s
     np.testing.assert_allclose(recording.readings[:, 0], [1.0005, 1.001, np.nan, 1, 1, 1])
     assert recording.presses_mm.tolist() == [[15, 20], [-5, 20]]
     assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([1, 4], [3, 5])
-    assert recording.source == {"kind": "csv", "file": "lab.csv", "mapping": mapping}
+    assert recording.source == {"kind": "csv", "file": "lab.csv", "columns": mapping}
+
+
+def test_import_csv_by_names_with_separators(tmp_path: Path) -> None:
     rows = ["0,1,,,12:30", "1,1,?,?,1_0", "2,1,,,?", "3,1,2,-1,", "4,1,,,"]
     (tmp_path / "lab.csv").write_text("\n".join(['"t;s;x","a;b",px,py,note', *rows]) + "\n")
     for unit, value in (("cm", 10.0), ("um", 1e-3)):
         recording = import_csv(tmp_path / "lab.csv", f"time=t;s;x,fibres=a;b,x=px:{unit},y=py:{unit}")
         np.testing.assert_allclose(recording.presses_mm, [[np.nan, np.nan], [2 * value, -value]])
+
+
+def test_import_csv_by_columns_of_measures(tmp_path: Path) -> None:
     rows = [f"{0.1 * i},{1 + (i // 10 % 2)},{i // 10 % 2},{250 * (i // 20)},{0.1 * (i // 20)}" for i in range(60)]
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,force_mN,deep_cm", *rows]))
     mapping = "time=t,fibres=a,press=down,force=force_mN:mN,reached=deep_cm:cm"
-    found = import_csv(tmp_path / "r.csv", mapping)
-    assert found.forces_n.tolist() == [0, 0.25, 0.5]
-    assert found.reached_mm == pytest.approx([0, 1, 2])
-    assert np.isnan(found.depths_mm).all()
+    recording = import_csv(tmp_path / "r.csv", mapping)
+    assert recording.forces_n.tolist() == [0, 0.25, 0.5]
+    assert recording.reached_mm == pytest.approx([0, 1, 2])
+    assert np.isnan(recording.depths_mm).all()
 
 
 @pytest.mark.parametrize(
@@ -119,7 +124,7 @@ def test_a_mapping_tells_what_other_columns_hold_in_any_unit_and_by_names_with_s
         ("time=t_ms,fibres=c*:mV,press=ch2", "press is nowhere 0"),
     ],
 )
-def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path: Path, mapping: str, message: str) -> None:
+def test_import_csv_refuses_columns_that_do_not_fit(tmp_path: Path, mapping: str, message: str) -> None:
     (tmp_path / "lab.csv").write_text(LAB)
     with pytest.raises(InputError, match=message):
         import_csv(tmp_path / "lab.csv", mapping)
@@ -128,9 +133,7 @@ def test_a_mapping_that_does_not_fit_the_file_is_one_line(tmp_path: Path, mappin
 MEASURED = ("depth_mm", "reached_mm", "force_n")
 
 
-def test_every_number_comes_back_and_measures_have_columns_where_they_are_known(
-    brief: Recording, tmp_path: Path
-) -> None:
+def test_export_csv_round_trip_and_columns_of_measures(brief: Recording, tmp_path: Path) -> None:
     count = len(brief.down_command)
     forces = np.where(np.arange(count) < 9, np.nan, 2.5)
     for change, columns in (
@@ -160,7 +163,7 @@ def test_every_number_comes_back_and_measures_have_columns_where_they_are_known(
         lambda text: "#" + text.replace(",", ";").replace("-1", "-1e0"),
     ],
 )
-def test_programs_write_the_same_table_in_many_ways(tmp_path: Path, change) -> None:
+def test_import_csv_reads_tables_of_other_programs(tmp_path: Path, change) -> None:
     (tmp_path / "plain.csv").write_text(lines(FINE))
     (tmp_path / "r.csv").write_text(change(lines(FINE)), encoding="utf-8", newline="")
     assert import_csv(tmp_path / "r.csv") == import_csv(tmp_path / "plain.csv")
@@ -170,7 +173,7 @@ CELLS = ["1_0", "\u0661", "\uff11", "0x10", "1 2", '"1,5"', "two", "1e", "--1", 
 
 
 @pytest.mark.parametrize("separator", [",", ";"])
-def test_what_only_some_programs_take_for_a_number_is_refused_with_its_line(tmp_path: Path, separator: str) -> None:
+def test_csv_table_refuses_ambiguous_numbers(tmp_path: Path, separator: str) -> None:
     for cell in CELLS if separator == "," else [cell for cell in CELLS if cell != '"1,5"']:
         for comment in ("", "# here\n"):
             rows = [separator.join(row) for row in (("x_mm", "y_mm"), ("1", "2"), ("3", cell))]
@@ -193,19 +196,18 @@ def test_what_only_some_programs_take_for_a_number_is_refused_with_its_line(tmp_
         (b'x_mm,"y_mm\n1,2\n', "not a CSV file .unexpected end"),
     ],
 )
-def test_what_is_no_table_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+def test_csv_table_refuses_what_is_no_table(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "t.csv").write_bytes(content)
     with pytest.raises(InputError, match=rf"t\.csv: {message}") as refused:
         read_plan(tmp_path / "t.csv", 1.0)
     assert len(str(refused.value)) < 300 + len(str(tmp_path))
 
 
-def test_a_table_that_is_read_in_pieces_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 10 MB most are notes; a line that is no number is named by its number wherever it stands."""
+def test_csv_table_reads_large_files_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [f"{at},{at % 7},{at % 40 // 20},{'n' * 1000}" for at in range(10_000)]
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
-    found = import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
-    assert found.times_s.tolist() == list(range(10_000))
+    recording = import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
+    assert recording.times_s.tolist() == list(range(10_000))
     rows[9000] = rows[9000].replace("9000", "9OOO")
     (tmp_path / "r.csv").write_text("\n".join(["t,a,down,note", *rows]))
     with pytest.raises(InputError, match="line 9002 holds no numbers"):

@@ -1,4 +1,4 @@
-"""Recordings as HDF5: every number comes back; nothing is read from elsewhere, and little of what is claimed."""
+"""Recordings from and to HDF5."""
 
 import os
 from dataclasses import replace
@@ -15,8 +15,7 @@ from padforge.sense import Recording, export_hdf5, import_hdf5, open_recording
 MAPPING = "time=times_s,fibres=readings_v,positions=presses_mm,down_command=down_command,up_command=up_command"
 
 
-def refused(path: Path, mapping: str = "") -> str:
-    """The one line that a file is refused with."""
+def refusal_of(path: Path, mapping: str = "") -> str:
     with pytest.raises(InputError) as refusal:
         import_hdf5(path, mapping)
     line = str(refusal.value)
@@ -25,7 +24,7 @@ def refused(path: Path, mapping: str = "") -> str:
     return line
 
 
-def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path: Path, eight: Recording) -> None:
+def test_export_hdf5_round_trip_is_reproducible(tmp_path: Path, eight: Recording) -> None:
     for each, measures in (
         (eight, {"depths_mm", "reached_mm", "forces_n"}),
         (replace(eight, depths_mm=np.empty(0), reached_mm=np.empty(0)), {"forces_n"}),
@@ -40,23 +39,23 @@ def test_an_export_reads_back_the_same_and_is_reproducible(tmp_path: Path, eight
             assert set(file) - {"times_s", "readings_v", "presses_mm", "down_command", "up_command"} == measures
 
 
-def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
+def test_import_hdf5_refuses_other_files(tmp_path: Path, eight: Recording) -> None:
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = np.arange(3)
     os.mkfifo(tmp_path / "pipe.h5")
-    assert "format is None" in refused(tmp_path / "other.h5")
-    assert "cannot be read" in refused(tmp_path / "absent.h5")
-    assert "a pipe or device, expected a file" in refused(tmp_path / "pipe.h5")
+    assert "format is None" in refusal_of(tmp_path / "other.h5")
+    assert "cannot be read" in refusal_of(tmp_path / "absent.h5")
+    assert "a pipe or device, expected a file" in refusal_of(tmp_path / "pipe.h5")
     export_hdf5(eight, tmp_path / "a.h5")
     content = (tmp_path / "a.h5").read_bytes()
     for keep in (0, 10, 500, -1):
         (tmp_path / "torn.h5").write_bytes(content[:keep])
-        refused(tmp_path / "torn.h5")
+        refusal_of(tmp_path / "torn.h5")
     with h5py.File(tmp_path / "deep.h5", "w", libver="latest") as file:
         group = file
         for _ in range(300):
             group = group.create_group("g")
-    assert "it has groups within groups, more than 64" in refused(tmp_path / "deep.h5", "time=t,fibres=a")
+    assert "it has groups within groups, more than 64" in refusal_of(tmp_path / "deep.h5", "time=t,fibres=a")
 
 
 @pytest.mark.parametrize(
@@ -72,20 +71,20 @@ def test_other_files_are_refused(tmp_path: Path, eight: Recording) -> None:
         ({"readings_v": (2**29, 1, 2**20)}, "readings_v holds 536870912 values, allowed are 268435456 in all"),
     ],
 )
-def test_datasets_that_do_not_fit_or_claim_much_are_one_line(
+def test_import_hdf5_refuses_datasets_that_do_not_fit_or_claim_much(
     tmp_path: Path, change: dict[str, Any], reason: str
 ) -> None:
-    fine = {"times_s": np.arange(40.0), "readings_v": np.ones((40, 2)), "presses_mm": np.ones((1, 2))}
-    edges = {"down_command": np.array([20]), "up_command": np.array([40])}
+    valid = {"times_s": np.arange(40.0), "readings_v": np.ones((40, 2)), "presses_mm": np.ones((1, 2))}
+    commands = {"down_command": np.array([20]), "up_command": np.array([40])}
     with h5py.File(tmp_path / "r.h5", "w") as file:
         file.attrs["format"], file.attrs["source"] = "padforge-hdf5/2", "{}"
-        for name, values in (fine | edges | change).items():
+        for name, values in (valid | commands | change).items():
             if isinstance(values, str) and values == "group":
                 file.create_group(name)
             elif isinstance(values, tuple):
                 rows, columns, chunk = values
-                most = {"maxshape": (None, columns), "chunks": (chunk, 1 if columns == 1 else chunk)}
-                file.create_dataset(name, (rows, columns), "f8", compression="gzip", **most)[:8, 0] = 1
+                options = {"maxshape": (None, columns), "chunks": (chunk, 1 if columns == 1 else chunk)}
+                file.create_dataset(name, (rows, columns), "f8", compression="gzip", **options)[:8, 0] = 1
             elif values is not None:
                 file[name] = values
     assert (tmp_path / "r.h5").stat().st_size < 2e6
@@ -95,7 +94,7 @@ def test_datasets_that_do_not_fit_or_claim_much_are_one_line(
 
 
 def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
-    """A file of somebody's program, and what it holds; a change to None leaves a dataset out."""
+    """Write a foreign file; a change to None leaves a dataset out."""
     content: dict[str, Any] = {
         "t": np.arange(40.0) * 100,
         "data/volts": np.random.default_rng(0).integers(900, 1100, (3, 40)).astype(np.int16),
@@ -111,7 +110,7 @@ def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
     return content
 
 
-def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_import_hdf5_by_columns(tmp_path: Path) -> None:
     content = lab(tmp_path)
     mapping = "time=/t:ms,fibres=/data/volts:mV,positions=/xy:cm,down_command=/on,up_command=off"
     recording = import_hdf5(tmp_path / "lab.h5", mapping)
@@ -125,20 +124,23 @@ def test_a_mapping_tells_what_other_datasets_hold_or_is_refused_in_one_line(tmp_
     lab(tmp_path, **{"data/volts": None, "data/ch0": content["data/volts"][0], "data/ch1": content["data/volts"][1]})
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("volts", "ch*")).fibres == 2
     lab(tmp_path)
-    there = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
+    present = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     for mapping, reason in (
-        ("", f"format is None, expected 'padforge-hdf5/2'; columns (--columns) say what other datasets hold, {there}"),
+        (
+            "",
+            f"format is None, expected 'padforge-hdf5/2'; columns (--columns) say what other datasets hold, {present}",
+        ),
         ("time=/s,fibres=data/volts", "time is 's', expected one of 'data/volts', 'note'"),
         ("time=t,fibres=data", "fibres is 'data', expected one of"),
         ("time=t,fibres=note", "note holds object values, expected an array of real numbers"),
         ("time=on,fibres=data/volts:mV", "fibres have shape (3, 40), expected (2, C) or (C, 2)"),
     ):
-        assert reason in refused(tmp_path / "lab.h5", mapping)
+        assert reason in refusal_of(tmp_path / "lab.h5", mapping)
 
 
 @pytest.mark.parametrize("kind", ["external link", "soft link", "virtual", "external storage"])
-def test_nothing_is_read_from_another_file(tmp_path: Path, eight: Recording, kind: str) -> None:
-    """Neither a file that is there, nor a pipe that nobody writes to, which would hang."""
+def test_import_hdf5_reads_nothing_from_other_files(tmp_path: Path, eight: Recording, kind: str) -> None:
+    """Also not a pipe that nobody writes to, which would hang."""
     path = tmp_path / "r.h5"
     (tmp_path / "other").write_bytes(eight.readings.tobytes())
     os.mkfifo(tmp_path / "pipe")
@@ -159,6 +161,6 @@ def test_nothing_is_read_from_another_file(tmp_path: Path, eight: Recording, kin
                 storage = [(str(tmp_path / other), 0, eight.readings.nbytes)]
                 file.create_dataset("readings_v", eight.readings.shape, "f8", external=storage)
         for mapping in ("", MAPPING):
-            line = refused(path, mapping)
+            line = refusal_of(path, mapping)
             assert "readings_v" in line
             assert "expected" in line

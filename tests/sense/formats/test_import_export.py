@@ -1,4 +1,4 @@
-"""Import and export: the published recording, CSV, and files that are neither."""
+"""Import and export by extension, and arguments of all readers and writers."""
 
 from pathlib import Path
 from typing import Any
@@ -27,19 +27,19 @@ from padforge.sense.formats.import_export import arm_states, export_file
 
 
 @pytest.mark.parametrize("name", ["run", "run.csv", "run.h5", "run.mcap"])
-def test_what_is_missing_stays_missing_and_nothing_else_is(eight: Recording, tmp_path: Path, name: str) -> None:
+def test_export_file_round_trip_with_missing_values(eight: Recording, tmp_path: Path, name: str) -> None:
     if name == "run":
         eight.save(tmp_path / name, {})
     else:
         export_file(eight, tmp_path / name)
-    found = open_recording(tmp_path / name)
-    assert found == eight
-    assert found.digest == eight.digest
-    assert found.has_position.sum() == 7
+    imported = open_recording(tmp_path / name)
+    assert imported == eight
+    assert imported.digest == eight.digest
+    assert imported.has_position.sum() == 7
 
 
 def unrelated(folder: Path) -> dict[str, bytes]:
-    """What files of other kinds hold, by their names."""
+    """Return the content of files of other kinds, by name."""
     image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8))
     for kind in ("png", "jpeg", "bmp", "tiff"):
         image.save(folder / f"image.{kind}")
@@ -55,7 +55,7 @@ def unrelated(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("end", ["mat", "csv", "h5", "mcap", "db3"])
-def test_files_of_another_kind_are_one_line_and_no_recording(tmp_path: Path, end: str) -> None:
+def test_import_refuses_files_of_another_kind(tmp_path: Path, end: str) -> None:
     for name, content in unrelated(tmp_path).items():
         file = tmp_path / f"{name.strip('.')}.{end}"
         file.write_bytes(content)
@@ -68,7 +68,7 @@ def test_files_of_another_kind_are_one_line_and_no_recording(tmp_path: Path, end
         assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_for_a_file_and_a_file_for_a_folder_are_one_line(brief: Recording, tmp_path: Path) -> None:
+def test_readers_and_writers_refuse_folders_for_files(brief: Recording, tmp_path: Path) -> None:
     for read, end in ((import_csv, "csv"), (import_mat, "mat"), (import_hdf5, "h5"), (import_bag, "mcap")):
         (tmp_path / f"folder.{end}").mkdir()
         for path in (tmp_path / f"folder.{end}", tmp_path / f"absent.{end}"):
@@ -82,7 +82,7 @@ def test_a_folder_for_a_file_and_a_file_for_a_folder_are_one_line(brief: Recordi
             export_csv(brief, path)
 
 
-def test_states_of_an_arm_are_read_from_a_run_directory_that_has_them(tmp_path: Path) -> None:
+def test_arm_states_of_a_run_directory(tmp_path: Path) -> None:
     states = np.arange(30.0).reshape(3, 10)
     with Recorder(tmp_path / "run", 1, {}, {}) as recorder:
         recorder.append([0.0, 1.0], [[1.0], [2.0]])
@@ -95,17 +95,16 @@ def test_states_of_an_arm_are_read_from_a_run_directory_that_has_them(tmp_path: 
 
 
 OTHERS: tuple[Any, ...] = (None, 3, b"x", ["a"], object())
-"""What is no path, no text, no recording."""
 
 
-def test_what_is_no_path_mapping_or_recording_is_refused_in_one_line(brief: Recording, tmp_path: Path) -> None:
+def test_readers_and_writers_refuse_other_arguments(brief: Recording, tmp_path: Path) -> None:
     readers = (import_csv, import_mat, import_hdf5, import_bag)
     for other in OTHERS:
         for read in (*readers, open_recording, Recording.open, Recorder.resume):
             with pytest.raises(InputError, match=r"path is .*, expected a path"):
                 read(other)
         for read in readers:
-            with pytest.raises(InputError, match=r"mapping is .*, expected a str"):
+            with pytest.raises(InputError, match=r"columns is .*, expected a str"):
                 read("file", other)
         for write in (export_csv, export_hdf5, export_bag, export_lerobot):
             with pytest.raises(InputError, match=r"recording is .*, expected a Recording"):
@@ -116,7 +115,7 @@ def test_what_is_no_path_mapping_or_recording_is_refused_in_one_line(brief: Reco
             with pytest.raises(InputError, match=r"path is .*, expected a path"):
                 make(other)
     for write in (export_bag, export_lerobot):
-        with pytest.raises(InputError, match="findings is 3, expected a ModelAnnotations"):
+        with pytest.raises(InputError, match="annotations is 3, expected a ModelAnnotations"):
             write(brief, tmp_path / "x", 3)  # pyright: ignore[reportArgumentType]
     for states in (np.ones((3, 9)), np.ones(10), "a", 3.0):
         with pytest.raises(InputError, match="states"):

@@ -1,4 +1,4 @@
-"""LeRobot datasets: each is checked for what the reader of lerobot 0.6 takes for granted of format v3.0."""
+"""LeRobot datasets, checked for what the reader of lerobot 0.6 requires of format v3.0."""
 
 import json
 from dataclasses import replace
@@ -22,12 +22,12 @@ STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", 
 
 @pytest.fixture(scope="module")
 def eight(eight: Recording) -> Recording:
-    """Eight presses of known depth, one of them at an unknown place, with readings that are missing."""
+    """Eight presses of known depth, one at an unknown position, with missing readings."""
     return replace(eight, depths_mm=np.where(np.isnan(eight.depths_mm), 1.5, eight.depths_mm))
 
 
-def checked(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
-    """What a dataset says of itself, its columns and its episodes, after all that the format asks for was looked at."""
+def check_dataset(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
+    """Check a dataset; return its info, columns and episodes."""
     info = json.loads((folder / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     assert info["fps"] > 0
@@ -47,7 +47,7 @@ def checked(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[d
 
 
 def read_columns(folder: Path, info: dict[str, Any], episodes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """All frames, from the files in which the episodes say that they lie, a group of rows for each episode."""
+    """Return all frames, from the files that the episodes name, one row group an episode."""
     parts: list[dict[str, np.ndarray]] = []
     path = folder
     files = sorted({(each["data/chunk_index"], each["data/file_index"]) for each in episodes})
@@ -89,14 +89,14 @@ def check_counts(info: dict, columns: dict[str, np.ndarray], episodes: list[dict
 
 
 def check_statistics(folder: Path, info: dict, columns: dict[str, np.ndarray], episodes: list[dict]) -> None:
-    whole = json.loads((folder / "meta" / "stats.json").read_text())
-    assert set(whole) == set(info["features"])
+    overall = json.loads((folder / "meta" / "stats.json").read_text())
+    assert set(overall) == set(info["features"])
     for name, values in columns.items():
-        assert set(whole[name]) == STATISTICS
+        assert set(overall[name]) == STATISTICS
         rows = values.reshape(len(values), -1).astype(float)
         spans = [(each["dataset_from_index"], each["dataset_to_index"]) for each in episodes]
-        told = [{key: each[f"stats/{name}/{key}"] for key in STATISTICS} for each in episodes]
-        for (start, end), about in zip([(0, len(rows)), *spans], [whole[name], *told], strict=True):
+        of_episodes = [{key: each[f"stats/{name}/{key}"] for key in STATISTICS} for each in episodes]
+        for (start, end), about in zip([(0, len(rows)), *spans], [overall[name], *of_episodes], strict=True):
             part = rows[start:end]
             assert about["count"] == [len(part)]
             for key, expected in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
@@ -104,20 +104,20 @@ def check_statistics(folder: Path, info: dict, columns: dict[str, np.ndarray], e
             np.testing.assert_allclose(about["q90"], np.nanquantile(part, 0.9, axis=0), rtol=1e-5)
 
 
-def test_a_dataset_has_all_that_the_format_asks_for(eight: Recording, tmp_path: Path) -> None:
+def test_export_lerobot_writes_the_format(eight: Recording, tmp_path: Path) -> None:
     export_file(eight, tmp_path / "set", "lerobot")
-    info, columns, episodes = checked(tmp_path / "set")
+    info, columns, episodes = check_dataset(tmp_path / "set")
     assert info["fps"] == 13
     assert len(episodes) == 7
     assert info["features"]["observation.state"]["names"] == [f"fibre_{i}_v" for i in range(4)]
     assert info["features"]["action"]["names"] == ["x_mm", "y_mm", "depth_mm", "down"]
     assert [file.name for file in tmp_path.iterdir()] == ["set"]
-    kept = np.delete(np.arange(8), 2)
-    for press, episode in zip(kept, episodes, strict=True):
+    presses = np.delete(np.arange(8), 2)
+    for press, episode in zip(presses, episodes, strict=True):
         rows = slice(episode["dataset_from_index"], episode["dataset_to_index"])
         action = columns["action"][rows]
-        told = [*eight.presses_mm[press], eight.depths_mm[press]]
-        np.testing.assert_allclose(action[:, :3], np.tile(told, (len(action), 1)), rtol=1e-6)
+        expected = [*eight.presses_mm[press], eight.depths_mm[press]]
+        np.testing.assert_allclose(action[:, :3], np.tile(expected, (len(action), 1)), rtol=1e-6)
         down = np.flatnonzero(action[:, 3])
         first = (0 if press == 0 else (eight.up_command[press - 1] + eight.down_command[press]) // 2) + down[0]
         assert (first, len(down)) == (eight.down_command[press], eight.up_command[press] - eight.down_command[press])
@@ -128,13 +128,13 @@ def test_a_dataset_has_all_that_the_format_asks_for(eight: Recording, tmp_path: 
         np.testing.assert_allclose(columns["observation.time"][rows], times - times[0], atol=1e-5)
 
 
-def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recording, tmp_path: Path) -> None:
-    known = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm), forces_n=np.arange(8.0))
+def test_export_lerobot_puts_every_frame_in_an_episode(eight: Recording, tmp_path: Path) -> None:
+    positioned = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm), forces_n=np.arange(8.0))
     nan = np.full(8, np.nan)
     touches = ModelAnnotations(np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), nan, nan)
-    export_lerobot(known, tmp_path / "set", touches)
-    info, columns, _ = checked(tmp_path / "set")
-    assert info["total_frames"] == len(known.readings)
+    export_lerobot(positioned, tmp_path / "set", touches)
+    info, columns, _ = check_dataset(tmp_path / "set")
+    assert info["total_frames"] == len(positioned.readings)
     assert info["features"]["observation.touch"]["names"] == ["x_mm", "y_mm", "r90_mm", "valid"]
     over = columns["observation.touch"][:, 3] == 1
     assert set(map(tuple, columns["observation.touch"][over])) == {(3.0, 3.0, 2.5, 1.0)}
@@ -144,14 +144,14 @@ def test_every_frame_is_in_one_episode_where_all_places_are_known(eight: Recordi
 
 
 @pytest.mark.parametrize(("slower", "fps"), [(1.0, 13), (10.0, 1.34), (0.05, 268)])
-def test_rates_are_whole_if_that_is_near_long_recordings_go_to_several_files_and_one_fibre_is_a_number(
+def test_export_lerobot_rounds_rates_and_splits_files(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slower: float, fps: float
 ) -> None:
     monkeypatch.setattr(lerobot, "FILE_MB", 100 * 50 / 2**20)
     monkeypatch.setattr(lerobot, "CHUNK_FILES", 2)
     changed = replace(eight, readings=eight.readings[:, :1], times_s=eight.times_s * slower)
     export_lerobot(changed, tmp_path / "set")
-    info, _, episodes = checked(tmp_path / "set")
+    info, _, episodes = check_dataset(tmp_path / "set")
     assert info["fps"] == pytest.approx(fps, rel=0.02)
     assert isinstance(info["fps"], int) == (slower < 2)
     assert info["features"]["observation.state"]["shape"] == [1]
@@ -159,7 +159,7 @@ def test_rates_are_whole_if_that_is_near_long_recordings_go_to_several_files_and
     assert files == {(0, 0), (0, 1), (1, 0), (1, 1)}
 
 
-def test_a_folder_appears_whole_or_not_at_all(
+def test_export_lerobot_writes_all_or_nothing(
     eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
@@ -175,7 +175,7 @@ def test_a_folder_appears_whole_or_not_at_all(
     with pytest.raises(InputError, match="set: exists and is not empty"):
         export_lerobot(eight, tmp_path / "set")
     unknown = replace(eight, presses_mm=np.full((8, 2), np.nan))
-    with pytest.raises(InputError, match="no place of a press is known"):
+    with pytest.raises(InputError, match="no position of a press is known"):
         export_lerobot(unknown, tmp_path / "other")
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"more: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):

@@ -1,4 +1,4 @@
-"""Recordings in MATLAB files: the published one, such as are cut off or go on, and files that are neither."""
+"""Recordings from MATLAB files."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from padforge.sense import import_mat
 MAT = "para5_long_first4500.mat"
 
 
-def test_the_published_recording_comes_in_as_it_is_and_a_part_is_refused(published: Path, tmp_path: Path) -> None:
+def test_import_mat_reads_the_published_recording_and_refuses_a_part(published: Path, tmp_path: Path) -> None:
     recording = import_mat(published / MAT)
     content = scipy.io.loadmat(published / MAT)
     assert np.array_equal(recording.readings, content["voltage"])
@@ -21,14 +21,14 @@ def test_the_published_recording_comes_in_as_it_is_and_a_part_is_refused(publish
     assert np.array_equal(recording.times_s, content["tim"].ravel())
     assert recording.down_command[:3].tolist() == [20, 60, 100]
     assert recording.up_command[:3].tolist() == [40, 80, 120]
-    whole = (published / MAT).read_bytes()
+    stored = (published / MAT).read_bytes()
     for share in (0.0, 0.3, 0.99999):
-        (tmp_path / "cut.mat").write_bytes(whole[: int(share * len(whole))])
+        (tmp_path / "cut.mat").write_bytes(stored[: int(share * len(stored))])
         with pytest.raises(InputError, match=r"cut\.mat"):
             import_mat(tmp_path / "cut.mat")
 
 
-def good() -> dict[str, np.ndarray]:
+def published_content() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     return {
         "voltage": rng.uniform(1, 2, (120, 4)),
@@ -38,7 +38,7 @@ def good() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("rows", "presses", "whole", "note"),
+    ("rows", "presses", "n_complete", "note"),
     [
         (120, 3, 3, None),
         (111, 3, 2, "the last of 3 presses is left out, with 31 of 40 readings"),
@@ -49,21 +49,21 @@ def good() -> dict[str, np.ndarray]:
         (40, 1, 1, None),
     ],
 )
-def test_presses_and_readings_may_end_apart(
-    tmp_path: Path, rows: int, presses: int, whole: int, note: str | None
+def test_import_mat_notes_incomplete_presses(
+    tmp_path: Path, rows: int, presses: int, n_complete: int, note: str | None
 ) -> None:
-    content = good()
+    content = published_content()
     cut = {"pos": content["pos"][:, :presses], "voltage": content["voltage"][:rows], "tim": content["tim"][:, :rows]}
     scipy.io.savemat(tmp_path / "r.mat", cut)
     recording = import_mat(tmp_path / "r.mat")
     assert np.array_equal(recording.readings, cut["voltage"])
-    assert np.array_equal(recording.presses_mm, cut["pos"].T[:whole])
-    assert recording.up_command.tolist() == [40, 80, 120][:whole]
+    assert np.array_equal(recording.presses_mm, cut["pos"].T[:n_complete])
+    assert recording.up_command.tolist() == [40, 80, 120][:n_complete]
     assert recording.source.get("note") == note
 
 
-def newer(path: Path, content: dict[str, np.ndarray]) -> Path:
-    """A file as MATLAB writes it from version 7.3 on: HDF5 behind 512 bytes of text, all arrays transposed."""
+def write_hdf5_mat(path: Path, content: dict[str, np.ndarray]) -> Path:
+    """Write a file of MATLAB 7.3: HDF5 behind 512 bytes of text, all arrays transposed."""
     import h5py
 
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -76,22 +76,22 @@ def newer(path: Path, content: dict[str, np.ndarray]) -> Path:
     return path
 
 
-def test_files_of_matlab_7_3_hold_the_same(tmp_path: Path) -> None:
-    scipy.io.savemat(tmp_path / "old.mat", good())
-    new = newer(tmp_path / "new.mat", good())
+def test_import_mat_reads_matlab_7_3(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "old.mat", published_content())
+    new = write_hdf5_mat(tmp_path / "new.mat", published_content())
     assert import_mat(new) == import_mat(tmp_path / "old.mat")
-    lacking = newer(tmp_path / "lacking.mat", {"tim": good()["tim"]})
+    lacking = write_hdf5_mat(tmp_path / "lacking.mat", {"tim": published_content()["tim"]})
     with pytest.raises(InputError, match=r"lacking\.mat: has no variable voltage \(found name, tim\)"):
         import_mat(lacking)
 
 
-def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
-    content = good()
+def test_import_mat_by_columns(tmp_path: Path) -> None:
+    content = published_content()
     pressed = np.arange(120) % 40 >= 20
     lab = {"t": 1000 * content["tim"], "U": content["voltage"].T, "c": pressed[None] * 1.0, "P": content["pos"] / 10}
-    mapping = "time=t:ms,fibres=U,press=c,places=P:cm"
+    mapping = "time=t:ms,fibres=U,press=c,positions=P:cm"
     scipy.io.savemat(tmp_path / "old.mat", lab)
-    for path in (tmp_path / "old.mat", newer(tmp_path / "new.mat", lab)):
+    for path in (tmp_path / "old.mat", write_hdf5_mat(tmp_path / "new.mat", lab)):
         recording = import_mat(path, mapping)
         assert np.array_equal(recording.readings, content["voltage"])
         np.testing.assert_allclose(recording.presses_mm, content["pos"].T)
@@ -116,16 +116,16 @@ def test_a_mapping_tells_what_other_variables_hold(tmp_path: Path) -> None:
         ("tim", np.where(np.arange(120) == 7, 6, np.arange(120)), "times do not ascend at reading 7"),
     ],
 )
-def test_variables_that_do_not_fit_are_refused(tmp_path: Path, name: str, value: Any, message: str) -> None:
-    content = {key: each for key, each in (good() | {name: value}).items() if each is not None}
+def test_import_mat_refuses_variables_that_do_not_fit(tmp_path: Path, name: str, value: Any, message: str) -> None:
+    content = {key: each for key, each in (published_content() | {name: value}).items() if each is not None}
     scipy.io.savemat(tmp_path / "bad.mat", content)
     with pytest.raises(InputError, match=message) as caught:
         import_mat(tmp_path / "bad.mat")
     assert "\n" not in str(caught.value)
 
 
-def test_a_mat_may_hold_what_real_rigs_give_and_no_places(tmp_path: Path) -> None:
-    content = good()
+def test_import_mat_accepts_any_types_gaps_and_no_positions(tmp_path: Path) -> None:
+    content = published_content()
     volts = content["voltage"]
     holed = volts.copy()
     holed[:, 1] = 3.3
@@ -145,7 +145,7 @@ def test_a_mat_may_hold_what_real_rigs_give_and_no_places(tmp_path: Path) -> Non
         assert np.array_equal(recording.readings, (content | change)["voltage"], equal_nan=True)
         assert np.array_equal(recording.times_s, (content | change)["tim"].ravel())
         assert np.array_equal(recording.presses_mm, content["pos"].T)
-    content = good()
+    content = published_content()
     scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
     blind = import_mat(tmp_path / "blind.mat")
     assert not blind.has_position.any()

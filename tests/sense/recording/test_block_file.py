@@ -1,4 +1,4 @@
-"""The stream: whole rows come back to the last bit, a torn end is cut, other damage is an error."""
+"""Block files: rows are read back exactly, a torn end is cut off, other damage is an error."""
 
 import io
 import zlib
@@ -35,20 +35,18 @@ def some_rows(count: int, fibres: int) -> np.ndarray:
     cuts=st.lists(st.integers(0, 60), max_size=5),
     flush=st.booleans(),
 )
-def test_rows_come_back_whatever_the_portions(
-    tmp_path_factory, count: int, fibres: int, cuts: list[int], flush: bool
-) -> None:
+def test_block_file_round_trip(tmp_path_factory, count: int, fibres: int, cuts: list[int], flush: bool) -> None:
     path = tmp_path_factory.mktemp("stream") / "readings.bin"
     rows = some_rows(count, fibres)
     write(path, rows, sorted(cuts), flush)
-    found, torn = read_blocks(path, fibres)
-    assert np.array_equal(found, rows)
+    read, torn = read_blocks(path, fibres)
+    assert np.array_equal(read, rows)
     assert not torn
 
 
 @settings(max_examples=50)
-@given(kept=st.integers(0, 10 * 256), zeros=st.sampled_from([0, 13, 700]))
-def test_a_torn_tail_leaves_all_whole_blocks_before_it(tmp_path_factory, kept: int, zeros: int) -> None:
+@given(size=st.integers(0, 10 * 256), zeros=st.sampled_from([0, 13, 700]))
+def test_read_blocks_cuts_off_a_torn_tail(tmp_path_factory, size: int, zeros: int) -> None:
     """Also one of zeros, as a crashed disk leaves it. Blocks are a multiple of 256 bytes and hold four rows or more."""
     for fibres, size in ((1, 256), (6, 256), (7, 512), (128, 4352), (512, 16640)):
         assert block_dtype(fibres).itemsize == size
@@ -56,16 +54,16 @@ def test_a_torn_tail_leaves_all_whole_blocks_before_it(tmp_path_factory, kept: i
     path = tmp_path_factory.mktemp("stream") / "readings.bin"
     rows = some_rows(40, 6)
     write(path, rows)
-    assume(not zeros or kept % 256 < 248)  # the last 8 bytes of a block are zeros
-    path.write_bytes(path.read_bytes()[:kept] + bytes(zeros))
-    found, torn = read_blocks(path, 6)
-    assert np.array_equal(found, rows[: kept // 256 * 4])
-    assert torn == bool(kept % 256 or zeros)
+    assume(not zeros or size % 256 < 248)  # the last 8 bytes of a block are zeros
+    path.write_bytes(path.read_bytes()[:size] + bytes(zeros))
+    read, torn = read_blocks(path, 6)
+    assert np.array_equal(read, rows[: size // 256 * 4])
+    assert torn == bool(size % 256 or zeros)
 
 
 @settings(max_examples=50)
 @given(byte=st.integers(0, 9 * 256 - 1), bit=st.integers(0, 7))
-def test_a_flipped_bit_before_an_intact_block_is_an_error(tmp_path_factory, byte: int, bit: int) -> None:
+def test_read_blocks_refuses_a_flipped_bit(tmp_path_factory, byte: int, bit: int) -> None:
     path = tmp_path_factory.mktemp("stream") / "readings.bin"
     write(path, some_rows(40, 6))
     content = bytearray(path.read_bytes())
@@ -78,32 +76,32 @@ def test_a_flipped_bit_before_an_intact_block_is_an_error(tmp_path_factory, byte
 @pytest.mark.parametrize(
     "change", [lambda c: c[:700] + c[701:], lambda c: c[:700] + b"x" + c[700:], lambda c: c[:512] + c[768:]]
 )
-def test_a_lost_or_added_byte_or_block_in_the_middle_is_an_error(tmp_path: Path, change) -> None:
+def test_read_blocks_refuses_lost_and_added_bytes(tmp_path: Path, change) -> None:
     write(tmp_path / "s", some_rows(40, 6))
     (tmp_path / "s").write_bytes(change((tmp_path / "s").read_bytes()))
     with pytest.raises(InputError, match=r"block 2 .*damaged"):
         read_blocks(tmp_path / "s", 6)
 
 
-@pytest.mark.parametrize("claimed", [0, 3, 6, 2**31, 2**32 - 1])
-def test_a_block_that_claims_other_counts_is_none_even_where_its_checksum_fits(tmp_path: Path, claimed: int) -> None:
+@pytest.mark.parametrize("count", [0, 3, 6, 2**31, 2**32 - 1])
+def test_read_blocks_refuses_other_counts(tmp_path: Path, count: int) -> None:
     write(tmp_path / "s", some_rows(40, 6))
     content = bytearray((tmp_path / "s").read_bytes())
     block = content[8 * 256 : 9 * 256]
-    block[16:20] = claimed.to_bytes(4, "little")
+    block[16:20] = count.to_bytes(4, "little")
     block[20:24] = zlib.crc32(block[24:], zlib.crc32(block[:20])).to_bytes(4, "little")
     (tmp_path / "s").write_bytes(content[: 8 * 256] + block + content[9 * 256 :])
     with pytest.raises(InputError, match=r"block [89] .*damaged"):
         read_blocks(tmp_path / "s", 6)
     (tmp_path / "s").write_bytes(content[: 8 * 256] + block)
-    if claimed > 4:
+    if count > 4:
         with pytest.raises(InputError, match="block 8 is whole, but not of 6 fibres"):
             read_blocks(tmp_path / "s", 6)
 
 
 @settings(max_examples=30)
 @given(fails=st.sets(st.integers(0, 30), max_size=8), share=st.floats(0, 1))
-def test_writes_that_fail_half_done_are_set_right_by_the_next(tmp_path_factory, fails: set[int], share: float) -> None:
+def test_block_writer_repairs_failed_writes(tmp_path_factory, fails: set[int], share: float) -> None:
     path, rows, calls = tmp_path_factory.mktemp("flaky") / "s", some_rows(40, 6), iter(range(999))
 
     class Flaky(io.FileIO):
@@ -123,6 +121,6 @@ def test_writes_that_fail_half_done_are_set_right_by_the_next(tmp_path_factory, 
                         break
                     except OSError:
                         continue
-    found, torn = read_blocks(path, 6)
-    assert np.array_equal(found, rows)
+    read, torn = read_blocks(path, 6)
+    assert np.array_equal(read, rows)
     assert not torn

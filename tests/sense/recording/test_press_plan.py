@@ -1,4 +1,4 @@
-"""Where and how deep a probe presses: plans of each kind over any pad, never in a hole, and plans from files."""
+"""Press plans of each kind over any pad, and from files."""
 
 from pathlib import Path
 
@@ -11,99 +11,99 @@ from padforge.design.settings import PadSettings
 from padforge.sense.recording.press_plan import PressPlan, make_plan, read_plan
 from padforge.sense.settings import RigSettings
 
-HOLE = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
+KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 KINDS = ("uniform", "grid", "serpentine", "adaptive")
 
 
-def made(size: PadSettings | None = None, **settings: object) -> PressPlan:
+def plan_of(size: PadSettings | None = None, **settings: object) -> PressPlan:
     pad = Morphology.straight(4 if size is None else size.layout)
     return make_plan(pad, validate(RigSettings, settings, "rig"), np.random.default_rng(0), size)
 
 
-def test_a_plan_survives_json_and_comes_from_a_file(tmp_path):
-    plan = made(presses=7, depths_mm=[2.0, 4.0])
+def test_plan_round_trip_and_from_file(tmp_path):
+    plan = plan_of(presses=7, depths_mm=[2.0, 4.0])
     again = PressPlan.from_rows(plan.to_rows())
     assert np.array_equal(again.positions_mm, plan.positions_mm)
     assert again.depths_mm.tolist() == [2, 4, 2, 4, 2, 4, 2]
-    assert set(made(presses=30).depths_mm) == {5.0}
+    assert set(plan_of(presses=30).depths_mm) == {5.0}
     (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
     assert read_plan(tmp_path / "gaps.csv", 2.5).to_rows() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
     (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,1.5\n")
     assert read_plan(tmp_path / "deep.csv", 3.0).to_rows() == [[1, 2, 1.5]]
 
 
-def test_a_grid_fills_the_square_half_a_pitch_beyond_the_outer_fibres_row_by_row():
+def test_make_plan_of_grids_row_by_row():
     line = [-22.5, 0.0, 22.5]
     rows = [(x, y) for y in line for x in line]
-    assert made(presses=9, plan="grid").positions_mm.tolist() == [list(place) for place in rows]
-    assert made(presses=8, plan="grid").positions_mm.tolist() == [list(place) for place in rows[:8]]
-    turned = [*rows[:3], *rows[5:2:-1], *rows[6:]]
-    assert made(presses=9, plan="serpentine").positions_mm.tolist() == [list(place) for place in turned]
-    assert made(presses=1, plan="grid").positions_mm.tolist() == [[0, 0]]
-    uniform = made(presses=2000).positions_mm
+    assert plan_of(presses=9, plan="grid").positions_mm.tolist() == [list(position) for position in rows]
+    assert plan_of(presses=8, plan="grid").positions_mm.tolist() == [list(position) for position in rows[:8]]
+    serpentine = [*rows[:3], *rows[5:2:-1], *rows[6:]]
+    assert plan_of(presses=9, plan="serpentine").positions_mm.tolist() == [list(position) for position in serpentine]
+    assert plan_of(presses=1, plan="grid").positions_mm.tolist() == [[0, 0]]
+    uniform = plan_of(presses=2000).positions_mm
     assert np.abs(uniform).max() > 22.4
     np.testing.assert_allclose(uniform.mean(axis=0), 0, atol=1.5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_plans_keep_to_what_is_pressed_of_the_pad(kind: str) -> None:
+def test_make_plan_stays_in_the_sensed_area(kind: str) -> None:
     presses = {"presses": 500 if kind in ("uniform", "adaptive") else 9, "plan": kind}
     pad = Morphology.straight(4)
 
-    def places(**size) -> np.ndarray:
+    def positions(**size) -> np.ndarray:
         rig = validate(RigSettings, presses, "rig")
         return make_plan(pad, rig, np.random.default_rng(0), PadSettings(**size)).positions_mm
 
-    strip = places(sensed_mm=(50.0, 8.0))
+    strip = positions(sensed_mm=(50.0, 8.0))
     np.testing.assert_allclose(np.abs(strip).max(axis=0), [25, 4], rtol=0.02)
     assert (np.abs(strip) <= [25.001, 4.001]).all()
-    np.testing.assert_allclose(np.abs(places(sensed_mm="fibres")).max(), 1.5 * 11.25, rtol=0.01)
+    np.testing.assert_allclose(np.abs(positions(sensed_mm="fibres")).max(), 1.5 * 11.25, rtol=0.01)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_plans_fill_a_rectangle_and_keep_out_of_holes(kind: str) -> None:
-    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+def test_make_plan_avoids_keep_outs_of_a_rectangle(kind: str) -> None:
+    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
 
-    def in_the_hole(plan: PressPlan) -> np.ndarray:
-        low, high = np.array(HOLE).min(axis=0), np.array(HOLE).max(axis=0)
+    def in_keep_out(plan: PressPlan) -> np.ndarray:
+        low, high = np.array(KEEP_OUT).min(axis=0), np.array(KEEP_OUT).max(axis=0)
         return ((plan.positions_mm > low) & (plan.positions_mm < high)).all(axis=1)
 
-    plan = made(size, presses=300, plan=kind)
+    plan = plan_of(size, presses=300, plan=kind)
     assert len(plan) == 300
-    assert not in_the_hole(plan).any()
+    assert not in_keep_out(plan).any()
     # half a pitch beyond the outermost of 2 verticals, 8 mm apart, and of 3 horizontals, 15 mm apart
     np.testing.assert_allclose(np.abs(plan.positions_mm).max(axis=0), [8.0, 22.5], rtol=0.05)
-    assert in_the_hole(made(size.model_copy(update={"keep_out_mm": ()}), presses=300, plan=kind)).any()
+    assert in_keep_out(plan_of(size.model_copy(update={"keep_out_mm": ()}), presses=300, plan=kind)).any()
 
 
 @pytest.mark.parametrize("counts", [(3, 6), (1, 9), (9, 1), (5, 4)])
-def test_places_of_a_grid_are_as_far_apart_along_both_axes(counts: tuple[int, int]) -> None:
+def test_make_plan_grid_has_one_step_along_both_axes(counts: tuple[int, int]) -> None:
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 15.0))
     for presses in (1, 2, 7, 60, 1500):
-        places = made(size, presses=presses, plan="grid").positions_mm
-        assert len(places) == len(np.unique(places, axis=0)) == presses
-        steps = [np.diff(np.unique(places[:, axis])) for axis in range(2)]
+        positions = plan_of(size, presses=presses, plan="grid").positions_mm
+        assert len(positions) == len(np.unique(positions, axis=0)) == presses
+        steps = [np.diff(np.unique(positions[:, axis])) for axis in range(2)]
         if min(map(len, steps)) >= 8:
             assert steps[0].mean() == pytest.approx(steps[1].mean(), rel=0.1)
 
 
-def test_a_hole_is_not_pressed_because_a_file_says_so(tmp_path: Path) -> None:
-    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+def test_make_plan_refuses_a_file_that_presses_a_keep_out(tmp_path: Path) -> None:
+    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
     (tmp_path / "plan.csv").write_text("x_mm,y_mm\n-3,2\n4,1\n")
     with pytest.raises(InputError, match=r"plan\.csv: press 2, at \(4, 1\) mm, lies in a keep-out"):
-        made(size, plan=str(tmp_path / "plan.csv"))
+        plan_of(size, plan=str(tmp_path / "plan.csv"))
     everything = ((-20.0, -40.0), (20.0, -40.0), (20.0, 40.0), (-20.0, 40.0))
     with pytest.raises(InputError, match=r"keep_out_mm leaves 0\.0% of what is pressed"):
-        made(size.model_copy(update={"keep_out_mm": (everything,)}))
+        plan_of(size.model_copy(update={"keep_out_mm": (everything,)}))
 
 
 @pytest.mark.parametrize("plan", ["grid", "serpentine"])
 @pytest.mark.parametrize("presses", [400, 361])
-def test_depths_of_a_grid_tell_nothing_of_the_place(plan, presses):
-    made_so = made(presses=presses, plan=plan, depths_mm=[0.5, 1, 2, 3, 5])
+def test_make_plan_depths_do_not_depend_on_the_position(plan, presses):
+    plan_ = plan_of(presses=presses, plan=plan, depths_mm=[0.5, 1, 2, 3, 5])
     for axis in (0, 1):
-        for value in np.unique(made_so.positions_mm[:, axis]):
-            assert len(set(made_so.depths_mm[made_so.positions_mm[:, axis] == value])) == 5
+        for value in np.unique(plan_.positions_mm[:, axis]):
+            assert len(set(plan_.depths_mm[plan_.positions_mm[:, axis] == value])) == 5
 
 
 @pytest.mark.parametrize(
@@ -112,11 +112,11 @@ def test_depths_of_a_grid_tell_nothing_of_the_place(plan, presses):
         ([[0, 0, 1e-3], [0, 0, 0.0]], "press 1 has depth"),
         ([[0, 0, -1.0]], "press 0 has depth"),
         ([[0, 0]], "shape"),
-        ([[0, 1e6, 1]], "places of the plan hold 1e.06 mm"),
+        ([[0, 1e6, 1]], "positions of the plan hold 1e.06 mm"),
         (np.empty((0, 3)), "Q > 0"),
     ],
 )
-def test_plans_that_no_probe_can_press_are_refused(rows, message: str) -> None:
+def test_press_plan_refuses_invalid_rows(rows, message: str) -> None:
     with pytest.raises(InputError, match=message):
         PressPlan.from_rows(rows)
     assert len(PressPlan.from_rows([[0, 0, 1e-3]])) == 1
@@ -134,7 +134,7 @@ def test_plans_that_no_probe_can_press_are_refused(rows, message: str) -> None:
         ("x_mm,y_mm,depth_mm\n1,2,-1\n", "depth -1 mm"),
     ],
 )
-def test_a_bad_plan_is_one_clear_line(tmp_path, content, line):
+def test_read_plan_refuses_other_files(tmp_path, content, line):
     (tmp_path / "plan.csv").write_text(content)
     with pytest.raises(InputError, match=line) as refusal:
         read_plan(tmp_path / "plan.csv", 3.0)

@@ -12,34 +12,30 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording
 
 
-def test_a_run_directory_gives_back_the_recording_and_a_torn_stream_loses_the_presses_it_had(
-    recording: Recording, folder: Path
-) -> None:
-    found = Recording.open(folder)
-    assert found == recording
-    assert found.digest == recording.digest
-    assert found.source == recording.source
-    assert found.torn_presses == 0
+def test_save_and_open_round_trip_and_torn_readings(recording: Recording, folder: Path) -> None:
+    opened = Recording.open(folder)
+    assert opened == recording
+    assert opened.digest == recording.digest
+    assert opened.source == recording.source
+    assert opened.torn_presses == 0
     assert sorted(path.name for path in folder.parent.iterdir()) == ["run"]
     stream = folder / "readings.bin"
     stream.write_bytes(stream.read_bytes()[: -10 * 256 - 3])
-    found = Recording.open(folder)
-    left = len(found.presses_mm)
-    assert 0 < found.torn_presses <= 2
-    assert left + found.torn_presses == len(recording.presses_mm)
-    assert np.array_equal(found.presses_mm, recording.presses_mm[:left])
-    assert np.array_equal(found.readings, recording.readings[: len(found.readings)])
+    opened = Recording.open(folder)
+    n_complete = len(opened.presses_mm)
+    assert 0 < opened.torn_presses <= 2
+    assert n_complete + opened.torn_presses == len(recording.presses_mm)
+    assert np.array_equal(opened.presses_mm, recording.presses_mm[:n_complete])
+    assert np.array_equal(opened.readings, recording.readings[: len(opened.readings)])
 
 
-def test_which_side_was_up_is_as_rig_said(recording: Recording) -> None:
+def test_mirrored_is_read_from_the_source(recording: Recording) -> None:
     for source in ({}, {"rig": {}}, {"rig": {"mirrored": "unknown"}}):
         assert replace(recording, source=source).mirrored is False
     assert replace(recording, source={"rig": {"mirrored": True}}).mirrored is True
 
 
-def test_a_recording_is_never_written_over_nor_where_it_cannot_be(
-    recording: Recording, folder: Path, tmp_path: Path
-) -> None:
+def test_save_refuses_existing_and_unwritable_paths(recording: Recording, folder: Path, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(InputError, match="never written over"):
         recording.save(folder, {})
@@ -47,15 +43,15 @@ def test_a_recording_is_never_written_over_nor_where_it_cannot_be(
     (tmp_path / "empty").mkdir()
     recording.save(tmp_path / "empty", {})
     assert Recording.open(tmp_path / "empty") == recording
-    (tmp_path / "file").write_text("kept")
+    (tmp_path / "file").write_text("content")
     for path in (tmp_path / "file", tmp_path / "file" / "below" / "run"):
         for write in (lambda path: recording.save(path, {}), lambda path: Recorder(path, 3, {}, {})):
             with pytest.raises(InputError, match="file is a file, expected a folder"):
                 write(path)
     with pytest.raises(InputError, match=r"cannot be written \(File name too long\)"):
         recording.save(tmp_path / ("n" * 300), {})
-    assert (tmp_path / "file").read_text() == "kept"
-    assert {found.name for found in tmp_path.iterdir()} == {"run", "empty", "file"}
+    assert (tmp_path / "file").read_text() == "content"
+    assert {entry.name for entry in tmp_path.iterdir()} == {"run", "empty", "file"}
 
 
 @pytest.mark.parametrize(
@@ -63,17 +59,17 @@ def test_a_recording_is_never_written_over_nor_where_it_cannot_be(
     [
         *(({"fibres": fibres}, "fibres is") for fibres in (None, 0, "6", 1e3, True, 513)),
         *(({"source": source}, "source is .*expected a mapping") for source in ([1], "simulated", None, 3)),
-        ({"format": "padforge-recording/2"}, "format"),
+        ({"format": "padforge-recording/1"}, "format"),
     ],
 )
-def test_a_start_document_of_other_values_is_refused(folder: Path, change: dict[str, object], message: str) -> None:
+def test_open_refuses_other_values_in_the_start_document(folder: Path, change: dict[str, object], message: str) -> None:
     document = json.loads((folder / "start.json").read_text())
     (folder / "start.json").write_text(json.dumps(document | change))
     with pytest.raises(InputError, match=message):
         Recording.open(folder)
 
 
-def test_what_a_live_recorder_synced_can_be_read_before_it_ends(tmp_path: Path) -> None:
+def test_open_while_recording(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     readings = rng.standard_normal((30, 3))
     recorder = Recorder(tmp_path / "live", 3, {}, {})
@@ -87,15 +83,15 @@ def test_what_a_live_recorder_synced_can_be_read_before_it_ends(tmp_path: Path) 
         if i == 25:
             recorder.begin((3.0, 4.0), i + 1)
             recorder.sync()
-    found = Recording.open(tmp_path / "live")
+    opened = Recording.open(tmp_path / "live")
     recorder.__exit__(None, None, None)
-    assert np.array_equal(found.readings, readings[: len(found.readings)])
-    assert len(found.readings) == 26
-    assert found.presses_mm.tolist() == [[1.5, -2.5]]
-    assert (found.down_command.tolist(), found.up_command.tolist()) == ([10], [20])
+    assert np.array_equal(opened.readings, readings[: len(opened.readings)])
+    assert len(opened.readings) == 26
+    assert opened.presses_mm.tolist() == [[1.5, -2.5]]
+    assert (opened.down_command.tolist(), opened.up_command.tolist()) == ([10], [20])
 
 
-def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
+def with_value(array: np.ndarray, index: Any, value: float) -> np.ndarray:
     array = array.copy()
     array[index] = value
     return array
@@ -104,48 +100,51 @@ def spoiled(array: np.ndarray, index: Any, value: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: {"readings": spoiled(r.readings, (7, 0), np.inf)}, r"readings hold infinity.*row 7"),
+        (lambda r: {"readings": with_value(r.readings, (7, 0), np.inf)}, r"readings hold infinity.*row 7"),
         (lambda r: {"readings": np.full_like(r.readings, np.nan)}, "readings are all missing"),
-        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.inf)}, r"presses hold infinity.*row 3"),
-        (lambda r: {"presses_mm": spoiled(r.presses_mm, (3, 1), np.nan)}, "press 3 has one of x and y"),
-        (lambda r: {"times_s": spoiled(r.times_s, 9, 0.0)}, "do not ascend at reading 9"),
+        (lambda r: {"presses_mm": with_value(r.presses_mm, (3, 1), np.inf)}, r"presses hold infinity.*row 3"),
+        (lambda r: {"presses_mm": with_value(r.presses_mm, (3, 1), np.nan)}, "press 3 has one of x and y"),
+        (lambda r: {"times_s": with_value(r.times_s, 9, 0.0)}, "do not ascend at reading 9"),
         (lambda r: {"times_s": r.times_s[:-1]}, r"times have shape"),
         (lambda r: {"readings": r.readings[:, :0]}, r"readings have shape"),
         (lambda r: {"presses_mm": r.presses_mm[:0]}, "at least one press"),
-        (lambda r: {"down_command": spoiled(r.down_command, 2, 70)}, "press 2 goes from"),
-        (lambda r: {"down_command": spoiled(r.down_command, 0, 0)}, "press 0 goes from reading 0"),
-        (lambda r: {"up_command": spoiled(r.up_command, -1, len(r.readings) + 1)}, "press 299 goes from"),
-        (lambda r: {"times_s": spoiled(r.times_s, 11, np.nan)}, r"times hold NaN or infinity \(first in row 11\), exp"),
+        (lambda r: {"down_command": with_value(r.down_command, 2, 70)}, "press 2 goes from"),
+        (lambda r: {"down_command": with_value(r.down_command, 0, 0)}, "press 0 goes from reading 0"),
+        (lambda r: {"up_command": with_value(r.up_command, -1, len(r.readings) + 1)}, "press 299 goes from"),
+        (
+            lambda r: {"times_s": with_value(r.times_s, 11, np.nan)},
+            r"times hold NaN or infinity \(first in row 11\), exp",
+        ),
         (lambda r: {"depths_mm": [1.0, 2.0]}, r"depths_mm have shape \(2,\), expected \(300,\)"),
         (lambda r: {"depths_mm": np.full(300, 0.0)}, "depths_mm of press 0 is 0 mm, allowed is more than 0"),
         (lambda r: {"forces_n": np.full(300, -1.0)}, "forces_n of press 0 is -1 N, allowed is 0 or more"),
         (lambda r: {"reached_mm": np.full(300, 1e6)}, "reached_mm hold 1e.06 mm"),
-        (lambda r: {"readings": spoiled(r.readings, (7, 0), -1e30)}, r"readings hold -1e\+30 V \(first in row 7\)"),
-        (lambda r: {"times_s": spoiled(r.times_s, -1, 1e30)}, r"times hold 1e\+30 s .*allowed"),
+        (lambda r: {"readings": with_value(r.readings, (7, 0), -1e30)}, r"readings hold -1e\+30 V \(first in row 7\)"),
+        (lambda r: {"times_s": with_value(r.times_s, -1, 1e30)}, r"times hold 1e\+30 s .*allowed"),
         (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e-300}, "times give .* readings a second, allowed"),
         (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e5}, "times give 1e-05 readings a second, allowed"),
         (lambda r: {"readings": [[1.0], [1.0, 2.0]]}, "readings are .*expected an array of real numbers"),
         (lambda r: {"readings": r.readings + 1j}, "readings are .*complex128"),
         (
-            lambda r: {"up_command": spoiled(r.up_command.astype(float), -1, 2.0**53 + 2)},
-            "lifted are .*whole numbers up to",
+            lambda r: {"up_command": with_value(r.up_command.astype(float), -1, 2.0**53 + 2)},
+            "up_command are .*whole numbers up to",
         ),
         (lambda r: {"times_s": None}, "times_s are None"),
         (lambda r: {"source": "a rig"}, "source is 'a rig', expected a mapping"),
         (lambda r: {"source": {"gain": np.nan}}, "source is .*expected what JSON can hold"),
     ],
 )
-def test_what_does_not_fit_together_and_no_rig_records_is_refused(recording: Recording, change, message: str) -> None:
+def test_recording_refuses_invalid_arrays(recording: Recording, change, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         replace(recording, **change(recording))
     assert "\n" not in str(caught.value)
 
 
-def test_one_missing_reading_is_as_another(recording: Recording) -> None:
+def test_equality_and_digest_treat_all_nan_alike(recording: Recording) -> None:
     other_nan = -np.array([0x7FF8000000000001], dtype=np.uint64).view(np.float64)[0]
-    places = spoiled(recording.presses_mm, 3, np.nan)
+    positions = with_value(recording.presses_mm, 3, np.nan)
     one, other = (
-        replace(recording, readings=spoiled(recording.readings, (7, 0), nan), presses_mm=places)
+        replace(recording, readings=with_value(recording.readings, (7, 0), nan), presses_mm=positions)
         for nan in (np.nan, other_nan)
     )
     assert one == other != recording
@@ -153,11 +152,11 @@ def test_one_missing_reading_is_as_another(recording: Recording) -> None:
     assert one.has_position.tolist() == [press != 3 for press in range(300)]
 
 
-def test_what_is_uneven_little_or_at_the_ends_of_what_is_allowed_is_fine(recording: Recording, tmp_path: Path) -> None:
+def test_recording_accepts_limits_and_uneven_times(recording: Recording, tmp_path: Path) -> None:
     assert replace(recording, down_command=recording.down_command.astype(float)) == recording
     for name, index, most in (("readings", (7, 0), 1e3), ("presses_mm", (3, 1), 1e5), ("times_s", -1, 1e10)):
         for value in {most, -most if name != "times_s" else most}:
-            assert getattr(replace(recording, **{name: spoiled(getattr(recording, name), index, value)}), name).size
+            assert getattr(replace(recording, **{name: with_value(getattr(recording, name), index, value)}), name).size
     uneven = np.cumsum(np.random.default_rng(0).exponential(0.07, len(recording.times_s)))
     assert replace(recording, times_s=uneven).rate_hz == pytest.approx(1 / 0.07 / np.log(2), rel=0.1)
     least = Recording(np.ones((2, 1)), np.arange(2.0), np.full((1, 2), np.nan), np.array([1]), np.array([2]))
@@ -165,7 +164,7 @@ def test_what_is_uneven_little_or_at_the_ends_of_what_is_allowed_is_fine(recordi
     assert Recording.open(tmp_path / "run") == least
 
 
-def test_a_folder_that_is_no_recording_is_said_to_be_none(folder: Path, tmp_path: Path) -> None:
+def test_open_refuses_other_folders(folder: Path, tmp_path: Path) -> None:
     for path in (tmp_path / "absent", tmp_path, folder / "start.json"):
         with pytest.raises(InputError, match=r"no recording, expected a folder with start\.json, journal\.ndjson and"):
             Recording.open(path)
@@ -175,12 +174,12 @@ def test_a_folder_that_is_no_recording_is_said_to_be_none(folder: Path, tmp_path
         Recording.open(folder)
 
 
-@pytest.mark.parametrize("made_before", [False, True])
-def test_of_two_saves_into_one_folder_the_first_stays_and_the_second_is_told(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_before: bool
+@pytest.mark.parametrize("exists_before", [False, True])
+def test_save_refuses_a_path_that_appeared_meanwhile(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exists_before: bool
 ) -> None:
     path = tmp_path / "run"
-    if made_before:
+    if exists_before:
         path.mkdir()
     late = replace(recording, times_s=recording.times_s + 1)
     sync = Recorder.sync
@@ -194,20 +193,20 @@ def test_of_two_saves_into_one_folder_the_first_stays_and_the_second_is_told(
     with pytest.raises(InputError, match="never written over"):
         late.save(path, {})
     assert Recording.open(path) == recording
-    assert [found.name for found in tmp_path.iterdir()] == ["run"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
 
 
-def test_depth_and_force_belong_to_a_press_but_not_to_the_digest(recording: Recording, tmp_path: Path) -> None:
+def test_measures_are_saved_but_not_in_the_digest(recording: Recording, tmp_path: Path) -> None:
     count = len(recording.down_command)
     unknown = replace(recording, depths_mm=np.empty(0))
     assert np.isnan([unknown.depths_mm, unknown.reached_mm, unknown.forces_n]).all()
     reached = np.where(np.arange(count) % 2 == 0, np.nan, 4.9)
-    known = replace(recording, reached_mm=reached, forces_n=np.linspace(0, 9, count))
-    assert known != recording
-    assert known.digest == recording.digest == unknown.digest
-    assert known.actual_depths_mm[:4].tolist() == [5, 4.9, 5, 4.9]
-    for number, each in enumerate((unknown, known)):
+    measured = replace(recording, reached_mm=reached, forces_n=np.linspace(0, 9, count))
+    assert measured != recording
+    assert measured.digest == recording.digest == unknown.digest
+    assert measured.actual_depths_mm[:4].tolist() == [5, 4.9, 5, 4.9]
+    for number, each in enumerate((unknown, measured)):
         each.save(tmp_path / str(number), {})
         assert Recording.open(tmp_path / str(number)) == each
     with pytest.raises(ValueError, match="read-only"):
-        known.forces_n[0] = 1
+        measured.forces_n[0] = 1

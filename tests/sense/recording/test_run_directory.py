@@ -1,4 +1,4 @@
-"""Whatever is left of a run directory, it goes on from there: no finished press lost, nothing else taken for one."""
+"""Run directories: whatever a break leaves, no finished press is lost, and no other one counts."""
 
 import json
 import os
@@ -25,7 +25,7 @@ FIBRES = 3
 
 
 def record(recorder: Recorder, presses: range, time_s: float) -> float:
-    """Twenty readings a press at 10 Hz, and as many states."""
+    """Record 20 readings a press at 10 Hz, and 10 states."""
     for press in presses:
         times = time_s + np.arange(20) / 10
         recorder.append(times[:10], np.full((10, FIBRES), press + 0.25))
@@ -38,7 +38,7 @@ def record(recorder: Recorder, presses: range, time_s: float) -> float:
     return time_s
 
 
-def made(folder, presses=5):
+def record_presses(folder, presses=5):
     with Recorder(folder / "run", FIBRES, {"kind": "made"}, {}) as recorder:
         record(recorder, range(presses), 0.0)
     return folder / "run"
@@ -46,13 +46,13 @@ def made(folder, presses=5):
 
 @pytest.fixture(scope="module")
 def five(tmp_path_factory):
-    """The files of a run directory of five presses."""
-    path = made(tmp_path_factory.mktemp("five"))
+    """Return the files of a run directory of five presses."""
+    path = record_presses(tmp_path_factory.mktemp("five"))
     return {file.name: file.read_bytes() for file in path.iterdir()}
 
 
-def require_as_recorded(recording):
-    """See that every press has its place and the readings that `record` gave it."""
+def check_as_recorded(recording):
+    """Check that every press has its position and the readings of `record`."""
     for (x, y), down_command, up_command in zip(
         recording.presses_mm, recording.down_command, recording.up_command, strict=True
     ):
@@ -61,8 +61,8 @@ def require_as_recorded(recording):
     assert (np.diff(recording.times_s) > 0).all()
 
 
-def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
-    path = made(tmp_path)
+def test_resume_leaves_a_finished_recording_as_it_is(tmp_path):
+    path = record_presses(tmp_path)
     before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
     with Recorder.resume(path) as recorder:
         assert recorder.done == set(range(5))
@@ -73,7 +73,7 @@ def test_a_recording_that_was_not_broken_off_resumes_as_it_is(tmp_path):
 
 @settings(max_examples=15)
 @given(st.data())
-def test_a_kill_at_any_byte_loses_no_finished_press(five, tmp_path_factory, data):
+def test_resume_after_a_kill_at_any_byte(five, tmp_path_factory, data):
     """Files grow in the order readings, states, journal; a kill leaves any prefix of what came after the last sync."""
     path = tmp_path_factory.mktemp("killed")
     (path / START).write_bytes(five[START])
@@ -83,24 +83,23 @@ def test_a_kill_at_any_byte_loses_no_finished_press(five, tmp_path_factory, data
     for name, columns, rows in ((READINGS, FIBRES, 20), (STATES, 9, 10)):
         dtype = block_dtype(columns)
         blocks = np.frombuffer(five[name], dtype)
-        kept = int(np.searchsorted(np.cumsum(blocks["count"]), rows * finished, side="right")) if finished else 0
-        synced[name] = kept * dtype.itemsize
+        n_synced = int(np.searchsorted(np.cumsum(blocks["count"]), rows * finished, side="right")) if finished else 0
+        synced[name] = n_synced * dtype.itemsize
     for name in (READINGS, STATES, JOURNAL):
         cut = data.draw(st.integers(synced[name], len(five[name])))
         (path / name).write_bytes(five[name][: cut if name != JOURNAL else min(cut, synced[name] + 40)])
     with Recorder.resume(path) as recorder:
         assert recorder.done >= set(range(finished))
         assert len(recorder.done) <= finished + 1
-        left = [press for press in range(5) if press not in recorder.done]
-        for press in left:
+        for press in sorted(set(range(5)) - recorder.done):
             record(recorder, range(press, press + 1), max(recorder.last_s, 0.0) + 1)
     recording = Recording.open(path)
     assert recording.presses_mm[:, 0].tolist() == list(range(5))
-    require_as_recorded(recording)
+    check_as_recorded(recording)
 
 
 def in_a_child(work):
-    """Do `work` in another process; its number."""
+    """Do `work` in another process; return its id."""
     child = os.fork()
     if child == 0:
         code = 1
@@ -115,10 +114,10 @@ def in_a_child(work):
 
 
 @pytest.mark.parametrize("limit", [100, 300, 700, 2000, 5200, 6000])
-def test_a_full_disk_loses_no_finished_press(tmp_path, limit):
-    """What was told to be done before the disk was full is there, and the rest can be recorded when it is not."""
-    told = tmp_path / "told"
-    told.touch()
+def test_resume_after_a_full_disk(tmp_path, limit):
+    """Presses that were synced before the disk was full are there, and the others can be recorded afterwards."""
+    counter = tmp_path / "counter"
+    counter.touch()
 
     def work():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -126,10 +125,10 @@ def test_a_full_disk_loses_no_finished_press(tmp_path, limit):
         with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
             for press in range(12):
                 record(recorder, range(press, press + 1), 2.0 * press)
-                os.truncate(told, press + 1)
+                os.truncate(counter, press + 1)
 
     code = os.waitstatus_to_exitcode(os.waitpid(in_a_child(work), 0)[1])
-    done = told.stat().st_size
+    done = counter.stat().st_size
     assert (code, done < 12) == (2, True)
     if not (tmp_path / "run" / START).exists():
         assert done == 0
@@ -137,44 +136,44 @@ def test_a_full_disk_loses_no_finished_press(tmp_path, limit):
     with Recorder.resume(tmp_path / "run") as recorder:
         assert set(range(done)) <= recorder.done
         record(recorder, range(20, 22), max(recorder.last_s, 0.0) + 1)
-        there = recorder.done
-    found = Recording.open(tmp_path / "run")
-    require_as_recorded(found)
-    assert set(found.presses_mm[:, 0]) == there
+        finished = recorder.done
+    recording = Recording.open(tmp_path / "run")
+    check_as_recorded(recording)
+    assert set(recording.presses_mm[:, 0]) == finished
 
 
 @pytest.mark.parametrize("pause_s", [0.01, pytest.param(0.1, marks=pytest.mark.slow)])
-def test_a_kill_in_the_middle_loses_no_finished_press(tmp_path, pause_s):
-    told = tmp_path / "told"
-    told.touch()
+def test_resume_after_a_killed_process(tmp_path, pause_s):
+    counter = tmp_path / "counter"
+    counter.touch()
 
     def work():
         with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
             for press in range(10_000):
                 record(recorder, range(press, press + 1), 2.0 * press)
-                os.truncate(told, press + 1)
+                os.truncate(counter, press + 1)
 
     child = in_a_child(work)
-    while not told.stat().st_size:
+    while not counter.stat().st_size:
         time.sleep(0.001)
     time.sleep(pause_s)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    done = told.stat().st_size
-    found = Recording.open(tmp_path / "run")
-    require_as_recorded(found)
-    assert found.presses_mm[:, 0].tolist()[:done] == list(range(done))
+    done = counter.stat().st_size
+    recording = Recording.open(tmp_path / "run")
+    check_as_recorded(recording)
+    assert recording.presses_mm[:, 0].tolist()[:done] == list(range(done))
     with Recorder.resume(tmp_path / "run") as recorder:
         assert set(range(done)) <= recorder.done
 
 
-def test_an_aborted_press_is_made_again(tmp_path):
+def test_abort_repeats_the_press(tmp_path):
     with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
         time_s = record(recorder, range(2), 0.0)
         recorder.append([time_s], np.zeros((1, FIBRES)))
         recorder.begin((2, -2), recorder.n_readings, 2)
         recorder.abort("the arm was stopped")
-        recorder.abort("told twice")
+        recorder.abort("a second time")
     events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
     assert events[-2:] == ["started", "aborted"]
     assert len(Recording.open(tmp_path / "run").presses_mm) == 2
@@ -185,8 +184,8 @@ def test_an_aborted_press_is_made_again(tmp_path):
 
 
 @pytest.mark.parametrize("name", [READINGS, JOURNAL])
-def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
-    path = made(tmp_path)
+def test_resume_refuses_damage_in_the_middle(tmp_path, name):
+    path = record_presses(tmp_path)
     content = bytearray((path / name).read_bytes())
     content[len(content) // 3] ^= 0xFF
     (path / name).write_bytes(bytes(content))
@@ -195,25 +194,25 @@ def test_damage_in_the_middle_is_told_not_repaired(tmp_path, name):
     assert (path / name).read_bytes() == bytes(content)
 
 
-def test_presses_whose_readings_were_torn_off_never_count_again(tmp_path):
+def test_resume_aborts_presses_without_their_readings(tmp_path):
     """The journal says they are done; once other readings fill the gap, it must not say so any more."""
-    path = made(tmp_path)
+    path = record_presses(tmp_path)
     content = (path / READINGS).read_bytes()
     (path / READINGS).write_bytes(content[: len(content) // 2])
     with Recorder.resume(path) as recorder:
-        kept = set(recorder.done)
-        assert kept < set(range(5))
+        done = set(recorder.done)
+        assert done < set(range(5))
         times = recorder.last_s + 1 + np.arange(100) / 10
         recorder.append(times, np.zeros((100, FIBRES)))
     with Recorder.resume(path) as recorder:
-        assert recorder.done == kept
-        recorder.begin((9, 9), recorder.n_readings, max(kept) + 1)
+        assert recorder.done == done
+        recorder.begin((9, 9), recorder.n_readings, max(done) + 1)
         recorder.abort("broken off")
-    assert len(Recording.open(path).presses_mm) == len(kept)
+    assert len(Recording.open(path).presses_mm) == len(done)
 
 
-def test_two_programs_cannot_record_into_one_folder(tmp_path):
-    path = made(tmp_path)
+def test_recorder_locks_the_folder(tmp_path):
+    path = record_presses(tmp_path)
     with Recorder.resume(path) as first:
         before = (path / READINGS).read_bytes()
         with pytest.raises(InputError, match="another program is recording"):
@@ -225,7 +224,7 @@ def test_two_programs_cannot_record_into_one_folder(tmp_path):
     assert len(Recording.open(path).down_command) == 7
 
 
-def test_a_full_disk_leaves_nothing_of_a_birth_and_on_closing_does_not_hide_what_went_wrong(tmp_path, monkeypatch):
+def test_recorder_on_a_full_disk_cleans_up_and_hides_no_error(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -241,7 +240,7 @@ def test_a_full_disk_leaves_nothing_of_a_birth_and_on_closing_does_not_hide_what
         with pytest.raises(InputError, match="No space left"):
             Recorder(tmp_path / "born" / "run", FIBRES, {}, {})
     assert list((tmp_path / "born" / "run").iterdir()) == []
-    made(tmp_path / "born")
+    record_presses(tmp_path / "born")
 
 
 @pytest.mark.parametrize(
@@ -251,25 +250,24 @@ def test_a_full_disk_leaves_nothing_of_a_birth_and_on_closing_does_not_hide_what
         (lambda r: r.append([0.0, 1.0], [[1.0, 2.0, 3.0]]), "times have shape"),
         (lambda r: r.append([np.nan], [[1.0, 2.0, 3.0]]), "finite numbers"),
         (lambda r: r.finish(100), "press 5 was not begun"),
-        (lambda r: r.begin((1.0, np.nan), 100), "place is .*, expected x and y up to"),
-        (lambda r: r.begin((1e6, 0.0), 100), "place is"),
+        (lambda r: r.begin((1.0, np.nan), 100), "position is .*, expected x and y up to"),
+        (lambda r: r.begin((1e6, 0.0), 100), "position is"),
         (lambda r: r.begin((0.0, 0.0), -1), "reading is -1"),
         (lambda r: r.begin((0.0, 0.0), 100, press=-1), "press is -1"),
         (lambda r: r.begin((0.0, 0.0), 100, depth_mm=np.nan), "expected what JSON can hold"),
         (lambda r: r.begin((0.0, 0.0), 100, tip=object()), "expected what JSON can hold"),
     ],
 )
-def test_what_would_spoil_a_recording_is_refused_and_leaves_it_as_it_was(tmp_path, call, message):
-    """A line of the journal that is none would make all of it one that nobody can read."""
-    path = made(tmp_path)
+def test_recorder_refuses_arguments_and_writes_nothing(tmp_path, call, message):
+    path = record_presses(tmp_path)
     before = {file.name: file.read_bytes() for file in path.iterdir()}
     with Recorder.resume(path) as recorder, pytest.raises(InputError, match=message):
         call(recorder)
     assert {file.name: file.read_bytes() for file in path.iterdir()} == before
 
 
-def test_presses_without_a_number_count_on_from_the_last(tmp_path):
-    """One that was aborted is made again under its number; after a break the count goes on."""
+def test_begin_numbers_presses(tmp_path):
+    """An aborted press keeps its number; after a break the count continues."""
     with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
         recorder.append(np.arange(5) / 10, np.zeros((5, FIBRES)))
         for press in (None, None, "aborted", None, 7):
@@ -287,36 +285,36 @@ def test_presses_without_a_number_count_on_from_the_last(tmp_path):
         assert recorder.done == {0, 1, 2, 7, 8}
 
 
-def die_being_born(path, step):
-    """Begin a recording in a process that ends where it puts something on the disk for the `step`th time."""
+def die_during_creation(path, step):
+    """Create a recording in a process that ends at its `step`th sync."""
     if os.fork() == 0:
-        left = iter(range(step))
-        os.fsync = lambda file: None if next(left, None) is not None else os._exit(0)
+        remaining = iter(range(step))
+        os.fsync = lambda file: None if next(remaining, None) is not None else os._exit(0)
         Recorder(path, FIBRES, {}, {})
         os._exit(0)
     os.wait()
 
 
-def test_a_recording_that_was_killed_while_being_born_can_be_made_again(tmp_path):
-    """Until `start.json` is there it begins anew, then it goes on."""
-    down_command = []
+def test_recorder_after_a_kill_during_creation(tmp_path):
+    """Without `start.json` it begins anew, else it is resumed."""
+    has_start = []
     for step in range(4):
         path = tmp_path / str(step) / "run"
         path.parent.mkdir()
-        die_being_born(path, step)
-        down_command.append((path / START).exists())
-        if down_command[-1]:
+        die_during_creation(path, step)
+        has_start.append((path / START).exists())
+        if has_start[-1]:
             with pytest.raises(InputError, match="never written over"):
                 Recorder(path, FIBRES, {}, {})
-        with Recorder.resume(path) if down_command[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
+        with Recorder.resume(path) if has_start[-1] else Recorder(path, FIBRES, {}, {}) as recorder:
             record(recorder, range(2), 0.0)
         assert len(Recording.open(path).presses_mm) == 2
         assert {file.name for file in path.iterdir()} == {START, READINGS, STATES, JOURNAL}
-    assert down_command == [False, True, True, True]
+    assert has_start == [False, True, True, True]
 
 
 @pytest.mark.parametrize("name", [READINGS, "notes.txt", ".unfinished-0123456789abcdef.json"])
-def test_what_another_left_is_in_the_way_and_stays(tmp_path, name):
+def test_recorder_refuses_a_folder_of_other_files(tmp_path, name):
     (tmp_path / name).write_text("mine")
     (tmp_path / JOURNAL).touch()
     with pytest.raises(InputError, match="exists and is not empty"):
@@ -324,9 +322,9 @@ def test_what_another_left_is_in_the_way_and_stays(tmp_path, name):
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "mine", JOURNAL: ""}
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="what is open is told on Linux")
-def test_what_a_recording_needs_to_be_opened_outlasts_a_power_cut(tmp_path, monkeypatch):
-    """Files before the folder that names them, and that before the one above; also where it is renamed into place."""
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are listed on Linux only")
+def test_recorder_and_save_sync_files_before_folders(tmp_path, monkeypatch):
+    """Files before their folder, and that before its parent; also where it is renamed."""
     synced = []
     fsync, rename = os.fsync, os.rename
 
@@ -349,25 +347,121 @@ def test_what_a_recording_needs_to_be_opened_outlasts_a_power_cut(tmp_path, monk
     assert tmp_path in synced[renamed:]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
+@pytest.mark.skipif(os.name != "posix", reason="kills and locks of POSIX")
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_recording_that_gives_way_is_there_whole_or_not_at_all(tmp_path, step):
-    """Killed between two file operations, any in the slow tier; and what is left goes with the next."""
-    new = replace(Recording.open(made(tmp_path, presses=2)), source={"kind": "simulated"})
+def test_save_replaces_all_or_nothing(tmp_path, step):
+    """Killed before any file operation (slow), or every third; the next save cleans up."""
+    new = replace(Recording.open(record_presses(tmp_path, presses=2)), source={"kind": "simulated"})
     with Recorder(tmp_path / "old", FIBRES, {"kind": "simulated"}, {}) as recorder:
         record(recorder, range(3), 0.0)
-    found = []
+    n_presses = []
     for number in count(step=step):
         folder = tmp_path / str(number)
         shutil.copytree(tmp_path / "old", folder / "run")
         (folder / ".run-mine").mkdir()
         ended = not killed(lambda folder=folder: new.save(folder / "run", {}, replacing=True), number, folder)
-        found.append(len(Recording.open(folder / "run").presses_mm) if (folder / "run").exists() else 0)
+        n_presses.append(len(Recording.open(folder / "run").presses_mm) if (folder / "run").exists() else 0)
         if not ended:
             new.save(folder / "run", {}, replacing=True)
         assert {path.name for path in folder.iterdir()} == {"run", ".run-mine"}
         if ended:
             break
-    assert set(found) <= {3, 0, 2}
-    assert found == sorted(found, key=[3, 0, 2].index)
-    assert step > 1 or set(found) == {3, 0, 2}
+    assert set(n_presses) <= {3, 0, 2}
+    assert n_presses == sorted(n_presses, key=[3, 0, 2].index)
+    assert step > 1 or set(n_presses) == {3, 0, 2}
+
+
+def test_open_drops_presses_of_torn_and_repeated_entries(recording: Recording, folder: Path) -> None:
+    journal = folder / "journal.ndjson"
+    journal.write_text(journal.read_text()[:-9])
+    assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 1
+    with Recorder.resume(folder) as recorder:
+        recorder.begin((0.0, 0.0), recorder.n_readings, press=7)
+    assert len(Recording.open(folder).presses_mm) == len(recording.presses_mm) - 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *(('"reading": 20,', f'"reading": {value},') for value in ("1e30", "20.0", "true", '"20"', "-1", "NaN")),
+        *(('"press": 0,', f'"press": {value},') for value in ("0.0", "false", '"0"', "null", "9" * 30)),
+        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"')),
+        ('"event": "started", ', ""),
+        ('"event": "started"', '"event": "began"'),
+        ('{"event"', "[" * 100_000 + '{"event"'),
+        ('{"event"', '3\n{"event"'),
+        *(
+            ('"event": "done",', f'"event": "done", {more},')
+            for more in ('"at_mm": 3', '"at_mm": [1, 2]', '"at_mm": [1, 2, "3"]', '"force_n": true')
+        ),
+    ],
+)
+def test_read_journal_refuses_other_values(folder: Path, old: str, new: str) -> None:
+    line = 2 if "done" in old else 1
+    journal = folder / "journal.ndjson"
+    text = journal.read_text()
+    assert old in text
+    journal.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=rf"journal\.ndjson: line {line} is no journal entry") as caught:
+        Recording.open(folder)
+    assert len(str(caught.value)) < 400
+
+
+def test_read_journal_reads_depth_and_force(recording: Recording, folder: Path) -> None:
+    journal = folder / "journal.ndjson"
+    first, *others = journal.read_text().replace('"depth_mm": 5.0', '"depth_mm": null').splitlines(keepends=True)
+    done = others[0].replace("}", ', "at_mm": [0.1, 0.2, 3.9], "force_n": 12.5}')
+    journal.write_text("".join([first.replace("null", "4"), done, *others[1:]]))
+    read = Recording.open(folder)
+    assert (read.depths_mm[0], read.reached_mm[0], read.forces_n[0]) == (4.0, 3.9, 12.5)
+    assert np.isnan([read.depths_mm[1:], read.reached_mm[1:], read.forces_n[1:]]).all()
+    assert read.digest == recording.digest
+
+
+@pytest.mark.parametrize("name", ["journal.ndjson", "readings.bin"])
+def test_resume_refuses_links(folder: Path, tmp_path: Path, name: str) -> None:
+    elsewhere = (folder / name).rename(tmp_path / "elsewhere")
+    elsewhere.write_bytes(elsewhere.read_bytes() + b"torn")
+    (folder / name).symlink_to(elsewhere)
+    before = {path: path.read_bytes() for path in (*folder.iterdir(), elsewhere)}
+    with pytest.raises(InputError, match=rf"{name}: is a link"):
+        Recorder.resume(folder)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_resume_refuses_presses_without_any_reading(folder: Path) -> None:
+    """No break leaves that: the readings are elsewhere, or not copied yet."""
+    (folder / "readings.bin").write_bytes(b"")
+    before = (folder / "journal.ndjson").read_bytes()
+    with pytest.raises(InputError, match=r"readings\.bin: not the readings of \d+ presses"):
+        Recorder.resume(folder)
+    assert (folder / "journal.ndjson").read_bytes() == before
+
+
+@pytest.mark.parametrize("fibres", [1, 2, 3, 5, 6, 7, 11])
+def test_resume_refuses_readings_of_other_fibres(folder: Path, fibres: int) -> None:
+    """Blocks of one size hold any of several numbers of fibres."""
+    start = folder / "start.json"
+    document = json.loads(start.read_text())
+    assert document["fibres"] == 4
+    start.write_text(json.dumps(document | {"fibres": fibres}))
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(InputError, match=r"readings\.bin: .* of \d+ fibres"):
+        Recorder.resume(folder)
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_resume_reads_the_journal_after_the_lock(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another program may finish a press before the lock."""
+
+    def finish_before_lock(file: object, busy: str) -> None:
+        monkeypatch.undo()
+        with Recorder.resume(folder) as another:
+            another.append([another.last_s + 1], np.zeros((1, another.fibres)))
+            another.begin((0, 0), another.n_readings, press=9999)
+            another.append([another.last_s + 1], np.zeros((1, another.fibres)))
+            another.finish(another.n_readings)
+
+    monkeypatch.setattr("padforge.sense.recording.run_directory.lock", finish_before_lock)
+    with Recorder.resume(folder) as recorder:
+        assert 9999 in recorder.done

@@ -1,0 +1,340 @@
+"""Recordings from and to bags of ROS 2, also as another reader (`mcap` with `mcap-ros2-support`) sees them."""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
+
+from padforge.design.common.validation import InputError
+from padforge.sense import Recording, open_recording
+from padforge.sense.formats import ros_recording
+from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
+from padforge.sense.formats.import_export import export_file, import_file
+from padforge.sense.formats.ros_recording import export_bag, import_bag
+
+from .foreign import STORE, Message, array, make, pose, wrench, write_bag
+
+READINGS, PLACE = "/pad/readings", "/pad/place"
+
+
+def read_by_mcap(path: Path) -> tuple[dict[str, list[tuple[int, Any]]], dict[str, str]]:
+    """Return stamps and messages by topic, and the types of topics."""
+    topics, types = defaultdict(list), {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, content in reader.iter_decoded_messages():
+            assert schema is not None
+            topics[channel.topic].append((message.log_time, content))
+            types[channel.topic] = schema.name
+    return topics, types
+
+
+def xyz(point: Any) -> list[float]:
+    return [point.x, point.y, point.z]
+
+
+def test_export_bag_is_read_by_mcap(eight: Recording, bag: Path) -> None:
+    topics, types = read_by_mcap(bag)
+    assert types == {
+        "/pad/readings": "std_msgs/msg/Float64MultiArray",
+        "/pad/pressed": "std_msgs/msg/Bool",
+        "/pad/place": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/pad/reached": "geometry_msgs/msg/PointStamped",
+        "/pad/force": "geometry_msgs/msg/WrenchStamped",
+        "/pad/recording": "std_msgs/msg/String",
+    }
+    stamps, messages = zip(*topics["/pad/readings"], strict=True)
+    assert np.abs(np.array(stamps) - eight.times_s * 1e9).max() <= 1
+    np.testing.assert_array_equal([message.data for message in messages], eight.readings)
+    (dim,) = messages[0].layout.dim
+    assert (dim.label, dim.size, dim.stride) == ("fibre", 4, 4)
+    assert [content.data for _, content in topics["/pad/pressed"]] == [True, False] * 8
+    assert [stamp for stamp, _ in topics["/pad/pressed"]][::2] == [stamps[at] for at in eight.down_command]
+    positions = dict(zip(np.flatnonzero(eight.has_position).tolist(), topics["/pad/place"], strict=True))
+    for press, (stamp, place) in positions.items():
+        assert place.header.frame_id == "pad"
+        assert place.header.stamp.sec * 10**9 + place.header.stamp.nanosec == stamp == stamps[eight.down_command[press]]
+        depth = 0.0 if press == 3 else -eight.depths_mm[press]
+        expected = np.append(eight.presses_mm[press], depth) / 1000
+        np.testing.assert_allclose(xyz(place.pose.pose.position), expected, rtol=1e-15)
+        assert place.pose.pose.orientation.w == 1
+        assert [at for at, value in enumerate(place.pose.covariance) if value] == ([14] if press == 3 else [])
+    assert positions[3][1].pose.covariance[14] == -1
+    reached = [content.point.z for _, content in topics["/pad/reached"]]
+    np.testing.assert_allclose(reached, -np.delete(eight.reached_mm, 3) / 1000, rtol=1e-15)
+    forces = [content.wrench.force.z for _, content in topics["/pad/force"]]
+    np.testing.assert_array_equal(forces, np.delete(eight.forces_n, 4))
+    about = json.loads(topics["/pad/recording"][0][1].data)
+    assert about["format"] == "padforge-ros/2"
+    assert about["digest"] == eight.digest
+    assert about["topics"]["/pad/readings"].startswith("V, ")
+    assert set(about["topics"]) | {"/pad/recording"} == set(types)
+
+
+def test_export_bag_round_trip_is_reproducible(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    """Also times of any clock, presses without a pause and one without an end."""
+    edges = np.array([10, 21, 200]), np.array([20, 30, len(eight.readings)])
+    others = [replace(eight, times_s=eight.times_s + shift) for shift in (-1e3, 1.7e9, 5e9, 0.1234567890123)]
+    for other in (eight, *others, Recording(eight.readings, eight.times_s, np.eye(3, 2), *edges)):
+        export_bag(other, tmp_path / "eight.mcap")
+        assert (imported := import_bag(tmp_path / "eight.mcap")) == other
+        assert (imported.digest, imported.source) == (other.digest, other.source)
+        assert [file.name for file in tmp_path.iterdir()] == ["eight.mcap"]
+    export_bag(eight, tmp_path / "eight.mcap")
+    assert (tmp_path / "eight.mcap").read_bytes() == bag.read_bytes()
+    with Reader(bag) as reader:  # rosbag2 tells whoever comes later what is in the recording
+        durability = {each.topic: each.ext.offered_qos_profiles[0].durability for each in reader.connections}  # pyright: ignore
+    assert {topic for topic, how in durability.items() if how == QosDurability.TRANSIENT_LOCAL} == {"/pad/recording"}
+
+
+def test_export_bag_carries_annotations(eight: Recording, tmp_path: Path) -> None:
+    depth = np.where(np.arange(8) < 4, 2.0, np.nan)
+    positions = np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])
+    faults = [FaultAnnotation(5, (1,), "open", "fibre 2 is open")]
+    annotations = ModelAnnotations(*positions, np.ones(8), depth, depth / 4, faults, (3,))
+    export_bag(eight, tmp_path / "r.mcap", annotations)
+    topics, types = read_by_mcap(tmp_path / "r.mcap")
+    assert types["/pad/touches"] == "geometry_msgs/msg/PoseWithCovarianceStamped"
+    stamp, first = topics["/pad/touches"][0]
+    assert stamp == topics["/pad/readings"][eight.up_command[0]][0]
+    np.testing.assert_allclose(xyz(first.pose.pose.position), [0.003, 0.003, -0.002])
+    std = np.sqrt([first.pose.covariance[at] for at in (0, 7, 14)])
+    np.testing.assert_allclose(std, [5e-4, 2.5e-4, 5e-4 / 1.6449])
+    assert topics["/pad/touches"][7][1].pose.covariance[14] == -1
+    levels = [[status.level for status in content.status] for _, content in topics["/pad/health"]]
+    numbers = [[level if isinstance(level, int) else level[0] for level in each] for each in levels]
+    assert numbers == [[0, 0, 0, 2], [0, 2, 0, 2]]
+    fault = topics["/pad/health"][1][1].status[1]
+    assert (fault.name, fault.message, fault.values[0].value) == ("pad: fibre 2", "fibre 2 is open", "open")
+    assert import_bag(tmp_path / "r.mcap") == eight
+    with pytest.raises(InputError, match=r"predictions of a model can be written as \.mcap"):
+        export_file(eight, tmp_path / "r.csv", annotations=annotations)
+
+
+def test_export_bag_writes_arm_poses(eight: Recording, tmp_path: Path) -> None:
+    states = np.zeros((3, 10))
+    states[:, 0] = [-5, 1, 2]
+    states[:, 1:4] = [100, 200, 300]
+    states[1, 4:7] = [0, np.pi, 0]
+    export_bag(eight, tmp_path / "r.mcap", states=states)
+    topics, _ = read_by_mcap(tmp_path / "r.mcap")
+    (_, turned), (stamp, straight) = topics["/arm/pose"]
+    assert stamp == 2 * 10**9
+    assert straight.header.frame_id == "base"
+    np.testing.assert_allclose(xyz(turned.pose.position), [0.1, 0.2, 0.3])
+    np.testing.assert_allclose([turned.pose.orientation.y, turned.pose.orientation.w], [1, 0], atol=1e-15)
+    assert straight.pose.orientation.w == 1
+    assert import_bag(tmp_path / "r.mcap") == eight
+
+
+def test_export_bag_refuses_what_cannot_be_read_or_written(
+    eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros_recording, "MAX_MESSAGES", 100)
+    with pytest.raises(InputError, match=r"would be \d+ messages .* allowed in a bag are 100"):
+        export_bag(eight, tmp_path / "r.mcap")
+    monkeypatch.undo()
+    with pytest.raises(InputError, match=r"too long for a bag: \d+ characters of times, presses and source"):
+        export_bag(replace(eight, source={"lists": [[]] * 2**21}), tmp_path / "r.mcap")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "there.mcap").mkdir()
+    with pytest.raises(InputError, match=r"there\.mcap: is a folder, expected a file or nothing"):
+        export_bag(eight, tmp_path / "there.mcap")
+    assert [file.name for file in tmp_path.iterdir()] == ["there.mcap"]
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
+    for run in (lambda: export_bag(eight, tmp_path / "r.mcap"), lambda: import_bag(tmp_path / "r.mcap")):
+        with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[ros\]'"):
+            run()
+
+
+def changed(bag: Path, folder: Path, change: Callable[[str, float, Any], bool]) -> Path:
+    """Write the messages of a bag for which `change`, which may alter them, returns True."""
+
+    def messages() -> Iterator[Message]:
+        with Reader(bag) as reader:
+            for connection, stamp, data in reader.messages():
+                message = STORE.deserialize_cdr(data, connection.msgtype)
+                if change(connection.topic, stamp / 1e9, message):
+                    yield connection.topic, stamp / 1e9, message
+
+    return write_bag(folder, messages())
+
+
+def check_close(recording: Recording, expected: Recording) -> None:
+    """Check that recordings are equal but for rounding, and depths at unknown positions."""
+    expected = replace(expected, depths_mm=np.where(expected.has_position, expected.depths_mm, np.nan))
+    np.testing.assert_array_equal(recording.readings, expected.readings)
+    np.testing.assert_array_equal(
+        [recording.down_command, recording.up_command], [expected.down_command, expected.up_command]
+    )
+    for name in ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n"):
+        np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12, atol=1e-9)
+
+
+def test_import_bag_from_messages_alone(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    imported = import_bag(changed(bag, tmp_path / "bag", lambda topic, *_: topic != "/pad/recording"))
+    check_close(imported, eight)
+    assert imported.source == {"kind": "ros", "file": "bag.mcap"}
+    unpressed = import_bag(changed(bag, tmp_path / "unpressed", lambda topic, *_: topic == READINGS))
+    assert unpressed.source["presses"] == "detected"
+    assert len(unpressed.presses_mm) >= 7
+    assert not unpressed.has_position.any()
+
+
+def test_z_points_into_a_mirrored_pad(eight: Recording, tmp_path: Path) -> None:
+    mirrored = replace(eight, source={"rig": {"mirrored": True}})
+    export_bag(mirrored, tmp_path / "r.mcap")
+    assert import_bag(tmp_path / "r.mcap").mirrored
+    heights: list[float] = []
+
+    def collect(topic: str, _: float, message: Any) -> bool:
+        heights.extend([message.pose.pose.position.z] if topic == PLACE else [])
+        return topic != "/pad/recording"
+
+    check_close(import_bag(changed(tmp_path / "r.mcap", tmp_path / "bag", collect)), eight)
+    np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.has_position]) / 1000)
+
+
+def test_import_bag_of_a_cut_or_edited_bag(eight: Recording, bag: Path, tmp_path: Path) -> None:
+    first, end = (int(stamps) for stamps in (eight.down_command[1] + 3, eight.down_command[6] + 2))
+    span = eight.times_s[[first, end]] + [-1e-6, 1e-6]
+    in_span = lambda topic, time, _: topic == "/pad/recording" or span[0] <= time <= span[1]  # noqa: E731
+    imported = import_bag(changed(bag, tmp_path / "bag", in_span))
+    assert imported.source["note"] == "was changed since it was exported; /pad/recording is left out"
+    names = ("presses_mm", "depths_mm", "reached_mm", "forces_n")
+    part = replace(
+        eight,
+        readings=eight.readings[first : end + 1],
+        times_s=eight.times_s[first : end + 1],
+        down_command=eight.down_command[2:7] - first,
+        up_command=np.append(eight.up_command[2:6] - first, end + 1 - first),
+        **{name: getattr(eight, name)[2:7] for name in names},
+    )
+    check_close(imported, part)
+
+    def edited(topic: str, _: float, message: Any) -> bool:
+        if topic == PLACE:
+            message.pose.pose.position.x += moved_m
+        if topic == READINGS:
+            message.data = message.data + louder_v
+        return True
+
+    moved_m, louder_v = 0.001, 0.0
+    imported = import_bag(changed(bag, tmp_path / "moved", edited))
+    np.testing.assert_allclose(imported.presses_mm[:, 0], eight.presses_mm[:, 0] + 1)
+    moved_m, louder_v = 0.0, 0.5
+    imported = import_bag(changed(bag, tmp_path / "louder", edited))
+    assert imported == replace(eight, readings=eight.readings + 0.5)
+    assert imported.source["note"] == "readings are not those that were exported"
+
+
+def lab() -> Iterator[Message]:
+    """Yield readings at 50 Hz; from 1 s on a press every second, 0.4 s long, at (n, -n) cm and with 2 n N."""
+    yield "/camera", 0.0, make("String", "no picture")
+    for step in range(300):
+        time = step / 50
+        number = step // 50
+        if step % 50 == 0 and number:
+            yield "/probe", time - 0.001, pose(number / 100, -number / 100)
+            yield "/wrench", time - 0.001, wrench(0.0, 1.2 * number, -1.6 * number)
+        if step % 50 in (0, 20) and number:
+            yield "/down", time - 0.001, make("Bool", step % 50 == 0)
+        yield "/skin/all", time, array("Float32MultiArray", np.array([number, step, 512], np.float32))
+        yield "/skin/1", time, make("Int16", number)
+        yield "/skin/2", time + 0.001, make("Float64", step / 2)
+        if step % 2 == 0:
+            yield "/at/y", time, make("UInt8", step // 2 % 7)
+        yield "/at/x", time + 0.001, make("Float32", step)
+
+
+ALL = "fibres=/skin/all:mV,positions=/probe,force=/wrench,press=/down"
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3", "packed", "folder", "sqlite3 folder"])
+def test_import_bag_by_columns(tmp_path: Path, form: str) -> None:
+    bag = write_bag(tmp_path / "lab", lab(), "sqlite3" if "sqlite3" in form else "mcap", form == "packed")
+    imported = import_file(bag.parent if "folder" in form else bag, ALL)
+    n = np.arange(1, 6)
+    np.testing.assert_allclose(imported.times_s, np.arange(300) / 50)
+    np.testing.assert_allclose(imported.readings[123], [0.002, 0.123, 0.512])
+    np.testing.assert_allclose(imported.presses_mm, np.column_stack([10 * n, -10 * n]))
+    np.testing.assert_allclose(imported.forces_n, 2 * n)
+    assert imported.down_command.tolist() == (50 * n).tolist()
+    assert imported.up_command.tolist() == (50 * n + 20).tolist()
+    assert imported.source["columns"] == ALL
+
+
+def test_import_bag_holds_values_of_scalar_topics(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "lab", lab())
+    imported = import_bag(bag, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y")
+    np.testing.assert_allclose(imported.readings[60], [0.01, 59 / 200])  # the second one comes after the first
+    assert np.isnan(imported.readings[0, 1])
+    middle = (imported.down_command + imported.up_command) // 2
+    np.testing.assert_allclose(imported.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 2 % 7)]))
+
+
+@pytest.mark.parametrize(
+    ("mapping", "reason"),
+    [
+        ("", r"has no topic /pad/readings; columns .* there are '/camera', '/skin/all', .* '/probe'"),
+        ("fibres=/skin", r"fibres is '/skin', expected one of '/camera', '/skin/all'"),
+        ("fibres=/camera", r"fibres is '/camera' of 'std_msgs/msg/String', expected std_msgs/msg/Float32MultiArray"),
+        ("fibres=/skin/all,positions=/wrench", r"positions is '/wrench' of .*WrenchStamped', expected geometry_msgs/"),
+        ("fibres=/skin/all,press=/skin/1", r"press is '/skin/1' of 'std_msgs/msg/Int16', expected std_msgs/msg/Bool"),
+        ("fibres=/skin/all,time=/skin/1", "mapping has 'time=/skin/1', expected QUANTITY=NAME"),
+        ("positions=/probe", "does not name fibres, expected fibres in each"),
+        ("fibres=/skin/all,fibres=/skin/1,positions=/probe:furlong", "unit of positions is 'furlong'"),
+    ],
+)  # fmt: skip
+def test_import_bag_refuses_columns_that_do_not_fit(tmp_path: Path, mapping: str, reason: str) -> None:
+    bag = write_bag(tmp_path / "lab", lab())
+    with pytest.raises(InputError, match=reason) as refusal:
+        import_bag(bag, mapping)
+    assert "\n" not in str(refusal.value)
+
+
+def test_import_bag_refuses_changing_lengths_and_empty_topics(tmp_path: Path) -> None:
+    messages = {"other": array("Float64MultiArray", np.ones(3)), "none": array("Float64MultiArray", np.ones(0))}
+    for name, message in messages.items():
+        bag = write_bag(tmp_path / name, [("/f", 0.1, array("Float64MultiArray", np.ones(2))), ("/f", 0.2, message)])
+        with pytest.raises(InputError, match=r"fibres is '/f': (data has 2 values in some|message 1 has no data)"):
+            import_bag(bag, "fibres=/f")
+    readings = [("/f", 0.1 * step, array("Float64MultiArray", np.ones(2))) for step in range(9)]
+    for name, pressed in (("never", [(0.2, False)]), ("before", [(0.0, True), (0.1, False)])):
+        bag = write_bag(tmp_path / name, [*readings, *(("/down", time, make("Bool", on)) for time, on in pressed)])
+        with pytest.raises(InputError, match="press is nowhere true after the first reading"):
+            import_bag(bag, "fibres=/f,press=/down")
+
+
+def test_import_file_reads_folders_of_one_or_more_files_in_any_order(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(InputError, match=r"ends in '', allowed are \.mat, \.csv, .*or a rosbag2 folder"):
+        import_file(tmp_path)
+    assert open_recording(folder)
+    bag = write_bag(tmp_path / "lab", lab())
+    (bag.parent / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  compression_mode: FILE\n")
+    with pytest.raises(InputError, match="lab: is compressed by FILE, expected none or by chunk"):
+        import_file(bag.parent, ALL)
+    (bag.parent / "metadata.yaml").write_text("")
+    assert import_file(bag.parent, ALL).fibres == 3
+    bag.unlink()
+    with pytest.raises(InputError, match=r"has metadata\.yaml, but no file that ends in \.mcap or \.db3"):
+        import_file(bag.parent, ALL)
+    messages = list(lab())
+    mixed = [messages[at] for at in np.random.default_rng(0).permutation(len(messages))]
+    for number, part in enumerate((messages[:400], messages[400:])):
+        bag = write_bag(tmp_path / f"part_{number}", part)
+        (tmp_path / "bag").mkdir(exist_ok=True)
+        bag.rename(tmp_path / "bag" / bag.name)
+    (tmp_path / "bag" / "metadata.yaml").write_text("")
+    expected = import_file(write_bag(tmp_path / "all", messages), ALL)
+    assert import_file(tmp_path / "bag", ALL) == expected
+    assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected
