@@ -219,22 +219,22 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     check_writable(path.parent)
     localizer, digest = LocalizerModel.load(model), sha256(model / "localizer.json")
     if path.suffix == ".onnx":
-        from padforge.sense.deploy.onnx_export import export_onnx, onnx_line
+        from padforge.sense.deploy.onnx_export import export_onnx
 
         opened = None if recording is None else read_recording(recording)
-        click.echo(f"{onnx_line(export_onnx(localizer, digest, path, opened))} -> {path}")
+        click.echo(f"{export_onnx(localizer, digest, path, opened).text} -> {path}")
         return
-    from padforge.sense.deploy.c_header import export_header, header_lines
-    from padforge.sense.deploy.streaming import Budget
+    from padforge.sense.deploy.c_header import export_header
+    from padforge.sense.deploy.streaming import MemoryBudget
     from padforge.sense.settings import LocalizerSettings
 
     if recording is None:
         raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
-    budget, options = Budget(flash, ram, quantize == "int8"), common.load_spec(spec).section(LocalizerSettings)
+    budget, options = MemoryBudget(flash, ram, quantize == "int8"), common.load_spec(spec).section(LocalizerSettings)
     opened = read_recording(recording)
     with progress_bar("training") as report:
         header = export_header(localizer, digest, path, opened, budget, options, report)
-    click.echo("\n".join([*header_lines(header, budget), f"localizer -> {path}"]))
+    click.echo("\n".join([*header.lines(budget), f"localizer -> {path}"]))
 
 
 @click.command()
@@ -266,7 +266,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     old, opened = LocalizerModel.load(model), open_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
     with progress_bar("recalibrating") as report:
-        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, progress=report)
+        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
     with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"

@@ -174,8 +174,8 @@ def simulate(
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     if rig.plan == "adaptive":
         raise InputError(
-            "[rig] plan is adaptive, which only steers a recording in real time; allowed in a simulation are sample_uniform, "
-            "grid, boustrophedon or a .csv file"
+            "[rig] plan is adaptive, which only steers a recording in real time; allowed in a simulation are uniform, "
+            "grid, serpentine or a .csv file"
         )
     if isinstance(pad, Twin):
         model = model_twin(pad, size)

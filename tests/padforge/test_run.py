@@ -63,7 +63,7 @@ def test_run_makes_everything(finished: tuple[Path, str]) -> None:
     text = (out / "report.html").read_text()
     assert text.count('src="data:image/') == 6
     assert "http://" not in text.replace("http://www.w3.org", "")
-    for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Lost fibres", "Provenance"):
+    for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Provenance"):
         assert f">{heading}</h2>" in text
 
 

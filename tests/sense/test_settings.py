@@ -50,7 +50,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         (RigSettings, "box_mm", ([-1e4, 1e4] * 3, "unknown"), ([0, 1] * 2, [0, float("nan")] * 3)),
         (RigSettings, "contact_mm", (-1e4, 1e4, "unknown"), (1.1e4, float("inf"), "unwatched")),
         (RigSettings, "tool_rad", ([0, 6.3, 0],), ([0, 6.4, 0], [0, 3.14])),
-        (RigSettings, "plan", ("adaptive", "mine.CSV"), ("serpentine", "mine.txt")),
+        (RigSettings, "plan", ("serpentine", "mine.CSV"), ("boustrophedon", "mine.txt")),
         (RigSettings, "baud", (9600, 20_000_000), (9599, 20_000_001)),
         (RigSettings, "channels", ([0, 511], []), (8, [-1], [512], ["A0"])),
         (LocalizerSettings, "test_share", (0.01, 0.99), (0.0, 1.0)),

@@ -43,7 +43,7 @@ def make_model(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(trace_model, "MOST_STEPS", 80):
+    with mock.patch.object(trace_model, "MAX_STEPS", 80):
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 

@@ -29,7 +29,7 @@ def test_import_maps_columns(padforge_sense) -> None:
     assert out == "3 presses, 30 readings of 2 fibres at 10.0 Hz -> out/lab/recording\n"
     recording = Recording.open("out/lab/recording")
     assert recording.presses_mm.tolist() == [[10, 0], [20, 0], [30, 0]]
-    assert recording.source["mapping"] == mapping
+    assert recording.source["columns"] == mapping
 
 
 def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:

@@ -22,8 +22,8 @@ from tests.helpers.door import Ended, call
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A published network of three neurons, and a coarse response model, which are not what is tested."""
-    monkeypatch.setattr("padforge.sense.localizer.training.HIDDEN", 3)
-    monkeypatch.setattr("padforge.sense.localizer.response_model.BUMPS", 7)
+    monkeypatch.setattr("padforge.sense.localizer.training.PUBLISHED_HIDDEN", 3)
+    monkeypatch.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
 
 
 def mean_of_map(part: dict) -> float:

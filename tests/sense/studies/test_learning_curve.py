@@ -45,7 +45,7 @@ def quick() -> Iterator[None]:
     """Few resamplings, and a coarse response model."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("padforge.sense.studies.learning_curve.RESAMPLINGS", 40)
-        patched.setattr("padforge.sense.localizer.response_model.BUMPS", 7)
+        patched.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
         yield
 
 
