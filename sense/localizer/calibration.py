@@ -21,13 +21,7 @@ from padforge.sense.localizer.bayes import N_SUMMARY
 from padforge.sense.localizer.evaluation import conformal, evaluate, held_back_presses
 from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.network import (
-    MAX_LOG_ERROR,
-    MIN_LOG_ERROR,
-    Weights,
-    check_weights,
-    predict_members,
-)
+from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights, check_weights, predict_members
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
@@ -47,31 +41,17 @@ INTERVAL_SUBSETS = 32
 OnProgress = Callable[[int, int], None]
 
 
-def _ignore(done: int, total: int) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class CalibrationData:
-    """Presses of known position to train on and to calibrate by.
+    """Q presses of known position to train on and to calibrate by."""
 
-    Attributes:
-        features: (Q) as commanded.
-        detected: the same presses as they would be detected in the readings; None where they are not augmented so.
-        positions_mm: (Q, 2).
-        measures: (Q,) of each of depth and force to be predicted.
-        feature_set: a name in `FEATURES`, or "array".
-        rate_hz: readings per second.
-        sha256: digest of what they came from.
-    """
-
-    features: PressFeatures
-    detected: PressFeatures | None
-    positions_mm: Array
-    measures: Mapping[str, Array]
-    feature_set: str
+    features: PressFeatures  # as commanded
+    detected: PressFeatures | None  # as they would be detected in the readings, to augment the others
+    positions_mm: Array  # (Q, 2)
+    measures: Mapping[str, Array]  # (Q,) of each of depth and force to be predicted
+    feature_set: str  # a name in `FEATURES`, or "array"
     rate_hz: float
-    sha256: str
+    sha256: str  # of what they came from
 
     @classmethod
     def from_recording(cls, recording: Recording, training: Indices, options: LocalizerSettings) -> "CalibrationData":
@@ -98,7 +78,7 @@ def calibrate(
     options: LocalizerSettings | None = None,
     *,
     time_budget: float | None = None,
-    on_progress: OnProgress = _ignore,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> tuple[LocalizerModel, dict[str, Any]]:
     """Train a localizer on a part of the presses and test it on the others.
 
@@ -131,14 +111,8 @@ def calibrate(
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"), one_torch_thread():
-        model = fit_model(
-            CalibrationData.from_recording(recording, training, options),
-            training,
-            options,
-            rng,
-            on_progress,
-            time_budget,
-        )
+        data = CalibrationData.from_recording(recording, training, options)
+        model = fit_model(data, training, options, rng, on_progress, time_budget)
     model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     with stage("evaluate"):
         document = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
@@ -151,7 +125,7 @@ def fit_recording(
     training: Indices,
     options: LocalizerSettings,
     rng: np.random.Generator,
-    on_progress: OnProgress = _ignore,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> LocalizerModel:
     """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
     return fit_model(CalibrationData.from_recording(recording, training, options), training, options, rng, on_progress)
@@ -162,7 +136,7 @@ def fit_model(
     training: Indices,
     options: LocalizerSettings,
     rng: np.random.Generator,
-    on_progress: OnProgress = _ignore,
+    on_progress: OnProgress = lambda done, total: None,
     time_budget: float | None = None,
 ) -> LocalizerModel:
     """Train a localizer and calibrate its uncertainty.
@@ -176,8 +150,8 @@ def fit_model(
         training: indices of the presses to train on and to calibrate by.
         options: how to train.
         rng: source of all that is random.
-        on_progress: called with (steps done, steps in all); with a time budget, with seconds.
-        time_budget: seconds to train for, see `calibrate`.
+        on_progress: see `calibrate`.
+        time_budget: see `calibrate`.
 
     Raises:
         InputError: too few presses, or the training diverged.
@@ -232,20 +206,13 @@ def calibrate_scales(
 
     The Bayesian localizer is overconfident of few or badly placed presses: those of training are augmented by the same
     response that it predicts them by.
-
-    Args:
-        model: with a Bayesian localizer.
-        presses: of the calibration.
-        positions_mm: (Q, 2).
-        levels: numbers of failed fibres, from 0.
     """
     targets = model.scaler.scale_targets(positions_mm)
     ratios = []
+    networks = model.bayes, model.residual_network
     for failed in (subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)):
         fibre_mask = presses.fibre_mask & ~np.isin(np.arange(model.fibres), failed)
-        outputs = predict_members(
-            model.weights, presses.inputs, fibre_mask, "ensemble", model.bayes, model.residual_network
-        )
+        outputs = predict_members(model.weights, presses.inputs, fibre_mask, "ensemble", *networks)
         predicted, log_error = np.split(outputs, 2, axis=2)
         expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
         ratios.append(np.abs(predicted - targets).mean(axis=2) / expected)
@@ -318,10 +285,7 @@ def _rows(measures: Mapping[str, Array], rows: Indices) -> dict[str, Array]:
 
 
 def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:
-    """Return the measures that can be learnt, (Q,) of all presses, by the names of `Recording.measures`.
-
-    Depth, if it is known of all `presses` and varies; then force too, if it is known of all.
-    """
+    """Depth, if it is known of all `presses` and varies; then force too, if it is known of all."""
     measures = recording.measures
     depth, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
     if np.isnan(depth).any() or depth.min() <= 0 or np.ptp(np.percentile(depth, [5, 95])) <= MIN_DEPTH_RANGE_MM:
@@ -332,8 +296,7 @@ def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:
 def unlearnt_lines(recording: Recording, model: LocalizerModel) -> list[str]:
     """Say in lines why a model has not learnt a depth or force that is known of some presses of a recording."""
     learnt = {target.name for target in model.scaler.measures}
-    measures = {name: values[recording.has_position] for name, values in recording.measures.items()}
-    depth, force = measures["depth_mm"], measures["force_n"]
+    depth, force = (recording.measures[name][recording.has_position] for name in ("depth_mm", "force_n"))
     presses, n_above = len(depth), int((depth <= 0).sum())
     n_depth, n_force = int((~np.isnan(depth)).sum()), int((~np.isnan(force)).sum())
     if model.method != "ensemble":

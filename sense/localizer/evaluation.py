@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.common.validation import InputError, check_int
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import FEATURES, interpolate_gaps, window_means
-from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
+from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/2"
@@ -41,8 +41,6 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         InputError: no level, one that leaves no fibre, no press of known position, or a recording that does not suit
             the localizer or was seen in its recalibration.
     """
-    check_type("localizer", model, LocalizerModel)
-    check_type("recording", recording, Recording)
     levels = tuple(levels)
     if not levels:
         raise InputError(f"levels name no number of failed fibres, expected one or more of 0 to {model.fibres - 1}")
@@ -89,14 +87,10 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
 
 
 def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices:
-    """Return the indices of the test presses of a model in the recording of its training.
-
-    Raises:
-        InputError: there is no such press, or its position is unknown.
-    """
+    """Return the indices of the test presses of a model in the recording of its training, checked."""
     presses = len(recording.presses_mm)
     for press in model.test:
-        if not 0 <= press < presses or not recording.has_position[press]:
+        if press >= presses or not recording.has_position[press]:
             raise InputError(
                 f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known position"
             )
@@ -140,16 +134,8 @@ def error_row(
 ) -> dict[str, Any]:
     """Summarize the errors of presses predicted with each set of failed fibres of a size.
 
-    Args:
-        n_failed: size of the sets.
-        predictions: of Q presses, one a set.
-        positions_mm: (Q, 2) true positions.
-        measures: (Q,) true depths and forces, NaN where unknown.
-
-    Returns:
-        Number of sets; mean, standard deviation and greatest of their mean errors; median and 95th percentile over all
-        presses; shares within the radii; of depth and force that are predicted and known, mean and 95th percentile of
-        the error, and the share within r90.
+    Mean, standard deviation and greatest are those of the mean errors of the sets; median, 95th percentile and shares
+    are over all presses. Arguments are as in `errors_by_loss`, with a prediction for each set.
     """
     errors = np.stack([distances(each.positions_mm, positions_mm) for each in predictions])
     means = errors.mean(axis=1)
@@ -178,18 +164,12 @@ def error_row(
 
 def _measure_errors(predictions: Sequence[Localization], measures: Measures | None) -> dict[str, tuple[Array, Array]]:
     """(sets, Q) errors of each predicted measure, NaN where the true value is unknown, and their r90."""
-    unknown = np.full(len(predictions[0].positions_mm), np.nan)
-
-    def stack(name: str, values: Callable[[MeasureEstimate], Array]) -> Array:
-        return np.stack([values(each.measures[name]) for each in predictions])
-
-    return {
-        name: (
-            np.abs(stack(name, lambda each: each.values) - (measures or {}).get(name, unknown)),
-            stack(name, lambda each: each.r90),
-        )
-        for name in predictions[0].measures
-    }
+    errors = {}
+    for name in predictions[0].measures:
+        estimates = [each.measures[name] for each in predictions]
+        values, r90 = np.stack([each.values for each in estimates]), np.stack([each.r90 for each in estimates])
+        errors[name] = np.abs(values - (measures or {}).get(name, np.nan)), r90
+    return errors
 
 
 def distances(predicted_mm: Array, pressed_mm: Array) -> Array:
@@ -214,8 +194,8 @@ def conformal(predictions: Sequence[Localization], positions_mm: Array, measures
     """
     standardized = [(each.positions_mm - positions_mm) / each.std_mm for each in predictions]
     errors = np.array([distances(each.positions_mm, positions_mm) for each in predictions])
-    factors = [float(np.sqrt(np.square(standardized).mean()))]
-    factors += [
+    factors = [
+        float(np.sqrt(np.square(standardized).mean())),
         _conformal_quantile(0.5, errors / [each.r50_mm for each in predictions]),
         _conformal_quantile(0.9, errors / [each.r90_mm for each in predictions]),
     ]
@@ -256,33 +236,30 @@ def errors_by_position(predicted_mm: Array, pressed_mm: Array) -> list[dict[str,
 
 def idle_share(recording: Recording) -> Array:
     """Return the (C,) share of presses in which a fibre changes by less than `ACTIVE` of its range over all presses."""
-    readings = interpolate_gaps(recording.readings)
-    windows = window_means(readings, recording.down_command, recording.up_command, FEATURES["causal"])
-    changes = windows[:, :, -1]
+    readings, commands = interpolate_gaps(recording.readings), (recording.down_command, recording.up_command)
+    changes = window_means(readings, *commands, FEATURES["causal"])[:, :, -1]
     return (np.abs(changes) <= ACTIVE * np.ptp(changes, axis=0)).mean(axis=0)
 
 
 def calibration_lines(document: Mapping[str, Any]) -> list[str]:
     """Format the errors of a calibration document as tables: of positions, and of depth and force if predicted."""
-    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
     rows = document["errors"]
+
+    def table(title: str, header: str, errors: Sequence[str], shares: Sequence[str]) -> list[str]:
+        formats = [("n_failed", "4d"), ("subsets", "5d"), *((name, "6.2f") for name in errors)]
+        formats += [(name, "7.1%") for name in shares]
+        return [title, header, *(" ".join(f"{row[name]:{spec}}" for name, spec in formats) for row in rows)]
+
     pad = " of a simulated pad" if document["provenance"].get("recording_kind") == "simulated" else ""
-    lines = [
+    lines = table(
         f"error in mm on {document['test_presses']} presses{pad} (split: {document['split']})",
         "lost  sets   mean    std    max median    p95  in r50  in r90",
-        *(
-            f"{row['n_failed']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
-            f"{row['within_r50']:7.1%} {row['within_r90']:7.1%}"
-            for row in rows
-        ),
-    ]
+        ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm"),
+        ("within_r50", "within_r90"),
+    )
     for kind, unit in (("depth", "mm"), ("force", "N")):
         names = (f"{kind}_mean_{unit.lower()}", f"{kind}_p95_{unit.lower()}")
         if names[0] in rows[0]:
-            lines += [f"error of {kind} in {unit}", "lost  sets   mean    p95  in r90"]
-            lines += [
-                f"{row['n_failed']:4d} {row['subsets']:5d} {' '.join(f'{row[name]:6.2f}' for name in names)} "
-                f"{row[f'{kind}_within_r90']:7.1%}"
-                for row in rows
-            ]
+            header = "lost  sets   mean    p95  in r90"
+            lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
     return lines

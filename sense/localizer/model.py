@@ -5,7 +5,7 @@ Where it was trained on presses of several depths, it predicts depth too, and fo
 
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from reprlib import repr as shortened
@@ -24,13 +24,7 @@ from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_f
 from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.localizer.network import Weights, check_weights, combine_members, predict_members
 from padforge.sense.localizer.response_model import GRID_CELLS
-from padforge.sense.localizer.scaler import (
-    DOCUMENT_CONFIG,
-    MAX_INPUT,
-    FeatureScaler,
-    ScaledFeatures,
-    array_field,
-)
+from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Features, Method, Split
 
@@ -51,12 +45,7 @@ _CHUNK = 2**16
 
 @dataclass(frozen=True)
 class MeasureEstimate:
-    """Depth or force of Q presses.
-
-    Attributes:
-        values: (Q,).
-        r90: (Q,) half-width of the interval around them that holds the true value in 90 % of cases.
-    """
+    """Depth or force of Q presses, and the half-width of the interval that holds it in 90 % of cases."""
 
     values: Array
     r90: Array
@@ -82,15 +71,7 @@ class Localization:
 
 
 def write_localization(localization: Localization, path: str | Path) -> None:
-    """Write predictions as CSV, one line a press, atomically.
-
-    Args:
-        localization: of Q presses.
-        path: of the file, whose columns are `COLUMNS` and `MEASURE_COLUMNS`.
-
-    Raises:
-        InputError: `path` cannot be written.
-    """
+    """Write predictions as CSV of `COLUMNS` and `MEASURE_COLUMNS`, one line a press, atomically."""
     estimates = [column for each in localization.measures.values() for column in (each.values, each.r90)]
     columns = [localization.positions_mm, localization.std_mm, localization.r50_mm, localization.r90_mm, *estimates]
     names = (*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure]))
@@ -102,44 +83,34 @@ def write_localization(localization: Localization, path: str | Path) -> None:
 
 def concatenate(parts: Sequence[Localization]) -> Localization:
     """Concatenate the predictions of localizers that predict the same measures; at least one part."""
-    arrays = ("positions_mm", "std_mm", "r50_mm", "r90_mm")
+
+    def joined(estimates: Sequence[Any], *names: str) -> Iterator[Array]:
+        return (np.concatenate([getattr(each, name) for each in estimates]) for name in names)
+
     measures = {
-        name: MeasureEstimate(*(np.concatenate([getattr(part.measures[name], key) for part in parts]) for key in keys))
-        for name, keys in dict.fromkeys(parts[0].measures, ("values", "r90")).items()
+        name: MeasureEstimate(*joined([part.measures[name] for part in parts], "values", "r90"))
+        for name in parts[0].measures
     }
-    return Localization(*(np.concatenate([getattr(part, name) for part in parts]) for name in arrays), measures)
+    return Localization(*joined(parts, "positions_mm", "std_mm", "r50_mm", "r90_mm"), measures)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalizerDocument:
-    """What `localizer.json` holds, by these names; the only list of its fields.
-
-    Attributes:
-        method: kind of networks and of training.
-        features: a name in `FEATURES`, or "array" for features that were passed as arrays.
-        rate_hz: readings per second of the recording of the training.
-        scaler: of features and targets.
-        interval_factors: (K, 3 + T) by number of failed fibres: factors from the expected error to the standard
-            deviation, to the radii of 50 and 90 %, and to the r90 of T measures, from presses never trained on.
-        training_recording_sha256: digest of the recording of the training.
-        split: how its test presses were held back.
-        test: indices of these presses.
-        recalibrated_by: digests of the recordings that it was recalibrated by, all of whose presses it has seen.
-        errors: rows of `evaluation.error_row` on the test presses, one a number of failed fibres.
-        provenance: where it came from; free JSON.
-    """
+    """What `localizer.json` holds, by these names; the only list of its fields."""
 
     __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
     method: Method
-    features: Features | Literal["array"]
-    rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]
+    features: Features | Literal["array"]  # "array" for features that were passed as arrays
+    rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the recording of the training
     scaler: FeatureScaler
+    # (K, 3 + T) by number of failed fibres: factors from the expected error to the standard deviation, to the radii of
+    # 50 and 90 %, and to the r90 of T measures, from presses never trained on
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
     training_recording_sha256: Digest
-    split: Split = "random"
+    split: Split = "random"  # how the test presses of the training were held back
     test: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    recalibrated_by: tuple[Digest, ...] = ()
-    errors: Sequence[Mapping[str, int | float]] = ()
+    recalibrated_by: tuple[Digest, ...] = ()  # recordings all of whose presses it has seen
+    errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
 
 
@@ -168,12 +139,7 @@ class LocalizerModel(LocalizerDocument):
         return len(self.scaler.mean_v)
 
     def raw_features(self, recording: Recording) -> PressFeatures:
-        """Return the features of every press of a recording in volts.
-
-        Raises:
-            InputError: the recording has other fibres or another rate than that of the training.
-        """
-        check_type("recording", recording, Recording)
+        """Return the features in volts of every press of a recording of the same pad, which is checked."""
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
@@ -209,22 +175,13 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: `failed` are no such fibres, or all; or some, and the method is "published".
         """
-        check_type("presses", presses, ScaledFeatures)
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
-        parts = [
-            combine_members(
-                predict_members(
-                    self.weights,
-                    presses.inputs[first : first + chunk],
-                    fibre_mask[first : first + chunk],
-                    self.method,
-                    self.bayes,
-                    self.residual_network,
-                )
-            )
-            for first in range(0, len(presses), chunk)
-        ]
+        networks, parts = (self.method, self.bayes, self.residual_network), []
+        for first in range(0, len(presses), chunk):
+            rows = slice(first, first + chunk)
+            outputs = predict_members(self.weights, presses.inputs[rows], fibre_mask[rows], *networks)
+            parts.append(combine_members(outputs))
         empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
         targets, std = (np.concatenate(part) for part in zip((empty, empty), *parts, strict=True))
         level = np.minimum((~fibre_mask).sum(axis=1), len(self.interval_factors) - 1)
@@ -260,11 +217,7 @@ class LocalizerModel(LocalizerDocument):
         return working
 
     def save(self, folder: str | Path) -> None:
-        """Write `localizer.json` and `localizer.safetensors`, both or none; `load` reads the same to the last bit.
-
-        Raises:
-            InputError: something is not finite or no JSON, or `folder` cannot be written.
-        """
+        """Write `localizer.json` and `localizer.safetensors`, both or none; `load` reads the same to the last bit."""
         document = {"format": FORMAT, **_DOCUMENT.dump_python(self, warnings=False)}
         arrays = {**self.weights, TABLE: self.table}
         if self.bayes is not None:
@@ -273,19 +226,18 @@ class LocalizerModel(LocalizerDocument):
 
     @classmethod
     def load(cls, folder: str | Path) -> "LocalizerModel":
-        """Read what `save` wrote.
-
-        Raises:
-            InputError: a file is missing, damaged or of another kind, a value is out of range, or the two files do not
-                belong together.
-        """
+        """Read what `save` wrote, and check that the files belong together and every value is in range."""
         files = files_of(folder, NAME)
-        document, digest = read_document(read_json(files.document, FORMAT), str(files.document))
+        document, digest = _read_document(read_json(files.document, FORMAT), str(files.document))
         scaler, method = document.scaler, document.method
         n_inputs, n_measures = scaler.n_inputs(method), len(scaler.measures)
         with files.arrays(digest, "the localizer") as weights:
-            table = weights.pop(TABLE)
-            _check_table(table, scaler)
+            table, shape = weights.pop(TABLE), (GRID_CELLS + 1, GRID_CELLS + 1, *scaler.mean_v.shape)
+            if table.shape != shape or table.dtype != np.float32 or not np.abs(table).max(initial=0) <= MAX_INPUT:
+                raise InputError(
+                    f"table of the response is {table.dtype} of shape {table.shape}, "
+                    f"expected float32 {shape} up to {MAX_INPUT:g}"
+                )
             parts = {name: weights.pop(name) for name in list(weights) if name.startswith((BAYES, RESIDUAL))}
             check_weights(weights, n_inputs, method, n_measures)
             bayes, residual_network = None, {}
@@ -300,16 +252,8 @@ class LocalizerModel(LocalizerDocument):
         return cls(**vars(document), weights=weights, table=table, bayes=bayes, residual_network=residual_network)
 
 
-def read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDocument, str]:
-    """Return the document of a localizer, checked, and the digest of its arrays.
-
-    Args:
-        document: content of `localizer.json`.
-        where: its path, for messages.
-
-    Raises:
-        InputError: a value is out of range, or values do not fit together.
-    """
+def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDocument, str]:
+    """Return the document of a localizer, checked, and the digest of its arrays; `where` is its path."""
     values = {name: value for name, value in document.items() if name not in ("format", "weights_sha256")}
     try:
         read = _DOCUMENT.validate_json(json.dumps(values))
@@ -350,12 +294,3 @@ def read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDoc
     coef = scaler.history_coef.reshape(fibres, n_history, n_features)  # an empty list has no last axis
     digest = check_type(f"{where}: weights_sha256", document.get("weights_sha256"), str)
     return replace(read, scaler=replace(scaler, history_coef=coef)), digest
-
-
-def _check_table(table: Floats, scaler: FeatureScaler) -> None:
-    shape = (GRID_CELLS + 1, GRID_CELLS + 1, *scaler.mean_v.shape)
-    if table.shape != shape or table.dtype != np.float32 or not np.abs(table).max(initial=0) <= MAX_INPUT:
-        raise InputError(
-            f"table of the response is {table.dtype} of shape {table.shape}, "
-            f"expected float32 {shape} up to {MAX_INPUT:g}"
-        )

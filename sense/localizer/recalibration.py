@@ -1,9 +1,8 @@
 """Recalibration: a localizer trained long ago follows its pad by a few new presses, or stays as it was.
 
-A pad that was re-made or re-mounted needs a correction first: every fibre answers by its own gain, and the pad lies
-shifted, rotated and scaled under the arm. That folds into the scaling of features and the last layer of the networks. A
-pad that drifted needs little: its networks are fine-tuned. Whether either is worth it is decided by cross-validation
-over the new presses; the model that is kept in the end has seen them all.
+A pad that was re-made or re-mounted needs a correction first, of the gain of every fibre and of the position, angle and
+scale of the pad, which folds into the scaling of features and the last layer of the networks. For a pad that drifted,
+fine tuning suffices. Cross-validation over the new presses decides whether either is worth it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.files import provenance
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.common.validation import InputError, check_int
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.evaluation import conformal, distances, error_row
@@ -74,8 +73,7 @@ def recalibrate(
     Raises:
         InputError: too few presses of known position, or a recording that does not suit the localizer.
     """
-    check_type("localizer", model, LocalizerModel)
-    known = np.flatnonzero(check_type("recording", recording, Recording).has_position)
+    known = np.flatnonzero(recording.has_position)
     seed = check_int("seed", seed, 0, 2**32 - 1)
     if len(known) < MIN_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known position, expected at least {MIN_PRESSES}")
@@ -90,8 +88,8 @@ def recalibrate(
     gain, standard_error = validation.gain(before, after)
     widened = validation.widening(after)
     made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
-    made_by["inputs"] = {"recording": recording.digest, "localizer": dict(model.provenance)}
-    made_by["recording_kind"] = recording.source.get("kind")
+    inputs = {"recording": recording.digest, "localizer": dict(model.provenance)}
+    made_by |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
     document = {
         "format": FORMAT,
         "presses": len(rows),
@@ -122,12 +120,9 @@ def _select_changes(
     """The model with the changes that are worth it, predictions of presses left out, and the names of the changes."""
     steps, total = count(1), 2 + FOLDS + 1 if model.method == "ensemble" else 1
 
-    def step() -> None:
-        on_progress(next(steps), total)
-
     def tune(old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures) -> LocalizerModel:
         tuned = _fine_tuned(old, features, positions_mm, measures, np.random.default_rng([seed, len(features)]))
-        step()
+        on_progress(next(steps), total)
         return tuned
 
     candidates: list[tuple[str, Change, float]] = [("corrected", fit_correction, CORRECT_FROM)]
@@ -137,7 +132,7 @@ def _select_changes(
     for name, change, threshold in candidates:
         changed = validation.change(folds, change)
         predictions = validation.predict(changed)
-        step()
+        on_progress(next(steps), total)
         gain, standard_error = validation.gain(after, predictions)
         if gain > threshold * standard_error:
             model, folds, after = change(model, *validation.presses), changed, predictions
@@ -168,14 +163,7 @@ def fit_correction(
     positions_mm: Array,
     measures: Mapping[str, Array] = MappingProxyType({}),
 ) -> LocalizerModel:
-    """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior.
-
-    Args:
-        model: to correct.
-        features: of Q presses in volts.
-        positions_mm: (Q, 2).
-        measures: (Q,) of those that the localizer predicts, NaN where unknown.
-    """
+    """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior."""
     from scipy.optimize import least_squares  # slow to import, and needed here only
 
     expected = model.predict_features(model.scaler.transform(features))
@@ -271,23 +259,21 @@ class CrossValidation:
     def predict(self, models: Sequence[LocalizerModel]) -> Predictions:
         """Predict each press by the model of the fold that leaves it out, without each set of failed fibres."""
         features = self.presses[0]
-        scaled = [each.scaler.transform(features[fold]) for each, fold in zip(models, self._folds, strict=True)]
+        parts = [(each, each.scaler.transform(features[fold])) for each, fold in zip(models, self._folds, strict=True)]
         return {
-            failed: concatenate(
-                [each.predict_features(part, failed) for each, part in zip(models, scaled, strict=True)]
-            )
+            failed: concatenate([each.predict_features(part, failed) for each, part in parts])
             for failed in self._subsets
         }
 
     def gain(self, before: Predictions, after: Predictions) -> tuple[float, float]:
         """Return the mean decrease of errors, mm, numbers of failed fibres weighing alike, and its standard error."""
-        decrease = np.mean(
-            [
-                np.mean([self._errors(before[failed]) - self._errors(after[failed]) for failed in level], axis=0)
-                for level in self._levels
-            ],
-            axis=0,
-        )
+        positions_mm = self.presses[1]
+
+        def errors(predictions: Predictions, failed: tuple[int, ...]) -> Array:
+            return distances(predictions[failed].positions_mm, positions_mm)
+
+        levels = [[errors(before, failed) - errors(after, failed) for failed in level] for level in self._levels]
+        decrease = np.mean([np.mean(level, axis=0) for level in levels], axis=0)
         return float(decrease.mean()), float(decrease.std(ddof=1) / np.sqrt(len(decrease)))
 
     def error_rows(self, predictions: Predictions) -> list[dict[str, Any]]:
@@ -303,9 +289,6 @@ class CrossValidation:
         _, positions_mm, measures = self.presses
         by_level = ([predictions[failed] for failed in level] for level in self._levels)
         return np.maximum([conformal(each, positions_mm, measures) for each in by_level], 1.0)
-
-    def _errors(self, prediction: Localization) -> Array:
-        return distances(prediction.positions_mm, self.presses[1])
 
 
 def recalibration_lines(document: Mapping[str, Any]) -> list[str]:

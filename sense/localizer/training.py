@@ -1,15 +1,10 @@
 """Training of the networks in torch: one loop for all, and what the localizer minimizes by it.
 
-`fit_network` is AdamW with a one-cycle learning rate and averaged weights. The loss is the distance itself, not its
-square, and a likelihood of the expected error. Every step masks random fibres and augments the positions of presses by
-a few millimetres, their features following the response model; where depths vary, they are augmented too, more for
-light presses, which noise blurs more. The members of the ensemble know nothing of the Bayesian localizer; a smaller
-network learns its residual. Their errors are of different kinds, so that together they err by a tenth less. Nothing is
-selected on presses held back: of so few, chance would select.
-
-Fine tuning follows a pad that has changed a little, by few presses: a step looks at new presses, augmented near their
-positions, and at the same presses moved anywhere on the pad, where the predictions must stay as they were (Li & Hoiem
-2016, Learning without forgetting). The published network is trained by Levenberg-Marquardt.
+The loss is the distance itself, not its square, and a likelihood of the expected error. Every step masks random fibres
+and augments the positions (and depths) of presses, their features following the response model. The members of the
+ensemble know nothing of the Bayesian localizer; a smaller network learns its residual. Their errors are of different
+kinds, so that together they err by a tenth less. Nothing is selected on presses held back: of so few, chance would
+select.
 """
 
 import math
@@ -29,13 +24,7 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.networks import fit_batch
 from padforge.sense.arrays import Floats
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
-from padforge.sense.localizer.network import (
-    MAX_LOG_ERROR,
-    MIN_LOG_ERROR,
-    N_OUTPUTS,
-    Weights,
-    stack_members,
-)
+from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, N_OUTPUTS, Weights, stack_members
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs, sample_fibre_dropout
@@ -57,13 +46,8 @@ def one_cycle(share: float) -> float:
 
 
 @dataclass
-class TrainingLength:
-    """Length of a training, in steps or in seconds.
-
-    Attributes:
-        steps: number of steps, where there is no time budget.
-        seconds: time budget; None for none. The clock starts when this is made.
-    """
+class _TrainingLength:
+    """Length of a training, in steps; or in seconds, counted from when this is made."""
 
     steps: int
     seconds: float | None = None
@@ -87,7 +71,7 @@ class TrainingLength:
 def fit_network(
     parameters: Mapping[str, Tensor],
     loss_of_batch: Callable[[], Tensor],
-    length: TrainingLength | int,
+    length: _TrainingLength | int,
     learning_rate: float,
     *,
     weight_decay: float = 1e-2,
@@ -99,16 +83,13 @@ def fit_network(
     Args:
         parameters: weights by name, which require gradients; they are changed in place.
         loss_of_batch: draws a batch and returns its loss, a scalar; called once a step.
-        length: number of steps, or a `TrainingLength`.
+        length: number of steps; a time budget in a calibration.
         learning_rate: maximum of the schedule.
         weight_decay: of AdamW.
-        averaged: whether the moving average of the weights is returned, or the last ones.
+        averaged: whether to return the moving average of the weights, or the last ones.
         on_progress: called up to `REPORTS` times with the steps (or seconds, in a time budget) done.
-
-    Returns:
-        The weights by the same names, as NumPy arrays.
     """
-    length = TrainingLength(length) if isinstance(length, int) else length
+    length = _TrainingLength(length) if isinstance(length, int) else length
     average = [weight.detach().clone() for weight in parameters.values()]
     optimizer = torch.optim.AdamW(parameters.values(), lr=learning_rate, weight_decay=weight_decay, fused=True)
     share, step, reports = 0.0, 0, 0
@@ -146,11 +127,7 @@ class JointProgress:
         self._lock, self._stopped = Lock(), Event()
 
     def update(self, number: int, done: int) -> None:
-        """Set the steps done of one training.
-
-        Raises:
-            StoppedError: the `with` block has ended.
-        """
+        """Set the steps done of one training; raise StoppedError if the `with` block has ended."""
         if self._stopped.is_set():
             raise StoppedError
         with self._lock:
@@ -180,6 +157,8 @@ MIN_BATCHES, MAX_STEPS, HARDER = 10, 11_000, 2
 release is not looked at, which is harder to learn."""
 RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
 """Largest size of the network that corrects the Bayesian localizer: larger ones gain nothing."""
+PUBLISHED_HIDDEN = 50
+"""Neurons of the published network, of one tanh layer."""
 PACE_STEPS, MIN_LENGTHS, MAX_MEMBERS = 12, 5, 64
 """With a time budget: steps that measure the pace, usual lengths of a training before there is another for each core,
 and the most networks."""
@@ -206,13 +185,12 @@ def train_members(
     Where depths vary there is no Bayesian localizer. Networks are trained in threads.
 
     Args:
-        presses: to learn from.
+        presses: training data.
         table: (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
         options: size of the networks and length of the training.
         rng: source of the seeds of torch's generators.
         on_progress: called with (steps done, steps in all), of all networks; with a time budget, with seconds.
-        time_budget: seconds to train for, with as many members as these are good for; None for the members and the
-            length of `options`.
+        time_budget: seconds to train for, with as many members as these are good for; None for those of `options`.
     """
     begin = time.monotonic()
     presses = leave_one_out_residuals(presses, table)
@@ -229,7 +207,7 @@ def train_members(
     has_bayes = networks > 1 and not presses.depth_gain
     bayes = BayesianLocalizer.fit(table, presses.inputs, presses.fibre_mask, presses.targets) if has_bayes else None
     seeds = [int(seed) for seed in rng.integers(2**63, size=networks)]
-    joint = JointProgress([TrainingLength(steps, seconds).total] * networks, on_progress)
+    joint = JointProgress([_TrainingLength(steps, seconds).total] * networks, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
     members = networks - has_bayes
 
@@ -239,7 +217,7 @@ def train_members(
         return fit_network(
             dict(training.network.named_parameters()),
             training.loss,
-            TrainingLength(steps, seconds),
+            _TrainingLength(steps, seconds),
             options.learning_rate,
             on_progress=lambda done: joint.update(number, done),
         )
@@ -257,16 +235,7 @@ def training_steps(presses: int, options: LocalizerSettings) -> int:
 
 
 def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np.random.Generator) -> Weights:
-    """Train the published network: 50 tanh neurons, by Levenberg-Marquardt.
-
-    Args:
-        train: presses to learn from.
-        early_stop: presses whose error ends the training.
-        rng: source of the first weights.
-
-    Returns:
-        Weights as `network.forward` takes them, the network's own scaling folded in.
-    """
+    """Train the published network by Levenberg-Marquardt; the error on presses of `early_stop` ends the training."""
     x, y, *held_back = (
         part.reshape(len(part), -1).astype(np.float64)
         for part in (train.inputs, train.targets, early_stop.inputs, early_stop.targets)
@@ -274,6 +243,7 @@ def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np
     network = fit_batch(x[None], y, [rng], PUBLISHED_HIDDEN, validation=(held_back[0][None], held_back[1]))[0]
     inputs, targets = network.inputs, network.targets
     hidden = network.hidden[:, :-1]
+    # The scaling of the network is folded into its weights.
     slope = np.divide(hidden, inputs.half, out=np.zeros_like(hidden), where=inputs.half > 0)
     weights = {
         "first.w": slope.T,
@@ -284,11 +254,7 @@ def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np
     return {name: np.ascontiguousarray(weight[None], dtype=np.float32) for name, weight in weights.items()}
 
 
-PUBLISHED_HIDDEN = 50
-"""Neurons of the published network."""
-
-
-def loss(error: Tensor) -> Tensor:
+def _loss(error: Tensor) -> Tensor:
     """Return the (...) loss of (..., 2 + T) errors: the distance, and a share of the others."""
     distance = error[..., :2].square().sum(dim=-1).add(1e-8).sqrt()
     return distance if error.shape[-1] == 2 else distance + MEASURE_WEIGHT * error[..., 2:].abs().sum(dim=-1)
@@ -305,11 +271,10 @@ class _PressSampler:
         generator: torch.Generator,
         bayes: BayesianLocalizer | None,
     ) -> None:
-        self.generator, device = generator, generator.device
-
         def tensor(array: Floats) -> Tensor:
-            return torch.from_numpy(array).to(device)
+            return torch.from_numpy(array).to(generator.device)
 
+        self.generator = generator
         x, self.fibre_mask, self.targets = map(tensor, (presses.inputs, presses.fibre_mask, presses.targets))
         self.fibres, self.depth_gain = x.shape[1], presses.depth_gain
         self._table, self._max_failures = tensor(table).flatten(2), min(max_failures, self.fibres - 1)
@@ -377,14 +342,14 @@ class _Training:
 
     def loss(self) -> Tensor:
         rows = self._presses.draw(self._batch)
-        targets = self.augment_position(self._presses.targets[rows])
+        targets = self._augment_position(self._presses.targets[rows])
         x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
         predicted, log_error = self.network.forward_bfloat16(x)[0].chunk(2, dim=1)
         error, log_error = predicted + position - targets, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
         likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
-        return (loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
+        return (_loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
 
-    def augment_position(self, targets: Tensor) -> Tensor:
+    def _augment_position(self, targets: Tensor) -> Tensor:
         """Move (B, 2 + T) targets at random, and their force with their depth; reflect them at the bounds."""
         low, high = self._bounds
         gain = self._presses.depth_gain
@@ -414,15 +379,10 @@ def fine_tune(
     rng: np.random.Generator,
     bayes: BayesianLocalizer | None = None,
 ) -> Weights:
-    """Fine-tune the members of method "ensemble", or the residual network of a Bayesian localizer.
+    """Fine-tune the members of method "ensemble", or the residual network of a Bayesian localizer, by new presses.
 
-    Args:
-        weights: as `network.forward` takes them.
-        presses: new ones.
-        table: (S, S, C, F + G) scaled response by position.
-        max_failures: most fibres that are masked at once.
-        rng: source of the seed of torch's generator.
-        bayes: the Bayesian localizer, which stays as it is, for its residual network.
+    A step looks at new presses, augmented near their positions, and at the same presses moved anywhere on the pad,
+    where predictions must stay as they were (Li & Hoiem 2016, Learning without forgetting).
     """
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     before, network = EnsembleMlp.from_numpy(weights), EnsembleMlp.from_numpy(weights)
@@ -438,17 +398,15 @@ def fine_tune(
         rows = sampler.draw(FINE_TUNING_BATCH)
         near = (sampler.targets[rows, :2] + NEAR_STD * sampler.normal(FINE_TUNING_BATCH, 2)).clamp(-1, 1)
         x, position, targets = inputs(rows, near, INPUT_NOISE)
-        new = loss(network(x)[..., : targets.shape[1]] - (targets - position)).mean(dim=1).sum()
+        new = _loss(network(x)[..., : targets.shape[1]] - (targets - position)).mean(dim=1).sum()
         rows = sampler.draw(FINE_TUNING_BATCH)
         x, _, _ = inputs(rows, 2 * torch.rand(FINE_TUNING_BATCH, 2, generator=generator) - 1, FAR_NOISE)
         with torch.no_grad():
             outputs = before(x)
         change, log_change = (network(x) - outputs).chunk(2, dim=2)
-        kept = (loss(change) + KEEP_LOG_ERROR_WEIGHT * log_change.abs().mean(dim=2)).mean(dim=1).sum()
+        kept = (_loss(change) + KEEP_LOG_ERROR_WEIGHT * log_change.abs().mean(dim=2)).mean(dim=1).sum()
         return share * new + (1 - share) * kept
 
-    parameters = dict(network.named_parameters())
+    parameters, length = dict(network.named_parameters()), FINE_TUNING_STEPS
     with one_torch_thread():
-        return fit_network(
-            parameters, loss_of_batch, FINE_TUNING_STEPS, FINE_TUNING_RATE, weight_decay=0.0, averaged=False
-        )
+        return fit_network(parameters, loss_of_batch, length, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)
