@@ -46,37 +46,22 @@ class BayesianLocalizer:
 
     All numbers are representable in single precision. NumPy computes in double precision, as the steps are only as
     accurate as the residuals; for training, single precision suffices.
-
-    Attributes:
-        projection: (C, F + G, D), scaled features to whitened discriminants.
-        grid: (P, 2) positions.
-        log_likelihood_coefficients: (C (D (D + 3) / 2 + 1), P), of products of discriminants, of discriminants and of
-            1, fibre by fibre.
-        linearization: (S, S, C (3 D + 3)) on a grid over [-1, 1] in x and y: expected discriminants, their weighted
-            Jacobian J' S^-1, and the Fisher information J' S^-1 J in xx, yy and xy.
-        bounds: (2, 2) least and greatest x and y of presses.
-        rotation: (2, 2), from the positions of the fit to those that are returned.
-        shift: (2,), added to the rotated positions.
     """
 
-    projection: Any
-    grid: Any
+    projection: Any  # (C, F + G, D), scaled features to whitened discriminants
+    grid: Any  # (P, 2) positions
+    # (C (D (D + 3) / 2 + 1), P), of products of discriminants, of discriminants and of 1, fibre by fibre
     log_likelihood_coefficients: Any
+    # (S, S, C (3 D + 3)) on a grid over [-1, 1] in x and y: expected discriminants, their weighted Jacobian J' S^-1,
+    # and the Fisher information J' S^-1 J in xx, yy and xy
     linearization: Any
-    bounds: Any
-    rotation: Any
-    shift: Any
+    bounds: Any  # (2, 2) least and greatest x and y of presses
+    rotation: Any  # (2, 2), from the positions of the fit to those that are returned
+    shift: Any  # (2,), added to the rotated positions
 
     @classmethod
     def fit(cls, table: Any, inputs: Any, fibre_mask: Mask, positions: Any) -> "BayesianLocalizer":
-        """Fit to presses and their response.
-
-        Args:
-            table: (S, S, C, F + G) expected inputs on a grid over [-1, 1] in x and y.
-            inputs: (Q, C, F + G).
-            fibre_mask: (Q, C).
-            positions: (Q, 2).
-        """
+        """Fit to scaled presses and the (S, S, C, F + G) table of their response over [-1, 1] in x and y."""
         side, _, fibres, size = table.shape
         table, inputs, positions = (part.astype(np.float64) for part in (table, inputs, positions))
         low, high = positions.min(axis=0), positions.max(axis=0)
@@ -89,9 +74,11 @@ class BayesianLocalizer:
         for fibre in range(fibres):
             used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
             expected = table[:, :, fibre, used].reshape(side * side, -1)
-            projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used])
+            projection[fibre, used] = _fit_lda(expected, residual[valid, fibre][:, used])
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
-        width = max(cell, SCATTER_WIDTH * _press_distance(positions))
+        # distance between neighbouring presses, if they lay on a grid
+        press_distance = float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
+        width = max(cell, SCATTER_WIDTH * press_distance)
         scatter = _local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
         scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
         coefficients, responses, jacobians, informations = [], [], [], []
@@ -118,15 +105,12 @@ class BayesianLocalizer:
         return cls(*map(_rounded, (*arrays, np.eye(2), np.zeros(2))))
 
     def predict(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Return the MAP position and the posterior summary of each press, from the fibres in the mask.
+        """Return (Q, 2) MAP positions and (Q, N_SUMMARY) posterior summaries, from the fibres in the mask.
 
         Args:
             inputs: (Q, C, F + G) scaled features.
             fibre_mask: (Q, C).
             xp: module of all arrays, numpy or torch.
-
-        Returns:
-            (Q, 2) positions and (Q, N_SUMMARY) summaries.
         """
         fibres, _, size = self.projection.shape
         mask = xp.asarray(fibre_mask, dtype=inputs.dtype)
@@ -140,7 +124,7 @@ class BayesianLocalizer:
             fisher = (mask[:, :, None] * local[:, 3 * fibres * size :].reshape(-1, fibres, 3)).sum(axis=1)
             gradient = (weighted * residual[:, :, None, :]).sum(axis=3).sum(axis=1)
             gradient = gradient + prior_precision * (grid_mean - position)
-            var, step = solve_2x2(fisher, prior_precision, gradient, xp)
+            var, step = _solve_2x2(fisher, prior_precision, gradient, xp)
             position = xp.clip(position + xp.clip(step, -MAX_STEP, MAX_STEP), self.bounds[0], self.bounds[1])
         # All of it about 1, as the inputs of a network should be.
         logs = [1 + 0.25 * xp.log(each) for each in (var, grid_var)]
@@ -166,8 +150,7 @@ class BayesianLocalizer:
 
     def transformed(self, rotation: Array, shift: Array) -> "BayesianLocalizer":
         """Return one whose positions are rotated (or any linear map, (2, 2)) and shifted, (2,)."""
-        both = rotation @ self.rotation, rotation @ self.shift + shift
-        return replace(self, rotation=_rounded(both[0]), shift=_rounded(both[1]))
+        return replace(self, rotation=_rounded(rotation @ self.rotation), shift=_rounded(rotation @ self.shift + shift))
 
     def map_arrays(self, function: Callable[[Any], Any]) -> "BayesianLocalizer":
         """Apply a function to every array in single precision, as to convert them to torch."""
@@ -179,12 +162,7 @@ class BayesianLocalizer:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any], fibres: int, n_features: int) -> "BayesianLocalizer":
-        """Read what `to_arrays` returned.
-
-        Raises:
-            KeyError: an array is missing.
-            InputError: shapes or values are none that `fit` makes of so many fibres and features.
-        """
+        """Read what `to_arrays` returned, and check shapes and values; KeyError if an array is missing."""
         bayes = cls(**{each.name: arrays[PREFIX + each.name].astype(np.float64) for each in fields(cls)})
         shapes = [part.shape for part in vars(bayes).values()]
         n_grid, side = (len(part) if part.ndim else 0 for part in (bayes.grid, bayes.linearization))
@@ -205,13 +183,8 @@ class BayesianLocalizer:
         return bayes
 
 
-def fit_lda(expected: Array, residual: Array) -> Array:
-    """Fit linear discriminants: (F, D) directions in which positions differ most for their scatter, whitened.
-
-    Args:
-        expected: (S, F) inputs at the positions of a grid.
-        residual: (Q, F) of presses, whose covariance becomes the unit matrix.
-    """
+def _fit_lda(expected: Array, residual: Array) -> Array:
+    """(F, D) whitened linear discriminants of (S, F) inputs at positions and (Q, F) residuals of presses."""
     size = residual.shape[1]
     scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)
     whitening = np.linalg.inv(np.linalg.cholesky(scatter)).T
@@ -222,15 +195,8 @@ def fit_lda(expected: Array, residual: Array) -> Array:
     return projection
 
 
-def solve_2x2(fisher: Any, prior_precision: Any, gradient: Any, xp: Any) -> tuple[Any, Any]:
-    """Solve (J + P) step = gradient for each press; return (Q, 2) variances and steps.
-
-    Args:
-        fisher: (Q, 3) information J in xx, yy and xy.
-        prior_precision: (Q, 2) diagonal of P.
-        gradient: (Q, 2) of the log posterior.
-        xp: module of the arrays, numpy or torch.
-    """
+def _solve_2x2(fisher: Any, prior_precision: Any, gradient: Any, xp: Any) -> tuple[Any, Any]:
+    """(Q, 2) variances and steps that solve (J + P) step = gradient; J is (Q, 3) in xx, yy, xy, P a (Q, 2) diagonal."""
     xx, yy, xy = fisher[:, 0] + prior_precision[:, 0], fisher[:, 1] + prior_precision[:, 1], fisher[:, 2]
     det = xp.clip(fisher[:, 0] * fisher[:, 1] - xy**2, 0.0, np.inf)  # rounding may leave less than 0
     det = det + fisher[:, 0] * prior_precision[:, 1] + fisher[:, 1] * prior_precision[:, 0]
@@ -256,11 +222,6 @@ def _local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask
         weights += weight @ fibre_mask[rows]
     prior = SCATTER_PRIOR_COUNT * np.eye(size)  # residuals are whitened
     return (sums.reshape(-1, fibres, size, size) + prior) / (weights + SCATTER_PRIOR_COUNT)[:, :, None, None]
-
-
-def _press_distance(positions: Array) -> float:
-    """Distance between neighbouring positions, if they lay on a grid."""
-    return float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
 
 
 def _log_likelihood_coefficients(expected: Array, precision: Array) -> Array:

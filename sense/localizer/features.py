@@ -41,23 +41,14 @@ MIN_PRESENT = 0.75
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """What is computed of each fibre for a press.
-
-    Attributes:
-        down: windows after the probe was sent down.
-        up: windows after the probe was sent up.
-        phases: windows whose sensitivity is modulated together, in each of G phases of a press.
-        n_windows: F, numbers of each fibre.
-        n_history: J, numbers of its history.
-        readings_needed: readings after the probe was sent down, and after it was sent up.
-    """
+    """What is computed of each fibre for a press."""
 
     down: tuple[Window, ...]
     up: tuple[Window, ...]
-    phases: tuple[slice, ...]
-    n_windows: int
-    n_history: int
-    readings_needed: tuple[int, int]
+    phases: tuple[slice, ...]  # windows whose sensitivity is modulated together, in each of G phases of a press
+    n_windows: int  # F, numbers of each fibre
+    n_history: int  # J, numbers of its history
+    readings_needed: tuple[int, int]  # after the probe was sent down, and after it was sent up
 
     @property
     def n_features(self) -> int:
@@ -82,25 +73,18 @@ readings, or the published running medians."""
 
 @dataclass(frozen=True)
 class PressFeatures:
-    """Features of Q presses in volts.
+    """Features of Q presses in volts."""
 
-    Attributes:
-        windows: (Q, C, F), V.
-        history: (Q, C, J), V relative to the rest before the press.
-        fibre_mask: (Q, C), whether the fibre gave enough readings.
-    """
-
-    windows: Array
-    history: Array
-    fibre_mask: Mask
+    windows: Array  # (Q, C, F)
+    history: Array  # (Q, C, J), relative to the rest before the press
+    fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
 
     def __getitem__(self, rows: Indices | slice) -> "PressFeatures":
         return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows])
 
     def __add__(self, other: "PressFeatures") -> "PressFeatures":
-        return PressFeatures(
-            *(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True))
-        )
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return PressFeatures(*map(np.concatenate, pairs))
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -118,11 +102,12 @@ def compute_features(readings: Array, down_command: Indices, up_command: Indices
     filled, kind = interpolate_gaps(readings), FEATURES[features]
     # A press counts up to its end, or to the end of its release if that is looked at.
     ends = up_command + UP[-1][1] if kind.readings_needed[1] else up_command
-    fibre_mask = _is_present(readings, np.maximum(down_command + REST[0], 0), np.minimum(ends, len(readings)))
+    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(ends, len(readings))
+    counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
+    fibre_mask = counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
     if not kind.n_history:
-        return PressFeatures(
-            running_medians(filled, down_command, up_command), np.empty((*fibre_mask.shape, 0)), fibre_mask
-        )
+        medians = _running_medians(filled, down_command, up_command)
+        return PressFeatures(medians, np.empty((*fibre_mask.shape, 0)), fibre_mask)
     windows = window_means(filled, down_command, up_command, kind)
     return PressFeatures(windows, compute_history(filled, down_command), fibre_mask)
 
@@ -138,11 +123,6 @@ def interpolate_gaps(readings: Array) -> Array:
         gap = missing[:, fibre]
         filled[gap, fibre] = np.interp(rows[gap], rows[~gap], readings[~gap, fibre])
     return filled
-
-
-def _is_present(readings: Array, first: Indices, ends: Indices) -> Mask:
-    counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
-    return counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
 
 
 def window_means(readings: Array, down_command: Indices, up_command: Indices, kind: FeatureSet) -> Array:
@@ -180,8 +160,8 @@ def _slow_median(readings: Array, down_command: Indices, length: int) -> Array:
     return out
 
 
-def running_medians(readings: Array, down_command: Indices, up_command: Indices) -> Array:
-    """Return (Q, C, 3) published features, V: the running median before, in and after the press."""
+def _running_medians(readings: Array, down_command: Indices, up_command: Indices) -> Array:
+    """(Q, C, 3) published features, V: the running median before, in and after the press."""
     previous_end, next_begin = _neighbours(down_command, up_command, len(readings))
     window = (-(MEDIAN // 2), MEDIAN // 2 + 1)
     ranges = (
@@ -200,6 +180,5 @@ def _neighbours(down_command: Indices, up_command: Indices, n_readings: int) -> 
 
 def _gather(readings: Array, origin: Indices, window: Window, low: Indices, high: Indices) -> Array:
     """(Q, W, C) readings in `origin` + window, clipped to low <= index < high."""
-    index = origin[:, None] + np.arange(*window)
-    high = np.minimum(high, len(readings))
-    return readings[np.clip(index, low[:, None], high[:, None] - 1)]
+    last = np.minimum(high, len(readings))[:, None] - 1
+    return readings[np.clip(origin[:, None] + np.arange(*window), low[:, None], last)]

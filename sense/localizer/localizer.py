@@ -1,7 +1,7 @@
 """The estimator: a localizer with `fit`, `predict`, `score`, `evaluate`, `save` and `load`, as in scikit-learn."""
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,11 +59,7 @@ class Localizer:
         return {name: getattr(self, name) for name in ("max_failures", "random_state", *OPTIONS)}
 
     def set_params(self, **params: Any) -> "Localizer":
-        """Set arguments of the constructor.
-
-        Raises:
-            InputError: there is no such argument.
-        """
+        """Set arguments of the constructor."""
         self.__init__(**{**self.get_params(), **params})
         return self
 
@@ -153,22 +149,10 @@ class Localizer:
         return self.evaluation_report(recording, max_failures)["errors"]
 
     def evaluation_report(self, recording: Recording, max_failures: int | None = None) -> dict[str, Any]:
-        """Evaluate on a recording, for every set of failed fibres.
-
-        Args:
-            recording: of the recording of the training, only the presses held back count.
-            max_failures: most fibres that are failed; None for those it was trained for.
-
-        Returns:
-            The document of `evaluation.evaluate`.
-
-        Raises:
-            InputError: not fitted, or as `evaluation.evaluate`.
-        """
+        """Return the document of `evaluation.evaluate` for up to `max_failures` fibres, or as many as in training."""
         model = self._fitted
         most = len(model.interval_factors) - 1 if max_failures is None else max_failures
-        levels: Iterable[int] = range(min(most, model.fibres - 1) + 1)
-        return evaluate(model, recording, levels)
+        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))
 
     def save(self, folder: str | Path) -> None:
         """Write `localizer.json` and `localizer.safetensors`; raises as `LocalizerModel.save`, or if not fitted."""

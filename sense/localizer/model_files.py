@@ -21,23 +21,13 @@ RATE_TOLERANCE = 0.25
 
 
 class ModelFiles(NamedTuple):
-    """NAME.json and NAME.safetensors, written together; the document holds the digest of the arrays.
-
-    Attributes:
-        document: path of the JSON file.
-        weights: path of the arrays.
-    """
+    """NAME.json and NAME.safetensors, written together; the document holds the digest of the arrays."""
 
     document: Path
     weights: Path
 
     def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write a document with "weights_sha256" added, and arrays, together or not at all.
-
-        Args:
-            document: JSON values.
-            arrays: by name.
-            what: name of the model in messages.
+        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`.
 
         Raises:
             InputError: the document is not finite or no JSON, or the folder cannot be written.
@@ -54,11 +44,7 @@ class ModelFiles(NamedTuple):
 
     @contextmanager
     def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the arrays of a document, to be checked in the body of `with`.
-
-        Args:
-            digest: "weights_sha256" of the document.
-            what: name of the model in messages.
+        """Yield the arrays of a document of this digest, to be checked in the body of `with`; messages say `what`.
 
         Raises:
             InputError: they cannot be read, belong to another document, or the body raises one.
@@ -97,11 +83,7 @@ class TrainedModel(Protocol):
 def check_same_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
     """Raise InputError if readings have another number of fibres, or another rate, than the training of a model.
 
-    Args:
-        model: that the readings are for.
-        what: its name in messages.
-        fibres: of the readings.
-        rate_hz: of the readings.
+    `what` is the name of the model in messages; fibres and rate are those of the readings.
     """
     if fibres != model.fibres:
         raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")

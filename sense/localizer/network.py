@@ -30,14 +30,7 @@ MAX_WEIGHT = 1e4
 
 
 def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:
-    """Raise InputError unless weights have the shapes and values of a network of a method.
-
-    Args:
-        weights: of the network.
-        n_inputs: D.
-        method: "ensemble" or "published".
-        n_measures: targets beside the position.
-    """
+    """Raise InputError unless weights have the shapes and values of a network of D inputs and T measures."""
     shapes = {name: weight.shape for name, weight in weights.items()}
     first, layers = shapes.get("first.w", ()), shapes.get("hidden.w", (0,))[:1]
     if len(first) != 3 or len(layers) != 1 or 0 in first:
@@ -63,14 +56,11 @@ def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int 
 
 
 def network_inputs(features: Floats, fibre_mask: Mask) -> Floats:
-    """Return (Q, C F + C) inputs of a network from (Q, C, F) features and a (Q, C) mask.
-
-    Features of masked fibres are replaced, not multiplied, by 0: not even NaN gets through.
-    """
+    """Return (Q, C F + C) inputs of a network from (Q, C, F) features and a (Q, C) mask."""
+    # Features of masked fibres are replaced, not multiplied, by 0: not even NaN gets through.
     masked = np.where(fibre_mask[:, :, None], features, np.float32(0))
-    return np.concatenate(
-        [masked.reshape(len(features), np.prod(features.shape[1:])), fibre_mask.astype(np.float32)], axis=1
-    )
+    masked = masked.reshape(len(features), np.prod(features.shape[1:]))
+    return np.concatenate([masked, fibre_mask.astype(np.float32)], axis=1)
 
 
 def forward(weights: Weights, x: Floats) -> Floats:

@@ -3,8 +3,7 @@
 The windows of a fibre are a sum of Gaussian radial basis functions of the position (in proportion to the depth, if
 depths vary) plus a linear function of its history, fitted together by ridge regression. Silicone creeps, so the history
 is subtracted before the windows are used. It also modulates the sensitivity: a fibre that was stretched a moment ago
-answers by a fifth more. That cannot be corrected before the position is known, so the modulation, a linear function of
-the history for each phase of a press, is an input of the networks.
+answers by a fifth more. The modulation, a linear function of the history for each phase, is an input of the networks.
 """
 
 from collections.abc import Sequence
@@ -29,18 +28,13 @@ _CHUNK = 16_384
 
 @dataclass(frozen=True)
 class ResponseModel:
-    """Fitted response of a pad.
+    """Fitted response of a pad."""
 
-    Attributes:
-        table: (S, S, C, F + G), V, windows on a grid over [-1, 1] in x and y; 0 for the G modulations.
-        history_coef: (C, J, F + G), V/V, effect of a volt of history on the windows; and, with a minus sign, on the
-            relative sensitivity in each of G phases, 1/V.
-        history_mean_v: (C, J), history that the table is for.
-    """
-
-    table: Array
+    table: Array  # (S, S, C, F + G), V, windows on a grid over [-1, 1] in x and y; 0 for the G modulations
+    # (C, J, F + G), V/V, effect of a volt of history on the windows; and, with a minus sign, on the relative
+    # sensitivity in each of G phases, 1/V
     history_coef: Array
-    history_mean_v: Array
+    history_mean_v: Array  # (C, J), history that the table is for
 
     @classmethod
     def fit(
@@ -78,18 +72,15 @@ class ResponseModel:
             depth = None if relative_depth is None else relative_depth[valid]
             gram, moments = _normal_equations(positions[valid], past, response, depth)
             weights = np.linalg.solve(gram + penalty, moments)
-            modulation = []
+            coef = weights[n_rbf:]
             if phases:
-                expected = _expected(positions[valid], weights[:n_rbf], depth)
+                expected = np.concatenate([rbf @ weights[:n_rbf] for _, rbf in _scaled_rbf(positions[valid], None)])
+                expected = expected if depth is None else depth[:, None] * expected
                 residual = response - expected - past @ weights[n_rbf:]
-                modulation = [
-                    _sensitivity_modulation(expected[:, phase].mean(axis=1), residual[:, phase].mean(axis=1), past)
-                    for phase in phases
-                ]
-            coef = np.column_stack([weights[n_rbf:], *(-each for each in modulation)])
-            history_coef[fibre] = np.divide(
-                coef, std[:, None], out=np.zeros(coef.shape), where=std[:, None] > MIN_SCALE_V
-            )
+                means = ((part[:, phase].mean(axis=1) for part in (expected, residual)) for phase in phases)
+                coef = np.column_stack([coef, *(-_sensitivity_modulation(*each, past) for each in means)])
+            std = std[:, None]
+            history_coef[fibre] = np.divide(coef, std, out=np.zeros(coef.shape), where=std > MIN_SCALE_V)
             table[:, fibre, :size] = grid_rbf @ weights[:n_rbf]
         return cls(table.reshape(GRID_CELLS + 1, GRID_CELLS + 1, fibres, -1), history_coef, history_mean)
 
@@ -116,12 +107,9 @@ def remove_history(windows: Array, history: Array, history_coef: Array, history_
 
 
 def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
-    """Interpolate a (S, S, D) table over [-1, 1] bilinearly at (B, 2) positions: (B, D).
+    """Interpolate a (S, S, D) table over [-1, 1] bilinearly at (B, 2) positions: (B, D); beyond the edge, as at it.
 
-    Args:
-        table: values on the grid.
-        positions: where to interpolate; beyond the edge, the value at the edge.
-        xp: module of the arrays, numpy or torch.
+    `xp` is the module of the arrays, numpy or torch.
     """
     side = table.shape[0]
     cell = xp.clip((positions + 1) * ((side - 1) / 2), 0, side - 1 - 1e-3)
@@ -161,11 +149,6 @@ def _normal_equations(
         design_matrix = np.hstack([rbf, past[rows]])
         gram, moments = gram + design_matrix.T @ design_matrix, moments + design_matrix.T @ response[rows]
     return gram, moments
-
-
-def _expected(positions: Array, weights: Array, relative_depth: Array | None) -> Array:
-    expected = np.concatenate([rbf @ weights for _, rbf in _scaled_rbf(positions, None)])
-    return expected if relative_depth is None else relative_depth[:, None] * expected
 
 
 def _sensitivity_modulation(expected: Array, residual: Array, past: Array) -> Array:

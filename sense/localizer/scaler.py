@@ -41,15 +41,10 @@ def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerialize
 
 @dataclass(frozen=True)
 class ScaledFeatures:
-    """Features of Q presses as the networks take them.
+    """Features of Q presses as the networks take them."""
 
-    Attributes:
-        inputs: (Q, C, F + G), about 1.
-        fibre_mask: (Q, C), whether the fibre gave enough readings.
-    """
-
-    inputs: Floats
-    fibre_mask: Mask
+    inputs: Floats  # (Q, C, F + G), about 1
+    fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
 
     def __getitem__(self, rows: slice | Indices) -> "ScaledFeatures":
         return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows])
@@ -60,13 +55,7 @@ class ScaledFeatures:
 
 @dataclass(frozen=True)
 class TargetScaler:
-    """Scaling of a depth or force to [-1, 1].
-
-    Attributes:
-        name: one of `Recording.measures`, which ends in its unit.
-        origin: value that is 0 when scaled.
-        scale: difference that is 1 when scaled.
-    """
+    """Scaling of a depth or force to [-1, 1]: `origin` becomes 0, a difference of `scale` 1."""
 
     __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
     name: Literal["depth_mm", "force_n"]
@@ -90,28 +79,17 @@ class TargetScaler:
 
 @dataclass(frozen=True)
 class FeatureScaler:
-    """Scaling of features and targets, fitted to the presses of training.
-
-    Attributes:
-        mean_v: (C, F + G), V; the G modulations of sensitivity are not scaled.
-        scale_v: (C, F + G), V.
-        history_coef: (C, J, F + G), effect of a volt of history, see `ResponseModel`.
-        history_mean_v: (C, J), V.
-        origin_mm: (2,) position that is 0 when scaled.
-        scale_mm: distance that is 1 when scaled.
-        half_size_mm: (2,) half the width and height of the area that was pressed.
-        measures: scaling of depth, or of depth and force, where they are predicted.
-    """
+    """Scaling of features and targets, fitted to the presses of training."""
 
     __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
-    mean_v: Annotated[Array, *array_field(-2 * MAX_VOLTS, 2 * MAX_VOLTS)]
-    scale_v: Annotated[Array, *array_field(MIN_SCALE_V, 2 * MAX_VOLTS)]
-    history_coef: Annotated[Array, *array_field(-1e6, 1e6)]
-    history_mean_v: Annotated[Array, *array_field(-2 * MAX_VOLTS, 2 * MAX_VOLTS)]
-    origin_mm: Annotated[Array, *array_field(-MAX_MM, MAX_MM)]
-    scale_mm: Annotated[float, Field(gt=0, le=MAX_MM)]
-    half_size_mm: Annotated[Array, *array_field(0, MAX_MM)]
-    measures: Annotated[tuple[TargetScaler, ...], Field(max_length=2, strict=False)] = ()
+    mean_v: Annotated[Array, *array_field(-2 * MAX_VOLTS, 2 * MAX_VOLTS)]  # (C, F + G), 0 for the G modulations
+    scale_v: Annotated[Array, *array_field(MIN_SCALE_V, 2 * MAX_VOLTS)]  # (C, F + G), 1 for the G modulations
+    history_coef: Annotated[Array, *array_field(-1e6, 1e6)]  # (C, J, F + G), see `ResponseModel`
+    history_mean_v: Annotated[Array, *array_field(-2 * MAX_VOLTS, 2 * MAX_VOLTS)]  # (C, J)
+    origin_mm: Annotated[Array, *array_field(-MAX_MM, MAX_MM)]  # (2,) position that is 0 when scaled
+    scale_mm: Annotated[float, Field(gt=0, le=MAX_MM)]  # distance that is 1 when scaled
+    half_size_mm: Annotated[Array, *array_field(0, MAX_MM)]  # (2,) half the size of the area that was pressed
+    measures: Annotated[tuple[TargetScaler, ...], Field(max_length=2, strict=False)] = ()  # where they are predicted
 
     @classmethod
     def fit(
@@ -133,19 +111,17 @@ class FeatureScaler:
             phases: windows whose sensitivity is modulated together.
 
         Returns:
-            The scaler, and the (S, S, C, F + G) scaled table of the response by position; where depths vary, for the
-            depth that is 0 when scaled.
+            The scaler, and the (S, S, C, F + G) scaled response by position, at the scaled depth 0 if depths vary.
         """
         targets = tuple(TargetScaler.fit(name, values) for name, values in (measures or {}).items())
         low, high = positions_mm.min(axis=0), positions_mm.max(axis=0)
         origin, scale_mm = (low + high) / 2, float((high - low).max() / 2) or 1.0
         relative_depth = measures["depth_mm"] / targets[0].origin if measures else None
         scaled_mm = (positions_mm - origin) / scale_mm
-        response = ResponseModel.fit(
-            scaled_mm, features.windows, features.history, features.fibre_mask, relative_depth, phases
-        )
+        inputs = features.windows, features.history
+        response = ResponseModel.fit(scaled_mm, *inputs, features.fibre_mask, relative_depth, phases)
         history = response.history_coef, response.history_mean_v
-        windows = remove_history(features.windows, features.history, *history)[:, :, : features.windows.shape[2]]
+        windows = remove_history(*inputs, *history)[:, :, : features.windows.shape[2]]
         mean = _masked_mean(windows, features.fibre_mask)
         variance = _masked_mean((windows - mean) ** 2, features.fibre_mask)
         scale = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
@@ -200,19 +176,12 @@ def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
 
 @dataclass(frozen=True)
 class TrainingPresses:
-    """Scaled presses of known targets, to train or to check on.
+    """Scaled presses of known targets, to train or to check on."""
 
-    Attributes:
-        inputs: (Q, C, F + G).
-        fibre_mask: (Q, C).
-        targets: (Q, 2 + T).
-        depth_gain: see `FeatureScaler.depth_gain`.
-    """
-
-    inputs: Floats
-    fibre_mask: Mask
-    targets: Floats
-    depth_gain: float = 0.0
+    inputs: Floats  # (Q, C, F + G)
+    fibre_mask: Mask  # (Q, C)
+    targets: Floats  # (Q, 2 + T)
+    depth_gain: float = 0.0  # see `FeatureScaler.depth_gain`
 
 
 def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:

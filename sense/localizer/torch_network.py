@@ -21,11 +21,7 @@ class _Affine(nn.Module):
 
 
 class EnsembleMlp(nn.Module):
-    """Ensemble of residual MLPs; the names and shapes of its parameters are those of `network.Weights`.
-
-    Args:
-        weights: first weights, as tensors; they are copied.
-    """
+    """Ensemble of residual MLPs; the names and shapes of its parameters are those of `network.Weights`."""
 
     def __init__(self, weights: Mapping[str, Tensor]) -> None:
         super().__init__()
@@ -72,11 +68,7 @@ class EnsembleMlp(nn.Module):
         return torch.baddbmm(self.last.b, _activate(h), self.last.w)
 
     def forward_bfloat16(self, x: Tensor) -> Tensor:
-        """Return the outputs to about 1 %, four times as fast, where the processor has instructions for it.
-
-        Matrices are multiplied in bfloat16 with sums in single precision; trained so, networks err no more. On other
-        processors, and in a torch that does not tell, this is `forward`.
-        """
+        """Return the outputs to about 1 %, four times as fast, if the processor has bfloat16; or `forward`."""
         supported = getattr(torch.cpu, "get_capabilities", dict)().get("avx512_bf16", False)
         with torch.autocast("cpu", torch.bfloat16, enabled=supported):
             return self.forward(x).float()

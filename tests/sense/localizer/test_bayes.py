@@ -166,11 +166,8 @@ def test_fit_takes_presses_on_a_point_or_line(places: np.ndarray) -> None:
 
 def test_transformed_can_be_repeated(fitted_waves: Fitted) -> None:
     bayes, inputs, _ = fitted_waves
-    turn, shift, fibre_mask = (
-        np.array([[0.9, -0.2], [0.3, 1.1]]),
-        np.array([0.1, -0.4]),
-        np.ones((30, FIBRES), dtype=bool),
-    )
+    turn, shift = np.array([[0.9, -0.2], [0.3, 1.1]]), np.array([0.1, -0.4])
+    fibre_mask = np.ones((30, FIBRES), dtype=bool)
     place, summary = bayes.predict(inputs[:30], fibre_mask)
     moved, as_before = bayes.transformed(turn, shift).transformed(turn, shift).predict(inputs[:30], fibre_mask)
     np.testing.assert_allclose(moved, (place @ turn.T + shift) @ turn.T + shift, atol=1e-6)

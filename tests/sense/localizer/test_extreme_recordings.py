@@ -22,11 +22,8 @@ TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_
 def worst(seed: int, recording: Recording) -> Recording:
     """Its readings with faults, and its presses oddly placed, timed or short."""
     rng = np.random.default_rng(seed)
-    places, down_command, up_command = (
-        recording.presses_mm.copy(),
-        recording.down_command.copy(),
-        recording.up_command.copy(),
-    )
+    places, down_command = recording.presses_mm.copy(), recording.down_command.copy()
+    up_command = recording.up_command.copy()
     times_s = recording.times_s
     match rng.integers(7):
         case 0:

@@ -7,16 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.features import (
-    FEATURES,
-    PAST,
-    REST,
-    SLOW,
-    PressFeatures,
-    compute_features,
-    compute_history,
-    interpolate_gaps,
-)
+from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features, interpolate_gaps
 from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
@@ -84,21 +75,6 @@ def test_compute_features_takes_presses_of_any_length(name: str, gaps: list[int]
     assert found.fibre_mask.all()
 
 
-def test_compute_history_is_relative_to_rest() -> None:
-    readings = np.random.default_rng(3).standard_normal((6000, 2))
-    down_command = np.array([20, 5000])
-    found = compute_history(readings, down_command)
-    rest = readings[5000 + REST[0] : 5000].mean(axis=0)
-    for number, (first, end) in enumerate(PAST):
-        assert np.allclose(found[1, :, number], readings[5000 + first : 5000 + end].mean(axis=0) - rest)
-    samples = readings[5000 - SLOW[0] : 5000 : SLOW[0] // 200]
-    assert np.allclose(found[1, :, len(PAST)], np.median(samples, axis=0) - rest)
-    # before the first reading there is the first reading
-    assert np.allclose(found[0, :, len(PAST) - 1], readings[0] - readings[10:20].mean(axis=0))
-    readings[5000:] = 99
-    assert np.array_equal(compute_history(readings, down_command), found)
-
-
 def test_interpolate_gaps_fills_gaps_only() -> None:
     readings = noise()
     holed = readings.copy()
@@ -158,8 +134,6 @@ def test_scaler_standardizes_features_and_positions() -> None:
     np.testing.assert_array_equal(scaled.fibre_mask, inputs.fibre_mask)
     for sign in (1, -1):  # what lies far off is held
         assert (scaling.scale(sign * np.full((1, FIBRES, WINDOWS), 1e9)) == sign * MAX_INPUT).all()
-    assert scaling.n_inputs("ensemble") == FIBRES * WINDOWS + FIBRES
-    assert scaling.n_inputs("published") == FIBRES * WINDOWS
     places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]
     scaling, _ = FeatureScaler.fit(inputs, places)
     np.testing.assert_allclose(scaling.origin_mm, [5, 5])

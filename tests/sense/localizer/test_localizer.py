@@ -22,7 +22,7 @@ def arrays(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     return features.windows, recording.presses_mm
 
 
-def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarray]) -> None:
+def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
     x, y = arrays
     localizer = Localizer(max_failures=1, random_state=3, **TINY)
     scores = cross_val_score(localizer, x, y, cv=3)
@@ -35,8 +35,9 @@ def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarr
     missing = x[200:].copy()
     missing[:, 1] = np.nan
     assert np.array_equal(fitted.predict(missing).positions_mm, fitted.predict(x[200:], [1]).positions_mm)
-    again = cast("Localizer", clone(fitted)).fit(x[:200], y[:200])
-    assert np.array_equal(again.predict(x).positions_mm, fitted.predict(x).positions_mm)
+    fitted.save(tmp_path)
+    for again in (cast("Localizer", clone(fitted)).fit(x[:200], y[:200]), Localizer.load(tmp_path)):
+        assert np.array_equal(again.predict(x).positions_mm, fitted.predict(x).positions_mm)
 
 
 def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_path: Path) -> None:
@@ -51,14 +52,6 @@ def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_pa
     assert np.array_equal(again.predict(brief, [0]).r90_mm, localizer.predict(brief, [0]).r90_mm)
     params = again.get_params()
     assert [params[name] for name in ("max_failures", "features", "split")] == [2, "causal", "chronological"]
-
-
-def test_localizer_of_arrays_is_kept_in_files(arrays: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
-    x, y = arrays
-    localizer = Localizer(1, members=1, **TINY).fit(x[:60, :, :3], y[:60])
-    localizer.save(tmp_path)
-    again = Localizer.load(tmp_path).predict(x[:, :, :3])
-    assert np.array_equal(again.positions_mm, localizer.predict(x[:, :, :3]).positions_mm)
 
 
 def test_localizer_params_are_settings() -> None:
@@ -76,11 +69,9 @@ def test_localizer_refuses_unfit_input(brief: Recording, arrays: tuple[np.ndarra
         Localizer().predict(brief)
     for bad, target, message in (
         (x[:, :, 0], y, r"X has shape \(300, 4\)"),
-        (x, y[:, 0], r"y has shape \(300,\)"),
         (x, None, "y has shape"),
         (x[:9], y, "X has 9 presses and y 300"),
         (brief, y, "y is given beside a recording"),
-        (x[:1], y[:1], "has 1 presses"),
     ):
         with pytest.raises(InputError, match=message):
             Localizer(**TINY).fit(bad, target)

@@ -21,7 +21,6 @@ from padforge.sense.localizer.model import LocalizerModel
 from tools.kills import killed
 
 Change = Callable[[Any], dict[str, Any]]
-WILD = (np.nan, np.inf, 1e13)
 
 
 @pytest.mark.parametrize(
@@ -32,20 +31,17 @@ WILD = (np.nan, np.inf, 1e13)
         ("features", "published", r"scaler\.mean_v"),
         ("method", "guess", "method"),
         ("method", "published", "force_n of method published"),
-        ("interval_factors", [], "interval_factors"),
         ("interval_factors.0", [1.0, 1.0], "interval_factors"),
         ("interval_factors.0.0", -1.0, "interval_factors"),
         ("scaler.history_coef.0.0", [1.0], r"scaler\.history_coef"),
         ("scaler.history_coef.0.0.0", np.nan, "history_coef"),
-        ("scaler.history_mean_v.0", [1.0], r"scaler\.history_mean_v"),
-        *(("rate_hz", value, "rate_hz") for value in (0, -1.0, "13", np.nan, np.inf, 1e-300, None)),
-        *((f"scaler.{key}.0.0", value, key) for key in ("mean_v", "scale_v") for value in (np.nan, np.inf, 1e9, "1")),
+        *(("rate_hz", value, "rate_hz") for value in (0, "13", np.nan)),
+        *((f"scaler.{key}.0.0", value, key) for key in ("mean_v", "scale_v") for value in (np.nan, 1e9, "1")),
         ("scaler.scale_v.0.0", 0.0, "scale_v"),
-        ("scaler.scale_v.0", [1.0], "scale_v"),
-        *(("scaler.origin_mm", value, "origin_mm") for value in ([0.0], [0.0, np.nan], [1e9, 0.0], 3, None)),
-        *(("scaler.scale_mm", value, "scale_mm") for value in (0.0, -1.0, np.nan, np.inf, 1e30, "9")),
+        *(("scaler.origin_mm", value, "origin_mm") for value in ([0.0], 3)),
+        *(("scaler.scale_mm", value, "scale_mm") for value in (0.0, 1e30)),
         ("split", "alphabetical", "split"),
-        *(("test", value, "test") for value in ([0.5], ["a"], [-1], [True], {}, [3, 3])),
+        *(("test", value, "test") for value in ([-1], [True], [3, 3])),
         ("errors", [{"mean_mm": np.nan}], r"errors\.0\.mean_mm"),
         ("training_recording_sha256", 7, "training_recording_sha256"),
         ("weights_sha256", 7, "weights_sha256"),
@@ -73,24 +69,15 @@ def test_load_refuses_documents_out_of_range(
 @pytest.mark.parametrize(
     "change",
     [
-        lambda of: {"weights": of.weights | {"last.b": of.weights["last.b"] * np.float32(np.nan)}},
         lambda of: {"weights": of.weights | {"first.w": of.weights["first.w"] + np.float32(1e30)}},
         lambda of: {"weights": of.weights | {"first.w": of.weights["first.w"][:, 1:]}},
         lambda of: {"weights": of.weights | {"hidden.b": of.weights["hidden.b"].astype(np.float64)}},
         lambda of: {"weights": {name: weight for name, weight in of.weights.items() if name != "last.w"}},
-        lambda of: {"weights": {}},
         lambda of: {"residual_network": {}},
-        lambda of: {"residual_network": of.weights},
         lambda of: {"residual_network": {name: weight * np.nan for name, weight in of.residual_network.items()}},
         lambda of: {"bayes": replace(of.bayes, grid=of.bayes.grid[1:])},
-        *(
-            lambda of, x=x: {
-                "bayes": replace(
-                    of.bayes, log_likelihood_coefficients=np.full_like(of.bayes.log_likelihood_coefficients, x)
-                )
-            }
-            for x in WILD
-        ),
+        lambda of: {"bayes": replace(of.bayes, shift=np.array([np.nan, 0.0]))},
+        lambda of: {"bayes": replace(of.bayes, shift=np.array([1e13, 0.0]))},
         lambda of: {"bayes": replace(of.bayes, linearization=-of.bayes.linearization)},
     ],
 )
@@ -175,11 +162,8 @@ def test_save_into_an_unusable_folder_changes_nothing(localizer: LocalizerModel,
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
         localizer.save(tmp_path / "file")
-    nowhere: Any
-    for nowhere in (None, 3, ["a"], np.ones(3), ""):
-        for use in (LocalizerModel.load, localizer.save):
-            with pytest.raises(InputError, match=r"folder is .*, expected a path"):
-                use(nowhere)
+    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
+        LocalizerModel.load("")
 
 
 @pytest.mark.slow

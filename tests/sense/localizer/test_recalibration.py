@@ -114,10 +114,7 @@ def test_recalibrate_follows_a_remade_pad(
     again = LocalizerModel.load(tmp_path)
     assert np.array_equal(again.table, now.table)
     assert again.recalibrated_by == (known_only(pad, NEW).digest,)
-    assert np.array_equal(
-        again.predict_features(again.scaled_features(pad)).positions_mm,
-        now.predict_features(now.scaled_features(pad)).positions_mm,
-    )
+    assert np.array_equal(again.predict(pad).positions_mm, now.predict(pad).positions_mm)
     json.dumps(document, allow_nan=False)
     twice = replace(again, recalibrated_by=("of before", *again.recalibrated_by))
     assert recalibrate(twice, known_only(pad, NEW))[0].recalibrated_by[:2] == twice.recalibrated_by
@@ -140,9 +137,8 @@ def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording
     assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
     if not document["changes"]:
         assert document["before"] == document["after"]
-    for presses in (0, 1, 3, 9):
-        with pytest.raises(InputError, match=f"has {presses} presses of known position, expected at least 10"):
-            recalibrate(localizer, known_only(recording, slice(0, presses)))
+    with pytest.raises(InputError, match="has 9 presses of known position, expected at least 10"):
+        recalibrate(localizer, known_only(recording, slice(0, 9)))
 
 
 def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recording: Recording) -> None:
@@ -158,11 +154,8 @@ def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recor
     np.testing.assert_allclose(
         found.scaled_features(pad).inputs, localizer.scaled_features(recording).inputs, atol=0.15
     )
-    off = distances(found.predict_features(found.scaled_features(pad)).positions_mm, moved)
-    assert (
-        off.mean()
-        < 0.1 * distances(localizer.predict_features(localizer.scaled_features(pad)).positions_mm, moved).mean()
-    )
+    before, after = (distances(each.predict(pad).positions_mm, moved).mean() for each in (localizer, found))
+    assert after < 0.1 * before
     # The table is turned with the pad.
     at = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
     one, other = (each.table.reshape(*each.table.shape[:2], -1) for each in (localizer, found))
