@@ -182,15 +182,8 @@ def conformal(predictions: Sequence[Localization], positions_mm: Array, measures
 
     Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): a quantile of
     distance over radius on presses that entered nothing before, one rank higher than the share, so that of few presses
-    they are more cautious.
-
-    Args:
-        predictions: of Q presses, one a set of failed fibres.
-        positions_mm: (Q, 2) true positions.
-        measures: (Q,) true depths and forces; where none is known, the factor is 1.
-
-    Returns:
-        (3 + T,) of the standard deviation, the radii of 50 and 90 %, and the r90 of T measures.
+    they are more cautious. The (3 + T,) factors are of the standard deviation, the radii of 50 and 90 %, and the r90 of
+    T measures (1 where no true value is known); arguments are as in `error_row`.
     """
     standardized = [(each.positions_mm - positions_mm) / each.std_mm for each in predictions]
     errors = np.array([distances(each.positions_mm, positions_mm) for each in predictions])

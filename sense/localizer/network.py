@@ -82,15 +82,9 @@ def predict_members(
     bayes: BayesianLocalizer | None = None,
     residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
-    """Return the (E, Q, 2 N) outputs of all members; the Bayesian localizer, corrected by its network, is the last.
+    """Return the (E, Q, 2 N) outputs of all members for (Q, C, F + G) scaled features and a (Q, C) mask.
 
-    Args:
-        weights: of the other members.
-        features: (Q, C, F + G) scaled.
-        fibre_mask: (Q, C).
-        method: "ensemble" or "published".
-        bayes: the Bayesian localizer, if any.
-        residual_network: weights of the network that corrects it.
+    The last member is the Bayesian localizer, if any, corrected by its residual network.
     """
     x = features.reshape(len(features), -1) if method == "published" else network_inputs(features, fibre_mask)
     outputs = forward(weights, x)

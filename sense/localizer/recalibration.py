@@ -7,7 +7,7 @@ fine tuning suffices. Cross-validation over the new presses decides whether eith
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import count
+from itertools import count, groupby
 from types import MappingProxyType
 from typing import Any
 
@@ -17,7 +17,7 @@ from padforge.design.common.files import provenance
 from padforge.design.common.validation import InputError, check_int
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices
-from padforge.sense.localizer.evaluation import conformal, distances, error_row
+from padforge.sense.localizer.evaluation import Measures, conformal, distances, error_row
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel, concatenate
 from padforge.sense.localizer.network import Weights
@@ -40,7 +40,6 @@ CORRECT_FROM, FINE_TUNE_FROM = 2.0, -1.0
 tuning gains almost always, but less than a hundred presses can show, so it is kept unless they speak against it."""
 SUBSETS = 16
 """Sets of failed fibres of a size that are looked at, at most."""
-Measures = Mapping[str, Array]
 Predictions = Mapping[tuple[int, ...], Localization]
 """By set of failed fibres."""
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
@@ -158,10 +157,7 @@ def _fine_tuned(
 
 
 def fit_correction(
-    model: LocalizerModel,
-    features: PressFeatures,
-    positions_mm: Array,
-    measures: Mapping[str, Array] = MappingProxyType({}),
+    model: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures = MappingProxyType({})
 ) -> LocalizerModel:
     """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior."""
     from scipy.optimize import least_squares  # slow to import, and needed here only
@@ -223,15 +219,7 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 
 
 class CrossValidation:
-    """Cross-validation of changes on new presses.
-
-    Args:
-        features: of the presses in volts.
-        positions_mm: (Q, 2).
-        folds: indices that are left out in turn, in order.
-        subsets: sets of failed fibres to predict without.
-        measures: (Q,) of each that the localizers predict, NaN where unknown.
-    """
+    """Cross-validation of changes on new presses: each fold is left out in turn, for each subset of failed fibres."""
 
     def __init__(
         self,
@@ -243,8 +231,7 @@ class CrossValidation:
     ) -> None:
         self.presses = features, positions_mm, measures
         self._folds, self._subsets = folds, subsets
-        sizes = dict.fromkeys(map(len, subsets))
-        self._levels = [[failed for failed in subsets if len(failed) == size] for size in sizes]
+        self._levels = [list(level) for _, level in groupby(subsets, len)]  # subsets ascend in size
 
     def change(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
         """Change the models, one a fold, each by the presses that its fold leaves."""

@@ -185,10 +185,9 @@ class TrainingPresses:
 
 
 def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:
-    """Move presses as far from the response table as if it had been fitted without them.
+    """Move presses as far from the response table as if it had been fitted without them, and others at their position.
 
-    The leave-one-out residual of a linear fit is the residual over 1 - leverage: of a few hundred presses, a third
-    more. All presses at one position are left out together.
+    The leave-one-out residual of a linear fit is the residual over 1 - leverage: of some hundred presses, a third more.
     """
     targets = presses.targets.astype(np.float64)
     positions, relative_depth = targets[:, :2], np.ones(len(targets))

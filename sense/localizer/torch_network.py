@@ -91,10 +91,7 @@ def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, generator: 
 def network_inputs(features: Tensor, fibre_mask: Tensor, bayes: BayesianLocalizer | None) -> tuple[Tensor, Tensor]:
     """Return the (B, D) inputs of a network and the (B, 2) position that it corrects, or 0 without `bayes`.
 
-    Args:
-        features: (B, C, F) scaled.
-        fibre_mask: (B, C).
-        bayes: the Bayesian localizer in tensors, whose posterior summary is an input.
+    The posterior summary of `bayes`, which is in tensors, is an input beside features (B, C, F) and mask (B, C).
     """
     masked = torch.where(fibre_mask[..., None], features, 0.0)
     x = torch.cat([masked.flatten(1), fibre_mask.to(features.dtype)], dim=1)

@@ -96,9 +96,8 @@ def test_predict_gives_intervals_of_depth_and_force(deep_localizer: LocalizerMod
     np.testing.assert_allclose(whole["force_n"].values, 3 * whole["depth_mm"].values, atol=2)
     assert (whole["depth_mm"].r90 > 0).all()
     assert fewer["depth_mm"].r90.mean() > whole["depth_mm"].r90.mean()
-    depth = deep_localizer.predict_features(ScaledFeatures(presses.inputs, np.zeros_like(presses.fibre_mask))).measures[
-        "depth_mm"
-    ]
+    blind = ScaledFeatures(presses.inputs, np.zeros_like(presses.fibre_mask))
+    depth = deep_localizer.predict_features(blind).measures["depth_mm"]
     assert depth.values == pytest.approx(2.75, abs=0.05)
     assert depth.r90 == pytest.approx(2.25, abs=0.05)
     found = concatenate([deep_localizer.predict_features(presses[:5]), deep_localizer.predict_features(presses[5:9])])
