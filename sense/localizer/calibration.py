@@ -14,7 +14,7 @@ from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_float, check_type
+from padforge.design.common.validation import InputError, check_float
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
@@ -98,7 +98,6 @@ def calibrate(
         InputError: an option out of range, a time budget for the published method, too few presses, or a training
             that diverged.
     """
-    check_type("recording", recording, Recording)
     options = or_default("options", options, LocalizerSettings)
     time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
     if options.method == "published":
@@ -143,18 +142,8 @@ def fit_model(
 
     A share of the presses calibrates the uncertainty, drawn at random or the last ones, as the split is. The others
     are trained on as they were commanded and, once more, as they would be detected. The published training ends by
-    presses of its own: were they those of the calibration, its intervals would be too short.
-
-    Args:
-        data: presses.
-        training: indices of the presses to train on and to calibrate by.
-        options: how to train.
-        rng: source of all that is random.
-        on_progress: see `calibrate`.
-        time_budget: see `calibrate`.
-
-    Raises:
-        InputError: too few presses, or the training diverged.
+    presses of its own: were they those of the calibration, its intervals would be too short. InputError is raised for
+    too few presses, and for a training that diverged.
     """
     # torch is slow to import, and predictions need none
     from padforge.sense.localizer.training import train_members, train_published

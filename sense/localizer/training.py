@@ -78,7 +78,7 @@ def fit_network(
     averaged: bool = True,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> dict[str, Floats]:
-    """Minimize a loss by AdamW with a one-cycle learning rate and averaged weights.
+    """Minimize a loss by AdamW with a one-cycle learning rate and averaged weights, and return these.
 
     Args:
         parameters: weights by name, which require gradients; they are changed in place.

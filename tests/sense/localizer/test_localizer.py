@@ -75,8 +75,6 @@ def test_localizer_refuses_unfit_input(brief: Recording, arrays: tuple[np.ndarra
     ):
         with pytest.raises(InputError, match=message):
             Localizer(**TINY).fit(bad, target)
-    with pytest.raises(InputError, match=r"\[localizer\] hidden"):
-        Localizer(hidden=0).fit(brief)
     fitted = Localizer(members=1, **TINY).fit(x[:40], y[:40])
     with pytest.raises(InputError, match="fitted to arrays"):
         fitted.predict(brief)
