@@ -36,21 +36,16 @@ COMMANDED, DETECTED = "health", "health_live"
 """Names of the files of a model: trained on presses as commanded, and as detected in the readings."""
 FALSE_ALARM_RATE, MAX_FALSE_ALARM_RATE = 1e-5, 0.1
 """False alarms a press, all fibres and kinds of fault together: the default, and the largest (then every press is)."""
-MAX_FAILED = 2
-"""Largest number of failed fibres for which the heights of chance are learnt."""
-MIN_PRESSES = 300
-"""Presses that a model is trained on, at least."""
+MAX_FAILED = 2  # largest number of failed fibres for which the heights of chance are learnt
+MIN_PRESSES = 300  # presses that a model is trained on, at least
 MIN_GAIN_PRESSES = 850
 """Presses from which a reduced gain is distinguished from presses at rare positions; with 680, simulated pads gave a
 false alarm in every other recording, with 850 none in 12."""
-WARM_UP = 10
-"""Presses after which the running level of a rest is reliable."""
+WARM_UP = 10  # presses after which the running level of a rest is reliable
 BLOCK = 50
 """Each member is trained on all presses but its fold, of blocks of successive ones: neighbours share what drifts."""
-SUBSETS = 4
-"""Random sets of failed fibres of a size from which the heights of chance are learnt."""
-MAX_ENTRY = 1e6
-"""Largest absolute entry of an array of a valid model."""
+SUBSETS = 4  # random sets of failed fibres of a size from which the heights of chance are learnt
+MAX_ENTRY = 1e6  # largest absolute entry of an array of a valid model
 POSITIVE = (
     *("pca.input_scale_v", "pca.target_scale_v", "likelihoods.std_scale", "likelihoods.library_std"),
     *("likelihoods.noise_v", "likelihoods.log_noise_std", "likelihoods.constant_share"),
@@ -74,33 +69,19 @@ class HealthDocument(Settings):
 
 @dataclass(frozen=True)
 class HealthModel:
-    """Model of a healthy pad. Its arrays have the L of the C fibres that were not dead.
+    """Model of a healthy pad. Its arrays have the L of the C fibres that were not dead."""
 
-    Attributes:
-        pca: reduces traces to the inputs and targets of the networks.
-        weights: of the networks that predict each fibre from the others.
-        likelihoods: distribution of healthy presses about the predictions.
-        exceedance: how high cumulative sums rise by chance.
-        rest_range_v: lowest and highest rest; shape (2, L), V.
-        fibres: number of fibres, C.
-        dead: indices of fibres that were dead in the recording.
-        rate_hz: readings per second of the recording.
-        presses: presses that the model was trained on.
-        false_alarm_rate: false alarms a press that are allowed on a healthy pad.
-        provenance: origin of the model, JSON.
-    """
-
-    pca: TracePCA
-    weights: Weights
-    likelihoods: FaultLikelihoods
-    exceedance: ExceedanceModel
-    rest_range_v: Array
-    fibres: int
-    dead: tuple[int, ...]
-    rate_hz: float
-    presses: int
-    false_alarm_rate: float = FALSE_ALARM_RATE
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    pca: TracePCA  # reduces traces to the inputs and targets of the networks
+    weights: Weights  # of the networks that predict each fibre from the others
+    likelihoods: FaultLikelihoods  # distribution of healthy presses about the predictions
+    exceedance: ExceedanceModel  # how high cumulative sums rise by chance
+    rest_range_v: Array  # lowest and highest rest; shape (2, L), V
+    fibres: int  # number of fibres, C
+    dead: tuple[int, ...]  # indices of fibres that were dead in the recording
+    rate_hz: float  # readings per second of the recording
+    presses: int  # that the model was trained on
+    false_alarm_rate: float = FALSE_ALARM_RATE  # false alarms a press that are allowed on a healthy pad
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # origin of the model, JSON
 
     @property
     def living(self) -> Indices:
@@ -115,10 +96,6 @@ class HealthModel:
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; `load` restores every bit.
 
-        Args:
-            folder: created if missing.
-            name: `COMMANDED` or `DETECTED`.
-
         Raises:
             InputError: the provenance is no JSON, or the folder cannot be written.
         """
@@ -130,13 +107,6 @@ class HealthModel:
     @classmethod
     def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":
         """Read what `save` wrote.
-
-        Args:
-            folder: folder of the model.
-            name: `COMMANDED` or `DETECTED`.
-
-        Returns:
-            The model.
 
         Raises:
             InputError: a file is missing, torn or of another kind, a value is out of range, or the two files do not

@@ -36,12 +36,10 @@ MIN_SINGULAR = 0.3
 """Relative singular value below which both sides of a pad, turned by more than some 28 degrees, count as equal."""
 JITTER = 0.1
 """Standard deviation of the interval between readings, as a share of its mean: the loop that records is no clock."""
-MIN_PRESSES = 100
-"""Presses from which noise, drift and hysteresis are measured."""
+MIN_PRESSES = 100  # presses from which noise, drift and hysteresis are measured
 REST_S, AFTER_S = 0.7, (0.7, 1.4)
 """Time before a press, and range of times after it, in which fibres are at rest and show what it left behind."""
-DECAY_S = np.geomspace(1.0, 100.0, 41)
-"""Time constants of hysteresis that are tried."""
+DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are tried
 
 
 @dataclass(frozen=True)
@@ -57,11 +55,7 @@ class PadModel:
 
 
 def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = None) -> PadModel:
-    """Model a pad as make_plan; `size` says where it is pressed.
-
-    Raises:
-        InputError: as `fit_pad_settings`.
-    """
+    """Model a pad as make_plan; `size` says where it is pressed, as `fit_pad_settings`."""
     size = fit_pad_settings(pad, size)
     keys = {"sensed_mm", "keep_out_mm"} if size.keep_out_mm else {"sensed_mm"}
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
@@ -74,11 +68,7 @@ def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = Non
 
 
 def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
-    """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; a dead channel stays at rest.
-
-    Raises:
-        InputError: no channel of the twin reads a fibre; or as `fit_pad_settings`.
-    """
+    """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; dead channels stay at rest."""
     live = _live_channels(twin)
     columns = [twin.channels.index(channel) for channel in live]
     fibres = np.array([channel.fibre for channel in live])
@@ -109,9 +99,6 @@ def model_like_twin(pad: Morphology, twin: Twin, size: PadSettings | None = None
     """Model another pad as make_plan, with the sensitivity profile of a twin and its median gain and noise.
 
     How its channels will differ is unknown before it is made: fibre i is on channel i, and all have the same gain.
-
-    Raises:
-        InputError: no channel of the twin reads a fibre; or as `fit_pad_settings`.
     """
     gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live_channels(twin)]).T
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
@@ -216,10 +203,7 @@ def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, si
 def measure_rig_settings(recording: Recording) -> dict[str, float]:
     """Measure the `noise_mv`, `drift_mv`, `hysteresis` and `hysteresis_s` of `[rig]` in a recording.
 
-    Channels that miss readings or are constant are ignored; positions of presses are not needed.
-
-    Returns:
-        The settings; none if there are fewer than MIN_PRESSES, or no such channel.
+    Channels that miss readings or are constant are ignored; none are returned for fewer than MIN_PRESSES or no channel.
     """
     down_command, up_command, rate_hz = recording.down_command[:-1], recording.up_command[:-1], recording.rate_hz
     valid = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > MIN_SCALE_V)
