@@ -88,19 +88,11 @@ class _PressRecord(NamedTuple):
 
 
 class FaultMonitor:
-    """Detect faulty fibres press by press; a faulty fibre is masked from then on.
-
-    Args:
-        model: of the healthy pad.
-
-    Attributes:
-        model: the model.
-        n_presses: presses processed so far.
-    """
+    """Detect faulty fibres press by press, by a model of the healthy pad; they are masked from then on."""
 
     def __init__(self, model: HealthModel) -> None:
         self.model = check_type("model", model, HealthModel)
-        self.n_presses = 0
+        self.n_presses = 0  # processed so far
         fibres = len(model.living)
         self._failed = np.zeros(fibres, dtype=bool)
         self._n_missing = np.zeros(fibres, dtype=np.int64)
@@ -294,9 +286,6 @@ class FaultDetector:
             recording: of the healthy pad.
             held_back: indices of presses that are left out.
             provenance: origin of the model, JSON.
-
-        Returns:
-            The detector.
 
         Raises:
             InputError: fewer than 300 complete presses, no living fibre, or indices out of range.

@@ -8,35 +8,30 @@ which converts a rate of false alarms into a threshold.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 from padforge.sense.health.trace_model import COMPONENTS, HELD, RELEASED, REST, T_DEGREES, TRACE
 
-OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
-"""Offsets of the rest that are tested, in standard deviations of its residual."""
+OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)  # of the rest, in standard deviations of its residual
 HYPOTHESES = ("stuck", "no_response", "reduced_gain", "inconsistent", "noisy", *(f"offset {o:+g}" for o in OFFSETS))
 """Constant readings; a gain of 0; a gain of one half; the response to another press; five times the noise; and a rest
 that has shifted by one of `OFFSETS`."""
 GAINS = (0.0, 0.5)
 NOISE_FACTOR = 5.0
-STD_FACTOR = 4.0
-"""An inconsistent response is either that to another press, or wrong by so many times the predicted deviation."""
-MAX_LLR, MAX_STEP_LLR = 6.0, 12.0
-"""Largest contribution of one press: no mishap in a single press is a fault. A step within a trace may add more at the
-onset of an offset, yet is below the threshold until the rest has shifted as well."""
-STEPS = np.arange(3, TRACE - 2)
-"""Readings of a trace at which a step is tested; one nearer to an end could as well be a spike."""
+STD_FACTOR = 4.0  # an inconsistent response is that to another press, or wrong by this many predicted deviations
+MAX_LLR = 6.0  # largest contribution of one press: no mishap in a single press is a fault
+MAX_STEP_LLR = 12.0  # of a step within a trace, yet below the threshold until the rest has shifted as well
+STEPS = np.arange(3, TRACE - 2)  # readings of a trace where a step is tested; nearer to an end it may be a spike
 LIBRARY = 64  # other presses that an inconsistent response is compared with
 STD_SCALES = np.geomspace(0.5, 2.0, 9)
 STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])  # calibrations of predicted deviations that are tried
 MIN_INNOVATION = 1e-3  # least standard deviation of the innovation of a rest, since it is divided by
 MAX_HEIGHT = 1e5  # a height that no sum reaches
 MIN_PEAKS = 30
-MEDIAN_T, FAR_T = 0.7267, 6.869
-"""Median and 0.999 quantile of the absolute value of Student's t with `T_DEGREES` degrees of freedom."""
+MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -154,7 +149,7 @@ def _calibrate_std(residual: Array, std: Array) -> tuple[Array, Array]:
 
 
 def _previous(values: Array) -> Array:
-    """(Q, ...) values of the press before each; the first stands for its own."""
+    """Return the values (Q, ...) of the press before each; the first stands for its own."""
     return np.concatenate([values[:1], values[:-1]])
 
 
@@ -225,12 +220,6 @@ class ExceedanceModel:
         """
         levels, slopes = zip(*[_fit_tail(*each) for each in llrs], strict=True)
         return cls(np.stack(levels), np.stack(slopes))
-
-    def without(self, hypothesis: str) -> "ExceedanceModel":
-        """Return a model by which no height of a hypothesis is rare."""
-        level = self.level.copy()
-        level[:, HYPOTHESES.index(hypothesis)] = MAX_HEIGHT
-        return replace(self, level=level)
 
     def neg_log_p(self, heights: Array, n_failed: int) -> Array:
         """Return minus the logarithm of how often a press of a healthy pad exceeds heights (..., H)."""

@@ -27,16 +27,14 @@ FIBRE = np.dtype(
         ("updated_s", "f8"),  # time of the last update
         ("reading", "f8"),  # the last one, V
         *[(name, "f8") for name in ("count", "lowest", "highest")],  # readings in the present block, their extremes
-        ("mean", "f8"),  # of the present block, V
-        ("previous_mean", "f8"),  # of the block before
+        *[("mean", "f8"), ("previous_mean", "f8")],  # of the present block, and of the one before, V
         ("residual", "f8"),  # of the block mean from the level, or from where a change began, V
         *[(name, "f8") for name in ("run_sum", "run_square_sum")],  # of the residuals of a run, and of their squares
         ("start_level", "f8"),  # where a change began, V
         ("peak_step", "f8"),  # of a change at its farthest, V
         ("press_step", "f8"),  # that the press made, V
         ("direction", "f8"),  # mean whitened step of touches
-        ("rest_level", "f8"),  # the last at rest, V
-        ("press_level", "f8"),  # the last under a press, V
+        *[("rest_level", "f8"), ("press_level", "f8")],  # the last at rest, and under a press, V
     ]
 )
 """State of a fibre; NaN is unknown."""
@@ -45,20 +43,14 @@ PAD = np.dtype(
     [
         ("n_readings", "i8"),
         ("reading_s", "f8"),  # time of the last reading
-        ("block_first", "i8"),  # first reading of the present block, its time, and how many there are
-        ("block_start_s", "f8"),
-        ("block_count", "i8"),
+        *[("block_first", "i8"), ("block_start_s", "f8"), ("block_count", "i8")],  # first reading, its time, and count
         ("block_s", "f8"),  # time of the last block
         ("n_blocks", "i8"),  # that the noise was learnt from
         ("resolution_v", "f8"),  # of the converter: least difference of two readings
-        ("run", "i8"),  # blocks in a row that leave the levels; first reading and time of the first
-        ("run_first", "i8"),
-        ("run_s", "f8"),
+        *[("run", "i8"), ("run_first", "i8"), ("run_s", "f8")],  # blocks in a row that leave the levels, and the first
         ("in_change", "?"),
         ("change", "i8"),  # a `Change`
-        ("peak_size", "f8"),  # size of the change at its farthest, the time, and the first reading after it (or -1)
-        ("peak_s", "f8"),
-        ("after_peak", "i8"),
+        *[("peak_size", "f8"), ("peak_s", "f8"), ("after_peak", "i8")],  # size, time, first reading after it (or -1)
         ("state", "i8"),  # a `State`
         ("released_s", "f8"),  # time of the last release
         ("unclear_first", "i8"),  # first reading of the change that led to `UNCLEAR`
@@ -73,31 +65,26 @@ PAD = np.dtype(
 """State of the pad."""
 
 BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
-FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0
-"""Times in which a slope fades (an overshoot comes back within seconds), is learnt, and the noise is learnt."""
-GAP_S, GIVE_UP_S = 1.0, 1.0
-"""A fibre missing for longer starts anew; a run that lasts longer without agreement is grown noise, and no change."""
-WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8
-"""Blocks before the first change; after n blocks the noise is widened by the share ROUGH_BLOCKS / n."""
-LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4
-"""Shares of a step by which the level after it, and its slope per s, may be wrong: silicone has not settled then."""
-MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0
-"""Standard deviations beyond which a block moves the level, and the noise, no further."""
-MIN_SHARE, MIN_V = 0.01, 1e-7
-"""Least noise, as a share of a typical press and in V; differences of readings below MIN_V are rounding."""
+FADE_S, SLOPE_S, NOISE_S = (
+    2.5,
+    1.0,
+    10.0,
+)  # in which a slope fades (as an overshoot does), is learnt, and noise is
+GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer starts anew; a longer run without agreement is grown noise
+WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # before the first change; after n blocks noise is widened by ROUGH_BLOCKS / n
+LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # shares of a step by which level, and slope per s, may be wrong: silicone settles
+MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # standard deviations beyond which a block moves level, and noise, no further
+MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, as a share of a typical press, and in V (smaller steps are rounding)
 MIN_CORRELATION = 0.25  # correlation of successive innovations from which on a level is taken to walk
 MEAN_TO_STD = math.sqrt(math.pi / 2)  # standard deviation over mean absolute value of a normal distribution
-STALL_S, SETTLED = 0.5, 0.1
-"""A change has ended when it goes no farther for STALL_S, or when two blocks differ by less than this share of it."""
+STALL_S, SETTLED = 0.5, 0.1  # a change ends if it goes no farther for STALL_S, or two blocks differ by less (share)
 RELEASE_S = 1.0  # a step in the direction of a release so soon after one belongs to it
-MAX_STEP, CLEAR_STEP = 20.0, 5.0
-"""Whitened steps: beyond MAX_STEP a fibre counts no more (a broken one would drown the others); from CLEAR_STEP on it
-adds to the typical press in V."""
+MAX_STEP = 20.0  # whitened; beyond it a fibre counts no more: a broken one would drown the others
+CLEAR_STEP = 5.0  # whitened; from it on a fibre adds to the typical press in V
 MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # touches, and their agreement, from which on their direction is used
 TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
 INVERTED, MIN_INVERTED = 1.2, 0.4
-"""Rests are presses, and presses rests, where rest levels scatter more than this share of the levels under presses,
-and of a typical press: only levels under presses differ from press to press."""
+"""Rests are presses if rest levels scatter more than these shares of levels under presses, and of a typical press."""
 
 
 class State(IntEnum):

@@ -112,8 +112,8 @@ def running_median(readings: ArrayLike, width: int, starts: ArrayLike = (), caus
     Raises:
         InputError: readings or starts as in `total_variation`, or a width that is no odd whole number above 0.
     """
-    before, after = _window(width, causal)
-    return _filter_channels(readings, starts, lambda segment: _median(segment, before, after))
+    window = _window(width, causal)
+    return _filter_channels(readings, starts, lambda segment: _median(segment, *window))
 
 
 class TotalVariation:
@@ -146,11 +146,7 @@ class TotalVariation:
         return np.array([channel.latest for channel in self._channels])
 
     def update(self, readings: ArrayLike) -> Array:
-        """Process readings (n, C); return the (m, C) values that have become final, in order.
-
-        Raises:
-            InputError: readings as in `total_variation`, or another number of channels.
-        """
+        """Process readings (n, C), as in `total_variation`; return the (m, C) values that have become final."""
         for channel, column in zip(self._channels, _check_block(readings, len(self._channels)), strict=True):
             channel.update(column)
         return self._pop_final()
@@ -218,11 +214,7 @@ class RunningMedian:
         self._n_returned = 0  # of these, whose median has been returned
 
     def update(self, readings: ArrayLike) -> Array:
-        """Process readings (n, C); return the (m, C) medians that have become known, in order.
-
-        Raises:
-            InputError: readings as in `running_median`, or another number of channels.
-        """
+        """Process readings (n, C), as in `running_median`; return the (m, C) medians that have become known."""
         self._readings = np.concatenate([self._readings, _check_block(readings, len(self._readings))], axis=1)
         return self._pop_medians(max(self._readings.shape[1] - self._after, 0))
 

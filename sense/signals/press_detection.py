@@ -15,11 +15,8 @@ from padforge.design.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
 from padforge.sense.signals.detector_kernels import detect, initial_state
 
-P_REJECT, P_ACCEPT = 1e-3, 1e-9
-"""Probabilities that white noise leaves the levels for a block, and that it is taken for a change."""
-TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08
-"""From a command to its first effect: a touch showed 2.2 readings after the first that followed the command, a release
-0.5 readings (means of the published recording at 14.3 Hz)."""
+P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise leaves the levels for a block; that it is a change
+TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08  # from a command to its first effect: means of the published recording
 MAX_LEAD = 2  # readings before its command at which a press may show: commands are noted a little late
 
 
@@ -59,17 +56,11 @@ class PressDetector:
         self._accept_limit = np.concatenate([[0.0], chdtri(degrees, P_ACCEPT)])
 
     def update(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
-        """Process further readings.
+        """Process further readings; return the events that they have made clear.
 
         Args:
             times_s: ascending, after those of the last call; shape (n,), s.
             readings: NaN where missing; shape (n, C), V.
-
-        Returns:
-            The events that these readings have made clear.
-
-        Raises:
-            InputError: as `check_stream`, or times that are not after the last ones.
         """
         times, rows = check_stream(times_s, readings, len(self._fibres))
         if len(times) and not times[0] > self._last_s:
@@ -87,12 +78,6 @@ def detect_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
     Args:
         readings: NaN where missing; shape (R, C), V.
         times_s: ascending; shape (R,), s.
-
-    Returns:
-        The presses.
-
-    Raises:
-        InputError: as `check_stream`.
     """
     times_s, readings = check_stream(times_s, readings)
     events = PressDetector(readings.shape[1]).update(times_s, readings)

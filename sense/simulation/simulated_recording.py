@@ -32,13 +32,10 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import DELAY_S, DRIFT_S, TRAVEL_S, Cycle, simulate_readings
 
-MIN_SINGULAR = 0.3
-"""Relative singular value below which both sides of a pad, turned by more than some 28 degrees, count as equal."""
-JITTER = 0.1
-"""Standard deviation of the interval between readings, as a share of its mean: the loop that records is no clock."""
+MIN_SINGULAR = 0.3  # relative; below it both sides of a pad, turned by more than some 28 degrees, count as equal
+JITTER = 0.1  # standard deviation of the interval between readings over its mean: the loop that records is no clock
 MIN_PRESSES = 100  # presses from which noise, drift and hysteresis are measured
-REST_S, AFTER_S = 0.7, (0.7, 1.4)
-"""Time before a press, and range of times after it, in which fibres are at rest and show what it left behind."""
+REST_S, AFTER_S = 0.7, (0.7, 1.4)  # times before and after a press in which fibres rest and show what it left behind
 DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are tried
 
 
@@ -160,10 +157,7 @@ def simulate(
     channels = len(pad.channels) if isinstance(pad, Twin) else len(check_type("pad", pad, Morphology).knots)
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     if rig.plan == "adaptive":
-        raise InputError(
-            "[rig] plan is adaptive, which only steers a recording in real time; allowed in a simulation are uniform, "
-            "grid, serpentine or a .csv file"
-        )
+        raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
     if isinstance(pad, Twin):
         model = model_twin(pad, size)
     elif like is None:
@@ -175,10 +169,7 @@ def simulate(
     plan = make_plan_in(model.corners_mm, rig, rng, model.free)
     values = len(plan) * rig.readings_per_press * channels
     if values > MAX_VALUES:
-        raise InputError(
-            f"[rig] presses is {len(plan)}: with {rig.readings_per_press} readings each of {channels} fibres "
-            f"{values} values, allowed are {MAX_VALUES}"
-        )
+        raise InputError(f"[rig] presses is {len(plan)}: they have {values} readings, allowed are {MAX_VALUES}")
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     readings = simulate_readings(model.responses(plan.positions_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz

@@ -14,7 +14,6 @@ from padforge.sense import (
     RunningMedian,
     TotalVariation,
     find_segment_starts,
-    open_recording,
     running_median,
     total_variation,
 )
@@ -327,15 +326,3 @@ def test_filters_refuse_wrong_arguments_in_one_line(call, message):
     with pytest.raises(InputError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
-
-
-def test_total_variation_of_the_published_recording(published):
-    recording = open_recording(published / "para5_long_first4500.mat")
-    y = recording.readings[: len(recording.readings) // 5]
-    x = total_variation(y, 4)
-    for c in (0, recording.fibres - 1):
-        assert excess_robust(y[:, c], x[:, c], 4) == 0
-    stream = TotalVariation(recording.fibres, 4)
-    blocks = [stream.update(block) for block in np.array_split(y, 40)]
-    assert len(y) - sum(map(len, blocks)) < 40  # readings held back: less than a press
-    np.testing.assert_array_equal(np.concatenate([*blocks, stream.flush()]), x)
