@@ -1,7 +1,4 @@
-"""Arrays that a recording consists of: their types, limits, and the checks of what comes from outside.
-
-Values beyond the limits are of no pad, probe or clock: the file is of another kind.
-"""
+"""Arrays that a recording consists of: their types, limits (no pad or clock goes beyond), and checks from outside."""
 
 from typing import Any
 
@@ -19,20 +16,13 @@ MAX_FIBRES = 512
 MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
 """Largest absolute reading, position, time and force (seconds since 1970 are 2e9)."""
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
-MAX_BYTES = 2**33
-"""Size of the largest file of a recording."""
-MAX_INDEX = 2**53
-"""Largest index that float64 holds exactly."""
-MIN_SCALE_V = 1e-9
-"""Least standard deviation that an input is divided by: what varies less is constant."""
+MAX_BYTES = 2**33  # size of the largest file of a recording
+MAX_INDEX = 2**53  # largest index that float64 holds exactly
+MIN_SCALE_V = 1e-9  # least standard deviation that an input is divided by: what varies less is constant
 
 
 def check_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
-    """Convert values to an array of float64, or of int64 if all are whole numbers.
-
-    Raises:
-        InputError: they are anything else, or too many.
-    """
+    """Convert values to an array of float64 or int64; raise InputError if they are anything else, or too many."""
     allowed = "real numbers" if kind is np.float64 else f"whole numbers up to {MAX_INDEX}"
     try:
         array = np.asarray(values)
@@ -73,18 +63,11 @@ def check_ascending(times_s: Array) -> None:
 
 
 def check_stream(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None) -> tuple[Array, Array]:
-    """Check readings and their times, and convert them to float64.
-
-    Args:
-        times_s: ascending; shape (n,), s.
-        readings: NaN where missing; shape (n, C), V.
-        fibres: required number of fibres C; None allows any.
-
-    Returns:
-        Times and readings.
+    """Check readings (n, C), V, NaN where missing, and their times (n,), s, and convert them to float64.
 
     Raises:
-        InputError: shapes that do not fit together, values beyond the limits, or times that do not ascend.
+        InputError: not `fibres` channels (None allows any), shapes that do not fit together, values beyond the limits,
+            or times that do not ascend.
     """
     times = check_numbers(times_s, np.float64, "times", copy=False)
     rows = check_numbers(readings, np.float64, "readings", copy=False)

@@ -38,16 +38,11 @@ from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.recording.recording import Recording
 from padforge.sense.signals.press_detection import align_to_detected
 
-MAX_MISSING = 20
-"""Successive presses without a reading after which a fibre is missing."""
-WINDOW = 64
-"""Presses that are evaluated again to identify a faulty fibre."""
-MAX_SUSPECTS = 4
-"""Fibres that are compared then."""
-MAX_SCORE = 99.0
-"""Score of what is certain."""
-FLOATING = 30.0
-"""Noise, as a multiple of the median, that only an open input picks up."""
+MAX_MISSING = 20  # successive presses without a reading after which a fibre is missing
+WINDOW = 64  # presses that are evaluated again to identify a faulty fibre
+MAX_SUSPECTS = 4  # fibres that are compared then
+MAX_SCORE = 99.0  # score of what is certain
+FLOATING = 30.0  # noise, as a multiple of the median, that only an open input picks up
 
 TEXTS = {
     "stuck": "reads one value",
@@ -66,21 +61,13 @@ TEXTS = {
 
 @dataclass(frozen=True)
 class FibreFault:
-    """A faulty fibre.
+    """A faulty fibre."""
 
-    Attributes:
-        press: index of the press at which the fault was detected.
-        since: estimated index of the first bad press.
-        fibres: indices of the fibres; two if they are swapped.
-        kind: a key of `TEXTS`.
-        score: a healthy pad looks like this once in 10 ** score presses; at most 99, which is certain.
-    """
-
-    press: int
-    since: int
-    fibres: tuple[int, ...]
-    kind: str
-    score: float
+    press: int  # index of the press at which the fault was detected
+    since: int  # estimated index of the first bad press
+    fibres: tuple[int, ...]  # indices of the fibres; two if they are swapped
+    kind: str  # a key of `TEXTS`
+    score: float  # a healthy pad looks like this once in 10 ** score presses; at most 99, which is certain
 
     @property
     def text(self) -> str:
@@ -101,19 +88,11 @@ class _PressRecord(NamedTuple):
 
 
 class FaultMonitor:
-    """Detect faulty fibres press by press; a faulty fibre is masked from then on.
-
-    Args:
-        model: of the healthy pad.
-
-    Attributes:
-        model: the model.
-        n_presses: presses processed so far.
-    """
+    """Detect faulty fibres press by press, by a model of the healthy pad; they are masked from then on."""
 
     def __init__(self, model: HealthModel) -> None:
         self.model = check_type("model", model, HealthModel)
-        self.n_presses = 0
+        self.n_presses = 0  # processed so far
         fibres = len(model.living)
         self._failed = np.zeros(fibres, dtype=bool)
         self._n_missing = np.zeros(fibres, dtype=np.int64)
@@ -135,9 +114,6 @@ class FaultMonitor:
                 up (fewer only if the next press begins), NaN where missing; shape (R, C), V.
             down_command: first of them after the probe was sent down, 1 or more.
             up_command: first of them after it was sent up, above `down_command`, R at most.
-
-        Returns:
-            Faults detected by this press; mostly none.
 
         Raises:
             InputError: another number of fibres than the model's, or indices out of range.
@@ -198,10 +174,6 @@ class FaultMonitor:
     def _records_since(self, first: int) -> list[_PressRecord]:
         return list(self._recent)[first - self.n_presses - 1 :]
 
-    def _first_record(self) -> int:
-        """Index of the oldest press in the window."""
-        return self.n_presses + 1 - len(self._recent)
-
     def _identify(self) -> FibreFault:
         """Identify the faulty fibre, mask it, and compute the sums as if it always had been masked.
 
@@ -213,7 +185,9 @@ class FaultMonitor:
         order = np.argsort(-worst, kind="stable")[: min(MAX_SUSPECTS, int((~self._failed).sum()))]
         suspects = order[worst[order] > self.model.threshold / 2]
         onset = self._onset
-        first = max(int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min()), self._first_record())
+        first = max(
+            int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min()), self.n_presses + 1 - len(self._recent)
+        )
         is_alarm = worst > self.model.threshold
         pairs = [pair for pair in combinations(sorted(order.tolist()), 2) if is_alarm[list(pair)].any()]
         pair = self._find_swapped(pairs, first)
@@ -262,7 +236,7 @@ class FaultMonitor:
 
     def _classify(self, fibre: int, hypothesis: int, since: int) -> str:
         """Return the kind of fault, by the last presses of the fibre."""
-        records = self._records_since(max(since, self._first_record()))
+        records = self._records_since(max(since, self.n_presses + 1 - len(self._recent)))
         rests = np.array([record.trace[fibre, :REST].mean() for record in records])
         last = self._recent[-1].trace[fibre]
         low, high = self.model.rest_range_v[:, fibre]
@@ -313,9 +287,6 @@ class FaultDetector:
             held_back: indices of presses that are left out.
             provenance: origin of the model, JSON.
 
-        Returns:
-            The detector.
-
         Raises:
             InputError: fewer than 300 complete presses, no living fibre, or indices out of range.
         """
@@ -340,13 +311,7 @@ class FaultDetector:
         return self
 
     def predict(self, recording: Recording) -> list[FibreFault]:
-        """Detect faults in a recording.
-
-        Args:
-            recording: of the same pad.
-
-        Returns:
-            Faults in the order of their detection.
+        """Detect faults in a recording of the same pad; return them in the order of their detection.
 
         Raises:
             InputError: another number of fibres, or another rate, than trained on; or `fit` or `load` was not called.
@@ -365,21 +330,13 @@ class FaultDetector:
         return faults
 
     def save(self, folder: str | Path) -> None:
-        """Write both models to a folder.
-
-        Raises:
-            InputError: as `HealthModel.save`.
-        """
+        """Write both models to a folder; raises as `HealthModel.save`."""
         self.model_.save(folder, COMMANDED)
         self.live_model_.save(folder, DETECTED)
 
     @classmethod
     def load(cls, folder: str | Path) -> "FaultDetector":
-        """Read what `save` wrote.
-
-        Raises:
-            InputError: as `HealthModel.load`.
-        """
+        """Read what `save` wrote; raises as `HealthModel.load`."""
         model, live_model = HealthModel.load(folder, COMMANDED), HealthModel.load(folder, DETECTED)
         detector = cls(model.false_alarm_rate)
         detector.model_, detector.live_model_ = model, live_model
@@ -396,15 +353,7 @@ HEALTH_FILES = frozenset(file.name for name in (COMMANDED, DETECTED) for file in
 
 
 def mask_faults(faults: Sequence[FibreFault], presses: int, fibres: int) -> Mask:
-    """Mask faulty fibres from the first bad press on.
-
-    Args:
-        faults: of a recording.
-        presses: number of its presses, Q.
-        fibres: number of fibres of the pad, C.
-
-    Returns:
-        Valid fibres of each press; shape (Q, C).
+    """Return the valid fibres (Q, C) of each of `presses`: faulty ones are masked from the first bad press on.
 
     Raises:
         InputError: a fault of a fibre that the pad does not have.

@@ -8,39 +8,30 @@ which converts a rate of false alarms into a threshold.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 from padforge.sense.health.trace_model import COMPONENTS, HELD, RELEASED, REST, T_DEGREES, TRACE
 
-OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
-"""Offsets of the rest that are tested, in standard deviations of its residual."""
+OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)  # of the rest, in standard deviations of its residual
 HYPOTHESES = ("stuck", "no_response", "reduced_gain", "inconsistent", "noisy", *(f"offset {o:+g}" for o in OFFSETS))
 """Constant readings; a gain of 0; a gain of one half; the response to another press; five times the noise; and a rest
 that has shifted by one of `OFFSETS`."""
 GAINS = (0.0, 0.5)
 NOISE_FACTOR = 5.0
-STD_FACTOR = 4.0
-"""An inconsistent response is either that to another press, or wrong by so many times the predicted deviation."""
-MAX_LLR, MAX_STEP_LLR = 6.0, 12.0
-"""Largest contribution of one press: no mishap in a single press is a fault. A step within a trace may add more at the
-onset of an offset, yet is below the threshold until the rest has shifted as well."""
-STEPS = np.arange(3, TRACE - 2)
-"""Readings of a trace at which a step is tested; one nearer to an end could as well be a spike."""
-LIBRARY = 64
-"""Other presses that an inconsistent response is compared with."""
+STD_FACTOR = 4.0  # an inconsistent response is that to another press, or wrong by this many predicted deviations
+MAX_LLR = 6.0  # largest contribution of one press: no mishap in a single press is a fault
+MAX_STEP_LLR = 12.0  # of a step within a trace, yet below the threshold until the rest has shifted as well
+STEPS = np.arange(3, TRACE - 2)  # readings of a trace where a step is tested; nearer to an end it may be a spike
+LIBRARY = 64  # other presses that an inconsistent response is compared with
 STD_SCALES = np.geomspace(0.5, 2.0, 9)
-STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
-"""Calibrations of predicted deviations that are tried."""
-MIN_INNOVATION = 1e-3
-"""Least standard deviation of the innovation of a rest, since it is divided by."""
-MAX_HEIGHT = 1e5
-"""A height that no sum reaches."""
+STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])  # calibrations of predicted deviations that are tried
+MIN_INNOVATION = 1e-3  # least standard deviation of the innovation of a rest, since it is divided by
+MAX_HEIGHT = 1e5  # a height that no sum reaches
 MIN_PEAKS = 30
-MEDIAN_T, FAR_T = 0.7267, 6.869
-"""Median and 0.999 quantile of the absolute value of Student's t with `T_DEGREES` degrees of freedom."""
+MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -102,17 +93,11 @@ class FaultLikelihoods:
         return np.take_along_axis(steps, np.abs(steps).argmax(axis=-1)[..., None], axis=-1)[..., 0]
 
     def log_likelihood_ratios(self, traces: Array, targets: Array, mean: Array, std: Array) -> tuple[Array, Array]:
-        """Compute the log-likelihood ratios of all hypotheses against health, for successive presses.
+        """Compute the log-likelihood ratios (Q, C, H) of all hypotheses against health, for successive presses.
 
-        Args:
-            traces: shape (Q, C, TRACE), V. The first press counts as preceded by itself.
-            targets: measured; shape (Q, C, T).
-            mean: predicted; shape (Q, C, T).
-            std: shape (Q, C, T).
-
-        Returns:
-            `llr_continuing` if the fault was present at the press before, and `llr_onset` if it has begun since; shape
-            (Q, C, H) each; 0 for a fibre that misses readings.
+        From traces (Q, C, TRACE), V, of which the first counts as preceded by itself, targets, and their predicted mean
+        and std (Q, C, T). Returns `llr_continuing` if the fault was present at the press before, and `llr_onset` if it
+        has begun since; 0 for a fibre that misses readings.
         """
         constant = np.where(_is_constant(traces), -np.log(self.constant_share), -MAX_LLR)
         noise_shift = np.log(NOISE_FACTOR) / self.log_noise_std
@@ -123,16 +108,16 @@ class FaultLikelihoods:
         innovation = (rest - self.rest_autocorr * _previous(rest)) / self.innovation_std
         step = self.largest_step(traces)
         step = np.stack([step, _previous(step)])
-        continuing, onset = list(common), [_clip(llr) for llr in common]
+        continuing, onset = list(common), [np.clip(llr, -MAX_LLR, MAX_LLR) for llr in common]
         for offset in OFFSETS:
             sign, size = np.sign(offset), abs(offset) / self.innovation_std
             continuing.append(_shift_llr(sign * innovation, (1 - self.rest_autocorr) * size))
             jump = np.maximum(sign * step, 0.0).max(axis=0)
             # A step may have any size up to some hundred deviations: the logarithm of its density is about -4.
             step_llr = np.clip(-_log_t(jump, 0.0, 1.0) - 4.0, 0.0, MAX_STEP_LLR)
-            onset.append(_clip(_shift_llr(sign * innovation, size)) + step_llr)
+            onset.append(np.clip(_shift_llr(sign * innovation, size), -MAX_LLR, MAX_LLR) + step_llr)
         valid = np.isfinite(traces).all(axis=-1, keepdims=True)
-        llrs = _clip(np.stack(continuing, axis=-1)), np.stack(onset, axis=-1)
+        llrs = np.clip(np.stack(continuing, axis=-1), -MAX_LLR, MAX_LLR), np.stack(onset, axis=-1)
         llr_continuing, llr_onset = (np.where(valid, np.nan_to_num(llr), 0.0) for llr in llrs)
         return llr_continuing, llr_onset
 
@@ -152,10 +137,6 @@ class FaultLikelihoods:
         return np.hypot(std * self.std_scale, self.std_floor)
 
 
-def _clip(llr: Array) -> Array:
-    return np.clip(llr, -MAX_LLR, MAX_LLR)
-
-
 def _calibrate_std(residual: Array, std: Array) -> tuple[Array, Array]:
     """Choose the scale and floor (C, T) that make residuals (Q, C, T) of predictions most likely.
 
@@ -168,15 +149,12 @@ def _calibrate_std(residual: Array, std: Array) -> tuple[Array, Array]:
 
 
 def _previous(values: Array) -> Array:
-    """(Q, ...) values of the press before each; the first stands for its own."""
+    """Return the values (Q, ...) of the press before each; the first stands for its own."""
     return np.concatenate([values[:1], values[:-1]])
 
 
 def estimate_noise(traces: Array) -> Array:
-    """Estimate the noise (...) of traces (..., TRACE): mean difference of successive readings in quiet parts, V.
-
-    The largest quarter of the differences is ignored: a spike is no noise.
-    """
+    """Estimate the noise (...), V, of traces (..., TRACE): mean step in quiet parts, but for the largest quarter."""
     quiet = (slice(0, REST), slice(REST + HELD - 10, REST + HELD), slice(TRACE - RELEASED + 10, TRACE))
     steps = np.sort(np.concatenate([np.abs(np.diff(traces[..., part], axis=-1)) for part in quiet], axis=-1), axis=-1)
     return steps[..., : steps.shape[-1] * 3 // 4].mean(axis=-1)
@@ -228,16 +206,10 @@ def cusum_update(height: Array, llr_continuing: Array, llr_onset: Array) -> Arra
 
 @dataclass(frozen=True)
 class ExceedanceModel:
-    """Exponential tail of the peaks of healthy sums, by the number of failed fibres: with fewer, more is chance.
+    """Exponential tail of the peaks of healthy sums: a height h is exceeded exp(-(h - level) / slope) times a press."""
 
-    Attributes:
-        level: a height h is exceeded exp(-(h - level) / slope) times a press, by all fibres together; shape (K, H) for
-            0 .. K - 1 failed fibres.
-        slope: shape (K, H).
-    """
-
-    level: Array
-    slope: Array
+    level: Array  # for all fibres together, and 0 .. K - 1 failed ones; shape (K, H)
+    slope: Array  # shape (K, H)
 
     @classmethod
     def fit(cls, llrs: Sequence[tuple[Array, Array]]) -> "ExceedanceModel":
@@ -248,12 +220,6 @@ class ExceedanceModel:
         """
         levels, slopes = zip(*[_fit_tail(*each) for each in llrs], strict=True)
         return cls(np.stack(levels), np.stack(slopes))
-
-    def without(self, hypothesis: str) -> "ExceedanceModel":
-        """Return a model by which no height of a hypothesis is rare."""
-        level = self.level.copy()
-        level[:, HYPOTHESES.index(hypothesis)] = MAX_HEIGHT
-        return replace(self, level=level)
 
     def neg_log_p(self, heights: Array, n_failed: int) -> Array:
         """Return minus the logarithm of how often a press of a healthy pad exceeds heights (..., H)."""

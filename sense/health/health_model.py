@@ -13,7 +13,14 @@ from padforge.design.common.files import read_json
 from padforge.design.common.settings import Settings, validate
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, MIN_SCALE_V, Array, Indices
-from padforge.sense.health.fault_likelihoods import HYPOTHESES, LIBRARY, STEPS, ExceedanceModel, FaultLikelihoods
+from padforge.sense.health.fault_likelihoods import (
+    HYPOTHESES,
+    LIBRARY,
+    MAX_HEIGHT,
+    STEPS,
+    ExceedanceModel,
+    FaultLikelihoods,
+)
 from padforge.sense.health.trace_model import (
     COMPONENTS,
     HIDDEN,
@@ -36,27 +43,13 @@ COMMANDED, DETECTED = "health", "health_live"
 """Names of the files of a model: trained on presses as commanded, and as detected in the readings."""
 FALSE_ALARM_RATE, MAX_FALSE_ALARM_RATE = 1e-5, 0.1
 """False alarms a press, all fibres and kinds of fault together: the default, and the largest (then every press is)."""
-MAX_FAILED = 2
-"""Largest number of failed fibres for which the heights of chance are learnt."""
-MIN_PRESSES = 300
-"""Presses that a model is trained on, at least."""
-MIN_GAIN_PRESSES = 850
-"""Presses from which a reduced gain is distinguished from presses at rare positions; with 680, simulated pads gave a
-false alarm in every other recording, with 850 none in 12."""
-WARM_UP = 10
-"""Presses after which the running level of a rest is reliable."""
-BLOCK = 50
-"""Each member is trained on all presses but its fold, of blocks of successive ones: neighbours share what drifts."""
-SUBSETS = 4
-"""Random sets of failed fibres of a size from which the heights of chance are learnt."""
-MAX_ENTRY = 1e6
-"""Largest absolute entry of an array of a valid model."""
-POSITIVE = (
-    *("pca.input_scale_v", "pca.target_scale_v", "likelihoods.std_scale", "likelihoods.library_std"),
-    *("likelihoods.noise_v", "likelihoods.log_noise_std", "likelihoods.constant_share"),
-    *("likelihoods.innovation_std", "exceedance.slope"),
-)
-"""Arrays that are divided by, or whose logarithm is taken."""
+MAX_FAILED = 2  # largest number of failed fibres for which the heights of chance are learnt
+MIN_PRESSES = 300  # presses that a model is trained on, at least
+MIN_GAIN_PRESSES = 850  # for a reduced gain: with 680, every other simulated pad gave a false alarm, none of 12 now
+WARM_UP = 10  # presses after which the running level of a rest is reliable
+BLOCK = 50  # successive presses of a fold, without which a member is trained: neighbours share what drifts
+SUBSETS = 4  # random sets of failed fibres of a size from which the heights of chance are learnt
+MAX_ENTRY = 1e6  # largest absolute entry of an array of a valid model
 
 
 class HealthDocument(Settings):
@@ -74,33 +67,19 @@ class HealthDocument(Settings):
 
 @dataclass(frozen=True)
 class HealthModel:
-    """Model of a healthy pad. Its arrays have the L of the C fibres that were not dead.
+    """Model of a healthy pad. Its arrays have the L of the C fibres that were not dead."""
 
-    Attributes:
-        pca: reduces traces to the inputs and targets of the networks.
-        weights: of the networks that predict each fibre from the others.
-        likelihoods: distribution of healthy presses about the predictions.
-        exceedance: how high cumulative sums rise by chance.
-        rest_range_v: lowest and highest rest; shape (2, L), V.
-        fibres: number of fibres, C.
-        dead: indices of fibres that were dead in the recording.
-        rate_hz: readings per second of the recording.
-        presses: presses that the model was trained on.
-        false_alarm_rate: false alarms a press that are allowed on a healthy pad.
-        provenance: origin of the model, JSON.
-    """
-
-    pca: TracePCA
-    weights: Weights
-    likelihoods: FaultLikelihoods
-    exceedance: ExceedanceModel
-    rest_range_v: Array
-    fibres: int
-    dead: tuple[int, ...]
-    rate_hz: float
-    presses: int
-    false_alarm_rate: float = FALSE_ALARM_RATE
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    pca: TracePCA  # reduces traces to the inputs and targets of the networks
+    weights: Weights  # of the networks that predict each fibre from the others
+    likelihoods: FaultLikelihoods  # distribution of healthy presses about the predictions
+    exceedance: ExceedanceModel  # how high cumulative sums rise by chance
+    rest_range_v: Array  # lowest and highest rest; shape (2, L), V
+    fibres: int  # number of fibres, C
+    dead: tuple[int, ...]  # indices of fibres that were dead in the recording
+    rate_hz: float  # readings per second of the recording
+    presses: int  # that the model was trained on
+    false_alarm_rate: float = FALSE_ALARM_RATE  # false alarms a press that are allowed on a healthy pad
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # origin of the model, JSON
 
     @property
     def living(self) -> Indices:
@@ -115,28 +94,20 @@ class HealthModel:
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; `load` restores every bit.
 
-        Args:
-            folder: created if missing.
-            name: `COMMANDED` or `DETECTED`.
-
         Raises:
             InputError: the provenance is no JSON, or the folder cannot be written.
         """
         keys = ("fibres", "dead", "rate_hz", "false_alarm_rate", "presses")
         document = {"format": FORMAT, **{key: getattr(self, key) for key in keys}}
         document |= {"weights_sha256": "", "provenance": dict(self.provenance)}
-        files_of(folder, name).write(document, self._arrays(), "health")
+        parts = {"pca": asdict(self.pca), "weights": self.weights, "likelihoods": asdict(self.likelihoods)}
+        parts["exceedance"] = asdict(self.exceedance)
+        arrays = {f"{part}.{key}": np.asarray(value) for part, values in parts.items() for key, value in values.items()}
+        files_of(folder, name).write(document, arrays | {"rest_range_v": self.rest_range_v}, "health")
 
     @classmethod
     def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":
         """Read what `save` wrote.
-
-        Args:
-            folder: folder of the model.
-            name: `COMMANDED` or `DETECTED`.
-
-        Returns:
-            The model.
 
         Raises:
             InputError: a file is missing, torn or of another kind, a value is out of range, or the two files do not
@@ -149,41 +120,42 @@ class HealthModel:
             raise InputError(f"{files.document}: dead is {document.dead}, expected some of {document.fibres} fibres")
         with files.arrays(document.weights_sha256, "the health") as arrays:
             validate_arrays(arrays, document.fibres - len(dead))
-        parts: dict[str, dict[str, Any]] = {"pca": {}, "weights": {}, "likelihoods": {}, "exceedance": {}}
-        rest_range_v = arrays.pop("rest_range_v")
-        for key, array in arrays.items():
-            part, _, entry = key.partition(".")
-            parts[part][entry] = array
+
+        def part(name: str) -> dict[str, Any]:
+            return {key.removeprefix(f"{name}."): arrays[key] for key in arrays if key.startswith(f"{name}.")}
+
         return cls(
-            TracePCA(**parts["pca"]),
-            parts["weights"],
-            FaultLikelihoods(**parts["likelihoods"]),
-            ExceedanceModel(**parts["exceedance"]),
-            rest_range_v,
+            TracePCA(**part("pca")),
+            part("weights"),
+            FaultLikelihoods(**part("likelihoods")),
+            ExceedanceModel(**part("exceedance")),
+            arrays["rest_range_v"],
             dead=tuple(dead),
             **document.model_dump(exclude={"format", "dead", "weights_sha256"}),
         )
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        parts = {"pca": asdict(self.pca), "weights": self.weights, "likelihoods": asdict(self.likelihoods)}
-        parts["exceedance"] = asdict(self.exceedance)
-        arrays = {f"{part}.{key}": np.asarray(value) for part, values in parts.items() for key, value in values.items()}
-        return arrays | {"rest_range_v": self.rest_range_v}
-
 
 def validate_arrays(arrays: Mapping[str, NDArray[Any]], fibres: int) -> None:
     """Raise ValueError unless arrays are those of a model of so many living fibres, with entries in range."""
-    doubles = {
-        "pca.components": (fibres, TRACE, COMPONENTS),
+    tail = min(MAX_FAILED, fibres - 1) + 1, len(HYPOTHESES)
+    positive = {  # they are divided by, or their logarithm is taken
         "pca.input_scale_v": (fibres, INPUTS),
         "pca.target_scale_v": (fibres, TARGETS),
-        **dict.fromkeys(("likelihoods.std_scale", "likelihoods.std_floor"), (fibres, TARGETS)),
+        "likelihoods.std_scale": (fibres, TARGETS),
+        "likelihoods.library_std": (LIBRARY, fibres, COMPONENTS),
+        **{f"likelihoods.{key}": (fibres,) for key in ("noise_v", "log_noise_std", "constant_share")},
+        "likelihoods.innovation_std": (1,),
+        "exceedance.slope": tail,
+    }
+    doubles = positive | {
+        "pca.components": (fibres, TRACE, COMPONENTS),
+        "likelihoods.std_floor": (fibres, TARGETS),
         "likelihoods.noise_floor": (fibres, COMPONENTS),
-        **dict.fromkeys(("likelihoods.library_mean", "likelihoods.library_std"), (LIBRARY, fibres, COMPONENTS)),
-        **{f"likelihoods.{key}": (fibres,) for key in ("noise_v", "log_noise_mean", "log_noise_std", "constant_share")},
+        "likelihoods.library_mean": (LIBRARY, fibres, COMPONENTS),
+        "likelihoods.log_noise_mean": (fibres,),
         "likelihoods.step_filters": (fibres, len(STEPS), TRACE),
-        **dict.fromkeys(("likelihoods.rest_autocorr", "likelihoods.innovation_std"), (1,)),
-        **dict.fromkeys(("exceedance.level", "exceedance.slope"), (min(MAX_FAILED, fibres - 1) + 1, len(HYPOTHESES))),
+        "likelihoods.rest_autocorr": (1,),
+        "exceedance.level": tail,
         "rest_range_v": (2, fibres),
     }
     floats = {
@@ -204,7 +176,7 @@ def validate_arrays(arrays: Mapping[str, NDArray[Any]], fibres: int) -> None:
     for key, array in arrays.items():
         if not np.abs(array).max(initial=0) <= MAX_ENTRY:
             raise ValueError(f"{key} goes up to {np.abs(array).max():g}, allowed is {MAX_ENTRY:g}")
-    for key in POSITIVE:
+    for key in positive:
         if not (arrays[key] > 0).all():
             raise ValueError(f"{key} is {arrays[key].min():g} at least, allowed is above 0")
 
@@ -269,12 +241,14 @@ def fit_health_model(
             subsets.append(llr)
         llrs.append((np.concatenate([each[0] for each in subsets]), np.concatenate([each[1] for each in subsets])))
     exceedance = ExceedanceModel.fit(llrs)
+    if len(traces) < MIN_GAIN_PRESSES:
+        exceedance.level[:, HYPOTHESES.index("reduced_gain")] = MAX_HEIGHT
     rests = traces[:, :, :REST].mean(axis=2)
     return HealthModel(
         pca=pca,
         weights=weights,
         likelihoods=likelihoods,
-        exceedance=exceedance if len(traces) >= MIN_GAIN_PRESSES else exceedance.without("reduced_gain"),
+        exceedance=exceedance,
         rest_range_v=np.stack([rests.min(axis=0), rests.max(axis=0)]),
         fibres=readings.shape[1],
         dead=tuple(dead.tolist()),

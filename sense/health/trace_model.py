@@ -1,13 +1,9 @@
 """Prediction of every fibre's response to a press from the responses of the others: mean and standard deviation.
 
-The trace of a press is the readings around it. The response of a fibre, its trace minus its rest, is reduced to a few
-principal components. A small ensemble of networks with dropout of fibres predicts the response of every fibre, and the
-level of its rest, from the other valid fibres. It predicts a standard deviation too, so that what is hard to predict
-for healthy fibres does not count as a fault.
-
-Heteroscedastic regression: D. A. Nix, A. S. Weigend, "Estimating the mean and variance of the target probability
-distribution", IEEE ICNN 1994; its ensembles: B. Lakshminarayanan, A. Pritzel, C. Blundell, "Simple and scalable
-predictive uncertainty estimation using deep ensembles", NeurIPS 2017.
+The response of a fibre, its trace (the readings around a press) minus its rest, is reduced to principal components. An
+ensemble of networks with dropout of fibres predicts it, and the level of the rest, from the other valid fibres; and a
+standard deviation, so that what is hard to predict does not count as a fault. Heteroscedastic regression: D. A. Nix,
+A. S. Weigend, IEEE ICNN 1994; ensembles: B. Lakshminarayanan, A. Pritzel, C. Blundell, NeurIPS 2017.
 """
 
 from collections.abc import Mapping
@@ -22,31 +18,20 @@ Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.mask` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
 (E, C, H, 2 T) and `last.b` (E, C, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""
 
-REST, HELD, RELEASED = 10, 20, 20
-"""Readings of a trace before the probe is sent down, after it, and after it is sent up."""
+REST, HELD, RELEASED = 10, 20, 20  # readings of a trace before the probe is sent down, after it, and after the release
 TRACE = REST + HELD + RELEASED
-COMPONENTS = 6
-"""Principal components of a response: 99.7 % of the variance on the published pad."""
-INPUTS, TARGETS = 2 * COMPONENTS + 1, COMPONENTS + 1
-"""Of each fibre: response, rest and history enter the network; response and rest are predicted."""
-LEVEL_RATE = 1 / 50
-"""Weight of a press in the running level of the rests: follows drift over hours, an offset only after 50 presses."""
-HISTORY_COEF = 0.7
-"""Share of earlier responses that is left after a press: silicone creeps back, so a rest depends on earlier presses."""
-T_DEGREES = 5.0
-"""Degrees of freedom of Student's t, the distribution of the residuals: a few in a thousand are outliers."""
-MAX_INPUT = 8.0
-"""Largest scaled input: an open fibre must not drive the network where it was never trained."""
+COMPONENTS = 6  # principal components of a response: 99.7 % of the variance on the published pad
+INPUTS, TARGETS = 2 * COMPONENTS + 1, COMPONENTS + 1  # response, rest and history; response and rest are predicted
+LEVEL_RATE = 1 / 50  # weight of a press in the running level of the rests, which follows drift, not offsets
+HISTORY_COEF = 0.7  # share of earlier responses that remains after a press: silicone creeps back
+T_DEGREES = 5.0  # of freedom of Student's t, the distribution of the residuals: a few in a thousand are outliers
+MAX_INPUT = 8.0  # largest scaled input: an open fibre must not drive the network where it was never trained
 
 MEMBERS, HIDDEN, BATCH, LEARNING_RATE = 3, 128, 96, 3e-3
-MAX_STEPS = 2500
-"""Steps of training: one a press, up to this. With more, predictions of presses held out get worse, the sooner the
-fewer presses there are (on the published recording and on simulated ones of 400 to 4500 presses)."""
-DROPOUT = (0.6, 0.25, 0.15)
-"""Probabilities that training masks 1, 2 and 3 fibres."""
+MAX_STEPS = 2500  # of training, one a press: with more, predictions of presses held out get worse
+DROPOUT = (0.6, 0.25, 0.15)  # probabilities that training masks 1, 2 and 3 fibres
 INPUT_NOISE, WEIGHT_DECAY = 0.02, 1e-2
-LOG_STD = (-4.0, 2.0)
-"""Range of the logarithm of a predicted standard deviation."""
+LOG_STD = (-4.0, 2.0)  # range of the logarithm of a predicted standard deviation
 
 
 def extract_trace(readings: Array, down_command: int, up_command: int, first: int, end: int) -> Array:
@@ -145,15 +130,9 @@ class TracePCA:
 
 
 def predict_fibres(weights: Weights, inputs: Floats, fibre_mask: Mask) -> tuple[Array, Array]:
-    """Predict the targets of each fibre from the *other* valid ones.
+    """Predict the targets (Q, C, T) of each fibre from scaled inputs (Q, C, N) of the *other* valid ones.
 
-    Args:
-        weights: of the networks.
-        inputs: scaled; shape (Q, C, N).
-        fibre_mask: valid fibres; shape (Q, C).
-
-    Returns:
-        Mean and standard deviation of the mixture of the members; shape (Q, C, T) each.
+    Returns the mean and the standard deviation of the mixture of the members.
     """
     # A fibre's term of the first layer is subtracted from the sum: C predictions for little more than one.
     terms = np.einsum("qcn,ecnh->eqch", inputs, weights["first.w"]) + weights["first.mask"][:, None]

@@ -1,15 +1,10 @@
 """Press detection as readings come: a Kalman filter for each fibre, a test for changes, and a state machine.
 
-1. Readings are averaged over blocks of BLOCK_S: slow converters are followed reading by reading.
-2. Each fibre's level, at rest or under a press, is tracked by a Kalman filter of level and slope (local linear trend;
-   A. C. Harvey, "Forecasting, Structural Time Series Models and the Kalman Filter", Cambridge 1989), whose slope fades
-   as silicone settles. Noise and the random walk of the level are learnt from the innovations.
-3. A change is a run of blocks that leave the prediction and agree with each other (chi-square tests with
-   `reject_limit` and `accept_limit`); a block that agrees with no other is a spike.
-4. A change is classified as touch or release. A release takes back the step of its touch and goes against the
-   direction of touches, since fibres that a press stretches drive their dividers all one way.
-
-Steps are whitened: divided by `scale`, the noise of the fibre. The size of a step is the sum of the squares.
+Means over blocks of BLOCK_S are tracked by a local linear trend (A. C. Harvey, "Forecasting, Structural Time Series
+Models and the Kalman Filter", Cambridge 1989), whose noise is learnt. A change is a run of blocks that leave the
+prediction and agree with each other (chi-square tests); a block that agrees with no other is a spike. A release takes
+back the step of its touch, and goes against the direction of touches, since stretched fibres drive their dividers all
+one way. Steps are whitened: divided by `scale`, the noise of the fibre. The size of a step is the sum of the squares.
 """
 
 import math
@@ -23,9 +18,7 @@ FIBRE = np.dtype(
     [
         ("level", "f8"),  # predicted for now, V
         ("slope", "f8"),  # V/s
-        ("level_var", "f8"),  # covariance of level and slope, in units of scale^2
-        ("cross_var", "f8"),
-        ("slope_var", "f8"),
+        *[(name, "f8") for name in ("level_var", "cross_var", "slope_var")],  # covariance, in units of scale^2
         ("noise", "f8"),  # standard deviation of a block mean, V
         ("scale", "f8"),  # the same, but not below what counts as noise, V
         ("innovation", "f8"),  # of the last update, V
@@ -33,20 +26,15 @@ FIBRE = np.dtype(
         ("random_walk_var", "f8"),  # variance of the level's own random walk, by `autocov`, V^2
         ("updated_s", "f8"),  # time of the last update
         ("reading", "f8"),  # the last one, V
-        ("count", "f8"),  # readings in the present block, and their extremes
-        ("lowest", "f8"),
-        ("highest", "f8"),
-        ("mean", "f8"),  # of the present block, V
-        ("previous_mean", "f8"),  # of the block before
+        *[(name, "f8") for name in ("count", "lowest", "highest")],  # readings in the present block, their extremes
+        *[("mean", "f8"), ("previous_mean", "f8")],  # of the present block, and of the one before, V
         ("residual", "f8"),  # of the block mean from the level, or from where a change began, V
-        ("run_sum", "f8"),  # of the residuals of a run, and of their squares
-        ("run_square_sum", "f8"),
+        *[(name, "f8") for name in ("run_sum", "run_square_sum")],  # of the residuals of a run, and of their squares
         ("start_level", "f8"),  # where a change began, V
         ("peak_step", "f8"),  # of a change at its farthest, V
         ("press_step", "f8"),  # that the press made, V
         ("direction", "f8"),  # mean whitened step of touches
-        ("rest_level", "f8"),  # the last at rest, V
-        ("press_level", "f8"),  # the last under a press, V
+        *[("rest_level", "f8"), ("press_level", "f8")],  # the last at rest, and under a press, V
     ]
 )
 """State of a fibre; NaN is unknown."""
@@ -55,20 +43,14 @@ PAD = np.dtype(
     [
         ("n_readings", "i8"),
         ("reading_s", "f8"),  # time of the last reading
-        ("block_first", "i8"),  # first reading of the present block, its time, and how many there are
-        ("block_start_s", "f8"),
-        ("block_count", "i8"),
+        *[("block_first", "i8"), ("block_start_s", "f8"), ("block_count", "i8")],  # first reading, its time, and count
         ("block_s", "f8"),  # time of the last block
         ("n_blocks", "i8"),  # that the noise was learnt from
         ("resolution_v", "f8"),  # of the converter: least difference of two readings
-        ("run", "i8"),  # blocks in a row that leave the levels; first reading and time of the first
-        ("run_first", "i8"),
-        ("run_s", "f8"),
+        *[("run", "i8"), ("run_first", "i8"), ("run_s", "f8")],  # blocks in a row that leave the levels, and the first
         ("in_change", "?"),
         ("change", "i8"),  # a `Change`
-        ("peak_size", "f8"),  # size of the change at its farthest, the time, and the first reading after it (or -1)
-        ("peak_s", "f8"),
-        ("after_peak", "i8"),
+        *[("peak_size", "f8"), ("peak_s", "f8"), ("after_peak", "i8")],  # size, time, first reading after it (or -1)
         ("state", "i8"),  # a `State`
         ("released_s", "f8"),  # time of the last release
         ("unclear_first", "i8"),  # first reading of the change that led to `UNCLEAR`
@@ -82,38 +64,27 @@ PAD = np.dtype(
 )
 """State of the pad."""
 
-BLOCK_S = 0.03
-"""Length of a block; a probe takes a tenth of a second to sink in."""
-FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0
-"""Times in which a slope fades (an overshoot comes back within seconds), is learnt, and the noise is learnt."""
-GAP_S, GIVE_UP_S = 1.0, 1.0
-"""A fibre missing for longer starts anew; a run that lasts longer without agreement is grown noise, and no change."""
-WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8
-"""Blocks before the first change; after n blocks the noise is widened by the share ROUGH_BLOCKS / n."""
-LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4
-"""Shares of a step by which the level after it, and its slope per s, may be wrong: silicone has not settled then."""
-MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0
-"""Standard deviations beyond which a block moves the level, and the noise, no further."""
-MIN_SHARE, MIN_V = 0.01, 1e-7
-"""Least noise, as a share of a typical press and in V; differences of readings below MIN_V are rounding."""
-MIN_CORRELATION = 0.25
-"""Correlation of successive innovations from which on a level is taken to walk."""
-MEAN_TO_STD = math.sqrt(math.pi / 2)
-"""Standard deviation over mean absolute value of a normal distribution."""
-STALL_S, SETTLED = 0.5, 0.1
-"""A change has ended when it goes no farther for STALL_S, or when two blocks differ by less than this share of it."""
-RELEASE_S = 1.0
-"""A step in the direction of a release so soon after one belongs to it."""
-MAX_STEP, CLEAR_STEP = 20.0, 5.0
-"""Whitened steps: beyond MAX_STEP a fibre counts no more (a broken one would drown the others); from CLEAR_STEP on it
-adds to the typical press in V."""
-MIN_PRESSES, MIN_AGREEMENT = 3, 0.5
-"""Touches, and their agreement, from which on their direction is used."""
-TOUCH_RATE, LEVEL_RATE = 0.05, 0.15
-"""Weights of the newest touch and level in their running means."""
+BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
+FADE_S, SLOPE_S, NOISE_S = (
+    2.5,
+    1.0,
+    10.0,
+)  # in which a slope fades (as an overshoot does), is learnt, and noise is
+GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer starts anew; a longer run without agreement is grown noise
+WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # before the first change; after n blocks noise is widened by ROUGH_BLOCKS / n
+LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # shares of a step by which level, and slope per s, may be wrong: silicone settles
+MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # standard deviations beyond which a block moves level, and noise, no further
+MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, as a share of a typical press, and in V (smaller steps are rounding)
+MIN_CORRELATION = 0.25  # correlation of successive innovations from which on a level is taken to walk
+MEAN_TO_STD = math.sqrt(math.pi / 2)  # standard deviation over mean absolute value of a normal distribution
+STALL_S, SETTLED = 0.5, 0.1  # a change ends if it goes no farther for STALL_S, or two blocks differ by less (share)
+RELEASE_S = 1.0  # a step in the direction of a release so soon after one belongs to it
+MAX_STEP = 20.0  # whitened; beyond it a fibre counts no more: a broken one would drown the others
+CLEAR_STEP = 5.0  # whitened; from it on a fibre adds to the typical press in V
+MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # touches, and their agreement, from which on their direction is used
+TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
 INVERTED, MIN_INVERTED = 1.2, 0.4
-"""Rests are presses, and presses rests, where rest levels scatter more than this share of the levels under presses,
-and of a typical press: only levels under presses differ from press to press."""
+"""Rests are presses if rest levels scatter more than these shares of levels under presses, and of a typical press."""
 
 
 class State(IntEnum):
@@ -223,14 +194,6 @@ def _start_track(fibre: Any, time_s: float, step: float) -> None:
 
 
 @kernel
-def _restart(fibres: Any, pad: Any, time_s: float) -> None:
-    """Start all filters at the present block; residuals are steps."""
-    for fibre in fibres:
-        _start_track(fibre, time_s, 0.0 if np.isnan(fibre.residual) else fibre.residual / fibre.scale)
-    pad.run = 0
-
-
-@kernel
 def kalman_update(fibres: Any, pad: Any, time_s: float) -> None:
     """Correct levels, slopes and noise by the present block, robustly."""
     share = max(1 / (pad.n_blocks + 1), 1 - math.exp(-min(time_s - pad.block_s, GAP_S) / NOISE_S))
@@ -271,7 +234,7 @@ def _learn_run_noise(fibres: Any, pad: Any, time_s: float) -> None:
 
 @kernel
 def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
-    """Start a run at the present block, or, since a touch may have two paces, at the one block before it."""
+    """Start a run at the present block, or at the one block before: a touch may have two paces."""
     if pad.run != 2:
         pad.run_first, pad.run_s = pad.block_first, time_s
     pad.run = 1
@@ -282,11 +245,7 @@ def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
 
 @kernel
 def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
-    """Add the present block to the run; return the common signal of its blocks, and the distance of the last one.
-
-    Both are sums of whitened squares. The common signal is the mean product of two different blocks, to which spikes
-    add nothing.
-    """
+    """Extend the run; return its common signal (mean product of two blocks: no spike), and the distance of the last."""
     common, distance = 0.0, 0.0
     n_before, pad.run = pad.run, pad.run + 1
     for fibre in fibres:
@@ -326,9 +285,10 @@ def has_changed(fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_
         _start_run(fibres, pad, time_s)
     elif time_s - pad.run_s > GIVE_UP_S:
         _learn_run_noise(fibres, pad, time_s)
+        pad.run = 0
         for fibre in fibres:
             fibre.residual = 0.0
-        _restart(fibres, pad, time_s)
+            _start_track(fibre, time_s, 0.0)
     return False
 
 
@@ -531,8 +491,9 @@ def _process_block(
             count = classify(fibres, pad, time_s, settled, events, count)
         if settled:
             count = commit(fibres, pad, time_s, events, count)
-            _restart(fibres, pad, time_s)
-            pad.in_change = False
+            pad.run, pad.in_change = 0, False
+            for fibre in fibres:
+                _start_track(fibre, time_s, 0.0 if np.isnan(fibre.residual) else fibre.residual / fibre.scale)
     for fibre in fibres:
         fibre.previous_mean = fibre.mean
     pad.block_s = time_s
@@ -543,19 +504,10 @@ def _process_block(
 def detect(
     fibres: Any, pad: Any, times_s: Any, readings: Any, reject_limit: Any, accept_limit: Any, events: Any
 ) -> Any:
-    """Detect presses in further readings.
+    """Detect presses in further readings (n, C), V, from the `initial_state`, which is overwritten.
 
-    Args:
-        fibres: state of the fibres, as `initial_state` makes it; overwritten.
-        pad: state of the pad; overwritten.
-        times_s: (n,) s, ascending.
-        readings: (n, C) V, NaN where missing.
-        reject_limit: (C + 1,) by the number of fibres present, chi-square that noise exceeds rarely.
-        accept_limit: (C + 1,) the same, hardly ever.
-        events: (2 n, 2) overwritten with rows of 1 (touch) or 0 (release), and the first reading that shows it.
-
-    Returns:
-        The number of events.
+    By the number of fibres present, `reject_limit` (C + 1,) is the chi-square that noise exceeds rarely, `accept_limit`
+    hardly ever. Returns the number of `events` (2 n, 2): 1 (touch) or 0, and the first reading that shows it.
     """
     count = np.int64(0)
     for r in range(len(times_s)):

@@ -1,18 +1,9 @@
 """Compiled passes of total variation denoising, and the running median.
 
-Total variation denoising minimises fidelity + lam sum |x_{i+1} - x_i| by dynamic programming (N. Johnson, "A dynamic
-programming algorithm for the fused lasso and L0 segmentation", J. Comput. Graph. Stat. 22, 2013; V. Kolmogorov, T.
-Pock, M. Rolinek, "Total variation on a tree", SIAM J. Imaging Sci. 9, 2016). The message of reading i is the least
-cost of all readings up to it as a function of x_i. A reading adds its fidelity; the coupling to the next clips the
-derivative of the message to +-lam, and where it does so are the bounds that x_i is clipped to, given the next value.
-The backward pass clips from the last value on.
-
-- Fidelity by absolute values (`forward_pass_l1`): the derivative is a rising staircase, to which a reading adds a step
-  of height 2. The steps are in two double-ended queues, below and above the minimum of the message: O(log min(R, lam))
-  a reading.
-- Fidelity by squares (`forward_pass_l2`): the derivative is piecewise linear, to which a reading adds x - y_i. Knots
-  beyond a cut never matter again, so they are pooled with the new reading like adjacent violators: O(1) a reading on
-  average. The taut string has the same geometry (L. Condat, IEEE Signal Process. Lett. 20, 2013).
+Total variation denoising is solved by dynamic programming (N. Johnson, J. Comput. Graph. Stat. 22, 2013; V. Kolmogorov,
+T. Pock, M. Rolinek, SIAM J. Imaging Sci. 9, 2016). The message of reading i is the least cost of all readings up to it
+as a function of x_i. A reading adds its fidelity; the coupling to the next clips the derivative of the message to
++-lam, and where it does so are the bounds that x_i is clipped to, given the next. The backward pass clips from the end.
 """
 
 from typing import Any
@@ -27,18 +18,9 @@ inlined = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
 
 @kernel
 def backward_pass(low: Any, high: Any, last: float, out: Any) -> int:
-    """Compute the minimiser by clipping from the last value back.
+    """Clip from the last value back, into `out` (R,); return the number of values that no later reading can change.
 
     A chain of clips is a clip. Where its bounds have met, what comes later does not matter: all before is final.
-
-    Args:
-        low: lower bounds from a forward pass; shape (R,).
-        high: upper bounds; shape (R,).
-        last: last value of the minimiser.
-        out: overwritten with the minimiser, NaN if there is no reading at all; shape (R,).
-
-    Returns:
-        The number of values that no later reading can change.
     """
     value, lowest, highest = last, -np.inf, np.inf
     n_final = 0
@@ -54,11 +36,7 @@ def backward_pass(low: Any, high: Any, last: float, out: Any) -> int:
 
 @kernel
 def running_median(readings: Any, before: int, after: int, out: Any) -> None:
-    """Compute the medians of the readings i - before .. i + after into out (R,), ignoring NaN.
-
-    An even number has the mean of the two in the middle; none has NaN. The window is a sorted array: O(before + after)
-    a reading, most of it one short move of memory.
-    """
+    """Compute the medians of the readings i - before .. i + after into out (R,), ignoring NaN; sorts by insertion."""
     width = before + 1 + after
     window, count = np.empty(min(width, len(readings))), 0
     for entering in range(len(readings) + after):
@@ -146,10 +124,8 @@ GRAIN = 2.0**40
 
 
 def initial_message_l1() -> tuple[Any, Any, Any]:
-    """Return the message before any reading.
-
-    It is (2,) the greatest value of the derivative (negated, its least) and its level between the queues, the least
-    that is not negative; and (2, a), (2, b) positions and heights of the steps below and above it, as interval heaps.
+    """Return the message before any reading: (2,) greatest value of the derivative and its level between the queues,
+    the least that is not negative; (2, a), (2, b) positions and heights of the steps below and above it, in heaps.
     """
     return np.zeros(2), np.empty((2, 0)), np.empty((2, 0))
 
@@ -187,19 +163,12 @@ def _minimum_l1(level: float, lower: Any, n_lower: int, upper: Any, n_upper: int
 
 @kernel
 def forward_pass_l1(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
-    """Carry a message on over readings, with fidelity |y_i - x_i|.
+    """Carry a message on over readings (R,), with fidelity |y_i - x_i|; return the last value of the minimiser, too.
 
-    Args:
-        readings: any unit, NaN where missing, which changes nothing; shape (R,).
-        lam: above 0; rounded to 1 / GRAIN, which moves no minimum by more than that (below 1/2 no reading changes).
-        message: of the readings before.
-        low: overwritten with the bounds of x_i given the next, x_i = clip(x_{i+1}, low, high); shape (R,). Where the
-            minimum allows an interval for either bound, it is the middle.
-        high: the upper bounds; shape (R,).
-        ends: overwritten with the last value of the minimiser up to each reading; shape (R,), or (0,) if not needed.
-
-    Returns:
-        The last value of the minimiser, NaN without any reading, and the message.
+    The derivative is a rising staircase, to which a reading adds a step of height 2. Its steps are in two double-ended
+    queues, below and above the minimum: O(log min(R, lam)) a reading. `lam` is rounded to 1 / GRAIN. Overwritten are
+    the bounds of x_i = clip(x_{i+1}, low, high), the middle where the minimum allows an interval; and `ends`, the last
+    value of the minimiser up to each reading; shape (R,), or (0,) if not needed.
     """
     lam = max(np.rint(lam * GRAIN), 1.0) / GRAIN
     greatest, level = message[0]
@@ -245,9 +214,8 @@ def forward_pass_l1(readings: Any, lam: float, message: Any, low: Any, high: Any
                 high[i] = _halfway(position, inner)
         if len(ends):
             ends[i] = _minimum_l1(level, lower, n_lower, upper, n_upper)
-    below, above = np.empty((2, n_lower)), np.empty((2, n_upper))
-    below[0], below[1] = lower[:n_lower], lower_heights[:n_lower]
-    above[0], above[1] = upper[:n_upper], upper_heights[:n_upper]
+    below = np.stack((lower[:n_lower], lower_heights[:n_lower]))
+    above = np.stack((upper[:n_upper], upper_heights[:n_upper]))
     return _minimum_l1(level, lower, n_lower, upper, n_upper), (np.array([greatest, level]), below, above)
 
 
@@ -264,19 +232,9 @@ def initial_message_l2() -> tuple[Any, Any]:
 
 @kernel
 def _cut_l2(step: int, reading: float, lams: float, lam: float, knots: Any, k: int, stop: int) -> int:
-    """Cut the derivative, with a reading added, at -lam (step 1, from the left) or at lam (-1).
+    """Cut the derivative, with a reading added, at -lam (step 1, inwards from knot k) or at lam (-1); return the knot.
 
-    Args:
-        step: direction inwards.
-        reading: counted from the first one.
-        lams: multiple of lam by which the derivative differed from the cut before the reading.
-        lam: weight of the variation.
-        knots: overwritten.
-        k: the outermost knot.
-        stop: the first knot, on the way in, that stays; those before it are pooled if they lie beyond the cut.
-
-    Returns:
-        The index of the new knot.
+    Before the reading it differed from the cut by `lams` lam. Knots up to `stop` are pooled if they are beyond the cut.
     """
     total, count = step * reading, float(step)
     position = (total + lams * lam) / count
@@ -309,7 +267,9 @@ def _minimum_l2(lam: float, knots: Any, first: int, last: int) -> float:
 def forward_pass_l2(readings: Any, lam: float, message: Any, low: Any, high: Any, ends: Any) -> tuple[float, Any]:
     """Carry a message on over readings, with fidelity (y_i - x_i)^2 / 2; as `forward_pass_l1`.
 
-    `ends` costs O(knots) a reading.
+    The derivative is piecewise linear. Knots beyond a cut never matter again, so they are pooled with the new reading
+    like adjacent violators: O(1) a reading on average, as the taut string (L. Condat, IEEE Signal Process. Lett. 20,
+    2013); `ends` costs O(knots).
     """
     origin, old_knots = message[0][0], message[1]
     room = len(readings)

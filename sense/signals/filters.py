@@ -4,8 +4,7 @@ Total variation denoising keeps the steps that presses make and flattens what li
 it has no weight and takes the level of its neighbours. Channels are filtered independently. The published filter is
 the robust one with lam = 4, or a median of 15 (T. G. Thuruthel, J. Hughes, F. Iida, IEEE Sensors J. 2020).
 
-The filters of streams take readings in blocks of any size and return what the filters of recordings do: each value of
-the minimiser is the next one clipped, so where a chain of clips has become a constant, no later reading matters.
+The filters of streams return what the filters of recordings do, for blocks of any size.
 """
 
 from collections.abc import Callable
@@ -26,12 +25,9 @@ _PASSES = {
     "robust": (filter_kernels.forward_pass_l1, filter_kernels.initial_message_l1),
     "squares": (filter_kernels.forward_pass_l2, filter_kernels.initial_message_l2),
 }
-MAX_VALUE = 1e100
-"""Largest absolute reading, and lam: beyond, sums may overflow."""
-MAX_WIDTH = 2**31 - 1
-"""Largest width of a running median: no recording is longer."""
-MAX_PENDING = 100_000
-"""Readings of a channel that are held back: two hours at 13 Hz."""
+MAX_VALUE = 1e100  # largest absolute reading, and lam: beyond, sums may overflow
+MAX_WIDTH = 2**31 - 1  # largest width of a running median: no recording is longer
+MAX_PENDING = 100_000  # readings of a channel that are held back: two hours at 13 Hz
 _NOT_NEEDED = np.empty(0)  # in place of the causal values of a forward pass
 _GRAIN = 20_000  # readings below which a thread costs more than it saves
 
@@ -50,10 +46,8 @@ def find_segment_starts(times_s: ArrayLike, max_interval_s: float) -> Indices:
         InputError: times that are not finite, are beyond 1e10 s or do not ascend, or an interval that is not above 0.
     """
     times = check_numbers(times_s, np.float64, "times_s")
-    if times.ndim != 1:
-        raise InputError(f"times_s have shape {times.shape}, expected (R,)")
     check_magnitude("times_s", times[:, None], MAX_S, "s")
-    if (np.diff(times) < 0).any():
+    if times.ndim != 1 or (np.diff(times) < 0).any():
         raise InputError(f"times_s are {short_repr(times_s)}, expected finite numbers that ascend")
     if not (interval := check_float("max_interval_s", max_interval_s, 0.0, 1e300)):
         raise InputError(f"max_interval_s is {max_interval_s!r}, allowed is a number above 0")
@@ -118,8 +112,8 @@ def running_median(readings: ArrayLike, width: int, starts: ArrayLike = (), caus
     Raises:
         InputError: readings or starts as in `total_variation`, or a width that is no odd whole number above 0.
     """
-    before, after = _window(width, causal)
-    return _filter_channels(readings, starts, lambda segment: _median(segment, before, after))
+    window = _window(width, causal)
+    return _filter_channels(readings, starts, lambda segment: _median(segment, *window))
 
 
 class TotalVariation:
@@ -148,15 +142,11 @@ class TotalVariation:
 
     @property
     def latest(self) -> Array:
-        """(C,) the last value of the minimiser so far, as `total_variation` with `causal`; NaN before a reading."""
+        """(C,) last values of the minimiser so far, as `total_variation` with `causal`; NaN before a reading."""
         return np.array([channel.latest for channel in self._channels])
 
     def update(self, readings: ArrayLike) -> Array:
-        """Process readings (n, C); return the (m, C) values that have become final, in order.
-
-        Raises:
-            InputError: readings as in `total_variation`, or another number of channels.
-        """
+        """Process readings (n, C), as in `total_variation`; return the (m, C) values that have become final."""
         for channel, column in zip(self._channels, _check_block(readings, len(self._channels)), strict=True):
             channel.update(column)
         return self._pop_final()
@@ -224,11 +214,7 @@ class RunningMedian:
         self._n_returned = 0  # of these, whose median has been returned
 
     def update(self, readings: ArrayLike) -> Array:
-        """Process readings (n, C); return the (m, C) medians that have become known, in order.
-
-        Raises:
-            InputError: readings as in `running_median`, or another number of channels.
-        """
+        """Process readings (n, C), as in `running_median`; return the (m, C) medians that have become known."""
         self._readings = np.concatenate([self._readings, _check_block(readings, len(self._readings))], axis=1)
         return self._pop_medians(max(self._readings.shape[1] - self._after, 0))
 
@@ -295,8 +281,7 @@ def _check_readings(readings: ArrayLike) -> Array:
     if beyond.any():
         first = np.argwhere(beyond)[0].tolist()
         raise InputError(
-            f"readings hold {array[beyond][0]:g} (first at {first}), allowed is {-MAX_VALUE:g} to {MAX_VALUE:g}, "
-            "or NaN for one that is missing"
+            f"readings hold {array[beyond][0]:g} (first at {first}), allowed is up to {MAX_VALUE:g}, or NaN"
         )
     return array
 

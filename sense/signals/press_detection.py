@@ -15,37 +15,23 @@ from padforge.design.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
 from padforge.sense.signals.detector_kernels import detect, initial_state
 
-P_REJECT, P_ACCEPT = 1e-3, 1e-9
-"""Probabilities that white noise leaves the levels for a block, and that it is taken for a change."""
-TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08
-"""From a command to its first effect: a touch showed 2.2 readings after the first that followed the command, a release
-0.5 readings (means of the published recording at 14.3 Hz)."""
-MAX_LEAD = 2
-"""Readings before its command at which a press may show: commands are noted a little late."""
+P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise leaves the levels for a block; that it is a change
+TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08  # from a command to its first effect: means of the published recording
+MAX_LEAD = 2  # readings before its command at which a press may show: commands are noted a little late
 
 
 class PressEvent(NamedTuple):
-    """A touch or a release.
+    """A touch or a release."""
 
-    Attributes:
-        down: whether it is a touch.
-        reading: index of the first reading that shows it, counted from the first that the detector got.
-    """
-
-    down: bool
-    reading: int
+    down: bool  # whether it is a touch
+    reading: int  # the first that shows it, counted from the first that the detector got
 
 
 class Presses(NamedTuple):
-    """Detected presses.
+    """Detected presses."""
 
-    Attributes:
-        touched: first reading that shows each press; shape (Q,), ascending.
-        released: first reading that shows its end, or R if it has none; shape (Q,).
-    """
-
-    touched: Indices
-    released: Indices
+    touched: Indices  # first reading that shows each press; shape (Q,), ascending
+    released: Indices  # first reading that shows its end, or R if it has none; shape (Q,)
 
 
 class PressDetector:
@@ -70,17 +56,11 @@ class PressDetector:
         self._accept_limit = np.concatenate([[0.0], chdtri(degrees, P_ACCEPT)])
 
     def update(self, times_s: ArrayLike, readings: ArrayLike) -> list[PressEvent]:
-        """Process further readings.
+        """Process further readings; return the events that they have made clear.
 
         Args:
             times_s: ascending, after those of the last call; shape (n,), s.
             readings: NaN where missing; shape (n, C), V.
-
-        Returns:
-            The events that these readings have made clear.
-
-        Raises:
-            InputError: as `check_stream`, or times that are not after the last ones.
         """
         times, rows = check_stream(times_s, readings, len(self._fibres))
         if len(times) and not times[0] > self._last_s:
@@ -98,12 +78,6 @@ def detect_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
     Args:
         readings: NaN where missing; shape (R, C), V.
         times_s: ascending; shape (R,), s.
-
-    Returns:
-        The presses.
-
-    Raises:
-        InputError: as `check_stream`.
     """
     times_s, readings = check_stream(times_s, readings)
     events = PressDetector(readings.shape[1]).update(times_s, readings)
@@ -114,15 +88,9 @@ def detect_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:
 
 
 def estimate_commands(presses: Presses, times_s: Array) -> tuple[Indices, Indices]:
-    """Estimate when a probe would have been commanded to make detected presses.
+    """Estimate `down_command` and `up_command` (Q,) of a `Recording` in which a probe made the detected presses.
 
-    Args:
-        presses: detected presses.
-        times_s: times of the readings; shape (R,), s.
-
-    Returns:
-        `down_command` and `up_command` as of a `Recording`: the first reading after the probe was sent down, and up;
-        R where a press has no end; shape (Q,) each.
+    `up_command` is R where a press has no end; `times_s` are those of the readings, shape (R,), s.
     """
     touched, released = presses
     up_command = np.searchsorted(times_s, np.append(times_s, np.inf)[released] - RELEASE_DELAY_S)
@@ -139,15 +107,7 @@ def align_to_detected(
 
     A probe takes up to 0.4 s from its command to the pad. Live, presses are aligned by what the readings show; a model
     that is used so must be trained so, since a release that is off by one reading costs several millimetres.
-
-    Args:
-        readings: NaN where missing; shape (R, C), V.
-        times_s: shape (R,), s.
-        down_command: first reading after the probe was sent down; shape (Q,).
-        up_command: first reading after it was sent up; shape (Q,).
-
-    Returns:
-        `down_command` and `up_command` as estimated from the readings; unchanged for a press that is not detected.
+    A press that is not detected keeps its commands.
     """
     presses = detect_presses(readings, times_s)
     downs, ups = estimate_commands(presses, times_s)

@@ -1,13 +1,9 @@
 """Physical model of a simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The strain of a fibre is its relative stretch by the contact model, times the relative depth of the probe. Four effects
-of the published recording are added: the response to a press scatters about that of the position; it creeps (part of it
-follows slowly); it has hysteresis (when unloaded, a fibre overshoots its rest and comes back within seconds); and the
-rest drifts over minutes. A fibre is a resistor in a potential divider with a fixed one; an ADC with white noise reads
-their middle.
-
-The defaults of `[rig]` have the size of that recording: responses up to some 0.2 V on a rest near 2 V that scatter by a
-sixth, an overshoot of a fifth, drift of 0.04 V and noise of 1.6 mV.
+The strain of a fibre is its relative stretch by the contact model, times the relative depth of the probe. Effects of
+the published recording, whose sizes are the defaults of `[rig]`, are added: the response scatters about that of the
+position, creeps, and has hysteresis (unloaded, a fibre overshoots its rest and comes back within seconds); the rest
+drifts over minutes. An ADC with white noise reads the middle of the fibre and a fixed resistor.
 """
 
 import math
@@ -23,19 +19,13 @@ from padforge.sense.settings import RigSettings
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095
-GAUGE_FACTOR = 0.4
-"""Relative change of a fibre's resistance per relative stretch at FULL_DEPTH_MM."""
+GAUGE_FACTOR = 0.4  # relative change of a fibre's resistance per relative stretch at FULL_DEPTH_MM
 FULL_DEPTH_MM = 5.0
-TRAVEL_S = 0.15
-"""Time that the probe takes from the surface to its depth, and back."""
-DELAY_S = (0.08, 0.2)
-"""Range of the time from the command to the touch, and to the start of the release."""
-CREEP_S = (0.4, 6.0)
-"""Time constants of creep, in equal shares."""
-DRIFT_S = 600.0
-"""Correlation time of the drift."""
-REST_V = (1.7, 2.1)
-"""Range of the voltages at rest; the divider is matched to half the supply only roughly."""
+TRAVEL_S = 0.15  # time that the probe takes from the surface to its depth, and back
+DELAY_S = (0.08, 0.2)  # range of the time from the command to the touch, and to the start of the release
+CREEP_S = (0.4, 6.0)  # time constants of creep, in equal shares
+DRIFT_S = 600.0  # correlation time of the drift
+REST_V = (1.7, 2.1)  # range of the voltages at rest; the divider is matched to half the supply only roughly
 
 
 @dataclass(frozen=True)
@@ -57,10 +47,7 @@ class Cycle:
 
 
 def relative_depths(cycle: Cycle, delays_s: Array) -> Array:
-    """Compute the relative depth (Q, 2 readings), 0 to 1, in the cycle of each press and the next, in which it leaves.
-
-    Its delays (Q, 2), s, are from the command to the touch, and to the start of the release.
-    """
+    """Compute the relative depth (Q, 2 readings), 0 to 1, in a press's cycle and the next, from `delays_s` (Q, 2)."""
     times_s = np.arange(2 * cycle.readings) / cycle.rate_hz
     touch_s = cycle.down_index / cycle.rate_hz + delays_s[:, :1]
     release_s = cycle.readings / cycle.rate_hz + delays_s[:, 1:]
@@ -75,40 +62,29 @@ def superpose_strain(responses: Array, depths: Array) -> Array:
     return strain.reshape(-1, responses.shape[1])
 
 
-class FirstOrderLag:
-    """First-order lag with a time constant in rows, settled at the first of its values (R, C)."""
-
-    def __init__(self, rows: float) -> None:
-        self._decay = np.exp(-1 / rows)
-        self._state: Array | None = None
-
-    def __call__(self, values: Array) -> Array:
-        """Filter further values (R, C)."""
-        state = self._decay * values[:1] if self._state is None else self._state
-        lagged, self._state = lfilter([1 - self._decay], [1.0, -self._decay], values, axis=0, zi=state)
-        return lagged
-
-
 class CreepHysteresis:
     """Creep of a share of the response, and hysteresis: an overshoot by a share of the strain lost, which decays."""
 
     def __init__(self, rate_hz: float, rig: RigSettings) -> None:
         self._creep, self._hysteresis = rig.creep, rig.hysteresis
-        self._lags = [FirstOrderLag(rate_hz * time_constant) for time_constant in CREEP_S]
+        self._creep_decays = [np.exp(-1 / (rate_hz * time_constant)) for time_constant in CREEP_S]
         self._decay = np.exp(-1 / (rate_hz * rig.hysteresis_s))
-        self._last: Array | None = None
-        self._overshoot: Array | None = None
+        self._last: Array | None = None  # strain, and the states of the filters after it
+        self._lags: list[Array] = []
+        self._overshoot = np.zeros(0)
 
     def __call__(self, strain: Array) -> Array:
         """Compute the visible part of further strain (R, C), which settles at the strain."""
+        if self._last is None:  # settled at the first strain
+            self._last, self._overshoot = strain[:1], np.zeros_like(strain[:1])
+            self._lags = [decay * strain[:1] for decay in self._creep_decays]
         visible = (1 - self._creep) * strain
-        for lag in self._lags:
-            visible = visible + self._creep / len(self._lags) * lag(strain)
-        last = strain[:1] if self._last is None else self._last
-        previous = np.concatenate([last, strain[:-1]])
+        for i, decay in enumerate(self._creep_decays):
+            lagged, self._lags[i] = lfilter([1 - decay], [1.0, -decay], strain, axis=0, zi=self._lags[i])
+            visible = visible + self._creep / len(self._lags) * lagged
+        previous = np.concatenate([self._last, strain[:-1]])
         unloading = np.sign(previous) * np.maximum(np.abs(previous) - np.abs(strain), 0)
-        state = np.zeros_like(last) if self._overshoot is None else self._overshoot
-        overshoot, self._overshoot = lfilter([1.0], [1.0, -self._decay], unloading, axis=0, zi=state)
+        overshoot, self._overshoot = lfilter([1.0], [1.0, -self._decay], unloading, axis=0, zi=self._overshoot)
         self._last = strain[-1:].copy()
         return visible - self._hysteresis * overshoot
 
@@ -204,15 +180,7 @@ def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
 
 
 class LivePad:
-    """A simulated pad under a moving tip; one physical model for every virtual rig.
-
-    Args:
-        pad: paths of the fibres.
-        contact: contact model.
-        rig: settings of scatter, creep, hysteresis, drift and noise.
-        rate_hz: readings per second.
-        rng: of rests, scatter, drift and noise.
-    """
+    """A simulated pad under a moving tip; one physical model for every virtual rig."""
 
     def __init__(
         self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, rng: np.random.Generator
@@ -225,14 +193,9 @@ class LivePad:
         self._is_touched = False
 
     def volts(self, positions_mm: Array, depths_mm: Array) -> Array:
-        """Read the fibres for further positions of the tip.
+        """Return the readings (R, C), V, at further positions (R, 2) of the tip, from the pad's centre.
 
-        Args:
-            positions_mm: from the pad's centre; shape (R, 2), mm.
-            depths_mm: below its surface, negative above; shape (R,), mm.
-
-        Returns:
-            Readings; shape (R, C), V.
+        Depths (R,) are below the surface, negative above.
         """
         strain = np.zeros((len(positions_mm), len(self._pad.knots)))
         for row, is_touched in enumerate(depths_mm > 0):

@@ -32,16 +32,11 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import DELAY_S, DRIFT_S, TRAVEL_S, Cycle, simulate_readings
 
-MIN_SINGULAR = 0.3
-"""Relative singular value below which both sides of a pad, turned by more than some 28 degrees, count as equal."""
-JITTER = 0.1
-"""Standard deviation of the interval between readings, as a share of its mean: the loop that records is no clock."""
-MIN_PRESSES = 100
-"""Presses from which noise, drift and hysteresis are measured."""
-REST_S, AFTER_S = 0.7, (0.7, 1.4)
-"""Time before a press, and range of times after it, in which fibres are at rest and show what it left behind."""
-DECAY_S = np.geomspace(1.0, 100.0, 41)
-"""Time constants of hysteresis that are tried."""
+MIN_SINGULAR = 0.3  # relative; below it both sides of a pad, turned by more than some 28 degrees, count as equal
+JITTER = 0.1  # standard deviation of the interval between readings over its mean: the loop that records is no clock
+MIN_PRESSES = 100  # presses from which noise, drift and hysteresis are measured
+REST_S, AFTER_S = 0.7, (0.7, 1.4)  # times before and after a press in which fibres rest and show what it left behind
+DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are tried
 
 
 @dataclass(frozen=True)
@@ -57,11 +52,7 @@ class PadModel:
 
 
 def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = None) -> PadModel:
-    """Model a pad as make_plan; `size` says where it is pressed.
-
-    Raises:
-        InputError: as `fit_pad_settings`.
-    """
+    """Model a pad as make_plan; `size` says where it is pressed, as `fit_pad_settings`."""
     size = fit_pad_settings(pad, size)
     keys = {"sensed_mm", "keep_out_mm"} if size.keep_out_mm else {"sensed_mm"}
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
@@ -74,11 +65,7 @@ def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = Non
 
 
 def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
-    """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; a dead channel stays at rest.
-
-    Raises:
-        InputError: no channel of the twin reads a fibre; or as `fit_pad_settings`.
-    """
+    """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; dead channels stay at rest."""
     live = _live_channels(twin)
     columns = [twin.channels.index(channel) for channel in live]
     fibres = np.array([channel.fibre for channel in live])
@@ -109,9 +96,6 @@ def model_like_twin(pad: Morphology, twin: Twin, size: PadSettings | None = None
     """Model another pad as make_plan, with the sensitivity profile of a twin and its median gain and noise.
 
     How its channels will differ is unknown before it is made: fibre i is on channel i, and all have the same gain.
-
-    Raises:
-        InputError: no channel of the twin reads a fibre; or as `fit_pad_settings`.
     """
     gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live_channels(twin)]).T
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
@@ -173,10 +157,7 @@ def simulate(
     channels = len(pad.channels) if isinstance(pad, Twin) else len(check_type("pad", pad, Morphology).knots)
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     if rig.plan == "adaptive":
-        raise InputError(
-            "[rig] plan is adaptive, which only steers a recording in real time; allowed in a simulation are uniform, "
-            "grid, serpentine or a .csv file"
-        )
+        raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
     if isinstance(pad, Twin):
         model = model_twin(pad, size)
     elif like is None:
@@ -188,10 +169,7 @@ def simulate(
     plan = make_plan_in(model.corners_mm, rig, rng, model.free)
     values = len(plan) * rig.readings_per_press * channels
     if values > MAX_VALUES:
-        raise InputError(
-            f"[rig] presses is {len(plan)}: with {rig.readings_per_press} readings each of {channels} fibres "
-            f"{values} values, allowed are {MAX_VALUES}"
-        )
+        raise InputError(f"[rig] presses is {len(plan)}: they have {values} readings, allowed are {MAX_VALUES}")
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     readings = simulate_readings(model.responses(plan.positions_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
@@ -216,10 +194,7 @@ def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, si
 def measure_rig_settings(recording: Recording) -> dict[str, float]:
     """Measure the `noise_mv`, `drift_mv`, `hysteresis` and `hysteresis_s` of `[rig]` in a recording.
 
-    Channels that miss readings or are constant are ignored; positions of presses are not needed.
-
-    Returns:
-        The settings; none if there are fewer than MIN_PRESSES, or no such channel.
+    Channels that miss readings or are constant are ignored; none are returned for fewer than MIN_PRESSES or no channel.
     """
     down_command, up_command, rate_hz = recording.down_command[:-1], recording.up_command[:-1], recording.rate_hz
     valid = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > MIN_SCALE_V)

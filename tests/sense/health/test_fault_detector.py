@@ -106,9 +106,6 @@ def test_predict_and_update_refuse_other_pads(pad: Recording, model: HealthModel
         detect(model, Recording(pad.readings, 2 * pad.times_s, *presses))
     with pytest.raises(InputError, match=r"expected \(R, 6\)"):
         FaultMonitor(model).update(pad.readings[:60, :5], 10, 30)
-    for down_command, up_command in ((0, 30), (30, 30), (10, 61)):
-        with pytest.raises(InputError, match="allowed is a whole number from"):
-            FaultMonitor(model).update(pad.readings[:60], down_command, up_command)
     with pytest.raises(InputError, match="not fitted"):
         FaultDetector().predict(pad)
 
@@ -182,11 +179,7 @@ def test_fit_trains_on_commanded_and_on_detected_presses(pad: Recording, monkeyp
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda pad: FaultDetector().fit(3), "recording is 3, expected a Recording"),  # type: ignore[arg-type]
         (lambda pad: FaultDetector().fit(pad, [0, 10**6]), "held_back is .*, allowed are presses from 0 to"),
-        (lambda pad: FaultDetector().fit(pad, [-1]), "held_back is .*, allowed are presses from 0 to"),
-        (lambda pad: FaultDetector().fit(pad, "ab"), "held_back"),
-        (lambda pad: FaultDetector(seed="a"), "seed is 'a'"),  # type: ignore[arg-type]
         (lambda pad: FaultDetector(0.0), "false_alarm_rate is 0"),
         (lambda pad: FaultDetector(0.2), "false_alarm_rate is 0.2"),
     ],

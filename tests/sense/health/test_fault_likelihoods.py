@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
@@ -112,14 +110,6 @@ def test_log_likelihood_ratios_are_0_for_missing_readings() -> None:
     assert llr_continuing[2, 0].any()
 
 
-def test_largest_step_is_that_of_the_filter_with_the_largest_output() -> None:
-    model, traces, *_ = random_case(1)
-    responses = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
-    for q, c in np.ndindex(PRESSES, FIBRES):
-        outputs = model.step_filters[c] @ responses[q, c]
-        assert model.largest_step(traces)[q, c] == pytest.approx(outputs[np.abs(outputs).argmax()])
-
-
 def test_fit_calibrates_deviations_noise_and_rests() -> None:
     """Errors are twice as large as predicted; rests correlate by 0.5 with those before; traces are noise alone."""
     rng = np.random.default_rng(5)
@@ -159,28 +149,6 @@ def test_step_filters_are_matched_and_scaled_for_heavy_tails() -> None:
     outputs = (heavy - heavy[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(np.quantile(np.abs(outputs), 0.999, axis=0), student.ppf(0.9995, 5), rtol=1e-3)
     assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == MEDIAN_T
-
-
-@settings(max_examples=10)
-@given(seed=st.integers(0, 2**32 - 1), size=st.floats(1e-3, 10))
-def test_estimate_noise_ignores_spikes_and_steep_parts(seed: int, size: float) -> None:
-    traces = size * np.random.default_rng(seed).standard_normal((2, 3, TRACE))
-    noise = estimate_noise(traces)
-    for index in np.ndindex(2, 3):
-        quiet = traces[index][:10], traces[index][20:30], traces[index][40:]
-        steps = sorted(abs(np.concatenate([np.diff(part) for part in quiet])))
-        assert noise[index] == pytest.approx(np.mean(steps[:20]))
-    spiked, steep = traces.copy(), traces.copy()
-    spiked[:, :, 5] += 1000 * size
-    assert (estimate_noise(spiked) < 2 * noise).all()
-    steep[:, :, 10:20] += 1000 * size * np.arange(10)
-    assert (estimate_noise(steep) == noise).all()
-
-
-def test_neg_log_p_is_that_of_the_number_of_failed_fibres() -> None:
-    model = ExceedanceModel(level=np.array([[1.0, 2.0], [3.0, 4.0]]), slope=np.array([[1.0, 2.0], [2.0, 4.0]]))
-    for n_failed, expected in ((0, [4.0, 3.0]), (1, [1.0, 1.0]), (7, [1.0, 1.0])):
-        np.testing.assert_allclose(model.neg_log_p(np.array([[5.0, 8.0]]), n_failed), [expected])
 
 
 def test_exceedance_fit_has_the_mean_excess_of_the_highest_tenth() -> None:

@@ -16,10 +16,8 @@ from padforge.design.common.validation import InputError
 from padforge.sense import FaultDetector, HealthModel, Recording
 from padforge.sense.arrays import MIN_SCALE_V
 from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
-from padforge.sense.health.fault_likelihoods import HYPOTHESES
 from padforge.sense.health.health_model import COMMANDED, MIN_PRESSES, find_dead_fibres
 from padforge.sense.localizer.model_files import ModelFiles, files_of
-from padforge.sense.localizer.training import one_cycle
 from tests.sense.health.pads import TRAINED, detect_later, fit, part_of, plant
 from tools.kills import killed
 
@@ -51,12 +49,10 @@ def test_detector_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_p
     ("change", "message"),
     [
         ({"false_alarm_rate": 0.0}, "false_alarm_rate: got 0.0"),
-        ({"rate_hz": "fast"}, "rate_hz: got 'fast'"),
         ({"dead": [6]}, "dead is \\[6\\]"),
         ({"dead": [2]}, "is .*, expected"),
         ({"format": "padforge-localizer/1"}, "format is 'padforge-localizer/1'"),
         ({"weights_sha256": "0" * 64}, "not the weights"),
-        ({"more": 1}, "more: no such key"),
     ],
 )
 def test_load_refuses_a_changed_document(model: HealthModel, tmp_path: Path, change: dict, message: str) -> None:
@@ -67,15 +63,7 @@ def test_load_refuses_a_changed_document(model: HealthModel, tmp_path: Path, cha
         HealthModel.load(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("part", "key", "value"),
-    [
-        ("exceedance", "slope", 0.0),
-        ("likelihoods", "noise_v", np.nan),
-        ("pca", "components", np.inf),
-        ("likelihoods", "std_scale", -1.0),
-    ],
-)
+@pytest.mark.parametrize(("part", "key", "value"), [("exceedance", "slope", 0.0), ("likelihoods", "noise_v", np.nan)])
 def test_load_refuses_entries_out_of_range(
     model: HealthModel, tmp_path: Path, part: str, key: str, value: float
 ) -> None:
@@ -102,16 +90,11 @@ def test_load_refuses_damaged_files(model: HealthModel, tmp_path: Path, name: st
         FaultDetector.load(tmp_path)
 
 
-@pytest.mark.parametrize("name", [None, 3, "", "a/b", "..", "x" * 300, "a\nb"])
+@pytest.mark.parametrize("name", ["a/b", ".."])
 def test_save_refuses_a_wrong_name_and_writes_nothing(model: HealthModel, tmp_path: Path, name: Any) -> None:
     with pytest.raises(InputError, match="name is"):
         model.save(tmp_path / "new", name)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("share", "rate"), [(0.05, 0.25), (0.1, 0.5), (0.2, 1.0), (0.4, 0.8535533906), (1.0, 0.0)])
-def test_one_cycle_rises_linearly_and_falls_as_a_cosine(share: float, rate: float) -> None:
-    assert one_cycle(share) == pytest.approx(rate)
 
 
 def written(folder: Path, value: float) -> ModelFiles:
@@ -142,12 +125,6 @@ def test_kill_while_writing_leaves_the_old_or_the_new_model(tmp_path: Path) -> N
         if ended:
             break
     assert (results[0], results[-1]) == ((1.0, 1.0), (2.0, 2.0))
-
-
-def test_threshold_shares_false_alarms_among_hypotheses(model: HealthModel) -> None:
-    for rate in (1e-3, 1e-5):
-        threshold = replace(model, false_alarm_rate=rate).threshold
-        assert np.exp(-threshold) == pytest.approx(rate / len(HYPOTHESES))
 
 
 def test_find_dead_fibres() -> None:

@@ -53,16 +53,6 @@ def test_project_follows_response_rest_and_history() -> None:
         np.testing.assert_array_equal(history.n_presses, count)
 
 
-def test_scale_clips_inputs_and_zeroes_missing_fibres() -> None:
-    pca = TracePCA(np.empty(0), np.full((FIBRES, INPUTS), 2.0), np.full((FIBRES, TARGETS), 4.0))
-    inputs = np.array([[3.0] * INPUTS, [np.nan] * INPUTS])
-    inputs[0, :2] = 100, -100
-    scaled, targets = pca.scale(inputs, np.full((FIBRES, TARGETS), 6.0))
-    assert scaled[0, :3].tolist() == [8, -8, 1.5]
-    assert not scaled[1].any()
-    assert (targets == 1.5).all()
-
-
 def test_fit_transform_finds_principal_directions_and_scales() -> None:
     rng = np.random.default_rng(1)
     patterns = np.linalg.qr(rng.normal(0, 1, (TRACE - REST, 3)))[0].T
