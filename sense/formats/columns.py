@@ -77,9 +77,8 @@ def parse_columns(text: str, quantities: Sequence[str] = tuple(UNITS)) -> list[C
     required = [quantity for quantity in ("time", "fibres") if quantity in quantities]
     for quantity in required:
         if quantity not in named:
-            raise InputError(
-                f"mapping {short_repr(text)} does not name {quantity}, expected {' and '.join(required)} in each"
-            )
+            expected = f"expected {' and '.join(required)} in each"
+            raise InputError(f"mapping {short_repr(text)} does not name {quantity}, {expected}")
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
             raise InputError(f"mapping {short_repr(text)} names one of {one} and {other}, expected both or neither")

@@ -197,11 +197,6 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
     return encoded
 
 
-def encode_text(store: "Typestore", text: str) -> memoryview:
-    """Serialize the message of RECORDING."""
-    return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
-
-
 def decode(store: "Typestore", raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
     """Return the numbers at the paths, attributes of the messages, in the order of stamps; refuse damaged messages."""
     from rosbags.serde import SerdeError
@@ -254,8 +249,8 @@ def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:
     return store.types[msgtype](**({name: zero(node) for name, node in store.fielddefs[msgtype][1]} | fields))
 
 
-def to_text(recording: Recording, epoch_s: float, topics: Iterable[str]) -> str:
-    """Return the text of RECORDING, with a description of each topic of the bag."""
+def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, topics: Iterable[str]) -> memoryview:
+    """Serialize the message of RECORDING, with a description of each topic of the bag."""
     arrays = {name: getattr(recording, name) for name in (*_NUMBERS, *_INDICES)}
     document = {
         "format": FORMAT,
@@ -271,7 +266,7 @@ def to_text(recording: Recording, epoch_s: float, topics: Iterable[str]) -> str:
             f"recording is too long for a bag: {len(text)} characters of times, presses and source, "
             f"allowed are {MAX_TEXT}, with {MAX_TEXT_PARTS} brackets and quotes"
         )
-    return text
+    return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
 
 
 def _is_readable(text: str) -> bool:

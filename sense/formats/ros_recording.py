@@ -47,10 +47,9 @@ from padforge.sense.formats.ros_messages import (
     decode_text,
     encode,
     encode_health,
-    encode_text,
+    encode_recording,
     from_text,
     stamps_at,
-    to_text,
     to_topics,
     touches,
 )
@@ -266,7 +265,7 @@ def export_bag(
     if annotations is not None and annotations.faults is not None:
         stamps[HEALTH], messages[HEALTH] = encode_health(store, recording, annotations, stamps[READINGS])
     stamps[RECORDING] = stamps[READINGS][:1]
-    messages = {RECORDING: [encode_text(store, to_text(recording, epoch_s, messages))], **messages}
+    messages = {RECORDING: [encode_recording(store, recording, epoch_s, messages)], **messages}
     _check_readable(messages)
     types = {topic: (TOPICS[topic].msgtype, TOPICS[topic].description) for topic in messages}
     in_order = merge(

@@ -182,7 +182,11 @@ class Recorder:
             try:
                 lock(self._journal, busy_message(path))
                 journal = read_journal(path / JOURNAL)
-                _check_readings(path, fibres, len(journal))
+                times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
+                if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
+                    # No break leaves that, so nothing may be cut off.
+                    what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
+                    raise InputError(f"{path / READINGS}: not {what}")
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
@@ -334,15 +338,6 @@ def is_uncommitted(path: Path) -> bool:
 def busy_message(path: Path) -> str:
     """Return the message for a recording that another recorder has locked."""
     return f"{path}: another program is recording into it"
-
-
-def _check_readings(path: Path, fibres: int, n_presses: int) -> None:
-    """Refuse readings that cannot be what a break left: nothing of them may be cut off then."""
-    times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
-    if (n_presses and not len(times_s)) or not (np.diff(times_s) > 0).all():
-        raise InputError(
-            f"{path / READINGS}: not the readings of {n_presses} presses of {fibres} fibres in the journal"
-        )
 
 
 def _create(path: Path) -> BinaryIO:
