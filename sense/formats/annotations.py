@@ -11,14 +11,7 @@ from padforge.sense.recording.recording import Recording
 
 @dataclass(frozen=True)
 class FaultAnnotation:
-    """A fault that a model names.
-
-    Attributes:
-        press: index of the press at which it is named.
-        fibres: indices of the fibres at fault.
-        kind: one word.
-        text: one line.
-    """
+    """A fault of fibres (indices) that a model names at a press (index): its kind, one word, and a line of text."""
 
     press: int
     fibres: tuple[int, ...]

@@ -5,7 +5,8 @@ stands for any characters and `?` for any one, also for a comma or a colon. A un
 as 0.001; without any, times are s, readings V, positions and depths mm, and forces N.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from math import isfinite
 from pathlib import Path
@@ -19,22 +20,15 @@ from padforge.sense.arrays import Array, Indices, Mask, check_numbers
 from padforge.sense.recording.csv_table import UNKNOWN
 from padforge.sense.recording.recording import Recording
 
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
-VOLTS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 MILLIMETRES = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1000.0}
-NEWTONS = {"N": 1.0, "mN": 1e-3}
 UNITS: dict[str, Mapping[str, float]] = {
-    "time": SECONDS,
-    "fibres": VOLTS,
-    "x": MILLIMETRES,
-    "y": MILLIMETRES,
-    "positions": MILLIMETRES,
-    "depth": MILLIMETRES,
-    "reached": MILLIMETRES,
-    "force": NEWTONS,
+    "time": _SECONDS,
+    "fibres": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},
+    **dict.fromkeys(("x", "y", "positions", "depth", "reached"), MILLIMETRES),
+    "force": {"N": 1.0, "mN": 1e-3},
     "press": {},
-    "down_command": SECONDS,
-    "up_command": SECONDS,
+    **dict.fromkeys(("down_command", "up_command"), _SECONDS),
 }
 """Quantities that a mapping may name, and their units in s, V, mm or N.
 
@@ -50,17 +44,20 @@ _MAX_LISTED = 12
 
 
 class ColumnEntry(NamedTuple):
-    """Entry of a mapping.
-
-    Attributes:
-        quantity: one of `UNITS`.
-        name: of a column, dataset or topic, or a pattern.
-        factor: from its values to s, V, mm or N; None without a unit.
-    """
+    """A quantity, the name or pattern of its column, and the factor to s, V, mm or N; None without a unit."""
 
     quantity: str
     name: str
     factor: float | None = None
+
+
+@contextmanager
+def naming_file(path: Path | str) -> Iterator[None]:
+    """Put what is read before the message of an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def check_import(path: object, columns: object) -> tuple[Path, str]:
@@ -69,16 +66,7 @@ def check_import(path: object, columns: object) -> tuple[Path, str]:
 
 
 def parse_columns(text: str, quantities: Sequence[str] = tuple(UNITS)) -> list[ColumnEntry]:
-    """Return the entries of a mapping, in its order; `fibres` may have several.
-
-    Args:
-        text: the mapping.
-        quantities: that it may name.
-
-    Raises:
-        InputError: no mapping, a quantity that is not allowed or named twice, one of two that belong together, two
-            that exclude each other, or no `time` (where it is allowed) or `fibres`.
-    """
+    """Return the entries of a mapping of these quantities, in its order; `fibres` may have several."""
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"mapping has {len(text)} characters, allowed are {MAX_CHARACTERS}")
     entries = [_parse_entry(entry.strip(), quantities) for entry in text.split(",")]
@@ -89,9 +77,8 @@ def parse_columns(text: str, quantities: Sequence[str] = tuple(UNITS)) -> list[C
     required = [quantity for quantity in ("time", "fibres") if quantity in quantities]
     for quantity in required:
         if quantity not in named:
-            raise InputError(
-                f"mapping {short_repr(text)} does not name {quantity}, expected {' and '.join(required)} in each"
-            )
+            expected = f"expected {' and '.join(required)} in each"
+            raise InputError(f"mapping {short_repr(text)} does not name {quantity}, {expected}")
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
             raise InputError(f"mapping {short_repr(text)} names one of {one} and {other}, expected both or neither")
@@ -134,17 +121,9 @@ def matches(name: str, pattern: str) -> bool:
 
 
 def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[tuple[ColumnEntry, list[int]]]:
-    """Find the columns of each entry. A pattern leaves out those of entries before it; fibres come last.
+    """Return the entries with the indices of their columns, ascending: one each, but for fibres, which come last.
 
-    Args:
-        entries: of a mapping.
-        names: of all columns.
-
-    Returns:
-        The entries with the indices of their columns, ascending: one each, but for fibres.
-
-    Raises:
-        InputError: an entry matches none, the column of another one, or several that are not of fibres.
+    A pattern leaves out the columns of entries before it.
     """
     matched: list[tuple[ColumnEntry, list[int]]] = []
     used: set[int] = set()
@@ -183,14 +162,9 @@ def assemble_recording(
         arrays: each with its entry. `time` and `press` have R values; `fibres` is (R, C), (C, R) or (R,), in one
             array or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
         source: of the recording.
-
-    Raises:
-        InputError: shapes that do not fit together, no press, or as `Recording`.
     """
-    try:
+    with naming_file(path):
         return _assemble(arrays, source)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
@@ -222,9 +196,8 @@ def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mappin
         if len(values) == len(down):
             return values
         if len(values) != len(times):
-            raise InputError(
-                f"{name} are {len(values)}, expected one for each of {len(down)} presses or {len(times)} readings"
-            )
+            expected = f"one for each of {len(down)} presses or {len(times)} readings"
+            raise InputError(f"{name} are {len(values)}, expected {expected}")
         return values[np.clip((down + up) // 2, 0, len(times) - 1)]
 
     measures: dict[str, Any] = {MEASURES[name]: at_presses(name, columns[name]) for name in MEASURES if name in columns}
@@ -245,13 +218,12 @@ def _scaled(entry: ColumnEntry, array: NDArray[Any]) -> Array:
 
 def _by_readings(values: Array, n_readings: int) -> Array:
     """Return (R, c) readings from (R, c), (c, R) or (R,)."""
-    if values.ndim in (1, 2) and len(values) == n_readings:
-        return values[:, None] if values.ndim == 1 else values
-    if values.ndim == 2 and values.shape[1] == n_readings:
-        return values.T
-    raise InputError(
-        f"fibres have shape {values.shape}, expected ({n_readings}, C) or (C, {n_readings}), as time has it"
-    )
+    if values.ndim not in (1, 2) or n_readings not in values.shape:
+        expected = f"({n_readings}, C) or (C, {n_readings}), as time has it"
+        raise InputError(f"fibres have shape {values.shape}, expected {expected}")
+    if values.ndim == 1:
+        return values[:, None]
+    return values if len(values) == n_readings else values.T
 
 
 def _join_positions(columns: Mapping[str, Array]) -> Array | None:
@@ -323,5 +295,4 @@ def _detect(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
         raise InputError("has no press: no position or number tells of one, and none is detected in the readings")
-    down, up = estimate_commands(presses, times_s)
-    return down, up
+    return estimate_commands(presses, times_s)

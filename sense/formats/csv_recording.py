@@ -23,6 +23,7 @@ from padforge.sense.formats.columns import (
     assemble_recording,
     check_import,
     match_columns,
+    naming_file,
     parse_columns,
 )
 from padforge.sense.recording.csv_table import CsvTable
@@ -39,17 +40,12 @@ def import_csv(path: str | Path, columns: str = "") -> Recording:
     Args:
         path: of the file.
         columns: what its columns hold, as `time=t_ms:ms,fibres=ch*`; by default they are padforge's own.
-
-    Raises:
-        InputError: no such CSV file, or no press in it; the message names the line.
     """
     path, columns = check_import(path, columns)
     entries = parse_columns(columns, QUANTITIES) if columns else None
     table = CsvTable(path)
-    try:
+    with naming_file(path):
         matched = match_columns(entries or _own_entries(table.names), table.names)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     indices = [i for _, entry_columns in matched for i in entry_columns]
     x_y = [entry_columns[0] for entry, entry_columns in matched if entry.quantity in "xy"]
     values = table.read_columns(indices, x_y)
@@ -79,15 +75,7 @@ def _own_entries(names: list[str]) -> list[ColumnEntry]:
 
 
 def export_csv(recording: Recording, path: str | Path) -> None:
-    """Write a recording as CSV, atomically; importing it gives the same numbers.
-
-    Args:
-        recording: to write.
-        path: of the file.
-
-    Raises:
-        InputError: the path cannot be written.
-    """
+    """Write a recording as CSV, atomically; importing it gives the same numbers."""
     path = check_export(recording, path)
     measures = {name: getattr(recording, MEASURES[quantity]) for name, quantity in _MEASURED.items()}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}

@@ -22,6 +22,7 @@ from padforge.sense.formats.columns import (
     check_import,
     join_names,
     match_columns,
+    naming_file,
     parse_columns,
 )
 from padforge.sense.recording.recording import Recording
@@ -29,24 +30,15 @@ from padforge.sense.recording.recording import Recording
 FORMAT = "padforge-hdf5/2"
 NOTE = "note"
 """Key in the source of a recording that says what was left out of it."""
-_DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")} | {
-    "readings_v": "readings"
-}
+_DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")}
+_DATASETS["readings_v"] = "readings"
 """Datasets, and their attributes of a `Recording`."""
 CYCLE, DOWN_AT = 40, 20
 """Readings of a published press, and the one at which the probe is sent down; it is sent up at the end."""
 
 
 def export_hdf5(recording: Recording, path: str | Path) -> None:
-    """Write a recording as HDF5, atomically; importing it gives the same numbers.
-
-    Args:
-        recording: to write.
-        path: of the file.
-
-    Raises:
-        InputError: the path cannot be written.
-    """
+    """Write a recording as HDF5, atomically; importing it gives the same numbers."""
     import h5py
 
     path = check_export(recording, path)
@@ -70,10 +62,6 @@ def import_hdf5(path: str | Path, columns: str = "") -> Recording:
     Args:
         path: of the file.
         columns: what its datasets hold, as `time=/t,fibres=/data/volts`; by default it was exported.
-
-    Raises:
-        InputError: the file is missing, torn, of another kind, takes values from other files, or its datasets do not
-            fit together.
     """
     path, columns = check_import(path, columns)
     if columns:
@@ -107,20 +95,15 @@ def import_mat(path: str | Path, columns: str = "") -> Recording:
     Args:
         path: of the file.
         columns: what its variables hold, as `time=t,fibres=volts`.
-
-    Raises:
-        InputError: the file is torn, of another kind, or its variables do not fit together.
     """
     path, columns = check_import(path, columns)
     content = load_mat(path, () if columns else ("voltage", "tim"))
-    try:
+    with naming_file(path):
         if not columns:
             return _import_published(path, content)
         names = [name for name in content if not name.startswith("__")]
         matched = match_columns(parse_columns(columns), names)
         arrays = [(entry, _matrix(content, names[i])) for entry, indices in matched for i in indices]
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     return assemble_recording(path, arrays, {"kind": "mat", "file": path.name, "columns": columns})
 
 

@@ -28,14 +28,7 @@ FORMATS = ("lerobot",)
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Open a recording: a run directory, finished or not, or a file that `import_file` reads without a mapping.
-
-    Args:
-        path: of the folder or file.
-
-    Raises:
-        InputError: as `Recording.open` and `import_file`.
-    """
+    """Open a recording: a run directory, finished or not, or a file that `import_file` reads without a mapping."""
     path = check_path("path", path)
     is_file = path.suffix.lower() in _READERS and not path.is_dir()
     return import_file(path) if is_file or _is_bag_folder(path) else Recording.open(path)
@@ -58,9 +51,6 @@ def import_file(path: Path, columns: str = "") -> Recording:
     Args:
         path: of the file or folder.
         columns: what the columns, datasets or topics of a foreign file hold.
-
-    Raises:
-        InputError: another extension, a folder that is no bag, or as the reader of that format.
     """
     if _is_bag_folder(path):
         return import_bag(path, columns)
@@ -70,11 +60,7 @@ def import_file(path: Path, columns: str = "") -> Recording:
 
 
 def arm_states(path: Path) -> Array | None:
-    """Return the (n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None if it has none.
-
-    Raises:
-        InputError: their file is damaged elsewhere than at its end.
-    """
+    """Return the (n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None if it has none."""
     file = path / STATES
     return read_blocks(file, len(STATE_COLUMNS) - 1)[0] if file.is_file() else None
 
@@ -94,9 +80,6 @@ def export_file(
         kind: one of `FORMATS`; "" for a file.
         annotations: of a model, for .mcap and LeRobot.
         states: (n, 10) of the arm, by `STATE_COLUMNS`, for .mcap.
-
-    Raises:
-        InputError: another extension, annotations for what cannot hold them, or the path cannot be written.
     """
     extension = path.suffix.lower()
     if kind == "lerobot":

@@ -43,12 +43,8 @@ def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotatio
 
     Args:
         recording: to write.
-        path: of the folder.
+        path: of a folder that is new or empty.
         annotations: of a model.
-
-    Raises:
-        InputError: pyarrow is not installed, no position is known, `path` exists and is not an empty folder, or cannot
-            be written.
     """
     path = check_export(recording, path, annotations)
     try:
@@ -122,7 +118,9 @@ def _write(
     starts = ends - lengths
     frame_bytes = sum(values[:1].nbytes for values in columns.values())
     files = (ends - 1) * frame_bytes // int(FILE_MB * 2**20)
-    table = pa.table({name: _to_arrow(values) for name, values in columns.items()})
+    flat = {name: pa.array(values.ravel()) for name, values in columns.items()}
+    lists = {n: pa.FixedSizeListArray.from_arrays(flat[n], v.shape[1]) for n, v in columns.items() if v.ndim > 1}
+    table = pa.table(flat | lists)
     for number in np.unique(files):
         in_file = np.flatnonzero(files == number)
         _write_table(folder / "data" / _file_name(number), table, starts[in_file].tolist(), ends[in_file].tolist())
@@ -140,7 +138,13 @@ def _write(
         episodes |= {f"stats/{name}/{statistic}": [part[statistic] for part in parts] for statistic in parts[0]}
     episodes |= {f"meta/episodes/{name}": np.zeros(len(lengths), np.int64) for name in ("chunk_index", "file_index")}
     _write_table(folder / "meta" / "episodes" / _file_name(0), pa.table(episodes))
-    _write_table(folder / "meta" / "tasks.parquet", _tasks_table())
+    # The index of pandas is the text of the one task.
+    index = {"metadata": None, "field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
+    column = dict.fromkeys(("field_name", "name"), "task_index") | dict.fromkeys(("pandas_type", "numpy_type"), "int64")
+    about = {"index_columns": ["task"], "column_indexes": [], "columns": [{"metadata": None} | column, index]}
+    tasks = pa.table({"task_index": pa.array([0], pa.int64()), "task": [TASK]})
+    tasks = tasks.replace_schema_metadata({"pandas": json.dumps(about | {"pandas_version": "2.0.0"})})
+    _write_table(folder / "meta" / "tasks.parquet", tasks)
     write_json(folder / "meta" / "info.json", _info(columns, names, lengths, fps))
     write_json(folder / "meta" / "stats.json", {name: _statistics(values) for name, values in columns.items()})
 
@@ -173,13 +177,6 @@ def _file_name(number: int) -> str:
     return _FILE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
 
 
-def _to_arrow(values: _Column) -> "pa.Array":
-    import pyarrow as pa
-
-    flat = pa.array(values.ravel())
-    return flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-
-
 def _write_table(path: Path, table: "pa.Table", starts: Sequence[int] = (0,), ends: Sequence[int] = ()) -> None:
     """Write a Parquet file with a row group from each start to its end, or one of all rows."""
     from pyarrow import parquet
@@ -188,23 +185,6 @@ def _write_table(path: Path, table: "pa.Table", starts: Sequence[int] = (0,), en
     with parquet.ParquetWriter(path, table.schema, compression="snappy") as writer:
         for start, end in zip(starts, ends or (len(table),), strict=True):
             writer.write_table(table.slice(start, end - start))
-
-
-def _tasks_table() -> "pa.Table":
-    """Return the table of the one task; its text is the index of pandas."""
-    import pyarrow as pa
-
-    column = {
-        "metadata": None,
-        "field_name": "task_index",
-        "name": "task_index",
-        "pandas_type": "int64",
-        "numpy_type": "int64",
-    }
-    index = {"metadata": None, "field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
-    about = {"index_columns": ["task"], "column_indexes": [], "columns": [column, index], "pandas_version": "2.0.0"}
-    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [TASK]})
-    return table.replace_schema_metadata({"pandas": json.dumps(about)})
 
 
 def _statistics(values: _Column) -> dict[str, Any]:

@@ -33,13 +33,7 @@ METADATA = "metadata.yaml"
 
 
 class RawMessages(NamedTuple):
-    """Messages of a topic as they are serialized, in the order of the file.
-
-    Attributes:
-        msgtype: their type, as "std_msgs/msg/Bool".
-        stamps: log time of each, ns.
-        messages: CDR of each.
-    """
+    """Messages of a topic in the order of the file: their type, and the log time (ns) and CDR of each."""
 
     msgtype: str
     stamps: list[int]
@@ -58,15 +52,8 @@ def load_typestore(purpose: str) -> "Typestore":
 def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> tuple[dict[str, RawMessages], dict[str, str]]:
     """Read messages of a bag: an .mcap or .db3 file, or a folder of such with METADATA.
 
-    Args:
-        path: file or folder.
-        is_wanted: whether messages of a topic of this name are asked for.
-
     Returns:
-        The topics asked for that have messages, and the types of all topics, both by name.
-
-    Raises:
-        InputError: nothing there, another kind of file, one that is cut off or damaged, or more than is allowed.
+        The topics asked for (by `is_wanted` of their names) that have messages, and the types of all, by name.
     """
     topics, types, n_messages, n_bytes = dict[str, RawMessages](), dict[str, str](), 0, 0
     for file in _storage_files(path):
@@ -227,17 +214,9 @@ def write_mcap(
     messages: Iterable[tuple[str, int, memoryview]],
     latched: str,
 ) -> Path:
-    """Write messages as a rosbag2 folder.
+    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return the .mcap file that holds them.
 
-    Args:
-        folder: to make.
-        store: definitions of the types.
-        topics: type and description of each topic.
-        messages: topic, stamp in ns and CDR of each message.
-        latched: topic whose last message those get that come later.
-
-    Returns:
-        The .mcap file in the folder, which holds everything.
+    Topics have a type and a description. The last message of the `latched` one is for those that come later.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
 

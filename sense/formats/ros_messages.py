@@ -46,13 +46,7 @@ _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
 
 
 class TopicType(NamedTuple):
-    """What a topic holds.
-
-    Attributes:
-        msgtype: type of its messages.
-        description: what it means, in the metadata of the bag.
-        paths: attributes that hold its numbers.
-    """
+    """Type of the messages of a topic, what they mean, and the attributes that hold their numbers."""
 
     msgtype: str
     description: str
@@ -95,12 +89,7 @@ TOPICS = {
 
 
 class TopicSeries(NamedTuple):
-    """Numbers of a topic.
-
-    Attributes:
-        stamps: (n,) ns, ascending.
-        values: (n, k), in the order of the paths.
-    """
+    """Numbers of a topic: stamps (n,), ns, ascending, and values (n, k), in the order of the paths."""
 
     stamps: Indices
     values: Array
@@ -111,11 +100,7 @@ class TopicSeries(NamedTuple):
 
 
 def choose_epoch(times_s: Array) -> float:
-    """Return the time that stamps count from: 0, unless they cannot hold the (n,) times as they are.
-
-    Raises:
-        InputError: the times last longer than stamps can count.
-    """
+    """Return the time that stamps count from: 0, unless they cannot hold the (n,) times as they are."""
     if times_s[-1] - times_s[0] >= _MAX_STAMP_S - 2:
         raise InputError(f"recording lasts {times_s[-1] - times_s[0]:g} s, allowed in a bag are {_MAX_STAMP_S - 2}")
     return 0.0 if times_s[0] >= 0 and times_s[-1] < _MAX_STAMP_S - 1 else float(np.floor(times_s[0]))
@@ -212,22 +197,8 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
     return encoded
 
 
-def encode_text(store: "Typestore", text: str) -> memoryview:
-    """Serialize the message of RECORDING."""
-    return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
-
-
 def decode(store: "Typestore", raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
-    """Return the numbers of messages in the order of their stamps.
-
-    Args:
-        store: definitions of the types.
-        raw: messages of a type that has numbers at the paths.
-        paths: attributes that hold a number or an array of numbers.
-
-    Raises:
-        InputError: messages that are damaged, have no numbers, or a different number of them.
-    """
+    """Return the numbers at the paths, attributes of the messages, in the order of stamps; refuse damaged messages."""
     from rosbags.serde import SerdeError
 
     getters, rows, width = [attrgetter(path) for path in paths], bytearray(), 0
@@ -278,17 +249,8 @@ def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:
     return store.types[msgtype](**({name: zero(node) for name, node in store.fielddefs[msgtype][1]} | fields))
 
 
-def to_text(recording: Recording, epoch_s: float, topics: Iterable[str]) -> str:
-    """Return the text of RECORDING.
-
-    Args:
-        recording: whose exact numbers it holds.
-        epoch_s: time that stamps count from.
-        topics: that the bag has, for a description of each.
-
-    Raises:
-        InputError: the text is too long to be read back.
-    """
+def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, topics: Iterable[str]) -> memoryview:
+    """Serialize the message of RECORDING, with a description of each topic of the bag."""
     arrays = {name: getattr(recording, name) for name in (*_NUMBERS, *_INDICES)}
     document = {
         "format": FORMAT,
@@ -304,7 +266,7 @@ def to_text(recording: Recording, epoch_s: float, topics: Iterable[str]) -> str:
             f"recording is too long for a bag: {len(text)} characters of times, presses and source, "
             f"allowed are {MAX_TEXT}, with {MAX_TEXT_PARTS} brackets and quotes"
         )
-    return text
+    return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
 
 
 def _is_readable(text: str) -> bool:
@@ -329,17 +291,7 @@ def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None
 def encode_health(
     store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
 ) -> tuple[Indices, list[memoryview]]:
-    """Return HEALTH: the state of all fibres at the first reading, and whenever a fault was named.
-
-    Args:
-        store: definitions of the types.
-        recording: that the model was applied to.
-        annotations: with faults.
-        stamps: (R,) of the readings, ns.
-
-    Returns:
-        (n,) stamps, and as many messages.
-    """
+    """Return HEALTH, (n,) stamps and messages: all fibres at the first reading, and whenever a fault was named."""
     faults = dict.fromkeys(annotations.dead, ("dead", "was dead in the recording that health was learnt from"))
     health_stamps, messages = [int(stamps[0])], [_health_message(store, recording.fibres, faults, int(stamps[0]))]
     ends = stamps_at(stamps, recording.up_command)
@@ -357,15 +309,7 @@ def _health_message(store: "Typestore", fibres: int, faults: Mapping[int, tuple[
     for fibre in range(fibres):
         kind, text = faults.get(fibre, ("", "sound"))
         values = [_empty(store, "diagnostic_msgs/msg/KeyValue", key="fault", value=kind)] if kind else []
-        message.status.append(
-            _empty(
-                store,
-                "diagnostic_msgs/msg/DiagnosticStatus",
-                level=2 if kind else 0,  # ERROR or OK
-                name=f"pad: fibre {fibre + 1}",
-                message=text,
-                hardware_id="pad",
-                values=values,
-            )
-        )
+        level, name = (2 if kind else 0), f"pad: fibre {fibre + 1}"  # ERROR or OK
+        about = {"level": level, "name": name, "message": text, "hardware_id": "pad", "values": values}
+        message.status.append(_empty(store, "diagnostic_msgs/msg/DiagnosticStatus", **about))
     return store.serialize_cdr(message, TOPICS[HEALTH].msgtype)

@@ -24,17 +24,11 @@ from padforge.sense.formats.columns import (
     join_names,
     match_columns,
     matches,
+    naming_file,
     parse_columns,
 )
 from padforge.sense.formats.hdf5_mat import NOTE
-from padforge.sense.formats.ros_bag import (
-    MAX_BYTES,
-    MAX_MESSAGES,
-    RawMessages,
-    load_typestore,
-    read_bag,
-    write_mcap,
-)
+from padforge.sense.formats.ros_bag import MAX_BYTES, MAX_MESSAGES, RawMessages, load_typestore, read_bag, write_mcap
 from padforge.sense.formats.ros_messages import (
     ARM,
     FORCE,
@@ -53,10 +47,9 @@ from padforge.sense.formats.ros_messages import (
     decode_text,
     encode,
     encode_health,
-    encode_text,
+    encode_recording,
     from_text,
     stamps_at,
-    to_text,
     to_topics,
     touches,
 )
@@ -68,12 +61,8 @@ if TYPE_CHECKING:
 
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
-_SCALARS = {
-    f"std_msgs/msg/{name}": ("data",)
-    for name in (
-        "Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64",
-    )
-}  # fmt: skip
+_NUMBERS = ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
+_SCALARS = {f"std_msgs/msg/{name}": ("data",) for name in _NUMBERS}
 _ARRAYS = {f"{msgtype}MultiArray": paths for msgtype, paths in _SCALARS.items()}
 _POSITIONS = {
     f"geometry_msgs/msg/{name}": (f"{prefix}x", f"{prefix}y")
@@ -109,10 +98,6 @@ def import_bag(path: str | Path, columns: str = "") -> Recording:
         columns: topics of each quantity, as `fibres=/skin/readings,positions=/probe,force=/wrench`; times are those at
             which messages were logged, a press or position holds until the next message, and positions without a unit
             are m. Without it, the bag is one that `export_bag` wrote.
-
-    Raises:
-        InputError: rosbags is not installed; no bag, one that is cut off or damaged, or beyond the limits of `ros_bag`;
-            or messages that do not fit together.
     """
     path, columns = check_import(path, columns)
     store = load_typestore(f"{path}: a bag of ROS 2")
@@ -130,7 +115,7 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
             f"there are {join_names(list(types))}"
         )
     source = {"kind": "ros", "file": path.name}
-    try:
+    with naming_file(path):
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {TOPICS[name].msgtype}")
@@ -140,8 +125,6 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
                 return recording
             source[NOTE] = f"was changed since it was exported; {RECORDING} is left out"
         arrays = _to_arrays(topics)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     return assemble_recording(path, arrays, source)
 
 
@@ -211,7 +194,7 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
     raw, types = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
     names = list(types)
-    try:
+    with naming_file(path):
         series = [
             (entry, _decode_entry(store, entry, names[i], raw))
             for entry, indices in match_columns(entries, names)
@@ -230,8 +213,6 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
                 values = np.linalg.norm(values, axis=1, keepdims=True)
             values = values if entry.quantity in ("fibres", "positions") else values[:, 0]
             arrays.append((entry, _hold(topic.stamps, values, clock)))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns})
 
 
@@ -242,10 +223,8 @@ def _decode_entry(store: "Typestore", entry: ColumnEntry, name: str, raw: Mappin
         raise InputError(f"{what}, which has no messages")
     if raw[name].msgtype not in types:
         raise InputError(f"{what} of {short_repr(raw[name].msgtype)}, expected {', '.join(types)}")
-    try:
+    with naming_file(what):
         return decode(store, raw[name], types[raw[name].msgtype])
-    except InputError as error:
-        raise InputError(f"{what}: {error}") from error
 
 
 def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:
@@ -268,10 +247,6 @@ def export_bag(
         path: of the file.
         annotations: of a model, for the topics of touches and health.
         states: (n, 10) of an arm, by `STATE_COLUMNS`; its poses become a topic.
-
-    Raises:
-        InputError: rosbags is not installed, the path cannot be written, the recording is too long for a bag, or an
-            argument is of another kind.
     """
     path = check_export(recording, path, annotations)
     if states is not None:
@@ -290,7 +265,7 @@ def export_bag(
     if annotations is not None and annotations.faults is not None:
         stamps[HEALTH], messages[HEALTH] = encode_health(store, recording, annotations, stamps[READINGS])
     stamps[RECORDING] = stamps[READINGS][:1]
-    messages = {RECORDING: [encode_text(store, to_text(recording, epoch_s, messages))], **messages}
+    messages = {RECORDING: [encode_recording(store, recording, epoch_s, messages)], **messages}
     _check_readable(messages)
     types = {topic: (TOPICS[topic].msgtype, TOPICS[topic].description) for topic in messages}
     in_order = merge(

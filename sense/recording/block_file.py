@@ -7,7 +7,6 @@ torn last block, which is cut off by readers; damage before an intact block has 
 
 import os
 import re
-import struct
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -17,22 +16,16 @@ from numpy.typing import NDArray
 
 from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError
-from padforge.sense.arrays import MAX_BYTES, MAX_FIBRES, Array, Mask
+from padforge.sense.arrays import MAX_BYTES, MAX_FIBRES, Array
 
 _MAGIC = b"PFB1"
 _UNIT = 256
 _COUNT_OFFSET, _CRC_OFFSET = 16, 20
-_COUNT = struct.Struct("<I")
 _HEADER = 24
 
 
 def open_in_place(path: Path) -> BinaryIO:
-    """Open an existing file for reading and writing in place, unbuffered, without following a symbolic link.
-
-    Raises:
-        InputError: it is a symbolic link.
-        OSError: it cannot be opened.
-    """
+    """Open an existing file for reading and writing in place, unbuffered, without following a symbolic link."""
     file = path.open("r+b", buffering=0)
     if not os.path.samestat(os.fstat(file.fileno()), path.lstat()):
         file.close()
@@ -45,26 +38,17 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
     row = 8 * (1 + fibres)
     size = -(-(_HEADER + 4 * row) // _UNIT) * _UNIT
     rows = (size - _HEADER) // row
-    return np.dtype(
-        {
-            "names": ["magic", "sequence", "first", "count", "crc", "rows"],
-            "formats": ["S4", "<u4", "<u8", "<u4", "<u4", ("<f8", (rows, 1 + fibres))],
-            "offsets": [0, 4, 8, _COUNT_OFFSET, _CRC_OFFSET, _HEADER],
-            "itemsize": size,
-        }
-    )
+    names = ["magic", "sequence", "first", "count", "crc", "rows"]
+    formats = ["S4", "<u4", "<u8", "<u4", "<u4", ("<f8", (rows, 1 + fibres))]
+    offsets = [0, 4, 8, _COUNT_OFFSET, _CRC_OFFSET, _HEADER]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
 
 
 class BlockWriter:
     """Appends rows to an open file: full blocks at once, the remaining rows at `flush`.
 
-    A write that fails adds nothing, and the next one overwrites what it left.
-
-    Args:
-        file: open for writing in place.
-        fibres: C.
-        blocks: that the file has already.
-        rows: that the file has already.
+    A write that fails adds nothing, and the next one overwrites what it left. `blocks` and `rows` count what the file,
+    open for writing in place, has already.
     """
 
     def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:
@@ -78,18 +62,11 @@ class BlockWriter:
 
     @classmethod
     def resume(cls, path: Path, fibres: int) -> tuple["BlockWriter", BinaryIO, Array]:
-        """Continue a file; its torn tail is cut off.
-
-        Returns:
-            The writer, the open file it appends to, and the (R, 1 + C) rows of the file.
-
-        Raises:
-            InputError: as `read_blocks`, or it is a link.
-        """
+        """Cut off the torn tail of a file; return a writer, the open file, and the (R, 1 + C) rows that it has."""
         rows, _ = read_blocks(path, fibres)
         dtype = block_dtype(fibres)
         file = open_in_place(path)
-        blocks = int(np.argmin(np.append(_is_intact(_blocks(file.read(), dtype)), False)))
+        blocks = len(_intact_blocks(file.read(), dtype))
         file.seek(blocks * dtype.itemsize)
         file.truncate()
         return cls(file, fibres, blocks, len(rows)), file, rows
@@ -132,18 +109,11 @@ def write_at(file: BinaryIO, position: int, data: bytes) -> None:
 
 
 def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
-    """Read all intact rows of a file.
-
-    Returns:
-        (R, 1 + C) rows, and whether a torn tail follows them.
-
-    Raises:
-        InputError: the file is missing, of another number of fibres, or a block is damaged although intact ones follow.
-    """
+    """Return all intact rows (R, 1 + C) of a file, and whether a torn tail follows them; refuse other damage."""
     dtype = block_dtype(fibres)
     content = read_bytes(path, MAX_BYTES)
-    blocks = _blocks(content, dtype)
-    end = int(np.argmin(np.append(_is_intact(blocks), False)))
+    blocks = _intact_blocks(content, dtype)
+    end = len(blocks)
     tail = content[end * dtype.itemsize :]
     if _has_block(tail, dtype):
         raise InputError(
@@ -152,26 +122,22 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
         )
     if _begins_with_block(tail):  # a writer that died does not leave it
         raise InputError(f"{path}: block {end} is whole, but not of {fibres} fibres, as the recording says it is")
-    blocks = blocks[:end]
     valid = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
     return blocks["rows"][valid], bool(tail)
 
 
-def _blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """Return the content as blocks, intact or not."""
-    return np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
-
-
-def _is_intact(blocks: NDArray[np.void]) -> Mask:
-    """Return (B,) whether each block has its magic and checksum, and is where it was written."""
+def _intact_blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """Return the blocks before the first without its magic and checksum, or that was written elsewhere."""
+    blocks = np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
     counts = blocks["count"].astype(np.int64)
-    return (
+    is_intact = (
         (blocks["magic"] == _MAGIC)
         & (blocks["crc"] == _checksums(blocks))
         & (blocks["sequence"] == np.arange(len(blocks)))
         & (blocks["first"] == np.cumsum(counts) - counts)
-        & (counts <= blocks.dtype["rows"].shape[0])
+        & (counts <= dtype["rows"].shape[0])
     )
+    return blocks[: int(np.argmin(np.append(is_intact, False)))]
 
 
 def _begins_with_block(content: bytes) -> bool:
@@ -191,7 +157,7 @@ def _has_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
     """Whether the content has an intact block at any offset."""
     for match in re.finditer(re.escape(_MAGIC), content[: max(len(content) - dtype.itemsize + len(_MAGIC), 0)]):
         start = match.start()
-        (count,) = _COUNT.unpack_from(content, start + _COUNT_OFFSET)
+        count = int.from_bytes(content[start + _COUNT_OFFSET : start + _CRC_OFFSET], "little")
         if count > dtype["rows"].shape[0]:  # quick, in a file full of magic words
             continue
         block = np.frombuffer(content, dtype, count=1, offset=start)

@@ -25,19 +25,7 @@ _BATCH, _MAX_LINE = 2**23, 2**20  # characters that are read at a time, and of a
 
 
 class CsvTable:
-    """A CSV file whose header has been read.
-
-    Args:
-        path: of the file.
-        skip_empty: whether empty lines between others are skipped; else they are lines without values.
-
-    Attributes:
-        path: of the file.
-        names: header of each column, stripped.
-
-    Raises:
-        InputError: the file cannot be read, or is no CSV.
-    """
+    """A CSV file whose header, `names`, has been read; with `skip_empty`, empty lines between others are skipped."""
 
     def __init__(self, path: Path, skip_empty: bool = False) -> None:
         self.path, self._skip_empty = check_file(path, MAX_BYTES), skip_empty
@@ -48,18 +36,7 @@ class CsvTable:
         self._skipped: list[int] = []
 
     def read_columns(self, columns: Sequence[int], may_be_unknown: Sequence[int] = ()) -> Array:
-        """Read columns as numbers.
-
-        Args:
-            columns: indices.
-            may_be_unknown: those of them whose cells may be `?`, which becomes UNKNOWN.
-
-        Returns:
-            (R, n) in the order of the indices; NaN where a cell is empty.
-
-        Raises:
-            InputError: a line of more or fewer cells, one without a number there, or more than MAX_VALUES in all.
-        """
+        """Return columns by their indices (R, n), NaN where a cell is empty; `?` is UNKNOWN where it is allowed."""
         parts, size = [np.empty((0, len(columns)))], 0
         self._skipped = []
         with _open_csv(self.path) as file:

@@ -31,9 +31,6 @@ class PressPlan:
     Attributes:
         positions_mm: (Q, 2) from the pad's centre.
         depths_mm: (Q,) below the pad's surface, > 0.
-
-    Raises:
-        InputError: shapes that do not fit together, no press, or values that are not finite or beyond all pads.
     """
 
     positions_mm: Array
@@ -72,17 +69,12 @@ class PressPlan:
 
 
 def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -> PadSettings:
-    """Return `[pad]`, or the default, for the layout of a pad: what is pressed of it, and what is kept out.
-
-    Raises:
-        InputError: presses beyond this pad, or keep-outs that leave less than MIN_PRESSABLE of the sensed area.
-    """
+    """Return `[pad]`, or the default, for the layout of a pad; keep-outs must leave MIN_PRESSABLE of what is sensed."""
     pad_settings = or_default("size", pad_settings, PadSettings).for_layout(pad.layout)
     if pad_settings.keep_out_mm:
         import shapely
 
-        (left, low), (right, high) = pad_settings.sensed
-        sensed = shapely.box(left, low, right, high)
+        sensed = shapely.box(*np.ravel(pad_settings.sensed))
         share = sensed.difference(shapely.union_all(keep_outs(pad_settings))).area / sensed.area
         if share < MIN_PRESSABLE:
             raise InputError(f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {MIN_PRESSABLE:.0%}")
@@ -124,9 +116,6 @@ def make_plan_in(
         rig: plan, file, presses and depths.
         rng: of random positions.
         is_pressable: which positions may be pressed.
-
-    Raises:
-        InputError: as `read_plan`, or a position of the file that may not be pressed.
     """
     if rig.plan_file is not None:
         return check_pressable(read_plan(rig.plan_file, rig.depth_mm), rig.plan_file, is_pressable)
@@ -158,7 +147,12 @@ def _grid(corners_mm: Array, count: int, serpentine: bool) -> tuple[Array, Indic
     """Return at least `count` positions (Q, 2) of a grid row by row, and the index of the depth of each (Q,)."""
     low, high = corners_mm
     width, height = (high - low).tolist()
-    n_columns, n_rows = _grid_shape(width, height, count)
+    if width == height:
+        n_columns = n_rows = int(np.ceil(np.sqrt(count)))
+    else:  # one step along both axes: (1 + width / step) (1 + height / step) = count
+        per_mm = 2 * (count - 1) / (width + height + np.sqrt((width + height) ** 2 + 4 * width * height * (count - 1)))
+        n_rows = round(1 + per_mm * height)
+        n_columns = -(-count // n_rows)
     x = np.linspace(low[0], high[0], n_columns) if n_columns > 1 else corners_mm[:, 0].mean(keepdims=True)
     y = np.linspace(low[1], high[1], n_rows) if n_rows > 1 else corners_mm[:, 1].mean(keepdims=True)
     columns = np.tile(np.arange(n_columns), (n_rows, 1))
@@ -166,17 +160,6 @@ def _grid(corners_mm: Array, count: int, serpentine: bool) -> tuple[Array, Indic
         columns[1::2] = columns[1::2, ::-1]
     positions = np.column_stack([x[columns.ravel()], np.repeat(y, n_columns)])
     return positions, (columns + np.arange(n_rows)[:, None]).ravel()
-
-
-def _grid_shape(width: float, height: float, count: int) -> tuple[int, int]:
-    """Return the columns and rows of a grid of at least `count` positions with about one step along both axes."""
-    if width == height:
-        side = int(np.ceil(np.sqrt(count)))
-        return side, side
-    # (1 + width / step) (1 + height / step) = count
-    per_mm = 2 * (count - 1) / (width + height + np.sqrt((width + height) ** 2 + 4 * width * height * (count - 1)))
-    n_rows = round(1 + per_mm * height)
-    return -(-count // n_rows), n_rows
 
 
 def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> PressPlan:
@@ -193,11 +176,7 @@ def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> 
 
 
 def read_plan(path: Path, depth_mm: float) -> PressPlan:
-    """Read a plan from a CSV file with the columns x_mm, y_mm and, unless all are `depth_mm` deep, depth_mm.
-
-    Raises:
-        InputError: no such CSV file; the message names the line.
-    """
+    """Read a plan from a CSV file with the columns x_mm, y_mm and, unless all are `depth_mm` deep, depth_mm."""
     table = CsvTable(path, skip_empty=True)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(table.names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")

@@ -45,9 +45,8 @@ from padforge.sense.recording.run_directory import (
     read_journal,
 )
 
-_ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64) | dict.fromkeys(
-    ("down_command", "up_command"), np.int64
-)
+_ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64)
+_ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
@@ -66,11 +65,6 @@ class Recording:
         depths_mm: (Q,) commanded depth below the surface, mm, > 0; NaN where unknown.
         reached_mm: (Q,) depth that the arm measured while it held the press, mm; NaN where unknown.
         forces_n: (Q,) force on the probe meanwhile, N, >= 0; NaN where unknown.
-
-    Raises:
-        InputError: no numbers, shapes that do not fit together, infinite values or beyond the limits of `arrays`, no
-            reading at all, one of x and y, times that do not ascend, presses that overlap, one without a reading before
-            it, depths or forces below 0, or a source that JSON cannot hold.
     """
 
     readings: Array
@@ -151,17 +145,10 @@ class Recording:
     def open(cls, path: str | Path) -> "Recording":
         """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
 
-        A torn end of the readings is cut off, with the presses in it.
-
-        Args:
-            path: of the folder.
-
-        Raises:
-            InputError: no run directory, a file damaged elsewhere than at its end, or no press in it.
+        A torn end of the readings is cut off, with the presses in it; other damage raises InputError.
         """
         path = check_path("path", path)
-        fibres = read_fibres(path)
-        rows, _ = read_blocks(path / READINGS, fibres)
+        rows, _ = read_blocks(path / READINGS, read_fibres(path))
         done = read_journal(path / JOURNAL)
         presses = [press for press in done.values() if press.up_command <= len(rows)]
         table = np.array(presses, dtype=np.float64).reshape(-1, len(Press._fields))
@@ -187,11 +174,8 @@ class Recording:
         Args:
             path: of the folder.
             provenance: of the recording; JSON.
-            replacing: whether an existing simulated recording is replaced, see `check_replaceable`.
-
-        Raises:
-            InputError: the path exists and is not an empty folder (no other recording is written over, not even one
-                that appeared meanwhile), or cannot be written.
+            replacing: whether an existing simulated recording is replaced, see `check_replaceable`; no other one is
+                ever written over, not even one that appeared meanwhile.
         """
         check_target = check_replaceable if check_type("replacing", replacing, bool) else check_new_folder
         check_target(path := check_path("path", path))

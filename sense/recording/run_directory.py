@@ -56,11 +56,7 @@ class Press(NamedTuple):
 
 
 def read_journal(path: Path) -> dict[int, Press]:
-    """Return the presses that are done by their numbers, ascending; one that was repeated counts as begun last.
-
-    Raises:
-        InputError: the file is missing, or a line other than a torn last one is no entry.
-    """
+    """Return the presses that are done by their numbers, ascending; one that was repeated counts as begun last."""
     try:
         text = read_bytes(path).decode()
     except UnicodeDecodeError as error:
@@ -134,24 +130,16 @@ class Recorder:
         provenance: of the recording; JSON.
 
     Attributes:
-        fibres: C.
         done: numbers of the presses that are done.
         n_readings: number of readings so far.
         last_s: time of the last reading or state, s; -inf without any.
-
-    Raises:
-        InputError: the folder holds something, see `check_new_recording`, or cannot be written, or too few or many
-            fibres.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
         fibres, path = check_int("fibres", fibres, 1, MAX_FIBRES), check_path("path", path)
-        document = {
-            "format": FORMAT,
-            "fibres": fibres,
-            "source": dict(check_mapping("source", source)),
-            "provenance": dict(check_mapping("provenance", provenance)),
-        }
+        document: dict[str, Any] = {"format": FORMAT, "fibres": fibres}
+        for key, value in (("source", source), ("provenance", provenance)):
+            document[key] = dict(check_mapping(key, value))
         check_new_recording(path)
         with reraise_write_error(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -183,11 +171,7 @@ class Recorder:
 
     @classmethod
     def resume(cls, path: Path) -> "Recorder":
-        """Continue an unfinished run directory; torn tails are cut off.
-
-        Raises:
-            InputError: no run directory, damage elsewhere than at its end, links, or presses without any reading.
-        """
+        """Continue an unfinished run directory; torn tails are cut off, and other damage or links refused."""
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
         with reraise_write_error(path):
@@ -198,13 +182,18 @@ class Recorder:
             try:
                 lock(self._journal, busy_message(path))
                 journal = read_journal(path / JOURNAL)
-                _check_readings(path, fibres, len(journal))
+                times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
+                if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
+                    # No break leaves that, so nothing may be cut off.
+                    what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
+                    raise InputError(f"{path / READINGS}: not {what}")
                 blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
                 raise
-            _cut_torn_line(path / JOURNAL)
-            self._set_state(path, blocks, (path / JOURNAL).stat().st_size)
+            end = (path / JOURNAL).read_bytes().rfind(b"\n") + 1
+            self._journal.truncate(end)  # of a torn line
+            self._set_state(path, blocks, end)
             self._update_last_time(rows)
             if (path / STATES).exists():
                 states, file, state_rows = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
@@ -219,12 +208,7 @@ class Recorder:
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add (n,) times in s and (n, C) volts.
-
-        Raises:
-            InputError: shapes that do not fit, or times that are not finite.
-            OSError: the disk is full or gone; then nothing was added.
-        """
+        """Add (n,) times in s and (n, C) volts; after an OSError (the disk is full or gone) nothing was added."""
         times, volts = check_numbers(times_s, np.float64, "times"), check_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
             raise InputError(
@@ -256,9 +240,6 @@ class Recorder:
             reading: index of the reading that follows.
             press: its number, by default one more than that of the last.
             more: JSON that is added to the entry, such as `depth_mm`.
-
-        Raises:
-            InputError: a position, index or number that no press has, or what JSON cannot hold.
         """
         position = check_numbers(position_mm, np.float64, "position")
         if position.shape != (2,) or not (np.isnan(position).all() or (np.abs(position) <= MAX_MM).all()):
@@ -277,9 +258,6 @@ class Recorder:
         Args:
             reading: index of the reading that follows.
             more: JSON that is added to the entry, such as `at_mm` and `force_n`.
-
-        Raises:
-            InputError: no press was begun, an index that no reading has, or what JSON cannot hold.
         """
         if not self._is_down:
             raise InputError(f"press {self._press} was not begun, so it cannot be finished")
@@ -325,11 +303,7 @@ class Recorder:
 
 
 def read_fibres(path: Path) -> int:
-    """Return the number of fibres of a run directory.
-
-    Raises:
-        InputError: no run directory, or one without it.
-    """
+    """Return the number of fibres of a run directory."""
     if not (path / START).is_file():
         raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
     fibres = read_json(path / START, FORMAT).get("fibres")
@@ -364,24 +338,6 @@ def is_uncommitted(path: Path) -> bool:
 def busy_message(path: Path) -> str:
     """Return the message for a recording that another recorder has locked."""
     return f"{path}: another program is recording into it"
-
-
-def _check_readings(path: Path, fibres: int, n_presses: int) -> None:
-    """Refuse readings that cannot be what a break left: nothing of them may be cut off then."""
-    times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
-    if (n_presses and not len(times_s)) or not (np.diff(times_s) > 0).all():
-        raise InputError(
-            f"{path / READINGS}: not the readings of {n_presses} presses of {fibres} fibres in the journal"
-        )
-
-
-def _cut_torn_line(path: Path) -> None:
-    """Cut off what follows the last complete line of a journal."""
-    content = path.read_bytes()
-    end = content.rfind(b"\n") + 1
-    if end < len(content):
-        with open_in_place(path) as file:
-            file.truncate(end)
 
 
 def _create(path: Path) -> BinaryIO:

@@ -33,12 +33,8 @@ def test_parse_columns_reads_names_and_units() -> None:
         ColumnEntry("fibres", "ü", 1e-6),
         *(ColumnEntry("x", "px", 10), ColumnEntry("y", "py", None), ColumnEntry("press", "contact", None)),
     ]
-    units = [
-        "time=t:min,fibres=c:V,positions=p:um,depth=d:m,force=f:mN",
-        "time=t:us,fibres=c:mV,reached=r:mm,force=f:N",
-    ]
-    factors = [[entry.factor for entry in parse_columns(each)] for each in units]
-    assert factors == [[60, 1, 1e-3, 1000, 1e-3], [1e-6, 1e-3, 1, 1]]
+    factors = [entry.factor for entry in parse_columns("time=t:min,fibres=c:V,positions=p:um,depth=d:m,force=f:mN")]
+    assert factors == [60, 1, 1e-3, 1000, 1e-3]
 
 
 def test_match_columns_by_name_and_pattern() -> None:
@@ -53,23 +49,15 @@ def test_match_columns_by_name_and_pattern() -> None:
     ("mapping", "message"),
     [
         ("", "mapping has '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, fibres, x"),
-        ("time=,fibres=ch*", "mapping has 'time='"),
         ("zeit=t,fibres=ch*", "mapping has 'zeit=t'"),
         ("time=t_ms", "does not name fibres"),
-        ("time=t_ms,time=t_ms,fibres=ch*", "names time twice"),
         ("time=t_ms,fibres=ch*,x=px", "names one of x and y, expected both or neither"),
-        ("time=t_ms,fibres=ch*,up_command=px", "names one of down_command and up_command"),
         ("time=t_ms,fibres=ch*,x=px,y=py,positions=contact", "names x and positions, expected one of them"),
-        ("time=t_ms,fibres=ch*,press=contact,down_command=px,up_command=py", "names press and down_command"),
         ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, min or a factor"),
-        ("time=t_ms:0,fibres=ch*", "unit of time is '0'"),
         ("time=t_ms:nan,fibres=ch*", "unit of time is 'nan'"),
-        ("time=t_ms:,fibres=ch*", "unit of time is ''"),
         ("time=t_ms,fibres=ch*,press=contact:2", "unit of press is '2', allowed is none"),
         ("time=t,fibres=ch*", r"time is 't', expected one of 't_ms', 'Time \[s\]', 'ch1'"),
-        ("time=?*,fibres=ch*", "time is '..', which may be each of"),
         ("time=ch1,fibres=ch1", "fibres is 'ch1', which is named before"),
-        ("time=a\nb,fibres=ch*", "time is 'a.nb', expected one of"),
         ("time=" + "t" * 20_000, "mapping has 20005 characters"),
     ],
 )
@@ -132,7 +120,7 @@ def test_assemble_recording_accepts_fibres_as_rows_or_columns() -> None:
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
 
 
-def test_assemble_recording_converts_units() -> None:
+def test_assemble_recording_converts_units_and_allows_for_rounded_times() -> None:
     arrays = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "positions": POSITIONS / 10}
     commands = {"down_command": np.array([150, 601]), "up_command": np.array([500, 801])}
     milli = dict.fromkeys(("time", "fibres", "down_command", "up_command"), 1e-3)
@@ -140,9 +128,6 @@ def test_assemble_recording_converts_units() -> None:
     expected = assembled(COMMANDS | {"positions": POSITIONS})
     for name in ("times_s", "readings", "presses_mm", "down_command", "up_command"):
         np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
-
-
-def test_assemble_recording_allows_for_rounded_times_of_commands() -> None:
     times, down = 0.0751879 * np.arange(4000), np.arange(20, 3900, 40)
     arrays = {"time": times, "fibres": np.ones((4000, 1)), "positions": np.zeros((len(down), 2))}
     commands = {"down_command": 1000 * times[down], "up_command": 1000 * times[down + 20]}
@@ -169,22 +154,12 @@ def test_assemble_recording_detects_presses_in_the_readings(recording: Recording
     ("arrays", "message"),
     [
         ({"time": np.ones((3, 4))}, r"time has shape \(3, 4\), expected one row or column"),
-        ({"time": np.array(["a", "b"])}, "time are"),
         ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), as time has it"),
-        ({"press": PRESSED[:11]}, "press has 11 values, expected 12, one a reading"),
         ({"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))}, "press is missing or negative in row 11 and 0"),
-        ({"press": 0 * PRESSED}, "press is nowhere above 0; without it, presses are detected"),
         ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
         ({"press": np.array([0, 0, 1, 1, 2, 2, 0, 0, 0, 0, 0, 0])}, "press 1 goes from reading 4"),
-        (COMMANDS | {"up_command": np.array([5])}, "down_command has 2 values and up_command 1"),
         (COMMANDS | {"down_command": np.array([2.5, 7])}, "down_command are .* whole numbers"),
         (COMMANDS | {"positions": np.ones((3, 2))}, "positions are 3, expected one for each of 2 presses or 12"),
-        (COMMANDS | {"positions": np.ones((2, 2, 2))}, r"positions have shape \(2, 2, 2\)"),
-        (COMMANDS | {"x": np.ones(2), "y": np.ones(3)}, "x has 2 values and y 3"),
-        (
-            {"positions": np.where(np.arange(24).reshape(12, 2) == 6, 1.0, np.nan)},
-            "positions have one of x and y in row 3",
-        ),
         ({}, "has no press"),
     ],
 )

@@ -45,12 +45,12 @@ def damages(draw: st.DrawFn) -> Callable[[bytes], bytes]:
     steps = draw(st.lists(step, min_size=1, max_size=3))
 
     def damaged(content: bytes) -> bytes:
-        content = bytearray(content)
+        changed = bytearray(content)
         for kind, share, piece in steps:
-            at = int(share**2 * len(content))
-            end = (at + len(piece), len(content), at, at + 16)[kind]
-            content[at:end] = piece if kind in (0, 2) else b""
-        return bytes(content)
+            at = int(share**2 * len(changed))
+            end = (at + len(piece), len(changed), at, at + 16)[kind]
+            changed[at:end] = piece if kind in (0, 2) else b""
+        return bytes(changed)
 
     return damaged
 

@@ -61,14 +61,10 @@ def test_import_hdf5_refuses_other_files(tmp_path: Path, eight: Recording) -> No
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"times_s": None}, "times_s"),
         ({"times_s": "group"}, "times_s is no dataset"),
         ({"times_s": h5py.Empty("f8")}, "times_s holds None values"),
-        ({"readings_v": "text"}, "readings_v holds object values, expected an array of real numbers"),
-        ({"down_command": np.array([20.5])}, "down_command are .*whole numbers"),
         ({"readings_v": (10**6, 10**6, 100)}, "readings_v holds 1000000000000 values, allowed are 268435456"),
         ({"readings_v": (2**24, 1, 2**20)}, "readings_v claims 134217728 bytes of float64 in [0-9]+ of the file"),
-        ({"readings_v": (2**29, 1, 2**20)}, "readings_v holds 536870912 values, allowed are 268435456 in all"),
     ],
 )
 def test_import_hdf5_refuses_datasets_that_do_not_fit_or_claim_much(

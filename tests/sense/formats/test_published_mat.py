@@ -42,11 +42,8 @@ def published_content() -> dict[str, np.ndarray]:
     [
         (120, 3, 3, None),
         (111, 3, 2, "the last of 3 presses is left out, with 31 of 40 readings"),
-        (81, 3, 2, "the last of 3 presses is left out, with 1 of 40 readings"),
         (80, 3, 2, "the last of 3 presses is left out, with 0 of 40 readings"),
         (100, 2, 2, "the last 20 readings belong to no press"),
-        (120, 1, 1, "the last 80 readings belong to no press"),
-        (40, 1, 1, None),
     ],
 )
 def test_import_mat_notes_incomplete_presses(
@@ -106,14 +103,9 @@ def test_import_mat_by_columns(tmp_path: Path) -> None:
         ("tim", None, r"has no variable tim \(found pos, voltage\)"),
         ("voltage", np.ones((79, 4)), r"voltage has shape \(79, 4\), expected 40 rows for each of the 3 presses"),
         ("voltage", np.ones((120, 4)) * 1j, "is complex, expected a full matrix of real numbers"),
-        ("voltage", np.array(["a", "b"], dtype=object), "is a cell array, expected a full matrix"),
-        ("voltage", np.ones((39, 4)), r"voltage has shape \(39, 4\), expected at least 40 rows"),
         ("voltage", scipy.sparse.csc_matrix(np.ones((120, 4))), "voltage is a sparse matrix, expected a full matrix"),
-        ("voltage", {"volts": 1.0}, "is a structure, expected a full matrix"),
         ("pos", np.ones((1, 3)), r"pos has shape \(1, 3\), expected \(2, presses\)"),
-        ("pos", np.ones((2, 0)), "pos has shape"),
         ("pos", np.ones((2, 5)), "each of the 5 presses of pos, 200 in all; only the last may be cut off"),
-        ("tim", np.where(np.arange(120) == 7, 6, np.arange(120)), "times do not ascend at reading 7"),
     ],
 )
 def test_import_mat_refuses_variables_that_do_not_fit(tmp_path: Path, name: str, value: Any, message: str) -> None:
@@ -126,31 +118,21 @@ def test_import_mat_refuses_variables_that_do_not_fit(tmp_path: Path, name: str,
 
 def test_import_mat_accepts_any_types_gaps_and_no_positions(tmp_path: Path) -> None:
     content = published_content()
-    volts = content["voltage"]
-    holed = volts.copy()
-    holed[:, 1] = 3.3
-    holed[:, 2] = np.nan
-    holed[50:55] = np.nan
-    uneven = np.cumsum(np.random.default_rng(1).exponential(0.07, 120))[None]
+    holed = content["voltage"].astype(np.float32)
+    holed[:, 2] = holed[50:55] = np.nan
     for change in (
-        {"voltage": np.rint(volts * 1000 / 5).astype(np.uint16)},
-        {"voltage": volts.astype(np.float32)},
-        {"voltage": holed},
-        {"tim": uneven},
-        {"tim": content["tim"].T},
-        {"pos": content["pos"].T},
+        {"voltage": np.rint(content["voltage"] * 200).astype(np.uint16)},
+        {"voltage": holed, "tim": content["tim"].T, "pos": content["pos"].T},
     ):
         scipy.io.savemat(tmp_path / "r.mat", content | change)
         recording = import_mat(tmp_path / "r.mat")
         assert np.array_equal(recording.readings, (content | change)["voltage"], equal_nan=True)
         assert np.array_equal(recording.times_s, (content | change)["tim"].ravel())
         assert np.array_equal(recording.presses_mm, content["pos"].T)
-    content = published_content()
     scipy.io.savemat(tmp_path / "blind.mat", {name: content[name] for name in ("voltage", "tim")})
     blind = import_mat(tmp_path / "blind.mat")
     assert not blind.has_position.any()
     assert blind.down_command.tolist() == [20, 60, 100]
-    pos = np.array(content["pos"], dtype=float)
-    pos[:, 1] = np.nan
-    scipy.io.savemat(tmp_path / "partly.mat", content | {"pos": pos})
+    content["pos"][:, 1] = np.nan
+    scipy.io.savemat(tmp_path / "partly.mat", content)
     assert import_mat(tmp_path / "partly.mat").has_position.tolist() == [True, False, True]

@@ -69,14 +69,10 @@ def test_import_bag_refuses_chunks_that_lie(tmp_path: Path) -> None:
     for name, made, reason in (
         ("compression", chunk(content, "brotli"), "Unsupported chunk compression 'brotli'"),
         ("checksum", chunk(content, "", checksum=1), "checksum mismatch"),
-        ("short", chunk(content[:-9]), "cut off or damaged"),
         ("noise", chunk(b"no such thing", "zstd", 50), "cut off or damaged"),
-        ("noise4", chunk(b"no such thing", "lz4", 50), "cut off or damaged"),
         ("record", record(6, b"short"), "cut off or damaged"),
         ("json", channel(1, "/f", FLOATS, "json"), "is written as 'json', expected 'cdr'"),
         ("twice", channel(1, "/f", FLOATS) + channel(2, "/f", "std_msgs/msg/Bool"), "and of 'std_msgs/msg/Bool'"),
-        ("letters", record(3, struct.pack("<H", 1) + struct.pack("<I", 2) + b"\xff\xfe"), "cut off or damaged"),
-        ("long", record(3, bytes(2) + struct.pack("<I", 2**31)), "cut off or damaged"),
     ):
         assert reason in refusal_of(mcap_file(tmp_path / f"{name}.mcap", [made]))
 
@@ -102,11 +98,9 @@ def cdr(*parts: bytes) -> bytes:
         (cdr(struct.pack("<III", 0, 0, 2**32 - 1), bytes(8)), "message 0 of .* is damaged"),
         (cdr(struct.pack("<I", 2**32 - 1), bytes(400)), "is damaged"),
         (cdr(struct.pack("<I", 10**5), bytes(2**20)), "1048584 bytes, allowed are 65536"),
-        (cdr(struct.pack("<II", 1, 2**31)), "is damaged"),
         (b"\0\7\0\0" + bytes(20), "is damaged .*CDR encapsulation"),
         (cdr(struct.pack("<III", 0, 0, 1), bytes(4), struct.pack("<d", np.inf)), "readings hold infinity"),
         (cdr(struct.pack("<III", 0, 0, 600), bytes(4), bytes(4800)), r"expected \(R, C\), R >= 2, C = 1 to 512"),
-        (b"", "is damaged"),
         (cdr(bytes(3)), "is damaged"),
     ],
 )
@@ -137,11 +131,9 @@ def test_import_bag_refuses_stamps_and_counts_beyond_the_limits(
 
 
 DOCUMENTS = {
-    "null": "null",
     "deep": "[" * 10**5,
     "wide": "[" + "[]," * 2**22 + "[]]",
     "bare": '{"format": "padforge-ros/2"}',
-    "zero": "\x00",
     "wrong": json.dumps(
         {"format": "padforge-ros/2", "digest": "", "epoch_s": float("nan"), "source": {}, "times_s": [1e400]}
         | {key: [{}] for key in ("presses_mm", "depths_mm", "down_command", "up_command")}

@@ -34,11 +34,10 @@ def test_plan_round_trip_and_from_file(tmp_path):
 
 def test_make_plan_of_grids_row_by_row():
     line = [-22.5, 0.0, 22.5]
-    rows = [(x, y) for y in line for x in line]
-    assert plan_of(presses=9, plan="grid").positions_mm.tolist() == [list(position) for position in rows]
-    assert plan_of(presses=8, plan="grid").positions_mm.tolist() == [list(position) for position in rows[:8]]
+    rows = [[x, y] for y in line for x in line]
+    assert plan_of(presses=8, plan="grid").positions_mm.tolist() == rows[:8]
     serpentine = [*rows[:3], *rows[5:2:-1], *rows[6:]]
-    assert plan_of(presses=9, plan="serpentine").positions_mm.tolist() == [list(position) for position in serpentine]
+    assert plan_of(presses=9, plan="serpentine").positions_mm.tolist() == serpentine
     assert plan_of(presses=1, plan="grid").positions_mm.tolist() == [[0, 0]]
     uniform = plan_of(presses=2000).positions_mm
     assert np.abs(uniform).max() > 22.4
@@ -110,9 +109,7 @@ def test_make_plan_depths_do_not_depend_on_the_position(plan, presses):
     ("rows", "message"),
     [
         ([[0, 0, 1e-3], [0, 0, 0.0]], "press 1 has depth"),
-        ([[0, 0, -1.0]], "press 0 has depth"),
         ([[0, 0]], "shape"),
-        ([[0, 1e6, 1]], "positions of the plan hold 1e.06 mm"),
         (np.empty((0, 3)), "Q > 0"),
     ],
 )
@@ -125,12 +122,9 @@ def test_press_plan_refuses_invalid_rows(rows, message: str) -> None:
 @pytest.mark.parametrize(
     ("content", "line"),
     [
-        ("", "header"),
         ("x,y\n1,2\n", "header"),
         ("x_mm,y_mm\n1,two\n", "line 2"),
         ("x_mm,y_mm\n1,2\n1\n", "line 3"),
-        ("x_mm,y_mm\n", "shape"),
-        ("x_mm,y_mm\n1,nan\n", "NaN"),
         ("x_mm,y_mm,depth_mm\n1,2,-1\n", "depth -1 mm"),
     ],
 )

@@ -55,17 +55,12 @@ def test_save_refuses_existing_and_unwritable_paths(recording: Recording, folder
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        *(({"fibres": fibres}, "fibres is") for fibres in (None, 0, "6", 1e3, True, 513)),
-        *(({"source": source}, "source is .*expected a mapping") for source in ([1], "simulated", None, 3)),
-        ({"format": "padforge-recording/1"}, "format"),
-    ],
+    "change", [{"fibres": True}, {"fibres": 513}, {"source": [1]}, {"source": None}, {"format": "padforge-recording/1"}]
 )
-def test_open_refuses_other_values_in_the_start_document(folder: Path, change: dict[str, object], message: str) -> None:
+def test_open_refuses_other_values_in_the_start_document(folder: Path, change: dict[str, object]) -> None:
     document = json.loads((folder / "start.json").read_text())
     (folder / "start.json").write_text(json.dumps(document | change))
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=f"{next(iter(change))} is"):
         Recording.open(folder)
 
 
@@ -73,20 +68,16 @@ def test_open_while_recording(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     readings = rng.standard_normal((30, 3))
     recorder = Recorder(tmp_path / "live", 3, {}, {})
-    for i in range(30):
-        recorder.append([float(i)], readings[i : i + 1])
-        if i == 9:
-            recorder.begin((1.5, -2.5), i + 1)
-        if i == 19:
-            recorder.finish(i + 1)
-            recorder.sync()
-        if i == 25:
-            recorder.begin((3.0, 4.0), i + 1)
-            recorder.sync()
+    recorder.append(np.arange(20.0), readings[:20])
+    recorder.begin((1.5, -2.5), 10)
+    recorder.finish(20)
+    recorder.append(np.arange(20.0, 26.0), readings[20:26])
+    recorder.begin((3.0, 4.0), 26)
+    recorder.sync()
+    recorder.append(np.arange(26.0, 30.0), readings[26:])
     opened = Recording.open(tmp_path / "live")
     recorder.__exit__(None, None, None)
-    assert np.array_equal(opened.readings, readings[: len(opened.readings)])
-    assert len(opened.readings) == 26
+    assert np.array_equal(opened.readings, readings[:26])
     assert opened.presses_mm.tolist() == [[1.5, -2.5]]
     assert (opened.down_command.tolist(), opened.up_command.tolist()) == ([10], [20])
 
@@ -102,35 +93,16 @@ def with_value(array: np.ndarray, index: Any, value: float) -> np.ndarray:
     [
         (lambda r: {"readings": with_value(r.readings, (7, 0), np.inf)}, r"readings hold infinity.*row 7"),
         (lambda r: {"readings": np.full_like(r.readings, np.nan)}, "readings are all missing"),
-        (lambda r: {"presses_mm": with_value(r.presses_mm, (3, 1), np.inf)}, r"presses hold infinity.*row 3"),
         (lambda r: {"presses_mm": with_value(r.presses_mm, (3, 1), np.nan)}, "press 3 has one of x and y"),
         (lambda r: {"times_s": with_value(r.times_s, 9, 0.0)}, "do not ascend at reading 9"),
-        (lambda r: {"times_s": r.times_s[:-1]}, r"times have shape"),
-        (lambda r: {"readings": r.readings[:, :0]}, r"readings have shape"),
         (lambda r: {"presses_mm": r.presses_mm[:0]}, "at least one press"),
         (lambda r: {"down_command": with_value(r.down_command, 2, 70)}, "press 2 goes from"),
-        (lambda r: {"down_command": with_value(r.down_command, 0, 0)}, "press 0 goes from reading 0"),
         (lambda r: {"up_command": with_value(r.up_command, -1, len(r.readings) + 1)}, "press 299 goes from"),
-        (
-            lambda r: {"times_s": with_value(r.times_s, 11, np.nan)},
-            r"times hold NaN or infinity \(first in row 11\), exp",
-        ),
         (lambda r: {"depths_mm": [1.0, 2.0]}, r"depths_mm have shape \(2,\), expected \(300,\)"),
-        (lambda r: {"depths_mm": np.full(300, 0.0)}, "depths_mm of press 0 is 0 mm, allowed is more than 0"),
         (lambda r: {"forces_n": np.full(300, -1.0)}, "forces_n of press 0 is -1 N, allowed is 0 or more"),
-        (lambda r: {"reached_mm": np.full(300, 1e6)}, "reached_mm hold 1e.06 mm"),
         (lambda r: {"readings": with_value(r.readings, (7, 0), -1e30)}, r"readings hold -1e\+30 V \(first in row 7\)"),
-        (lambda r: {"times_s": with_value(r.times_s, -1, 1e30)}, r"times hold 1e\+30 s .*allowed"),
-        (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e-300}, "times give .* readings a second, allowed"),
         (lambda r: {"times_s": np.arange(len(r.times_s)) * 1e5}, "times give 1e-05 readings a second, allowed"),
         (lambda r: {"readings": [[1.0], [1.0, 2.0]]}, "readings are .*expected an array of real numbers"),
-        (lambda r: {"readings": r.readings + 1j}, "readings are .*complex128"),
-        (
-            lambda r: {"up_command": with_value(r.up_command.astype(float), -1, 2.0**53 + 2)},
-            "up_command are .*whole numbers up to",
-        ),
-        (lambda r: {"times_s": None}, "times_s are None"),
-        (lambda r: {"source": "a rig"}, "source is 'a rig', expected a mapping"),
         (lambda r: {"source": {"gain": np.nan}}, "source is .*expected what JSON can hold"),
     ],
 )
@@ -154,9 +126,8 @@ def test_equality_and_digest_treat_all_nan_alike(recording: Recording) -> None:
 
 def test_recording_accepts_limits_and_uneven_times(recording: Recording, tmp_path: Path) -> None:
     assert replace(recording, down_command=recording.down_command.astype(float)) == recording
-    for name, index, most in (("readings", (7, 0), 1e3), ("presses_mm", (3, 1), 1e5), ("times_s", -1, 1e10)):
-        for value in {most, -most if name != "times_s" else most}:
-            assert getattr(replace(recording, **{name: with_value(getattr(recording, name), index, value)}), name).size
+    for name, index, most in (("readings", (7, 0), -1e3), ("presses_mm", (3, 1), 1e5), ("times_s", -1, 1e10)):
+        assert getattr(replace(recording, **{name: with_value(getattr(recording, name), index, most)}), name).size
     uneven = np.cumsum(np.random.default_rng(0).exponential(0.07, len(recording.times_s)))
     assert replace(recording, times_s=uneven).rate_hz == pytest.approx(1 / 0.07 / np.log(2), rel=0.1)
     least = Recording(np.ones((2, 1)), np.arange(2.0), np.full((1, 2), np.nan), np.array([1]), np.array([2]))

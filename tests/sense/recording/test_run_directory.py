@@ -7,6 +7,7 @@ import shutil
 import signal
 import time
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -59,16 +60,6 @@ def check_as_recorded(recording):
         assert x == -y
         assert (recording.readings[down_command:up_command] == x + 0.5).all()
     assert (np.diff(recording.times_s) > 0).all()
-
-
-def test_resume_leaves_a_finished_recording_as_it_is(tmp_path):
-    path = record_presses(tmp_path)
-    before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
-    with Recorder.resume(path) as recorder:
-        assert recorder.done == set(range(5))
-        assert recorder.n_readings == 100
-        assert recorder.last_s == pytest.approx(9.9)
-    assert {name: (path / name).read_bytes() for name in before} == before
 
 
 @settings(max_examples=15)
@@ -183,17 +174,6 @@ def test_abort_repeats_the_press(tmp_path):
     assert len(Recording.open(tmp_path / "run").presses_mm) == 4
 
 
-@pytest.mark.parametrize("name", [READINGS, JOURNAL])
-def test_resume_refuses_damage_in_the_middle(tmp_path, name):
-    path = record_presses(tmp_path)
-    content = bytearray((path / name).read_bytes())
-    content[len(content) // 3] ^= 0xFF
-    (path / name).write_bytes(bytes(content))
-    with pytest.raises(InputError, match=name):
-        Recorder.resume(path)
-    assert (path / name).read_bytes() == bytes(content)
-
-
 def test_resume_aborts_presses_without_their_readings(tmp_path):
     """The journal says they are done; once other readings fill the gap, it must not say so any more."""
     path = record_presses(tmp_path)
@@ -213,13 +193,14 @@ def test_resume_aborts_presses_without_their_readings(tmp_path):
 
 def test_recorder_locks_the_folder(tmp_path):
     path = record_presses(tmp_path)
+    before = {name: (path / name).read_bytes() for name in (READINGS, STATES, JOURNAL)}
     with Recorder.resume(path) as first:
-        before = (path / READINGS).read_bytes()
+        assert (first.done, first.n_readings, first.last_s) == (set(range(5)), 100, pytest.approx(9.9))
         with pytest.raises(InputError, match="another program is recording"):
             Recorder.resume(path)
         with pytest.raises(InputError, match="never written over"):
             Recorder(path, FIBRES, {}, {})
-        assert (path / READINGS).read_bytes() == before
+        assert {name: (path / name).read_bytes() for name in before} == before
         record(first, range(5, 7), 10.0)
     assert len(Recording.open(path).down_command) == 7
 
@@ -247,15 +228,11 @@ def test_recorder_on_a_full_disk_cleans_up_and_hides_no_error(tmp_path, monkeypa
     ("call", "message"),
     [
         (lambda r: r.append([0.0], [[1.0, 2.0]]), r"expected \(n,\) finite numbers and \(n, 3\)"),
-        (lambda r: r.append([0.0, 1.0], [[1.0, 2.0, 3.0]]), "times have shape"),
         (lambda r: r.append([np.nan], [[1.0, 2.0, 3.0]]), "finite numbers"),
         (lambda r: r.finish(100), "press 5 was not begun"),
         (lambda r: r.begin((1.0, np.nan), 100), "position is .*, expected x and y up to"),
-        (lambda r: r.begin((1e6, 0.0), 100), "position is"),
         (lambda r: r.begin((0.0, 0.0), -1), "reading is -1"),
-        (lambda r: r.begin((0.0, 0.0), 100, press=-1), "press is -1"),
         (lambda r: r.begin((0.0, 0.0), 100, depth_mm=np.nan), "expected what JSON can hold"),
-        (lambda r: r.begin((0.0, 0.0), 100, tip=object()), "expected what JSON can hold"),
     ],
 )
 def test_recorder_refuses_arguments_and_writes_nothing(tmp_path, call, message):
@@ -383,17 +360,13 @@ def test_open_drops_presses_of_torn_and_repeated_entries(recording: Recording, f
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        *(('"reading": 20,', f'"reading": {value},') for value in ("1e30", "20.0", "true", '"20"', "-1", "NaN")),
-        *(('"press": 0,', f'"press": {value},') for value in ("0.0", "false", '"0"', "null", "9" * 30)),
-        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "1e6", "true", '"2"')),
-        ('"event": "started", ', ""),
+        *(('"reading": 20,', f'"reading": {value},') for value in ("20.0", "true", "-1", "NaN")),
+        *(('"press": 0,', f'"press": {value},') for value in ("null", "9" * 30)),
+        *(('"x_mm": ', f'"x_mm": {value}, "was": ') for value in ("1e999", "true")),
         ('"event": "started"', '"event": "began"'),
         ('{"event"', "[" * 100_000 + '{"event"'),
         ('{"event"', '3\n{"event"'),
-        *(
-            ('"event": "done",', f'"event": "done", {more},')
-            for more in ('"at_mm": 3', '"at_mm": [1, 2]', '"at_mm": [1, 2, "3"]', '"force_n": true')
-        ),
+        *(('"event": "done",', f'"event": "done", {more},') for more in ('"at_mm": [1, 2]', '"force_n": true')),
     ],
 )
 def test_read_journal_refuses_other_values(folder: Path, old: str, new: str) -> None:
@@ -418,35 +391,37 @@ def test_read_journal_reads_depth_and_force(recording: Recording, folder: Path) 
     assert read.digest == recording.digest
 
 
-@pytest.mark.parametrize("name", ["journal.ndjson", "readings.bin"])
-def test_resume_refuses_links(folder: Path, tmp_path: Path, name: str) -> None:
-    elsewhere = (folder / name).rename(tmp_path / "elsewhere")
+def link(path: Path) -> None:
+    elsewhere = path.rename(path.parent.parent / "elsewhere")
     elsewhere.write_bytes(elsewhere.read_bytes() + b"torn")
-    (folder / name).symlink_to(elsewhere)
-    before = {path: path.read_bytes() for path in (*folder.iterdir(), elsewhere)}
-    with pytest.raises(InputError, match=rf"{name}: is a link"):
-        Recorder.resume(folder)
-    assert {path: path.read_bytes() for path in before} == before
+    path.symlink_to(elsewhere)
 
 
-def test_resume_refuses_presses_without_any_reading(folder: Path) -> None:
-    """No break leaves that: the readings are elsewhere, or not copied yet."""
-    (folder / "readings.bin").write_bytes(b"")
-    before = (folder / "journal.ndjson").read_bytes()
-    with pytest.raises(InputError, match=r"readings\.bin: not the readings of \d+ presses"):
-        Recorder.resume(folder)
-    assert (folder / "journal.ndjson").read_bytes() == before
+def damage(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    path.write_bytes(bytes(content))
 
 
-@pytest.mark.parametrize("fibres", [1, 2, 3, 5, 6, 7, 11])
-def test_resume_refuses_readings_of_other_fibres(folder: Path, fibres: int) -> None:
-    """Blocks of one size hold any of several numbers of fibres."""
-    start = folder / "start.json"
-    document = json.loads(start.read_text())
-    assert document["fibres"] == 4
-    start.write_text(json.dumps(document | {"fibres": fibres}))
+def set_fibres(path: Path, fibres: int) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fibres": fibres}))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        *((name, link, f"{name}: is a link") for name in (JOURNAL, READINGS)),
+        *((name, damage, name) for name in (JOURNAL, READINGS)),
+        # Blocks of one size hold any of several numbers of fibres.
+        *((START, partial(set_fibres, fibres=fibres), r"readings\.bin: .* of \d+ fibres") for fibres in (3, 5, 11)),
+        # No break leaves presses without any reading.
+        (READINGS, lambda path: path.write_bytes(b""), r"readings\.bin: not the readings of \d+ presses"),
+    ],
+)
+def test_resume_refuses_damage_and_changes_nothing(folder: Path, name: str, change, message: str) -> None:
+    change(folder / name)
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(InputError, match=r"readings\.bin: .* of \d+ fibres"):
+    with pytest.raises(InputError, match=message):
         Recorder.resume(folder)
     assert {path: path.read_bytes() for path in before} == before
 
