@@ -33,13 +33,9 @@ def exported(
     return path, export_onnx(localizer, DIGEST, path, recording)
 
 
-def open_graph(path: Path) -> onnxruntime.InferenceSession:
-    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-
-
 @pytest.fixture
 def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
-    return open_graph(exported[0])
+    return onnxruntime.InferenceSession(exported[0])
 
 
 def inputs_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
@@ -86,7 +82,7 @@ def test_graph_has_all_kinds_of_features(features: str, brief: Recording, tmp_pa
 def test_graph_gives_depth_and_force(deep_localizer, deep_recording, tmp_path) -> None:
     export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", deep_recording)
     presses = deep_localizer.scaled_features(deep_recording)
-    expected, graph = deep_localizer.predict_features(presses), open_graph(tmp_path / "l.onnx")
+    expected, graph = deep_localizer.predict_features(presses), onnxruntime.InferenceSession(tmp_path / "l.onnx")
     names = [each.name for each in graph.get_outputs()][4:]
     assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
     values = graph.run(names, inputs_of(deep_recording, presses.fibre_mask))
