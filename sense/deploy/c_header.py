@@ -134,7 +134,6 @@ def render_header(student: StudentNetwork, budget: MemoryBudget, about: Sequence
 
 
 def _tables(student: StudentNetwork) -> dict[str, Any]:
-    """Return the constant arrays by name."""
     model, of = student.model, student.model.scaler
     units = [of.scale_mm] * 3 + [measure.scale for measure in of.measures]
     tables: dict[str, Any] = {
@@ -155,7 +154,6 @@ def _tables(student: StudentNetwork) -> dict[str, Any]:
 
 
 def _numbers(table: Array | Floats) -> str:
-    """Write an array as rows of C."""
     texts = map(str if table.dtype.kind == "i" else _float, table.ravel().tolist())
     return fill(", ".join(texts), LINE, initial_indent="  ", subsequent_indent="  ")
 

@@ -13,16 +13,7 @@ import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.deploy.streaming import (
-    N_LAYERS,
-    MemoryBudget,
-    StreamedPresses,
-    ThresholdDetector,
-    commanded_features,
-    match_presses,
-    max_hidden,
-    stream_presses,
-)
+from padforge.sense.deploy import streaming
 from padforge.sense.localizer.calibration import (
     CALIBRATION_SHARE,
     calibrate_intervals,
@@ -39,10 +30,8 @@ from padforge.sense.localizer.scaler import FeatureScaler
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-TEACHER_WEIGHT = 0.5
-"""Weight of the teacher's predictions in the targets."""
-EPOCHS_FACTOR = 4
-"""A student is trained so much longer than a localizer: it has no Bayesian localizer, and its steps are short."""
+TEACHER_WEIGHT = 0.5  # of the teacher's predictions in the targets
+EPOCHS_FACTOR = 4  # by which its training is longer than a localizer's: it has no Bayesian one, and its steps are short
 MAX_INT8 = 127
 
 Measures = dict[str, Array]
@@ -61,7 +50,7 @@ class StudentNetwork:
     """What `localizer.h` holds."""
 
     model: LocalizerModel  # one member, of the features of `stream_presses`; int8 weights are dequantized in it
-    detector: ThresholdDetector
+    detector: streaming.ThresholdDetector
     quantized: bool  # to int8
 
     @property
@@ -71,10 +60,10 @@ class StudentNetwork:
 
     def predict(
         self, readings: Array, pressed: Mask | None = None, failed: tuple[int, ...] = ()
-    ) -> tuple[StreamedPresses, Localization]:
+    ) -> tuple[streaming.StreamedPresses, Localization]:
         """Detect and localize presses as `localizer.h` does; `pressed` (R,) is None for the detector to decide."""
         fibre_mask = ~np.isin(np.arange(self.model.fibres), failed)
-        presses = stream_presses(readings, self.detector, pressed, fibre_mask)
+        presses = streaming.stream_presses(readings, self.detector, pressed, fibre_mask)
         scaled = self.model.scaler.transform(presses.features)
         return presses, self.model.predict_features(replace(scaled, fibre_mask=scaled.fibre_mask & fibre_mask))
 
@@ -129,7 +118,7 @@ def distill(
     recording: Recording,
     teacher: LocalizerModel,
     training: Indices,
-    budget: MemoryBudget,
+    budget: streaming.MemoryBudget,
     options: LocalizerSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudentNetwork:
@@ -143,21 +132,22 @@ def distill(
     from padforge.sense.localizer.training import train_members
 
     rng = np.random.default_rng(options.seed)
-    detector = ThresholdDetector.fit(recording, training)
+    detector = streaming.ThresholdDetector.fit(recording, training)
     shares = split_presses(len(training), options.split, CALIBRATION_SHARE["ensemble"], rng, min_training=2)
     training, calibration = (training[share] for share in shares)
     n_measures, n_levels = len(teacher.scaler.measures), len(teacher.interval_factors)
-    hidden = max_hidden(teacher.fibres, n_measures, n_levels, budget)
-    commanded, detected = commanded_features(recording), stream_presses(recording.readings, detector)
-    press = match_presses(recording, detected.down_command)
+    hidden = streaming.max_hidden(teacher.fibres, n_measures, n_levels, budget)
+    commanded = streaming.commanded_features(recording)
+    detected = streaming.stream_presses(recording.readings, detector)
+    press = streaming.match_presses(recording, detected.down_command)
     matched = np.flatnonzero(np.isin(press, training))
     features = commanded[training] + detected.features[matched]
     positions_mm, measures = _distillation_targets(recording, teacher, np.concatenate([training, press[matched]]))
     scaler, table = FeatureScaler.fit(features, positions_mm, measures)
-    size = {"members": 1, "hidden": hidden, "layers": N_LAYERS, "max_failures": n_levels - 1}
+    size = {"members": 1, "hidden": hidden, "layers": streaming.N_LAYERS, "max_failures": n_levels - 1}
     # `train_members` lengthens the training of other features by a factor of its own.
     length = {"epochs": EPOCHS_FACTOR * options.epochs, "features": "press_and_release"}
-    options = options.model_copy(update={**size, **length})
+    options = options.model_copy(update=size | length)
     presses = scaler.training_presses(features, positions_mm, measures)
     with one_torch_thread():
         weights = train_members(presses, table, options, rng, on_progress).weights
@@ -214,7 +204,7 @@ def evaluate_student(
         next press; "detected_mean_mm": mean error of those detected, None if there are none.
     """
     positions_mm, model = recording.presses_mm[test], student.model
-    compared = {"header": (model, model.scaler.transform(commanded_features(recording)[test]))}
+    compared = {"header": (model, model.scaler.transform(streaming.commanded_features(recording)[test]))}
     compared |= {each.features: (each, each.scaled_features(recording)[test]) for each in references}
     levels = range(len(model.interval_factors))
     errors = {
@@ -222,7 +212,7 @@ def evaluate_student(
         for name, (each, features) in compared.items()
     }
     presses, prediction = student.predict(recording.readings)
-    press = match_presses(recording, presses.down_command)
+    press = streaming.match_presses(recording, presses.down_command)
     detected = np.flatnonzero(np.isin(press, test))
     distance = distances(prediction.positions_mm[detected], recording.presses_mm[press[detected]])
     return {
