@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
-from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
+from padforge.design.common.validation import InputError, check_float
+from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
@@ -137,17 +137,18 @@ class Live:
     def __init__(
         self, localizers: Sequence[LocalizerModel], health: HealthModel | None, fibres: int, rate_hz: float
     ) -> None:
-        fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
         rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        if not isinstance(localizers, Sequence) or not localizers:
-            raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
+        if not localizers:
+            raise InputError("there are no localizers, expected at least one")
         for model in localizers:
-            check_same_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
+            check_same_pad(model, "the localizer", fibres, rate_hz)
         self._monitor = None if health is None else FaultMonitor(health)
         if health is not None:
             check_same_pad(health, "health", fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda model: FEATURES[model.features].readings_needed[::-1])
-        self._response_v = _typical_response(self._localizers[-1])
+        scaler, n_windows = self._localizers[-1].scaler, FEATURES[self._localizers[-1].features].n_windows
+        response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
+        self._response_v = np.where(response_v > 0, response_v, 1.0)  # that a press goes up to
         self._detector = PressDetector(fibres)
         self._buffer = RingBuffer(1 + fibres)  # times, then volts
         self._press: BufferedPress | None = None
@@ -299,10 +300,3 @@ class Live:
         faults = self._monitor.update(readings[first:], down_command - first, up_command - first)
         self.faults += faults
         return faults
-
-
-def _typical_response(localizer: LocalizerModel) -> Array:
-    """(C,) V that the response of each fibre to a press goes up to."""
-    scaler, n_windows = localizer.scaler, FEATURES[localizer.features].n_windows
-    response = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
-    return np.where(response > 0, response, 1.0)

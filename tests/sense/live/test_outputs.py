@@ -163,13 +163,7 @@ def test_json_lines_sends_nothing_without_the_token() -> None:
             assert json.loads(client.makefile().readline())["topic"] == HEALTH
 
 
-class LongMessage(Message):
-    """A message of 400 kB."""
-
-    text = '"' + "x" * 400_000 + '"'
-
-    def to_json(self, number: int) -> str:
-        return self.text
+LONG = Message(READINGS, {}, {"text": "x" * 400_000})
 
 
 def test_slow_subscriber_is_disconnected_and_delays_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +172,7 @@ def test_slow_subscriber_is_disconnected_and_delays_nobody(monkeypatch: pytest.M
         lines.send(STATES)
         slow = subscribe(stack, lines)
         for _ in range(200):
-            lines.send(LongMessage(READINGS, {}, {}))
+            lines.send(LONG)
         subscribe(stack, lines)
         assert sum(1 for _ in slow) < 200  # the connection ends, though the server does not
 
@@ -189,7 +183,7 @@ def test_queued_messages_still_arrive_at_the_end() -> None:
             lines.send(STATES)
             client, received = subscribe(stack, lines), []
             for _ in range(30):
-                lines.send(LongMessage(READINGS, {}, {}))
+                lines.send(LONG)
             slow = threading.Timer(0.2, lambda: received.extend(client))
             slow.start()
         slow.join(20)
