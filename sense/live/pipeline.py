@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_float
-from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
+from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
+from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
@@ -137,11 +137,12 @@ class Live:
     def __init__(
         self, localizers: Sequence[LocalizerModel], health: HealthModel | None, fibres: int, rate_hz: float
     ) -> None:
+        fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
         rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        if not localizers:
-            raise InputError("there are no localizers, expected at least one")
+        if not isinstance(localizers, Sequence) or not localizers:
+            raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
         for model in localizers:
-            check_same_pad(model, "the localizer", fibres, rate_hz)
+            check_same_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
         self._monitor = None if health is None else FaultMonitor(health)
         if health is not None:
             check_same_pad(health, "health", fibres, rate_hz)
