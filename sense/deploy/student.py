@@ -70,19 +70,13 @@ class StudentNetwork:
     def layers(self) -> dict[str, Layer]:
         """Return the layers in order, by name."""
         weights, layers = self.model.weights, {}
-        names = ["first", *(f"hidden_{number}" for number in range(len(weights["hidden.w"]))), "last"]
-        for name, w, b in zip(
-            names,
-            *(
-                [weights[f"first.{kind}"][0], *weights[f"hidden.{kind}"][:, 0], weights[f"last.{kind}"][0]]
-                for kind in "wb"
-            ),
-            strict=True,
-        ):
-            layers[name] = Layer(w.T, b[0], None)
-            if self.quantized:
-                scale = _int8_scale(w)
-                layers[name] = Layer(np.rint(w / scale).astype(np.int8).T, b[0], scale)
+        pairs = {"first": (weights["first.w"], weights["first.b"])}
+        for number, pair in enumerate(zip(weights["hidden.w"], weights["hidden.b"], strict=True)):
+            pairs[f"hidden_{number}"] = pair
+        pairs["last"] = weights["last.w"], weights["last.b"]
+        for name, ((w,), ((b,),)) in pairs.items():  # of the one member
+            scale = _int8_scale(w) if self.quantized else None
+            layers[name] = Layer(w.T if scale is None else np.rint(w / scale).astype(np.int8).T, b, scale)
         return layers
 
 

@@ -83,8 +83,8 @@ class MessageBuilder:
         status = []
         for number, state in enumerate(states, 1):
             level = _OK if state in ("sound", "unmonitored") else _ERROR
-            status.append({"level": level, "name": f"pad: fibre {number}", "message": state})
-            status[-1] |= {"hardware_id": "pad", "values": []}
+            entry = {"level": level, "name": f"pad: fibre {number}", "message": state, "hardware_id": "pad"}
+            status.append(entry | {"values": []})
         pad: dict[str, Any] = {"event": "health", "time_s": time_s, "states": states}
         if fault is not None:
             pad["fault"] = {**asdict(fault), "text": fault.text}
