@@ -33,19 +33,13 @@ LINE = 118  # characters
 
 @dataclass(frozen=True)
 class HeaderReport:
-    """A written header.
-
-    Attributes:
-        student: in it.
-        table_bytes: of its constant tables.
-        state_bytes: of its state, at most.
-        errors: of the student, see `evaluate_student`, with the numbers of "test_presses" and "training_presses".
-    """
+    """A written header, and the errors of the student in it."""
 
     student: StudentNetwork
     table_bytes: int
     state_bytes: int
-    errors: Mapping[str, Any]
+    errors: Mapping[str, Any]  # see `evaluate_student`
+    n_test: int
 
     def lines(self, budget: MemoryBudget) -> list[str]:
         """Return the report as text, beside the budget that it was made for."""
@@ -57,7 +51,7 @@ class HeaderReport:
         lines = [
             f"{student.hidden} neurons in each of {N_LAYERS + 1} layers, {kind}: {flash}, "
             f"{CODE_BYTES / 1024:g} of them for code; RAM {self.state_bytes / 1024:.1f} KiB of {budget.ram / 1024:.4g}",
-            f"mean error in mm on {errors['test_presses']} presses never trained on",
+            f"mean error in mm on {self.n_test} presses never trained on",
             "failed  sets" + "".join(f" {name:>{width}}" for name in columns),
         ]
         for row in zip(*columns.values(), strict=True):
@@ -65,11 +59,11 @@ class HeaderReport:
             lines.append(f"{row[0]['n_failed']:6d} {row[0]['subsets']:5d}{means}")
         mean_mm = errors["detected_mean_mm"]
         of_detected = "" if mean_mm is None else f"; mean error of these {mean_mm:.2f} mm"
-        return [
-            *lines,
-            f"its own detector detects {errors['n_detected']} of {errors['test_presses']} presses, "
-            f"with {errors['n_false']} false detections{of_detected}",
-        ]
+        lines.append(
+            f"its own detector detects {errors['n_detected']} of {self.n_test} presses, "
+            f"with {errors['n_false']} false detections{of_detected}"
+        )
+        return lines
 
 
 def export_header(
@@ -113,26 +107,21 @@ def export_header(
         student,
         table_bytes(n_fibres, n_measures, n_levels, student.hidden, budget.quantized),
         state_bytes(n_fibres, n_measures, student.hidden),
-        errors | {"test_presses": len(test), "training_presses": len(training)},
+        errors,
+        len(test),
     )
 
 
 def render_header(student: StudentNetwork, budget: MemoryBudget, about: Sequence[str]) -> str:
-    """Render the template.
-
-    Args:
-        student: network and detector.
-        budget: beyond which the header does not compile.
-        about: lines of its first comment.
-    """
+    """Render the template; beyond the budget, the header does not compile. `about` is lines of its first comment."""
     environment = Environment(
         loader=PackageLoader("padforge.sense.deploy", "."), undefined=StrictUndefined, keep_trailing_newline=True
     )
     environment.filters |= {"f": _float, "literal": _literal, "numbers": _numbers}
-    modules = (streaming, network, scaler, localizer_model)
-    constants = {name: value for module in modules for name, value in vars(module).items() if name.isupper()}
+    modules = map(vars, (streaming, network, scaler, localizer_model))
+    constants = {name: value for module in modules for name, value in module.items() if name.isupper()}
     return environment.get_template("localizer.h.j2").render(
-        constants,
+        constants | {"WRAP_AT": WRAP_AT, "WRAP_BY": WRAP_BY},
         about=about,
         budget=budget,
         model=student.model,
@@ -141,13 +130,10 @@ def render_header(student: StudentNetwork, budget: MemoryBudget, about: Sequence
         hidden=student.hidden,
         quantized=student.quantized,
         tables=_tables(student),
-        wrap_at=WRAP_AT,
-        wrap_by=WRAP_BY,
     )
 
 
 def _tables(student: StudentNetwork) -> dict[str, Any]:
-    """Return the constant arrays by name."""
     model, of = student.model, student.model.scaler
     units = [of.scale_mm] * 3 + [measure.scale for measure in of.measures]
     tables: dict[str, Any] = {
@@ -168,7 +154,6 @@ def _tables(student: StudentNetwork) -> dict[str, Any]:
 
 
 def _numbers(table: Array | Floats) -> str:
-    """Write an array as rows of C."""
     texts = map(str if table.dtype.kind == "i" else _float, table.ravel().tolist())
     return fill(", ".join(texts), LINE, initial_indent="  ", subsequent_indent="  ")
 

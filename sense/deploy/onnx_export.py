@@ -1,18 +1,16 @@
 """`localizer.onnx`: the localizer as one graph, from readings and the commands of presses to positions and radii.
 
 The graph is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian localizer with the
-rest of padforge. It is written only if onnxruntime computes from it what the localizer predicts. Of torch's two
-exporters this is the older one (`dynamo=False`), since the other needs onnxscript.
+rest of padforge. It is written only if onnxruntime computes from it what the localizer predicts.
 """
 
 import io
 import json
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import onnx
@@ -25,20 +23,9 @@ from padforge.design.common.files import atomic_file
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
+from padforge.sense.localizer import features
 from padforge.sense.localizer.bayes import BayesianLocalizer
-from padforge.sense.localizer.features import (
-    DOWN,
-    FEATURES,
-    MEDIAN,
-    MEDIAN_OFFSET,
-    PAST,
-    REST,
-    SLOW,
-    SLOW_SAMPLES,
-    Window,
-    compute_features,
-    interpolate_gaps,
-)
+from padforge.sense.localizer.features import Window, compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR
@@ -88,16 +75,12 @@ class _Traceable:
         return torch.exp(x)
 
 
-class FeatureModule(nn.Module):
-    """`compute_features` and `FeatureScaler.transform` in torch.
-
-    Args:
-        model: localizer whose features and scaler these are.
-    """
+class _FeatureModule(nn.Module):
+    """`compute_features` and `FeatureScaler.transform` in torch."""
 
     def __init__(self, model: LocalizerModel) -> None:
         super().__init__()
-        self.kind, scaler = FEATURES[model.features], model.scaler
+        self.kind, scaler = features.FEATURES[model.features], model.scaler
         for name in ("mean_v", "scale_v", "history_coef", "history_mean_v"):
             self.register_buffer(name, torch.from_numpy(getattr(scaler, name)))
 
@@ -112,14 +95,14 @@ class FeatureModule(nn.Module):
             return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)]
 
         if not self.kind.n_history:  # the published running medians
-            half = -(MEDIAN // 2), MEDIAN // 2 + 1
-            before = _median(gather(down_command - MEDIAN_OFFSET, half, previous_end, down_command))
-            within = _median(gather(down_command + MEDIAN_OFFSET, half, down_command, up_command))
-            after = _median(gather(up_command + MEDIAN_OFFSET, half, down_command, next_begin))
+            half = -(features.MEDIAN // 2), features.MEDIAN // 2 + 1
+            before = _median(gather(down_command - features.MEDIAN_OFFSET, half, previous_end, down_command))
+            within = _median(gather(down_command + features.MEDIAN_OFFSET, half, down_command, up_command))
+            after = _median(gather(up_command + features.MEDIAN_OFFSET, half, down_command, next_begin))
             return self._scale(torch.stack([before, within, after], dim=2))
         means = [gather(down_command, each, down_command, up_command).mean(dim=1) for each in self.kind.down]
         means += [gather(up_command, each, down_command, next_begin).mean(dim=1) for each in self.kind.up]
-        rest = gather(down_command, REST, previous_end, down_command).mean(dim=1)
+        rest = gather(down_command, features.REST, previous_end, down_command).mean(dim=1)
         windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(self.kind.phases)))
         history = _history(readings, down_command) - self.history_mean_v
         effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
@@ -147,24 +130,20 @@ def _history(readings: Tensor, down_command: Tensor) -> Tensor:
         end = torch.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + readings[:1]
 
-    means = [mean(window) for window in PAST]
-    for length in SLOW:
-        offsets = torch.arange(-length, 0, length // SLOW_SAMPLES)
+    means = [mean(window) for window in features.PAST]
+    for length in features.SLOW:
+        offsets = torch.arange(-length, 0, length // features.SLOW_SAMPLES)
         means.append(_median(readings[torch.clamp(down_command[:, None] + offsets, min=0)]))
-    return torch.stack(means, dim=2) - mean(REST)[:, :, None]
+    return torch.stack(means, dim=2) - mean(features.REST)[:, :, None]
 
 
-class LocalizerModule(nn.Module):
-    """`LocalizerModel.predict` in torch, from readings and commands to `OUTPUTS`.
-
-    Args:
-        model: localizer of method "ensemble".
-    """
+class _LocalizerModule(nn.Module):
+    """`LocalizerModel.predict` of an ensemble in torch, from `INPUTS` to `OUTPUTS`."""
 
     def __init__(self, model: LocalizerModel) -> None:
         super().__init__()
         scaler = model.scaler
-        self.features, self.members = FeatureModule(model), EnsembleMlp.from_numpy(model.weights)
+        self.features, self.members = _FeatureModule(model), EnsembleMlp.from_numpy(model.weights)
         self.residual = EnsembleMlp.from_numpy(model.residual_network) if model.bayes is not None else None
         if model.bayes is not None:
             for each in fields(model.bayes):  # single precision is exact, and half the size
@@ -174,21 +153,15 @@ class LocalizerModule(nn.Module):
         self.register_buffer("interval_factors", torch.from_numpy(model.interval_factors * units).float())
         self.register_buffer("origin_mm", torch.from_numpy(scaler.origin_mm).float())
 
-    @property
-    def output_names(self) -> list[str]:
-        """Names of the outputs, in order."""
-        return [*list(OUTPUTS)[:4], *(name for measure in self.measures for name in MEASURE_COLUMNS[measure.name])]
-
     def forward(
         self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return the outputs for Q presses, see `INPUTS`."""
-        features = self.features(readings, down_command, up_command)
-        x, _ = network_inputs(features, fibre_mask, None)
+        scaled = self.features(readings, down_command, up_command)
+        x, _ = network_inputs(scaled, fibre_mask, None)
         outputs = self.members(x.expand(self.members.n_members, -1, -1))
         if self.residual is not None:
             bayes = BayesianLocalizer(*(getattr(self, each.name).double() for each in fields(BayesianLocalizer)))
-            position, summary = bayes.predict(features.double(), fibre_mask, _Traceable())
+            position, summary = bayes.predict(scaled.double(), fibre_mask, _Traceable())
             corrected = self.residual(torch.cat([x, summary.float()], dim=1)[None])
             outputs = torch.cat([outputs, corrected + functional.pad(position.float(), (0, 2))])
         targets, std = _combine_members(outputs)
@@ -223,23 +196,16 @@ def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
     return mean, torch.sqrt((weight * (variance + (targets - mean) ** 2)).sum(dim=0))
 
 
-def build_graph(model: LocalizerModel, metadata: Mapping[str, str]) -> onnx.ModelProto:
-    """Export a localizer as a graph for any number of presses and readings.
-
-    Args:
-        model: localizer of method "ensemble".
-        metadata: texts in the file, beside those of inputs and outputs.
-    """
-    module, trial = LocalizerModule(model), _made_up_presses(model)
-    mask = np.ones((N_TRIALS, model.fibres), bool)
-    arguments = tuple(map(torch.from_numpy, (trial.readings, trial.down_command, trial.up_command, mask)))
-    names = module.output_names
+def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
+    """Export a localizer of method "ensemble" as a graph for any number of presses and readings."""
+    arguments = tuple(map(torch.from_numpy, (*_made_up_presses(model), np.ones((N_TRIALS, model.fibres), bool))))
+    names = [*list(OUTPUTS)[:4], *(name for each in model.scaler.measures for name in MEASURE_COLUMNS[each.name])]
     axes = {"readings": {0: "readings"}} | {name: {0: "presses"} for name in [*list(INPUTS)[1:], *names]}
     content = io.BytesIO()
     with warnings.catch_warnings(), one_torch_thread(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter is deprecated, and constants are traced as such
         torch.onnx.export(
-            module,
+            _LocalizerModule(model),
             arguments,
             content,
             input_names=list(INPUTS),
@@ -247,48 +213,44 @@ def build_graph(model: LocalizerModel, metadata: Mapping[str, str]) -> onnx.Mode
             dynamic_axes=axes,
             opset_version=OPSET,
             do_constant_folding=False,  # which would double the size
-            dynamo=False,
+            dynamo=False,  # the other exporter needs onnxscript
         )
     graph = onnx.load_model_from_string(content.getvalue())
     for each in (*graph.graph.input, *graph.graph.output):
         each.doc_string = (INPUTS | OUTPUTS)[each.name]
     graph.producer_name = "padforge"
-    onnx.helper.set_model_props(graph, dict(metadata))
+    metadata = {
+        "format": FORMAT,
+        "padforge": version("padforge"),
+        "localizer_sha256": digest,
+        "training_recording_sha256": model.training_recording_sha256,
+        "features": model.features,
+        "rate_hz": f"{model.rate_hz:.9g}",
+        "fibres": json.dumps([f"fibre_{fibre}_v" for fibre in range(model.fibres)]),
+        "inputs": json.dumps(INPUTS),
+        "outputs": json.dumps({name: OUTPUTS[name] for name in names}),
+    }
+    onnx.helper.set_model_props(graph, metadata)
     return graph
 
 
 @dataclass(frozen=True)
 class OnnxReport:
-    """A written graph, and how it compares with its localizer.
+    """A written graph, and how it compares with its localizer."""
 
-    Attributes:
-        size: bytes of the file.
-        n_presses: that it was tested on.
-        max_failures: fibres that were masked in the tests, at most.
-        position_difference_mm: largest distance of two positions.
-        r90_difference_mm: largest difference of two radii of 90 %.
-    """
-
-    size: int
-    n_presses: int
-    max_failures: int
-    position_difference_mm: float
+    size: int  # bytes of the file
+    n_presses: int  # that it was tested on
+    max_failures: int  # fibres that were masked in the tests, at most
+    position_difference_mm: float  # the largest
     r90_difference_mm: float
 
     @property
     def text(self) -> str:
-        """One line."""
         return (
             f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses with up to {self.max_failures} failed "
             f"fibres: positions within {1e3 * self.position_difference_mm:.2f} µm of the localizer's, "
             f"radii within {1e3 * self.r90_difference_mm:.2f} µm"
         )
-
-
-class _TrialPresses(NamedTuple):
-    readings: Array
-    down_command: Indices
-    up_command: Indices
 
 
 def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recording | None = None) -> OnnxReport:
@@ -301,33 +263,18 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
         recording: whose presses it is tested on; None for made-up ones.
 
     Raises:
-        InputError: the localizer is of the published method, the recording of another pad or rate, or `path` cannot be
-            written.
+        InputError: localizer of the published method, recording of another pad or rate, or `path` cannot be written.
         Fault: positions differ by more than MAX_DIFFERENCE_MM.
     """
     if model.method != "ensemble":
         raise InputError(f"the localizer is of method {model.method}, expected ensemble: calibrate again")
     if recording is not None:
         check_same_pad(model, "the localizer", recording.fibres, recording.rate_hz)
-    names = LocalizerModule(model).output_names
-    document = {name: getattr(model, name) for name in ("training_recording_sha256", "features")}
-    metadata = {
-        "format": FORMAT,
-        "padforge": version("padforge"),
-        "localizer_sha256": digest,
-        **document,
-        "rate_hz": f"{model.rate_hz:.9g}",
-        "fibres": json.dumps([f"fibre_{fibre}_v" for fibre in range(model.fibres)]),
-        "inputs": json.dumps(INPUTS),
-        "outputs": json.dumps({name: OUTPUTS[name] for name in names}),
-    }
-    content = build_graph(model, metadata).SerializeToString()
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    if recording is None:
-        trial = _made_up_presses(model)
+        trial = recording.readings, recording.down_command, recording.up_command
     else:
-        trial = _TrialPresses(recording.readings, recording.down_command, recording.up_command)
-    positions, radii, max_failures = _compare(model, session, trial)
+        trial = _made_up_presses(model)
+    content = _build_graph(model, digest).SerializeToString()
+    positions, radii = _compare(model, content, *trial)
     if not positions <= MAX_DIFFERENCE_MM:
         raise Fault(
             f"{path}: not written, positions by onnxruntime differ by {positions:.2g} mm from those of the localizer, "
@@ -335,35 +282,36 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
         )
     with atomic_file(path) as temporary:
         temporary.write_bytes(content)
-    return OnnxReport(len(content), len(trial.down_command), max_failures, positions, radii)
+    return OnnxReport(len(content), len(trial[1]), len(model.interval_factors) - 1, positions, radii)
 
 
-def _made_up_presses(model: LocalizerModel) -> _TrialPresses:
-    """Return noise with presses as strong as those of the training."""
+def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
+    """Return noise with presses as strong as those of the training, and their commands."""
     rng, scaler = np.random.default_rng(0), model.scaler
     down_command = TRIAL_READINGS // 2 + TRIAL_READINGS * np.arange(N_TRIALS)
-    up_command = down_command + DOWN[-1][1]
+    up_command = down_command + features.DOWN[-1][1]
     readings = 1e-3 * rng.standard_normal(((N_TRIALS + 1) * TRIAL_READINGS, model.fibres))
     response = np.abs(scaler.mean_v).max(axis=1) + scaler.scale_v.max(axis=1)
     for first, end in zip(down_command, up_command, strict=True):
         readings[first:end] += response * rng.uniform(-1, 1, model.fibres)
-    return _TrialPresses(readings, down_command, up_command)
+    return readings, down_command, up_command
 
 
 def _compare(
-    model: LocalizerModel, session: onnxruntime.InferenceSession, trial: _TrialPresses
-) -> tuple[float, float, int]:
-    """Return the largest differences of positions and of radii, mm, and the most failed fibres in the test."""
-    presses = model.scaler.transform(compute_features(*trial, model.features))
-    rng, max_failures = np.random.default_rng(0), len(model.interval_factors) - 1
-    differences = []
-    for n_failed in range(max_failures + 1):
+    model: LocalizerModel, content: bytes, readings: Array, down_command: Indices, up_command: Indices
+) -> tuple[float, float]:
+    """Return the largest differences of positions and of radii, mm."""
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    presses = model.scaler.transform(compute_features(readings, down_command, up_command, model.features))
+    inputs = {"readings": interpolate_gaps(readings), "down_command": down_command, "up_command": up_command}
+    rng, differences = np.random.default_rng(0), []
+    for n_failed in range(len(model.interval_factors)):
         # In every press another random set of fibres is masked.
         fibre_mask = presses.fibre_mask & (rng.random(presses.fibre_mask.shape).argsort(axis=1) >= n_failed)
         expected = model.predict_features(replace(presses, fibre_mask=fibre_mask))
-        arrays = trial._replace(readings=interpolate_gaps(trial.readings))._asdict() | {"fibre_mask": fibre_mask}
-        positions_mm, r90_mm = map(np.asarray, session.run(["positions_mm", "r90_mm"], arrays))
+        outputs = session.run(["positions_mm", "r90_mm"], inputs | {"fibre_mask": fibre_mask})
+        positions_mm, r90_mm = map(np.asarray, outputs)
         distance = np.hypot(*(positions_mm - expected.positions_mm).T)
         differences.append((distance.max(), np.abs(r90_mm - expected.r90_mm).max()))
     positions, radii = np.max(differences, axis=0)
-    return float(positions), float(radii), max_failures
+    return float(positions), float(radii)

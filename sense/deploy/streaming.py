@@ -28,11 +28,9 @@ SETTLING = 3  # readings after a release in which the baseline is the reading, a
 BASELINE_RATE = 0.125  # weight of a new reading in the baseline while the pad is free
 RELEASE_SHARE = 0.5  # of the largest deviation; below it the press has ended
 MAX_PRESS = 1024  # readings; what lasts longer is a new rest
-MAX_V = MAX_VOLTS  # beyond it, a reading counts as missing
 N_REST, PRESS = -REST[0], DOWN[-1][1]  # readings before a press that its rest is the mean of, and readings of it used
-WINDOWS = DOWN
 TIME_CONSTANTS = (2, 4, 8, 16, 32, 64, 128, 512, 2048)  # of the averages, readings
-N_WINDOWS, N_HISTORY = len(WINDOWS), len(TIME_CONSTANTS)
+N_WINDOWS, N_HISTORY = len(DOWN), len(TIME_CONSTANTS)
 RATES = (1 / np.array(TIME_CONSTANTS)).astype(np.float32)  # weight of a new reading in each average
 
 N_LAYERS = 3  # residual layers of a student
@@ -46,15 +44,14 @@ SCORE_TOLERANCE = 2e-3  # a score so much below the best one counts as good
 MIN_NOISE = 0.01  # noise of a fibre, at least, as a share of its response to presses
 
 PRESSED, SUSPECTED, DOWN_COMMAND, UP_COMMAND, PREVIOUS_END, ESTIMATED, TOUCHED = range(7)
-"""State of the pad: whether it is pressed, whether the last reading exceeded the threshold, the readings with which the
-press began and ended and the press before it ended, whether its position is estimated, and the reading at which it was
-detected."""
+"""State of the pad: is it pressed, did the last reading exceed the threshold, the readings with which the press began
+and ended and the press before it ended, is its position estimated, and the reading at which it was detected."""
 
 kernel = njit(cache=True, error_model="numpy", nogil=True)
 
 
 @kernel
-def run_stream(
+def _run_stream(
     readings: Any,
     pressed: Any,
     fibre_mask: Any,
@@ -66,22 +63,10 @@ def run_stream(
     features: Any,
     valid: Any,
 ) -> int:
-    """Process readings in order and compute the features of every press.
+    """Fill `edges` (R, 3), `features` (R, C, K + J) and `valid` (R, C) of every press, and return how many there are.
 
-    Args:
-        readings: (R, C) V, NaN where missing.
-        pressed: (R,) whether the pad is pressed, as known from elsewhere; empty for the detector to decide.
-        fibre_mask: (C,) fibres that the detector uses.
-        rates: (J,) weights of a new reading in the averages.
-        inverse_noise: (C,) 1/V.
-        detector: threshold, and readings from the begin of a press to the first that shows it.
-        windows: (1 + K, 2) the rest before a press, and the windows of it.
-        edges: (R, 3) overwritten: readings with which each press began, was long enough, and ended; R if it has not.
-        features: (R, C, K + J) overwritten: windows and history, V, relative to the rest.
-        valid: (R, C) overwritten: whether the fibre gave enough readings.
-
-    Returns:
-        The number of presses.
+    `pressed` is empty for the detector to decide; `detector` holds its threshold and delay, and `windows` (1 + K, 2)
+    the rest before a press and the windows of it.
     """
     n_readings, n_fibres = readings.shape
     ring = np.zeros((RING, n_fibres), np.float32)
@@ -117,10 +102,10 @@ def run_stream(
 
 @kernel
 def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: Any, rates: Any) -> None:
-    """Store a reading; what is missing or beyond MAX_V repeats the reading before."""
+    """Store a reading; what is missing or beyond MAX_VOLTS repeats the reading before."""
     for c in range(len(row)):
         x = row[c]
-        if not abs(x) <= np.float32(MAX_V):
+        if not abs(x) <= np.float32(MAX_VOLTS):
             missing[c] += 1
             x = ring[(n - 1) % RING, c]
         lagged = ring[(n - LAG) % RING, c]
@@ -136,7 +121,7 @@ def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: 
 
 @kernel
 def _follow(n: int, pressed: bool, pad: Any) -> int:
-    """Return 1 if a press begins with this reading, -1 if it ends, 0 otherwise, as known from elsewhere."""
+    """Return 1 if a press begins with this reading, -1 if it ends, 0 otherwise, by what the caller says."""
     if pressed and pad[PRESSED] == 0:
         pad[PRESSED], pad[PREVIOUS_END] = 1, pad[UP_COMMAND]
         pad[DOWN_COMMAND] = max(n, pad[PREVIOUS_END] + 1)
@@ -218,17 +203,11 @@ def _compute_features(c: int, end: int, ring: Any, history: Any, pad: Any, windo
 
 @dataclass(frozen=True)
 class ThresholdDetector:
-    """The simple detector of touches.
+    """The simple detector of touches."""
 
-    Attributes:
-        noise_v: (C,) V, infinite for a fibre that does not respond.
-        threshold: of the sum of squared deviations in units of the noise.
-        delay: readings from the begin of a press to the first that shows it.
-    """
-
-    noise_v: Array
-    threshold: float
-    delay: int
+    noise_v: Array  # (C,), infinite for a fibre that does not respond
+    threshold: float  # of the sum of squared deviations in units of the noise
+    delay: int  # readings from the begin of a press to the first that shows it
 
     @property
     def inverse_noise(self) -> Floats:
@@ -260,44 +239,30 @@ class ThresholdDetector:
 
 @dataclass(frozen=True)
 class StreamedPresses:
-    """Q presses as they are seen reading by reading.
+    """Q presses as they are detected reading by reading."""
 
-    Attributes:
-        down_command: (Q,) first reading of each.
-        estimated: (Q,) reading with which its position is estimated.
-        ended: (Q,) first reading after it; R if it has not ended.
-        features: of each, float32 numbers.
-    """
-
-    down_command: Indices
-    estimated: Indices
-    ended: Indices
+    down_command: Indices  # (Q,) first reading of each
+    estimated: Indices  # (Q,) reading with which its position is estimated
+    ended: Indices  # (Q,) first reading after it; R if it has not ended
     features: PressFeatures
 
 
 def stream_presses(
     readings: Array, detector: ThresholdDetector, pressed: Mask | None = None, fibre_mask: Mask | None = None
 ) -> StreamedPresses:
-    """Process readings as a microcontroller does.
-
-    Args:
-        readings: (R, C) V, NaN where missing.
-        detector: of touches.
-        pressed: (R,) whether the pad is pressed; None for the detector to decide.
-        fibre_mask: (C,) fibres that it uses; None for all.
-    """
+    """Process (R, C) readings as a microcontroller does; `pressed` (R,) is None for the detector to decide."""
     n_readings, n_fibres = readings.shape
     edges = np.empty((n_readings, 3), np.int64)
     features = np.empty((n_readings, n_fibres, N_WINDOWS + N_HISTORY), np.float32)
     valid = np.empty((n_readings, n_fibres), bool)
-    n_presses = run_stream(
+    n_presses = _run_stream(
         np.ascontiguousarray(readings, np.float32),
         np.zeros(0, bool) if pressed is None else pressed,
         np.ones(n_fibres, bool) if fibre_mask is None else fibre_mask,
         RATES,
         detector.inverse_noise,
         np.array([detector.threshold, detector.delay], np.float32),
-        np.array([REST, *WINDOWS]),
+        np.array([REST, *DOWN]),
         edges,
         features,
         valid,
@@ -307,7 +272,7 @@ def stream_presses(
 
 
 def commanded_presses(recording: Recording) -> Mask:
-    """Return (R,) whether the pad was pressed, by the commands; there is a free reading between two presses."""
+    """Return (R,) whether the pad was pressed, by the commands; a free reading lies between two presses."""
     pressed = np.zeros(len(recording.readings) + 1, bool)
     for first, end in zip(recording.down_command, recording.up_command, strict=True):
         pressed[first - 1] = False
@@ -330,11 +295,9 @@ def commanded_features(recording: Recording) -> PressFeatures:
 
 
 def match_presses(recording: Recording, down_command: Indices) -> Indices:
-    """Match detected presses, by their first readings, to those of the recording.
+    """Return the index of the recording's press that each detection, by its first reading, is the first of.
 
-    Returns:
-        (Q,) index of the press of the recording, of which the first detected one counts; -1 - i for a false detection
-        after press i has begun.
+    It is -1 - i for a false detection after press i has begun.
     """
     press = np.maximum(np.searchsorted(recording.down_command, down_command + TOLERANCE, side="right") - 1, 0)
     inside = (down_command >= recording.down_command[press] - TOLERANCE) & (down_command < recording.up_command[press])
@@ -358,15 +321,7 @@ class MemoryBudget:
 
 
 def table_bytes(n_fibres: int, n_measures: int, n_levels: int, hidden: int, quantized: bool) -> int:
-    """Return the bytes of all constant tables of a student.
-
-    Args:
-        n_fibres: C.
-        n_measures: targets beside the position.
-        n_levels: numbers of failed fibres that intervals are calibrated for.
-        hidden: neurons of a layer.
-        quantized: whether the weights are int8.
-    """
+    """Return the bytes of a student's tables; intervals are calibrated for `n_levels` numbers of failed fibres."""
     n_inputs, n_outputs = n_fibres * (N_WINDOWS + 1), 2 * (2 + n_measures)
     weights = n_inputs * hidden + N_LAYERS * hidden * hidden + hidden * n_outputs
     biases = (N_LAYERS + 1) * hidden + n_outputs
@@ -383,11 +338,7 @@ def state_bytes(n_fibres: int, n_measures: int, hidden: int) -> int:
 
 
 def max_hidden(n_fibres: int, n_measures: int, n_levels: int, budget: MemoryBudget) -> int:
-    """Return the neurons of a layer that a budget allows.
-
-    Raises:
-        InputError: not even the smallest student fits.
-    """
+    """Return the neurons of a layer that a budget allows; InputError if not even the smallest student fits."""
 
     def needed(hidden: int) -> tuple[int, int]:
         flash = CODE_BYTES + table_bytes(n_fibres, n_measures, n_levels, hidden, budget.quantized)

@@ -4,7 +4,7 @@ Knowledge distillation (Hinton et al. 2015, "Distilling the knowledge in a neura
 between the true positions and those that the localizer, the teacher, predicts.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,16 +13,7 @@ import numpy as np
 
 from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.deploy.streaming import (
-    N_LAYERS,
-    MemoryBudget,
-    StreamedPresses,
-    ThresholdDetector,
-    commanded_features,
-    match_presses,
-    max_hidden,
-    stream_presses,
-)
+from padforge.sense.deploy import streaming
 from padforge.sense.localizer.calibration import (
     CALIBRATION_SHARE,
     calibrate_intervals,
@@ -39,41 +30,28 @@ from padforge.sense.localizer.scaler import FeatureScaler
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-TEACHER_WEIGHT = 0.5
-"""Weight of the teacher's predictions in the targets."""
-EPOCHS_FACTOR = 4
-"""A student is trained so much longer than a localizer: it has no Bayesian localizer, and its steps are short."""
+TEACHER_WEIGHT = 0.5  # of the teacher's predictions in the targets
+EPOCHS_FACTOR = 4  # by which its training is longer than a localizer's: it has no Bayesian one, and its steps are short
 MAX_INT8 = 127
+
+Measures = dict[str, Array]
 
 
 class Layer(NamedTuple):
-    """A layer y = b + W x.
+    """A layer y = b + W x."""
 
-    Attributes:
-        weights: W (out, in), float32 or int8.
-        bias: b (out,).
-        scale: (out,) that rows of int8 are multiplied by; None for float32.
-    """
-
-    weights: Array
+    weights: Array  # W (out, in), float32 or int8
     bias: Floats
-    scale: Floats | None
+    scale: Floats | None  # (out,) that rows of int8 are multiplied by; None for float32
 
 
 @dataclass(frozen=True)
 class StudentNetwork:
-    """What `localizer.h` holds.
+    """What `localizer.h` holds."""
 
-    Attributes:
-        model: localizer of the features of `commanded_features` or `stream_presses`, of one member; int8 weights are
-            dequantized in it.
-        detector: of touches.
-        quantized: whether the weights are int8.
-    """
-
-    model: LocalizerModel
-    detector: ThresholdDetector
-    quantized: bool
+    model: LocalizerModel  # one member, of the features of `stream_presses`; int8 weights are dequantized in it
+    detector: streaming.ThresholdDetector
+    quantized: bool  # to int8
 
     @property
     def hidden(self) -> int:
@@ -82,33 +60,27 @@ class StudentNetwork:
 
     def predict(
         self, readings: Array, pressed: Mask | None = None, failed: tuple[int, ...] = ()
-    ) -> tuple[StreamedPresses, Localization]:
-        """Detect and localize presses as `localizer.h` does.
-
-        Args:
-            readings: (R, C) V, NaN where missing.
-            pressed: (R,) whether the pad is pressed; None for the detector to decide.
-            failed: indices of fibres to mask.
-        """
+    ) -> tuple[streaming.StreamedPresses, Localization]:
+        """Detect and localize presses as `localizer.h` does; `pressed` (R,) is None for the detector to decide."""
         fibre_mask = ~np.isin(np.arange(self.model.fibres), failed)
-        presses = stream_presses(readings, self.detector, pressed, fibre_mask)
+        presses = streaming.stream_presses(readings, self.detector, pressed, fibre_mask)
         scaled = self.model.scaler.transform(presses.features)
         return presses, self.model.predict_features(replace(scaled, fibre_mask=scaled.fibre_mask & fibre_mask))
 
     def layers(self) -> dict[str, Layer]:
         """Return the layers in order, by name."""
-        weights = self.model.weights
-        pairs = {"first": (weights["first.w"][0], weights["first.b"][0, 0])}
-        for number, (w, b) in enumerate(zip(weights["hidden.w"], weights["hidden.b"], strict=True)):
-            pairs[f"hidden_{number}"] = (w[0], b[0, 0])
-        pairs["last"] = (weights["last.w"][0], weights["last.b"][0, 0])
-        if not self.quantized:
-            return {name: Layer(w.T, b, None) for name, (w, b) in pairs.items()}
-        scaled = {name: (w, b, int8_scale(w)) for name, (w, b) in pairs.items()}
-        return {name: Layer(np.rint(w / scale).astype(np.int8).T, b, scale) for name, (w, b, scale) in scaled.items()}
+        weights, layers = self.model.weights, {}
+        pairs = {"first": (weights["first.w"], weights["first.b"])}
+        for number, pair in enumerate(zip(weights["hidden.w"], weights["hidden.b"], strict=True)):
+            pairs[f"hidden_{number}"] = pair
+        pairs["last"] = weights["last.w"], weights["last.b"]
+        for name, ((w,), ((b,),)) in pairs.items():  # of the one member
+            scale = _int8_scale(w) if self.quantized else None
+            layers[name] = Layer(w.T if scale is None else np.rint(w / scale).astype(np.int8).T, b, scale)
+        return layers
 
 
-def int8_scale(w: Floats) -> Floats:
+def _int8_scale(w: Floats) -> Floats:
     """Return the (..., out) value of 1 as int8 in each column of (..., in, out) weights."""
     largest = np.abs(w).max(axis=-2)
     return np.where(largest > 0, largest / np.float32(MAX_INT8), np.float32(1)).astype(np.float32)
@@ -118,60 +90,35 @@ def quantize(weights: Weights) -> dict[str, Floats]:
     """Round weights to int8 with a scale for each output, and dequantize them; biases stay as they are."""
 
     def rounded(w: Floats) -> Floats:
-        scale = int8_scale(w)[..., None, :]
+        scale = _int8_scale(w)[..., None, :]
         return (np.rint(w / scale) * scale).astype(np.float32)
 
     return {name: rounded(w) if name.endswith(".w") else w for name, w in weights.items()}
 
 
-@dataclass(frozen=True)
-class DistillationTargets:
-    """Targets of Q presses.
+def _distillation_targets(recording: Recording, teacher: LocalizerModel, presses: Indices) -> tuple[Array, Measures]:
+    """Mix positions and measures of presses with the predictions of the teacher, used alone where one is unknown."""
+    prediction = teacher.predict(recording)
 
-    Attributes:
-        positions_mm: (Q, 2).
-        measures: (Q,) of each of depth and force that the teacher predicts.
-    """
+    def mix(true: Array, predicted: Array) -> Array:
+        mixed = (1 - TEACHER_WEIGHT) * true + TEACHER_WEIGHT * predicted
+        return np.where(np.isnan(true), predicted, mixed)[presses]
 
-    positions_mm: Array
-    measures: Mapping[str, Array]
-
-    def __getitem__(self, presses: Indices) -> "DistillationTargets":
-        measures = {name: values[presses] for name, values in self.measures.items()}
-        return DistillationTargets(self.positions_mm[presses], measures)
-
-    @classmethod
-    def compute(cls, recording: Recording, teacher: LocalizerModel) -> "DistillationTargets":
-        """Mix what is known of every press with the prediction of the teacher, or take that where nothing is known."""
-        prediction = teacher.predict(recording)
-
-        def mix(known: Array, predicted: Array) -> Array:
-            mixed = (1 - TEACHER_WEIGHT) * known + TEACHER_WEIGHT * predicted
-            return np.where(np.isnan(known), predicted, mixed)
-
-        measures = {name: mix(recording.measures[name], each.values) for name, each in prediction.measures.items()}
-        return cls(mix(recording.presses_mm, prediction.positions_mm), measures)
+    measures = {name: mix(recording.measures[name], each.values) for name, each in prediction.measures.items()}
+    return mix(recording.presses_mm, prediction.positions_mm), measures
 
 
 def distill(
     recording: Recording,
     teacher: LocalizerModel,
     training: Indices,
-    budget: MemoryBudget,
+    budget: streaming.MemoryBudget,
     options: LocalizerSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudentNetwork:
-    """Train a student.
+    """Train a student as large as the budget allows, on presses of known position.
 
     Every press is used with the features of its command and, where the detector finds it, with those of its detection.
-
-    Args:
-        recording: of the pad of the teacher.
-        teacher: localizer to distill.
-        training: indices of presses of known position.
-        budget: memory that the student may use, which decides its size.
-        options: length and rate of the training, and its seed.
-        on_progress: called with steps done and steps in all.
 
     Raises:
         InputError: the budget is too small, there are too few presses, or the training diverged.
@@ -179,22 +126,23 @@ def distill(
     from padforge.sense.localizer.training import train_members
 
     rng = np.random.default_rng(options.seed)
-    detector = ThresholdDetector.fit(recording, training)
+    detector = streaming.ThresholdDetector.fit(recording, training)
     shares = split_presses(len(training), options.split, CALIBRATION_SHARE["ensemble"], rng, min_training=2)
     training, calibration = (training[share] for share in shares)
-    targets, n_levels = DistillationTargets.compute(recording, teacher), len(teacher.interval_factors)
-    hidden = max_hidden(teacher.fibres, len(targets.measures), n_levels, budget)
-    commanded, detected = commanded_features(recording), stream_presses(recording.readings, detector)
-    press = match_presses(recording, detected.down_command)
+    n_measures, n_levels = len(teacher.scaler.measures), len(teacher.interval_factors)
+    hidden = streaming.max_hidden(teacher.fibres, n_measures, n_levels, budget)
+    commanded = streaming.commanded_features(recording)
+    detected = streaming.stream_presses(recording.readings, detector)
+    press = streaming.match_presses(recording, detected.down_command)
     matched = np.flatnonzero(np.isin(press, training))
     features = commanded[training] + detected.features[matched]
-    targets = targets[np.concatenate([training, press[matched]])]
-    scaler, table = FeatureScaler.fit(features, targets.positions_mm, targets.measures)
-    size = {"members": 1, "hidden": hidden, "layers": N_LAYERS, "max_failures": n_levels - 1}
+    positions_mm, measures = _distillation_targets(recording, teacher, np.concatenate([training, press[matched]]))
+    scaler, table = FeatureScaler.fit(features, positions_mm, measures)
+    size = {"members": 1, "hidden": hidden, "layers": streaming.N_LAYERS, "max_failures": n_levels - 1}
     # `train_members` lengthens the training of other features by a factor of its own.
     length = {"epochs": EPOCHS_FACTOR * options.epochs, "features": "press_and_release"}
-    options = options.model_copy(update={**size, **length})
-    presses = scaler.training_presses(features, targets.positions_mm, targets.measures)
+    options = options.model_copy(update=size | length)
+    presses = scaler.training_presses(features, positions_mm, measures)
     with one_torch_thread():
         weights = train_members(presses, table, options, rng, on_progress).weights
     check_trained(weights, {}, scaler, options)
@@ -204,24 +152,20 @@ def distill(
         table=table,
         method="ensemble",
         features="causal",
-        interval_factors=np.ones((1, 3 + len(targets.measures))),
+        interval_factors=np.ones((1, 3 + n_measures)),
         rate_hz=recording.rate_hz,
         training_recording_sha256=recording.digest,
     )
-    known = {name: recording.measures[name][calibration] for name in targets.measures}
     scaled, positions_mm = scaler.transform(commanded[calibration]), recording.presses_mm[calibration]
-    factors = calibrate_intervals(model, scaled, positions_mm, n_levels, known)
+    true_measures = {name: recording.measures[name][calibration] for name in measures}
+    factors = calibrate_intervals(model, scaled, positions_mm, n_levels, true_measures)
     return StudentNetwork(replace(model, interval_factors=factors), detector, budget.quantized)
 
 
 def split_student_presses(
     recording: Recording, teacher: LocalizerModel, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
-    """Return presses of known position to train on, and those to test on, which the teacher was not trained on either.
-
-    Raises:
-        InputError: the teacher was recalibrated by the recording, or there are too few presses.
-    """
+    """Return presses to train on, and those to test on, which the teacher was not trained on either."""
     check_same_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
     return split_unseen(recording, teacher, options)
 
@@ -233,18 +177,7 @@ def causal_reference(
     options: LocalizerSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> LocalizerModel:
-    """Return a localizer of full size that uses no readings after the end of a press, as the student.
-
-    Args:
-        teacher: returned, if it is such a localizer.
-        recording: of its pad.
-        training: indices of the presses that another one is trained on.
-        options: of that training.
-        on_progress: called with steps done and steps in all.
-
-    Raises:
-        InputError: raised by the training.
-    """
+    """Return the teacher or a localizer of its size that, as the student, uses no readings after the end of a press."""
     if teacher.features == "causal":
         return teacher
     max_failures = len(teacher.interval_factors) - 1
@@ -257,13 +190,7 @@ def causal_reference(
 def evaluate_student(
     student: StudentNetwork, references: Sequence[LocalizerModel], recording: Recording, test: Indices
 ) -> dict[str, Any]:
-    """Evaluate a student and localizers on presses.
-
-    Args:
-        student: network and detector.
-        references: localizers to compare it with.
-        recording: of the pad.
-        test: indices of presses of known position.
+    """Evaluate a student, and localizers to compare it with, on presses of known position.
 
     Returns:
         "errors": by "header" and the features of the localizers, a row for each number of failed fibres;
@@ -271,7 +198,7 @@ def evaluate_student(
         next press; "detected_mean_mm": mean error of those detected, None if there are none.
     """
     positions_mm, model = recording.presses_mm[test], student.model
-    compared = {"header": (model, model.scaler.transform(commanded_features(recording)[test]))}
+    compared = {"header": (model, model.scaler.transform(streaming.commanded_features(recording)[test]))}
     compared |= {each.features: (each, each.scaled_features(recording)[test]) for each in references}
     levels = range(len(model.interval_factors))
     errors = {
@@ -279,7 +206,7 @@ def evaluate_student(
         for name, (each, features) in compared.items()
     }
     presses, prediction = student.predict(recording.readings)
-    press = match_presses(recording, presses.down_command)
+    press = streaming.match_presses(recording, presses.down_command)
     detected = np.flatnonzero(np.isin(press, test))
     distance = distances(prediction.positions_mm[detected], recording.presses_mm[press[detected]])
     return {

@@ -14,21 +14,12 @@ import socketserver
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from padforge.design.common.server import HOST, ConnectionServer, LocalPage, page_text
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array
-from padforge.sense.formats.ros_messages import (
-    FRAME,
-    HEALTH,
-    PRESSED,
-    READINGS,
-    TOPICS,
-    TOUCHES,
-    UNKNOWN_VARIANCE,
-    Z90,
-)
+from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, UNKNOWN_VARIANCE, Z90
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live
 
@@ -40,34 +31,21 @@ MAX_COMMANDS = 16  # of a page that wait to be read: a button may be hit again a
 TOUCH_UNITS = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm"}
 """Values of a touch that OSC and LSL send, with their units."""
 _OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
-_OK_STATES = ("sound", "unmonitored")
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message.
+    """One message."""
 
-    Attributes:
-        topic: a key of `TOPICS`.
-        msg: the message of ROS 2, as JSON.
-        pad: the same values in mm and V, with the name of the "event".
-    """
-
-    topic: str
-    msg: dict[str, Any]
-    pad: dict[str, Any]
+    topic: str  # a key of `TOPICS`
+    msg: dict[str, Any]  # of ROS 2, as JSON
+    pad: dict[str, Any]  # the same values in mm and V, with the name of the "event"
 
     def to_json(self, number: int) -> str:
         """Return the message as a line of JSON, the `number`-th of its stream, from 0."""
+        operation = {"op": "publish", "topic": self.topic, "type": TOPICS[self.topic].msgtype, "msg": self.msg}
         pad = {"format": FORMAT, "number": number, **self.pad}
-        operation = {
-            "op": "publish",
-            "topic": self.topic,
-            "type": TOPICS[self.topic].msgtype,
-            "msg": self.msg,
-            "pad": pad,
-        }
-        return json.dumps(operation, allow_nan=False)
+        return json.dumps(operation | {"pad": pad}, allow_nan=False)
 
 
 class MessageBuilder:
@@ -79,9 +57,8 @@ class MessageBuilder:
     """
 
     def __init__(self, pipeline: Live, mirrored: bool = False) -> None:
-        self._pipeline, self._pressed = pipeline, False
+        self._pipeline, self._pressed, self._is_first = pipeline, False, True
         self._z_sign = 1.0 if mirrored else -1.0
-        self._is_first = True
 
     def build(self, times_s: Array, readings: Array, events: Sequence[Event]) -> Iterator[Message]:
         """Yield the messages of a block of readings, (n,) s and (n, C) V, and of the events that it led to."""
@@ -103,16 +80,11 @@ class MessageBuilder:
 
     def _health(self, time_s: float, fault: FibreFault | None) -> Message:
         states = [fibre["state"] for fibre in self._pipeline.view()["fibres"]]
-        status = [
-            {
-                "level": _OK if state in _OK_STATES else _ERROR,
-                "name": f"pad: fibre {number}",
-                "message": state,
-                "hardware_id": "pad",
-                "values": [],
-            }
-            for number, state in enumerate(states, 1)
-        ]
+        status = []
+        for number, state in enumerate(states, 1):
+            level = _OK if state in ("sound", "unmonitored") else _ERROR
+            entry = {"level": level, "name": f"pad: fibre {number}", "message": state, "hardware_id": "pad"}
+            status.append(entry | {"values": []})
         pad: dict[str, Any] = {"event": "health", "time_s": time_s, "states": states}
         if fault is not None:
             pad["fault"] = {**asdict(fault), "text": fault.text}
@@ -148,7 +120,6 @@ class OutputStream(Protocol):
 
     def send(self, message: Message) -> None:
         """Send one message; never wait for who receives it."""
-        ...
 
 
 def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> None:
@@ -181,7 +152,6 @@ class JsonLines(ConnectionServer):
         self.address: tuple[str, int] = self.server_address[:2]  # type: ignore[assignment]
 
     def send(self, message: Message) -> None:
-        """Send one message to all subscribers."""
         line = f"{message.to_json(self._number)}\n".encode()
         self._number += 1
         with self._changed:
@@ -198,7 +168,7 @@ class JsonLines(ConnectionServer):
             self._changed.wait_for(lambda: not self._subscribers, timeout_s)
 
     def subscribe(self, subscriber: "_Subscriber") -> bool:
-        """Add a subscriber, unless there are too many."""
+        """Add a subscriber; return False if there are too many."""
         with self._changed:
             if len(self._subscribers) >= MAX_SUBSCRIBERS:
                 return False
@@ -208,7 +178,6 @@ class JsonLines(ConnectionServer):
             return True
 
     def unsubscribe(self, subscriber: "_Subscriber") -> None:
-        """Remove a subscriber."""
         with self._changed:
             self._subscribers.discard(subscriber)
             self._changed.notify_all()
@@ -243,7 +212,7 @@ class _Subscriber(socketserver.StreamRequestHandler):
             self.server.unsubscribe(self)
 
 
-class OscOutput:
+class OscOutput(contextlib.AbstractContextManager["OscOutput"]):
     """Open Sound Control over UDP: /pad/touches, /pad/readings, /pad/pressed and /pad/health.
 
     Args:
@@ -272,29 +241,22 @@ class OscOutput:
         # The numeric address: a name would be resolved for every message, and all outputs wait for that.
         self._client = SimpleUDPClient(str(target[0]), int(port), family=family)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self._client.close()
 
     def send(self, message: Message) -> None:
-        """Send one message."""
         with contextlib.suppress(OSError):  # UDP: what nobody receives, or a cable that is out, is lost
-            self._client.send_message(message.topic, _osc_values(message))
+            self._client.send_message(message.topic, _values(message))
 
 
-def _osc_values(message: Message) -> list[Any]:
+def _values(message: Message) -> list[Any]:
+    """Return the values of a message that OSC and LSL send."""
     pad = message.pad
     if message.topic == READINGS:
-        return _with_nan(pad["volts"])
+        return [math.nan if value is None else value for value in pad["volts"]]
     if message.topic == TOUCHES:
         return [pad[name] for name in TOUCH_UNITS]
     return [pad["pressed"]] if message.topic == PRESSED else list(pad["states"])
-
-
-def _with_nan(volts: list[float | None]) -> list[float]:
-    return [float("nan") if value is None else value for value in volts]
 
 
 class LslOutput:
@@ -320,9 +282,9 @@ class LslOutput:
     def send(self, message: Message) -> None:
         """Send one message, if it is of readings or of a touch."""
         if message.topic == READINGS:
-            self._readings.push_sample(_with_nan(message.pad["volts"]))
+            self._readings.push_sample(_values(message))
         elif message.topic == TOUCHES:
-            self._touches.push_sample([float(message.pad[name]) for name in TOUCH_UNITS])
+            self._touches.push_sample(list(map(float, _values(message))))
 
 
 def _open_outlet(name: str, units: Mapping[str, str], rate_hz: float) -> Any:
@@ -364,8 +326,7 @@ class LivePage(LocalPage):
     def _on_command(self, body: bytes) -> None:
         command = body.decode("ascii", "replace")
         if command not in self._allowed:
-            raise InputError(
-                f"command is {short_repr(command)}, allowed are {', '.join(sorted(self._allowed)) or 'none'}"
-            )
+            allowed = ", ".join(sorted(self._allowed)) or "none"
+            raise InputError(f"command is {short_repr(command)}, allowed are {allowed}")
         with contextlib.suppress(queue.Full):
             self._commands.put_nowait(command)

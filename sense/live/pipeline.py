@@ -7,7 +7,7 @@ localizer needs, refined by others that need more; and faulty fibres, which are 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,49 +23,28 @@ from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import HISTORY, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
-MAX_SHOWN = 12
-"""Latest presses that are shown."""
-OPENING = DOWN[-1][1]
-"""Readings after `down_command` that features look at; of those until `up_command`, they look at no more."""
-RELEASE = max(UP[-1][1], RELEASED)
-"""Readings after `up_command` with which a press is complete."""
+MAX_SHOWN = 12  # latest presses that are shown
+OPENING = DOWN[-1][1]  # readings after `down_command` that features look at; until `up_command`, they look at no more
+RELEASE = max(UP[-1][1], RELEASED)  # readings after `up_command` with which a press is complete
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The position of a press, estimated by one localizer.
+    """The position of a press, estimated by one localizer."""
 
-    Attributes:
-        press: index of the press, from 0.
-        time_s: of its touch, by the clock of the readings.
-        features: of the localizer.
-        final: whether no other localizer will refine it.
-        x_mm: position in x.
-        y_mm: position in y.
-        std_x_mm: standard deviation in x.
-        std_y_mm: standard deviation in y.
-        r50_mm: radius that holds the true position in 50 % of cases.
-        r90_mm: radius that holds the true position in 90 % of cases.
-        failed: indices of the fibres that were masked.
-        depth_mm: depth of the press; None where that was not learnt, as the three that follow.
-        depth_r90_mm: half width of its 90 % interval.
-        force_n: force of the press.
-        force_r90_n: half width of its 90 % interval.
-    """
-
-    press: int
-    time_s: float
-    features: str
-    final: bool
+    press: int  # index, from 0
+    time_s: float  # of its touch, by the clock of the readings
+    features: str  # of the localizer
+    final: bool  # whether no other localizer will refine it
     x_mm: float
     y_mm: float
     std_x_mm: float
     std_y_mm: float
-    r50_mm: float
+    r50_mm: float  # radius that holds the true position in 50 % of cases
     r90_mm: float
-    failed: tuple[int, ...]
-    depth_mm: float | None = None
-    depth_r90_mm: float | None = None
+    failed: tuple[int, ...]  # indices of the fibres that were masked
+    depth_mm: float | None = None  # None where the localizer does not predict it, as the three that follow
+    depth_r90_mm: float | None = None  # half width of its 90 % interval
     force_n: float | None = None
     force_r90_n: float | None = None
 
@@ -77,7 +56,6 @@ class Estimate:
 
     @property
     def text(self) -> str:
-        """One line."""
         return (
             f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, within {self.r50_mm:.1f} mm at 50 %, "
             f"{self.r90_mm:.1f} mm at 90 %{self.measures_text} ({self.features})"
@@ -91,38 +69,18 @@ class Estimate:
 Event = Estimate | FibreFault
 
 
-class Excerpt(NamedTuple):
-    """Readings (n, C) V around a press, with the indices of its commands and of the end of the press before it."""
-
-    readings: Array
-    down_command: int
-    up_command: int
-    previous_end: int
-
-
 @dataclass
 class BufferedPress:
-    """The press under way; indices are those of readings in the stream.
+    """The press under way; indices are those of readings in the stream."""
 
-    Attributes:
-        number: of presses before it.
-        time_s: when the pad was touched.
-        touched: first reading that shows it.
-        down_command: first reading after the probe was sent down, or would have been.
-        previous_end: `up_command` of the press before, < `down_command`.
-        rest: (C,) V before it.
-        up_command: first reading after the probe was sent up; None while it is held.
-        n_estimates: number of localizers that have estimated its position.
-    """
-
-    number: int
-    time_s: float
-    touched: int
-    down_command: int
-    previous_end: int
-    rest: Array
-    up_command: int | None = None
-    n_estimates: int = 0
+    number: int  # of presses before it
+    time_s: float  # when the pad was touched
+    touched: int  # first reading that shows it
+    down_command: int  # first reading after the probe was sent down, or would have been
+    previous_end: int  # `up_command` of the press before, < `down_command`
+    rest: Array  # (C,) V before it
+    up_command: int | None = None  # first reading after the probe was sent up; None while it is held
+    n_estimates: int = 0  # number of localizers that have estimated its position
     _opening: Array | None = None
 
     def release(self, up_command: int) -> None:
@@ -142,8 +100,11 @@ class BufferedPress:
         if self._opening is None and self.up_command is None and buffer.end >= self.down_command + OPENING:
             self._opening = buffer.rows(self.down_command - HISTORY, self.down_command + OPENING)[:, 1:].copy()
 
-    def excerpt(self, buffer: RingBuffer, end: int) -> Excerpt:
-        """Return its readings before index `end`; of a long press without those that no features look at."""
+    def excerpt(self, buffer: RingBuffer, end: int) -> tuple[Array, int, int, int]:
+        """Return its readings before index `end`, the indices of its commands and that of the end of the press before.
+
+        Of a long press, the readings are without those that no features look at.
+        """
         up_command = end if self.up_command is None else min(self.up_command, end)
         if self._opening is None or up_command <= self.down_command + OPENING:
             readings = buffer.rows(self.down_command - HISTORY, end)[:, 1:]
@@ -153,7 +114,7 @@ class BufferedPress:
             readings = np.concatenate([self._opening, buffer.rows(up_command, end)[:, 1:]])
             up = len(self._opening)
             down = up - OPENING
-        return Excerpt(readings, down, up, max(down - (self.down_command - self.previous_end), 0))
+        return readings, down, up, max(down - (self.down_command - self.previous_end), 0)
 
 
 class Live:
@@ -186,7 +147,9 @@ class Live:
         if health is not None:
             check_same_pad(health, "health", fibres, rate_hz)
         self._localizers = sorted(localizers, key=lambda model: FEATURES[model.features].readings_needed[::-1])
-        self._response_v = _typical_response(self._localizers[-1])
+        scaler, n_windows = self._localizers[-1].scaler, FEATURES[self._localizers[-1].features].n_windows
+        response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
+        self._response_v = np.where(response_v > 0, response_v, 1.0)  # that a press goes up to
         self._detector = PressDetector(fibres)
         self._buffer = RingBuffer(1 + fibres)  # times, then volts
         self._press: BufferedPress | None = None
@@ -242,12 +205,11 @@ class Live:
             a line each.
         """
         swings = self._swings()
-        states = self._states(np.isnan(swings))
         return {
             "pressed": self.pressed,
             "fibres": [
                 {"swing": None if np.isnan(swing) else round(swing, 3), "state": state}
-                for swing, state in zip(swings.tolist(), states, strict=True)
+                for swing, state in zip(swings.tolist(), self._states(np.isnan(swings)), strict=True)
             ],
             "presses": [
                 press.to_dict() | {"measures_text": press.measures_text, "text": press.text} for press in self.presses
@@ -339,10 +301,3 @@ class Live:
         faults = self._monitor.update(readings[first:], down_command - first, up_command - first)
         self.faults += faults
         return faults
-
-
-def _typical_response(localizer: LocalizerModel) -> Array:
-    """(C,) V that the response of each fibre to a press goes up to."""
-    scaler, n_windows = localizer.scaler, FEATURES[localizer.features].n_windows
-    response = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
-    return np.where(response > 0, response, 1.0)

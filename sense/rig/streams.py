@@ -1,7 +1,4 @@
-"""Streams of live readings: a board's samples averaged to the rate of the readings, or a recording that is replayed.
-
-`RingBuffer` keeps the latest readings of a stream for what looks back at them.
-"""
+"""Streams of live readings: a board's samples averaged to the rate of the readings, or a recording that is replayed."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -24,24 +21,18 @@ HISTORY = SLOW[-1]  # readings before a press that the history features look bac
 SLACK = 4096  # readings beyond HISTORY, as a press is detected some readings after it began
 PAUSE_S = 0.01  # between two polls of a board, or of the clock of a replay
 MAX_BLOCK = 64  # readings that are replayed at a time, so that a fast replay can be watched
-RECORDED = "recording"
-"""Name of the training recording in the folder of a model."""
+RECORDED = "recording"  # name of the training recording in the folder of a model
 
-Block = tuple[Array, Array]
-"""Times (n,) in s, and readings (n, C) in V."""
+Block = tuple[Array, Array]  # times (n,) in s, and readings (n, C) in V
 
 
 class RingBuffer:
-    """The latest rows of a stream, at least HISTORY + SLACK of them.
-
-    Attributes:
-        end: number of rows so far, which is the index of the next one.
-    """
+    """The latest rows of a stream, at least HISTORY + SLACK of them."""
 
     def __init__(self, n_columns: int) -> None:
         self._rows = np.empty((2 * (HISTORY + SLACK), n_columns))
         self._filled = 0
-        self.end = 0
+        self.end = 0  # number of rows so far, which is the index of the next one
 
     def append(self, row: Array) -> None:
         """Add a row (columns,)."""
@@ -72,16 +63,12 @@ class Averager:
     """Mean of every `ratio` samples, by the count of the board, so that a lost sample shifts nothing.
 
     A mean is over those samples of its block that arrived; a block without any gives no reading.
-
-    Attributes:
-        n_missing: samples that never arrived.
     """
 
     def __init__(self, ratio: int, n_channels: int) -> None:
-        self._ratio = ratio
-        self._index = 0
+        self._ratio, self._index = ratio, 0
         self._pending = np.empty((0, 2 + n_channels))  # block, time, volts
-        self.n_missing = 0
+        self.n_missing = 0  # samples that never arrived
 
     def feed(self, samples: BoardSamples) -> Block:
         """Return times (n,) and volts (n, C) of the blocks that are complete now; keep the other samples."""
@@ -93,8 +80,7 @@ class Averager:
         new = np.column_stack([counts // self._ratio, samples.times_s, samples.volts])
         rows = np.vstack([self._pending, new])
         complete = rows[:, 0] < self._index // self._ratio
-        self._pending = rows[~complete]
-        rows = rows[complete]
+        self._pending, rows = rows[~complete], rows[complete]
         blocks, first, count = np.unique(rows[:, 0], return_index=True, return_counts=True)
         if len(blocks) == 0:
             return np.empty(0), np.empty((0, rows.shape[1] - 2))
@@ -104,19 +90,12 @@ class Averager:
 
 @dataclass(frozen=True)
 class ReadingStream:
-    """Readings as they arrive.
-
-    Attributes:
-        fibres: C.
-        rate_hz: readings per second.
-        blocks: of readings; a block may be empty.
-        board: identity of the board, empty if there is none.
-    """
+    """Readings as they arrive."""
 
     fibres: int
     rate_hz: float
-    blocks: Iterator[Block]
-    board: Mapping[str, Any] = field(default_factory=dict)
+    blocks: Iterator[Block]  # which may be empty
+    board: Mapping[str, Any] = field(default_factory=dict)  # its identity, empty if there is none
 
 
 def stream_board(board: Board, rate_hz: float) -> ReadingStream:
@@ -159,14 +138,7 @@ def is_pad_mirrored(model: Path, rig: RigSettings) -> bool:
     """Return whether the pad lies with its tracks up, so that x and y of its plan are right-handed with z into it.
 
     `[rig]` says so. Where it leaves that open, the pad lies as it did in the training recording: in a holder, perhaps,
-    which only the recording mentions.
-
-    Args:
-        model: folder of the model.
-        rig: settings of the rig that reads the pad.
-
-    Raises:
-        InputError: the recording beside the model is damaged.
+    which only the recording mentions; InputError if that is damaged.
     """
     if rig.mirrored is not None:
         return rig.mirrored

@@ -21,6 +21,7 @@ from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import ROOT, tutorial_code
+from tests.sense.live.conftest import first_presses
 
 DIGEST = "a" * 64
 
@@ -33,13 +34,9 @@ def exported(
     return path, export_onnx(localizer, DIGEST, path, recording)
 
 
-def open_graph(path: Path) -> onnxruntime.InferenceSession:
-    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-
-
 @pytest.fixture
 def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
-    return open_graph(exported[0])
+    return onnxruntime.InferenceSession(exported[0])
 
 
 def inputs_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
@@ -66,12 +63,7 @@ def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, record
 def test_graph_takes_any_number_of_presses_and_readings(graph, localizer, brief) -> None:
     presses = localizer.scaled_features(brief)
     for count in (1, 2, 7):
-        inputs = {
-            "readings": brief.readings[: brief.down_command[count]],
-            "down_command": brief.down_command[:count],
-            "up_command": brief.up_command[:count],
-            "fibre_mask": np.ones((count, 4), bool),
-        }
+        inputs = inputs_of(first_presses(brief, count), np.ones((count, 4), bool))
         check_positions(graph.run(["positions_mm"], inputs)[0], localizer.predict_features(presses[np.arange(count)]))
 
 
@@ -86,7 +78,7 @@ def test_graph_has_all_kinds_of_features(features: str, brief: Recording, tmp_pa
 def test_graph_gives_depth_and_force(deep_localizer, deep_recording, tmp_path) -> None:
     export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", deep_recording)
     presses = deep_localizer.scaled_features(deep_recording)
-    expected, graph = deep_localizer.predict_features(presses), open_graph(tmp_path / "l.onnx")
+    expected, graph = deep_localizer.predict_features(presses), onnxruntime.InferenceSession(tmp_path / "l.onnx")
     names = [each.name for each in graph.get_outputs()][4:]
     assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
     values = graph.run(names, inputs_of(deep_recording, presses.fibre_mask))

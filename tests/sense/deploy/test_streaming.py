@@ -106,9 +106,8 @@ def test_match_presses_takes_the_first_detection(recording: Recording) -> None:
 @pytest.mark.parametrize(("flash", "ram"), [(20_000, 65_536), (262_144, 2_000), (150_000, 8_192)])
 def test_max_hidden_is_the_largest_within_the_budget(flash: int, ram: int, quantized: bool) -> None:
     hidden = max_hidden(6, 0, 4, MemoryBudget(flash, ram, quantized))
-
-    def fits(hidden: int) -> bool:
-        return CODE_BYTES + table_bytes(6, 0, 4, hidden, quantized) <= flash and state_bytes(6, 0, hidden) <= ram
-
-    assert fits(hidden)
-    assert not fits(hidden + HIDDEN_STEP)
+    fits = [
+        CODE_BYTES + table_bytes(6, 0, 4, size, quantized) <= flash and state_bytes(6, 0, size) <= ram
+        for size in (hidden, hidden + HIDDEN_STEP)
+    ]
+    assert fits == [True, False]

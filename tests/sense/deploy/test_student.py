@@ -9,14 +9,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import LocalizerSettings, Recording, calibrate
 from padforge.sense.deploy.streaming import MemoryBudget
-from padforge.sense.deploy.student import (
-    MAX_INT8,
-    StudentNetwork,
-    distill,
-    evaluate_student,
-    quantize,
-    split_student_presses,
-)
+from padforge.sense.deploy.student import StudentNetwork, distill, evaluate_student, quantize, split_student_presses
 from padforge.sense.formats.import_export import open_recording
 from padforge.sense.localizer import training as trainings
 from padforge.sense.localizer.model import LocalizerModel
@@ -70,19 +63,14 @@ def test_distill_ignores_test_presses(brief: Recording, localizer: LocalizerMode
     assert one.detector.threshold == other.detector.threshold
 
 
-def test_split_leaves_out_presses_of_unknown_position(brief: Recording, localizer: LocalizerModel) -> None:
+def test_split_leaves_out_presses_that_cannot_test(brief: Recording, localizer: LocalizerModel) -> None:
     unknown = np.array(brief.presses_mm)
     unknown[:10] = np.nan
     training, test = split_student_presses(replace(brief, presses_mm=unknown), localizer, QUICK)
     assert min(*training, *test) == 10
-
-
-def test_split_refuses_recordings_that_cannot_test(brief: Recording, localizer: LocalizerModel) -> None:
     recalibrated = replace(localizer, recalibrated_by=(brief.digest,))
     with pytest.raises(InputError, match="the localizer was recalibrated by"):
         split_student_presses(brief, recalibrated, QUICK)
-    with pytest.raises(InputError, match="presses of known position"):
-        split_student_presses(first_presses(brief, 3), localizer, QUICK)
     with pytest.raises(InputError, match="within 25%"):
         split_student_presses(replace(brief, times_s=brief.times_s * 2), localizer, QUICK)
 
@@ -97,9 +85,6 @@ def test_distill_reports_a_training_that_diverged(brief, localizer, monkeypatch)
 def test_quantize_is_within_half_a_step(student: StudentNetwork) -> None:
     quantized = quantize(student.model.weights)
     for name, weight in student.model.weights.items():
-        if name.endswith(".b"):
-            assert quantized[name] is weight
-        else:
-            step = np.abs(weight).max(axis=-2, keepdims=True) / MAX_INT8
-            assert (np.abs(quantized[name] - weight) <= 0.501 * step).all()
-            assert (np.abs(np.rint(quantized[name] / step)) <= MAX_INT8).all()
+        step = np.abs(weight).max(axis=-2, keepdims=True) / 127 if name.endswith(".w") else 0  # biases stay
+        assert (np.abs(quantized[name] - weight) <= 0.501 * step).all()
+        assert not name.endswith(".w") or (np.abs(np.rint(quantized[name] / step)) <= 127).all()

@@ -15,6 +15,8 @@ from typing import IO
 
 import numpy as np
 import pytest
+from pythonosc.osc_message import OscMessage
+from pythonosc.udp_client import UDPClient
 
 from padforge.design.common import server
 from padforge.design.common.validation import InputError
@@ -54,7 +56,7 @@ def of_topic(topic: str, messages: list[Message]) -> list[Message]:
     return [message for message in messages if message.topic == topic]
 
 
-def test_build_gives_every_reading_and_press_in_order(messages, brief: Recording) -> None:
+def test_build_gives_every_reading_and_press_as_operations_of_rosbridge(messages, brief: Recording) -> None:
     readings = of_topic(READINGS, messages)
     np.testing.assert_array_equal([message.msg["data"] for message in readings], brief.readings)
     np.testing.assert_array_equal([message.pad["time_s"] for message in readings], brief.times_s)
@@ -62,9 +64,6 @@ def test_build_gives_every_reading_and_press_in_order(messages, brief: Recording
     pressed = [message.msg["data"] for message in of_topic(PRESSED, messages)]
     assert pressed == [True, False] * (len(pressed) // 2) + [True] * (len(pressed) % 2)
     assert len(pressed) // 2 >= len(brief.presses_mm) - 2
-
-
-def test_to_json_is_an_operation_of_rosbridge(messages) -> None:
     for number, message in enumerate(messages[:50]):
         line = json.loads(message.to_json(number))
         assert (line["op"], line["type"]) == ("publish", TOPICS[line["topic"]].msgtype)
@@ -104,8 +103,7 @@ def test_health_comes_first_and_with_every_fault(messages, brief: Recording, loc
     assert messages[0].topic == HEALTH
     assert messages[0].pad["states"] == ["unmonitored"] * brief.fibres
     pipeline = pipeline_of(localizer, brief)
-    fault = FibreFault(press=3, since=1, fibres=(2,), kind="stuck", score=8.0)
-    rows = brief.readings[:2].copy()
+    fault, rows = FibreFault(press=3, since=1, fibres=(2,), kind="stuck", score=8.0), brief.readings[:2].copy()
     rows[1, 0] = np.nan
     pipeline.feed(brief.times_s[:2], rows)
     first, one, two, last = MessageBuilder(pipeline).build(brief.times_s[:2], rows, [fault])
@@ -165,13 +163,7 @@ def test_json_lines_sends_nothing_without_the_token() -> None:
             assert json.loads(client.makefile().readline())["topic"] == HEALTH
 
 
-class LongMessage(Message):
-    """A message of 400 kB."""
-
-    text = '"' + "x" * 400_000 + '"'
-
-    def to_json(self, number: int) -> str:
-        return self.text
+LONG = Message(READINGS, {}, {"text": "x" * 400_000})
 
 
 def test_slow_subscriber_is_disconnected_and_delays_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,19 +172,18 @@ def test_slow_subscriber_is_disconnected_and_delays_nobody(monkeypatch: pytest.M
         lines.send(STATES)
         slow = subscribe(stack, lines)
         for _ in range(200):
-            lines.send(LongMessage(READINGS, {}, {}))
+            lines.send(LONG)
         subscribe(stack, lines)
         assert sum(1 for _ in slow) < 200  # the connection ends, though the server does not
 
 
 def test_queued_messages_still_arrive_at_the_end() -> None:
-    """The end of the program would cut a slow subscriber off."""
     with ExitStack() as stack:
         with JsonLines("127.0.0.1", 0) as lines:
             lines.send(STATES)
             client, received = subscribe(stack, lines), []
             for _ in range(30):
-                lines.send(LongMessage(READINGS, {}, {}))
+                lines.send(LONG)
             slow = threading.Timer(0.2, lambda: received.extend(client))
             slow.start()
         slow.join(20)
@@ -218,8 +209,6 @@ def test_client_has_a_time_limit_for_its_token_however_slowly_it_sends(monkeypat
 
 
 def test_osc_sends_numbers() -> None:
-    from pythonosc.osc_message import OscMessage
-
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(20)
@@ -233,8 +222,6 @@ def test_osc_sends_numbers() -> None:
 
 
 def test_osc_survives_a_lost_network_and_resolves_its_host_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pythonosc.udp_client import UDPClient
-
     def fail(client: UDPClient, content: object) -> None:
         addresses.append(client._address)  # noqa: SLF001
         raise OSError(errno.ENETUNREACH, "Network is unreachable")
@@ -246,13 +233,10 @@ def test_osc_survives_a_lost_network_and_resolves_its_host_once(monkeypatch: pyt
     assert addresses[0] in ("127.0.0.1", "::1")
 
 
-def test_lsl_refuses_a_name_that_is_no_text() -> None:
-    with pytest.raises(InputError, match="the name of a stream is"):
-        LslOutput("\udc80", 2, 13.0)
-
-
 def test_lsl_streams_readings_and_touches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In its own process, which looks for streams on this machine only."""
+    with pytest.raises(InputError, match="the name of a stream is"):
+        LslOutput("\udc80", 2, 13.0)
     (tmp_path / "lsl.cfg").write_text("[multicast]\nResolveScope = machine\n[log]\nlevel = -3\n")
     code = """
 import pylsl

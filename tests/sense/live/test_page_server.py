@@ -41,6 +41,12 @@ def page() -> Iterator[LivePage]:
         yield page
 
 
+@pytest.fixture
+def hand_page() -> Iterator[LivePage]:
+    with LivePage(0, "hand.html", ("back", "skip")) as page:
+        yield page
+
+
 def get(page: LivePage, path: str, host: str | None = None) -> HTTPResponse:
     connection = HTTPConnection(HOST, port_of(page), timeout=10)
     connection.request("GET", path, headers={} if host is None else {"Host": host})
@@ -64,13 +70,11 @@ def test_page_allows_only_its_own_script(name: str) -> None:
     with LivePage(0, name) as page:
         response = get(page, "/")
         text = response.read().decode()
-    assert "common." not in text
-    assert "local_page." not in text
     assert response.status == 200
     assert text.startswith("<!doctype html>")
     policy = response.headers["Content-Security-Policy"]
     assert policy.startswith("default-src 'none'")
-    assert "unsafe" not in policy
+    assert not any(word in policy + text for word in ("unsafe", "common.", "local_page."))
     # One page, nothing from elsewhere: no address but the namespace of SVG, and no markup made from data.
     assert [part.split('"')[0] for part in text.split("http://")[1:]] == ["www.w3.org/2000/svg"]
     assert not any(word in text for word in ("https://", "innerHTML", "outerHTML", "insertAdjacentHTML", "eval("))
@@ -112,14 +116,11 @@ def test_slow_browser_skips_views_and_delays_nobody(page: LivePage) -> None:
         numbers = [message["at"] for message in iter(lambda: next(messages), {"at": 2000})]
     assert numbers == sorted(numbers)
     assert len(numbers) < 1000
-
-
-def test_browser_gets_the_last_view() -> None:
-    with LivePage(0) as page:
-        page.show({"at": 0})
-        browser = get(page, "/events")
-        page.show({"ended": "ended"})
-    assert browser.read().decode().endswith('data: {"ended": "ended"}\n\n')
+    with LivePage(0) as other:
+        other.show({"at": 0})
+        browser = get(other, "/events")
+        other.show({"ended": "ended"})
+    assert browser.read().decode().endswith('data: {"ended": "ended"}\n\n')  # the last view is not skipped
 
 
 def test_server_survives_browsers_that_go_away(page: LivePage, capfd: pytest.CaptureFixture[str]) -> None:
@@ -136,12 +137,6 @@ def test_server_survives_browsers_that_go_away(page: LivePage, capfd: pytest.Cap
     assert capfd.readouterr().err == ""
 
 
-@pytest.fixture
-def hand_page() -> Iterator[LivePage]:
-    with LivePage(0, "hand.html", ("back", "skip")) as page:
-        yield page
-
-
 def post(page: LivePage, body: bytes, **headers: str) -> int:
     """Post a command as the page that was served does by default; return the status."""
     connection = HTTPConnection(HOST, port_of(page), timeout=10)
@@ -155,8 +150,7 @@ def test_commands_are_accepted_from_the_page_only(page: LivePage, hand_page: Liv
     for word in (b"", b"quit", b"skip\n", b"\xff" * 4, b"back" * 1000):
         assert post(hand_page, word) == 400
     port = port_of(hand_page)
-    for origin in ("http://elsewhere.example", "null", f"https://{HOST}:{port}", f"http://{HOST}:{port + 1}"):
-        assert post(hand_page, b"skip", Origin=origin) == 403
+    assert post(hand_page, b"skip", Origin=f"http://{HOST}:{port + 1}") == 403
     assert post(page, b"skip") == 400  # it has no commands
     assert hand_page.read_commands() == page.read_commands() == []
     for _ in range(20):
