@@ -45,15 +45,9 @@ class HandPhase(StrEnum):
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
-    """Return the responses of a press early, once it has sunk in, and at its end.
+    """Return the responses (2, C) of a press early, once it has sunk in, and at its end.
 
-    Args:
-        readings: V, NaN where missing; shape (n, C).
-        down_command: Index of the first reading of the press, > 0.
-        up_command: Index of the first reading after it, <= n.
-
-    Returns:
-        Difference from the baseline before it, V, 0 where missing; shape (2, C).
+    They are the differences from the baseline before it, V, 0 where missing; of readings (n, C), NaN where missing.
     """
     quarter = max((up_command - down_command) // 4, 1)
     early, last = down_command + quarter, up_command - 1  # the last reading may show the finger leave
@@ -101,13 +95,8 @@ class PressValidator:
     def is_untouched(self, volts: Array, before: Array, held_s: float) -> bool:
         """Return whether nothing touches a pad that the detector has touched.
 
-        Either it reads as before the touch: that was none, or its end was missed. Or it is back at its baseline: that
-        was the end of a press that the detector had ended too soon.
-
-        Args:
-            volts: Readings now; shape (C,).
-            before: Readings before the touch; shape (C,).
-            held_s: Time since the touch.
+        Either the readings (C,) are as before the touch: that was none, or its end was missed. Or they are back at the
+        baseline: that was the end of a press that the detector had ended too soon.
         """
         if held_s > RELEASE_S and self.relative_response(volts - before) < MIN_RESPONSE:
             return True
@@ -133,16 +122,9 @@ class PressValidator:
 
 
 class PressSequence:
-    """Targets to press one after the other, each asked for until a press of it is accepted.
+    """Targets (Q, 2) to press one after the other, each asked for until a press of it is accepted.
 
-    Args:
-        targets_mm: Positions; shape (Q, 2).
-        hold_s: For how long a press is to be held, and the pad left alone after it, > 0.
-        now_s: The time.
-
-    Attributes:
-        hold_s: See above.
-        accepted_mm: Positions of the accepted presses, oldest first.
+    A press is to be held for `hold_s`, and the pad to be left alone for as long after it.
     """
 
     def __init__(self, targets_mm: Array, hold_s: float, now_s: float) -> None:
