@@ -270,7 +270,7 @@ class HandSession:
             "target": sequence.target,
             "rejected": self._rejected_mm,
             "done": done,
-            "total": done + sequence.n_remaining,
+            "total": done + len(sequence.remaining),
             "presses": [{"x_mm": x, "y_mm": y} for x, y in sequence.accepted_mm[-TRAIL:]],
             "fibres": [
                 {"swing": None, "state": "missing"} if np.isnan(swing) else {"swing": round(swing, 3), "state": ""}
@@ -336,10 +336,7 @@ def _position_text(position_mm: Position | None) -> str:
 
 
 def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, Any]:
-    """Return the constant part of the view, as JSON: frame, paths of the fibres in mm, and commands.
-
-    Positions are those of the plan; of a pad that lies `mirrored`, with its tracks up, x runs to the left.
-    """
+    """Return the constant part of the view, as JSON; of a pad `mirrored`, with its tracks up, x runs to the left."""
     return {
         "title": title,
         "origin_mm": [0.0, 0.0],

@@ -161,10 +161,9 @@ def check_platform() -> None:
 
 
 def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
-    """Start `python -m module` with pipes to its stdin and stdout.
+    """Start `python -m module` with pipes to its stdin and stdout; an interrupt from the keyboard does not reach it.
 
-    It finds this package wherever it is started from, and imports nothing from the current folder (`-P`). An interrupt
-    from the keyboard does not reach it: its parent decides what ends first.
+    It finds this package wherever it is started from, and imports nothing from the current folder (`-P`).
     """
     path = os.pathsep.join((str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))))
     return subprocess.Popen(

@@ -59,9 +59,9 @@ class Limits:
         x0, x1, y0, y1, z0, z1 = rig.box_mm
         try:
             return cls(
-                box_mm=((x0, x1), (y0, y1), (z0, z1)),
-                contact_mm=rig.contact_mm,
-                max_depth_mm=rig.max_depth_mm,
+                ((x0, x1), (y0, y1), (z0, z1)),
+                rig.contact_mm,
+                rig.max_depth_mm,
                 max_speed_mm_s=max(rig.travel_mm_s, rig.press_mm_s),
                 max_acceleration_mm_s2=rig.acceleration_mm_s2,
                 tool=rig.tool_rad,

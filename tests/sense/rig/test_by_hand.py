@@ -39,10 +39,11 @@ from tests.sense.conftest import QUICK
 from tests.sense.rig.fakes import Time
 
 IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
-VIEW: dict[str, Any] = {"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7}
-VIEW |= {"message": "counted: x 0, y 0 mm"}
-VIEW |= {"target": (16.875, 16.875), "rejected": None}
-VIEW |= {"presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}]}
+VIEW: dict[str, Any] = {
+    **{"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7},
+    **{"message": "counted: x 0, y 0 mm", "target": (16.875, 16.875), "rejected": None},
+    "presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}],
+}
 
 
 def config_of(**settings: object) -> RigConfig:
@@ -80,9 +81,7 @@ def test_plan_targets_rounds_none_into_a_keep_out() -> None:
 def test_pad_view_has_the_paths() -> None:
     pad = Morphology.random(2, knots=3, seed=1)
     view = json.loads(json.dumps(pad_view(pad, "hand")))
-    assert pad_view(pad, "hand", mirrored=True)["paths"] == pad_view(pad, "hand")["paths"]
     assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
-    assert len(view["paths"]) == 4
     ends = np.array([[path[0], path[-1]] for path in view["paths"]])
     np.testing.assert_allclose(ends, pad.to_mm(pad.knots[:, [0, -1]]), atol=0.051)
 
@@ -93,7 +92,6 @@ def test_view_lines_map_positions() -> None:
     assert lines[0] == "PRESS X 5, Y 5 MM"
     assert lines[1].count("#") == lines[1].count(".") == 15
     rows = lines[3 : 3 + MAP_ROWS]
-    assert {len(row) for row in rows} == {MAP_COLUMNS + 2}
     assert (rows[0][MAP_COLUMNS], rows[0][1]) == ("O", ".")  # up is up, right is right
     assert "".join(rows).count("O") == 1
     assert rows[MAP_ROWS // 2][1 + MAP_COLUMNS // 2] == "."
@@ -316,12 +314,11 @@ def test_session_executes_commands(hands) -> None:
         return schedule.pop(len(hand.messages), []) if hand.views and hand.views[-1]["phase"] == "wait" else []
 
     recording = hand.record(commands=commands)
-    first, second, third, *others = hand.targets.tolist()
+    first, second, _, *others = hand.targets.tolist()
     assert accepted_mm(recording).tolist() == [first, second, *others]  # the second again, and the third left out
     assert len(recording.presses_mm) == 5
     journal = [json.loads(line) for line in (hand.out / "journal.ndjson").read_text().splitlines()]
     assert [event["rejected"] for event in journal if "rejected" in event] == ["it was taken back"]
-    assert third not in accepted_mm(recording).tolist()
     hand.record(resume=True)  # what was skipped is asked for again
     np.testing.assert_array_equal(np.sort(accepted_mm(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
 

@@ -36,7 +36,7 @@ def test_sequence_goes_through_all_phases(sequence: PressSequence) -> None:
     assert sequence.progress(101.0) == pytest.approx(0.5)
     assert sequence.release(101.7) == ""
     sequence.accept(101.8)
-    assert (sequence.accepted_mm, sequence.target, sequence.n_remaining) == ([(1.0, 2.0)], (3.0, 4.0), 2)
+    assert (sequence.accepted_mm, sequence.target, len(sequence.remaining)) == ([(1.0, 2.0)], (3.0, 4.0), 2)
     assert [sequence.phase(time_s) for time_s in (102.6, 102.7)] == ["wait", "press"]
     for down_s in (103.0, 106.0):
         assert press(sequence, down_s, down_s + 1) == ""
