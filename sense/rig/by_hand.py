@@ -55,15 +55,9 @@ PollCommands = Callable[[], Sequence[str]]
 
 
 def plan_targets(config: RigConfig) -> Array:
-    """Return the targets that `[rig]` asks for: of a grid or a file in that order, or uniform ones in short rounds.
+    """Return the targets (Q, 2) that `[rig]` asks for: of a grid or a file in that order, or uniform ones in rounds.
 
     Uniform targets are whole millimetres: nobody hits fractions, and whole ones are found on squared paper.
-
-    Returns:
-        Positions, mm; shape (Q, 2).
-
-    Raises:
-        InputError: An adaptive plan, or a file that is no plan.
     """
     rig = config.rig
     if rig.plan == "adaptive":
@@ -73,10 +67,10 @@ def plan_targets(config: RigConfig) -> Array:
         return positions_mm
     rounded_mm = np.rint(positions_mm)
     free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))(rounded_mm)
-    return order_in_rounds(np.where(free[:, None], rounded_mm, positions_mm))
+    return _order_in_rounds(np.where(free[:, None], rounded_mm, positions_mm))
 
 
-def order_in_rounds(positions_mm: Array) -> Array:
+def _order_in_rounds(positions_mm: Array) -> Array:
     """Order positions (Q, 2) by nearest neighbour, `ROUND` at a time, each round from where the last one ended."""
     ordered = np.empty_like(positions_mm)
     position = positions_mm[0]
@@ -89,26 +83,21 @@ def order_in_rounds(positions_mm: Array) -> Array:
     return ordered
 
 
-def remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
+def _remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
     """Return those of the targets (Q, 2), in order, without the positions (R, 2) already pressed, one for one."""
-    pressed = [tuple(position) for position in pressed_mm.tolist()]
-    remaining = []
+    pressed, remaining = pressed_mm.tolist(), []
     for position in targets_mm.tolist():
-        if tuple(position) in pressed:
-            pressed.remove(tuple(position))
+        if position in pressed:
+            pressed.remove(position)
         else:
             remaining.append(position)
     return np.array(remaining).reshape(-1, 2)
 
 
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
-    """Open the run directory of a recording by hand, a new one or one to resume, of a board with that identity.
+    """Open the run directory of a recording by hand, new or resumed, of a board with that identity.
 
-    Returns:
-        The recorder, the targets (Q, 2) of its plan, and those (P, 2) still to press, mm.
-
-    Raises:
-        InputError: Targets that cannot be, another recording in the way, or one that was begun otherwise.
+    Returns the recorder, the targets (Q, 2) of its plan, and those (P, 2) still to press, mm.
     """
     is_resumed = resume and (config.out / START).exists()
     if is_resumed:
@@ -121,19 +110,11 @@ def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: b
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
     pressed = [press[:2] for press in read_journal(config.out / JOURNAL).values()] if is_resumed else []
-    return recorder, targets_mm, remaining_targets(targets_mm, np.reshape(pressed, (-1, 2)))
+    return recorder, targets_mm, _remaining_targets(targets_mm, np.reshape(pressed, (-1, 2)))
 
 
 class HandSession:
-    """A session of recording by hand.
-
-    Args:
-        recorder: New or resumed.
-        n_fibres: C.
-        targets_mm: Positions to press, in this order; shape (Q, 2).
-        hold_s: For how long a press is to be held, and the pad left alone after it.
-        n_done: Presses made before.
-    """
+    """A session of recording by hand, of the targets (Q, 2) in this order; `n_done` presses were made before."""
 
     def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
         self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done
@@ -156,16 +137,7 @@ class HandSession:
     def run(
         self, blocks: Iterable[tuple[Array, Array]], on_view: OnView, poll_commands: PollCommands = lambda: ()
     ) -> None:
-        """Record until all presses are made or the command quit comes.
-
-        Args:
-            blocks: Times (n,) s and readings (n, C) V as they come.
-            on_view: Receives what there is to show, see `view`.
-            poll_commands: Returns the commands, of `COMMANDS`, since its last call.
-
-        Raises:
-            RigFault: The board failed, or the disk; what is done is on the disk.
-        """
+        """Record blocks of times (n,) s and readings (n, C) V until all presses are made or the command quit comes."""
         try:
             for times_s, readings in blocks:
                 for command in poll_commands():
@@ -220,12 +192,11 @@ class HandSession:
             self._validator.accept(responses, self._baseline)
             self._max_response_v = max(self._max_response_v, float(np.abs(responses).max()))
             self._sequence.accept(self._now_s)
-            self._message = f"counted: {position_text(target)}"
+            self._message = f"counted: {_position_text(target)}"
         self._recorder.sync()
         self._number, self._released, self._released_s = self._number + 1, up_command, self._now_s
 
     def _record_rejected(self, press: int, down_command: int, up_command: int, reason: str) -> None:
-        """Record that a press was at an unknown position."""
         self._recorder.begin(UNKNOWN, down_command, press)
         self._recorder.finish(up_command, rejected=reason)
 
@@ -245,9 +216,8 @@ class HandSession:
     def _check_detector(self) -> None:
         """Believe the readings if they contradict the detector, and restart it."""
         rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
-        volts = interpolate_gaps(rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]).mean(
-            axis=0
-        )  # the latest
+        latest = rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]
+        volts = interpolate_gaps(latest).mean(axis=0)
         if self._sequence.is_pressed:
             if self._validator.is_untouched(volts, self._baseline, self._sequence.held_s(self._now_s)):
                 self._restart_detector()
@@ -282,12 +252,11 @@ class HandSession:
     def view(self) -> dict[str, Any]:
         """Return what there is to show now, as JSON.
 
-        Returns:
-            "phase", a `HandPhase`, and "progress", 0 to 1; "prompt", what is asked for, and "message", the outcome of
-            the last press, a line each; "target", and "rejected", the target of the last press if that was rejected,
-            [x, y] mm or None; "done" and "total", numbers of presses; "presses" accepted last, "x_mm" and "y_mm";
-            "fibres", each with "swing" (from its baseline, as a share of the largest response; None if missing) and
-            "state".
+        It has "phase", a `HandPhase`, and "progress", 0 to 1; "prompt", what is asked for, and "message", the outcome
+        of the last press, a line each; "target", and "rejected", the target of the last press if that was rejected,
+        [x, y] mm or None; "done" and "total", numbers of presses; "presses" accepted last, "x_mm" and "y_mm";
+        "fibres", each with "swing" (from its baseline, as a share of the largest response; None if missing) and
+        "state".
         """
         sequence, end = self._sequence, self._ring.end
         baseline = self._baseline if sequence.is_pressed else self._mean_before(end)
@@ -301,7 +270,7 @@ class HandSession:
             "target": sequence.target,
             "rejected": self._rejected_mm,
             "done": done,
-            "total": done + sequence.n_remaining,
+            "total": done + len(sequence.remaining),
             "presses": [{"x_mm": x, "y_mm": y} for x, y in sequence.accepted_mm[-TRAIL:]],
             "fibres": [
                 {"swing": None, "state": "missing"} if np.isnan(swing) else {"swing": round(swing, 3), "state": ""}
@@ -316,7 +285,7 @@ class HandSession:
         sequence = self._sequence
         if self._detector is None or sequence.held_s(self._now_s) > MAX_HOLD * sequence.hold_s:
             return "lift; if nothing touches the pad, say so (f)"
-        target = position_text(sequence.target)
+        target = _position_text(sequence.target)
         return {
             HandPhase.SETTLE: "hands off the pad",
             HandPhase.WAIT: f"next {target}: wait" if target else "hands off the pad",
@@ -339,8 +308,8 @@ def record_by_hand(
     Args:
         config: What is recorded.
         board: Not yet connected.
-        on_view: See `HandSession.run`.
-        poll_commands: See `HandSession.run`.
+        on_view: Receives what there is to show, see `HandSession.view`.
+        poll_commands: Returns the commands, of `COMMANDS`, since its last call.
         resume: Whether to resume what is in `config.out`, if anything is.
 
     Raises:
@@ -360,18 +329,14 @@ def record_by_hand(
     return Recording.open(config.out)
 
 
-def position_text(position_mm: Position | None) -> str:
-    """Write a position for people."""
+def _position_text(position_mm: Position | None) -> str:
     if position_mm is None:
         return ""
     return "x {}, y {} mm".format(*(f"{value:.1f}".removesuffix(".0") for value in position_mm))
 
 
 def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, Any]:
-    """Return the constant part of the view, as JSON: frame, paths of the fibres in mm, and commands.
-
-    Positions are those of the plan; of a pad that lies `mirrored`, with its tracks up, x runs to the left.
-    """
+    """Return the constant part of the view, as JSON; of a pad `mirrored`, with its tracks up, x runs to the left."""
     return {
         "title": title,
         "origin_mm": [0.0, 0.0],

@@ -45,15 +45,9 @@ class HandPhase(StrEnum):
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
-    """Return the responses of a press early, once it has sunk in, and at its end.
+    """Return the responses (2, C) of a press early, once it has sunk in, and at its end.
 
-    Args:
-        readings: V, NaN where missing; shape (n, C).
-        down_command: Index of the first reading of the press, > 0.
-        up_command: Index of the first reading after it, <= n.
-
-    Returns:
-        Difference from the baseline before it, V, 0 where missing; shape (2, C).
+    They are the differences from the baseline before it, V, 0 where missing; of readings (n, C), NaN where missing.
     """
     quarter = max((up_command - down_command) // 4, 1)
     early, last = down_command + quarter, up_command - 1  # the last reading may show the finger leave
@@ -101,13 +95,8 @@ class PressValidator:
     def is_untouched(self, volts: Array, before: Array, held_s: float) -> bool:
         """Return whether nothing touches a pad that the detector has touched.
 
-        Either it reads as before the touch: that was none, or its end was missed. Or it is back at its baseline: that
-        was the end of a press that the detector had ended too soon.
-
-        Args:
-            volts: Readings now; shape (C,).
-            before: Readings before the touch; shape (C,).
-            held_s: Time since the touch.
+        Either the readings (C,) are as before the touch: that was none, or its end was missed. Or they are back at the
+        baseline: that was the end of a press that the detector had ended too soon.
         """
         if held_s > RELEASE_S and self.relative_response(volts - before) < MIN_RESPONSE:
             return True
@@ -133,20 +122,13 @@ class PressValidator:
 
 
 class PressSequence:
-    """Targets to press one after the other, each asked for until a press of it is accepted.
+    """Targets (Q, 2) to press one after the other, each asked for until a press of it is accepted.
 
-    Args:
-        targets_mm: Positions; shape (Q, 2).
-        hold_s: For how long a press is to be held, and the pad left alone after it, > 0.
-        now_s: The time.
-
-    Attributes:
-        hold_s: See above.
-        accepted_mm: Positions of the accepted presses, oldest first.
+    A press is to be held for `hold_s`, and the pad to be left alone for as long after it.
     """
 
     def __init__(self, targets_mm: Array, hold_s: float, now_s: float) -> None:
-        self._remaining: deque[Position] = deque((x, y) for x, y in targets_mm.tolist())
+        self.remaining: deque[Position] = deque((x, y) for x, y in targets_mm.tolist())
         self.hold_s, self.accepted_mm = hold_s, list[Position]()
         self._since_s, self._ready_s, self._is_settling = now_s, now_s + SETTLE_S, True
         self._touched_s: float | None = None
@@ -155,12 +137,7 @@ class PressSequence:
     @property
     def target(self) -> Position | None:
         """The position to press; None when all are done."""
-        return self._remaining[0] if self._remaining else None
-
-    @property
-    def n_remaining(self) -> int:
-        """Number of targets still to press."""
-        return len(self._remaining)
+        return self.remaining[0] if self.remaining else None
 
     @property
     def is_pressed(self) -> bool:
@@ -178,7 +155,7 @@ class PressSequence:
             return HandPhase.LIFT if is_over else HandPhase.HOLD
         if now_s < self._ready_s:
             return HandPhase.SETTLE if self._is_settling else HandPhase.WAIT
-        return HandPhase.PRESS if self._remaining else HandPhase.DONE
+        return HandPhase.PRESS if self.remaining else HandPhase.DONE
 
     def progress(self, now_s: float) -> float:
         """Return how far the wait or the hold has gone, 0 to 1."""
@@ -188,8 +165,8 @@ class PressSequence:
     def touch(self, time_s: float) -> Position | None:
         """Note a touch; return the target it was meant for, None if none was asked for."""
         self._touched_s = time_s
-        self._rejection = "" if self._remaining and time_s >= self._ready_s else "it came before it was asked for"
-        return None if self._rejection else self._remaining[0]
+        self._rejection = "" if self.remaining and time_s >= self._ready_s else "it came before it was asked for"
+        return None if self._rejection else self.remaining[0]
 
     def release(self, time_s: float) -> str:
         """Note a release; return why the press is rejected, or ""."""
@@ -208,14 +185,14 @@ class PressSequence:
 
     def accept(self, now_s: float) -> None:
         """Accept the press released last, and go on to the next target."""
-        self.accepted_mm.append(self._remaining.popleft())
+        self.accepted_mm.append(self.remaining.popleft())
         self._wait_until(now_s, self._ready_s)
 
     def skip(self, now_s: float) -> None:
         """Leave the target out, and reject the press under way, if any."""
         self.reject("its place was skipped")
-        if self._remaining:
-            self._remaining.popleft()
+        if self.remaining:
+            self.remaining.popleft()
         self._wait_until(now_s, self._ready_s)
 
     def undo(self, now_s: float) -> bool:
@@ -223,7 +200,7 @@ class PressSequence:
         if self.is_pressed or not self.accepted_mm:
             self.reject("it was taken back")
             return False
-        self._remaining.appendleft(self.accepted_mm.pop())
+        self.remaining.appendleft(self.accepted_mm.pop())
         self._wait_until(now_s, self._ready_s)
         return True
 

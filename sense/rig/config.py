@@ -51,37 +51,23 @@ _IDENTITY_KEYS = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial",
 
 @dataclass(frozen=True)
 class RobotFrame:
-    """The pad's frame in the arm's base frame.
+    """The pad's frame in the arm's base frame."""
 
-    Attributes:
-        centre_mm: x and y of the pad's centre.
-        turn_rad: From the base's y axis to the pad's.
-        contact_mm: Height of the pad's surface.
-        tool_rad: Rotation vector of the tool.
-        mirrored: Whether the pad lies with its tracks up: its y axis as on the plan, its x axis the other way.
-    """
-
-    centre_mm: tuple[float, float]
-    turn_rad: float
-    contact_mm: float
-    tool_rad: tuple[float, float, float]
-    mirrored: bool = False
+    centre_mm: tuple[float, float]  # of the pad
+    turn_rad: float  # from the base's y axis to the pad's
+    contact_mm: float  # height of the pad's surface
+    tool_rad: tuple[float, float, float]  # rotation vector
+    mirrored: bool = False  # the pad lies with its tracks up: its y axis as on the plan, its x axis the other way
 
     @classmethod
     def from_settings(cls, rig: RigSettings) -> "RobotFrame":
         """Return the frame that `[rig]` sets; raises RigFault if the contact height or the pad's centre is unknown."""
         if rig.contact_mm is None:
-            raise RigFault(
-                "refused",
-                "[rig] contact_mm is unknown, allowed is the height of the pad's surface in the base frame",
-                "touch the pad with the tool by hand and note its z",
-            )
+            message = "[rig] contact_mm is unknown, allowed is the height of the pad's surface in the base frame"
+            raise RigFault("refused", message, "touch the pad with the tool by hand and note its z")
         if rig.pad_mm is None:
-            raise RigFault(
-                "refused",
-                "[rig] pad_mm is unknown, allowed are x and y of the pad's centre in the base frame",
-                "jog the tool to the middle of the pad and note its x and y",
-            )
+            message = "[rig] pad_mm is unknown, allowed are x and y of the pad's centre in the base frame"
+            raise RigFault("refused", message, "jog the tool to the middle of the pad and note its x and y")
         return cls(rig.pad_mm, math.radians(rig.pad_angle_deg), rig.contact_mm, rig.tool_rad, bool(rig.mirrored))
 
     def pose(self, position_mm: Array, depth_mm: float) -> Pose:
@@ -114,18 +100,10 @@ class HolderFrame(Settings):
 
 
 def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
-    """Fill in where the pad lies on a printer's bed, and the workspace above it, from its holder.
+    """Fill in where the pad lies on a printer's bed, and the workspace above it, from the holder in `folder`.
 
     The workspace is the pad seen from above, as far as the nozzle gets; down to `max_depth_mm`, but never below the top
-    of the holder's walls. What `[rig]` sets takes precedence.
-
-    Args:
-        rig: `[rig]`.
-        folder: Has the `fabrication.json` of a pad with a holder; see "frame" in it.
-
-    Raises:
-        RigFault: "refused" if something is unknown that neither the folder nor `[rig]` tells.
-        InputError: The file is damaged.
+    of the holder's walls. What `[rig]` sets takes precedence; what neither tells raises RigFault("refused").
     """
     if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
         return rig
@@ -158,58 +136,40 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
 
 
 def _read_holder_frame(folder: Path) -> HolderFrame:
-    path, advice = folder / FABRICATION_FILE, "measure them, or make the pad's holder: [mould] holder = true"
-    if not path.is_file():
-        message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and there is no {path}"
-        raise RigFault("refused", message, advice)
-    frame = read_json(path, FABRICATION_FORMAT).get("frame")
-    if not isinstance(frame, Mapping):
-        message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {path} is of a pad without a holder"
-        raise RigFault("refused", message, advice)
-    return validate(HolderFrame, frame, f"{path}: frame")
+    path = folder / FABRICATION_FILE
+    frame = read_json(path, FABRICATION_FORMAT).get("frame") if path.is_file() else None
+    if isinstance(frame, Mapping):
+        return validate(HolderFrame, frame, f"{path}: frame")
+    reason = f"{path} is of a pad without a holder" if path.is_file() else f"there is no {path}"
+    message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {reason}"
+    raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
 
 
 @dataclass(frozen=True)
 class RigConfig:
-    """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from.
-
-    Attributes:
-        pad: The pad.
-        contact: What a press deforms.
-        rig: `[rig]`.
-        out: The run directory.
-        command: Command line, for the provenance.
-        inputs: Files it was made from, for the provenance.
-        pad_settings: Which part of the pad is pressed, unless a file says where; None for the default.
-        folder: Of the pad, with what fabricate has written.
-    """
+    """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from."""
 
     pad: Morphology
-    contact: Contact
+    contact: Contact  # what a press deforms
     rig: RigSettings
-    out: Path
-    command: str
+    out: Path  # the run directory
+    command: str  # for the provenance, as are the inputs
     inputs: Sequence[Path] = ()
-    pad_settings: PadSettings | None = None
-    folder: Path = Path()
+    pad_settings: PadSettings | None = None  # which part of the pad is pressed, unless a file says where
+    folder: Path = Path()  # of the pad, with what fabricate has written
 
 
 def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
     """Return the stored plan of a resumed recording, otherwise the one that `rig` asks for."""
     if resume and (config.out / START).exists():
         plan = PressPlan.from_rows(read_source(config, rig, KIND)["plan"]["presses"])
-        return check_pressable(
-            plan, config.out, pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
-        )
+        free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
+        return check_pressable(plan, config.out, free)
     return make_plan(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings)
 
 
 def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
-    """Return the source of the recording in `config.out`, which is to be resumed.
-
-    Raises:
-        InputError: It is of another kind, has no plan, or was begun with other settings or another pad.
-    """
+    """Return the source of the recording to resume; raises InputError if it was begun otherwise or has no plan."""
     source = read_json(config.out / START, FORMAT).get("source")
     source = source if isinstance(source, dict) else {}
     if not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
@@ -255,8 +215,7 @@ def open_recorder(
         identities: What "arm" and "board" returned on connecting.
         kind: Of the source.
 
-    Raises:
-        InputError: The recording cannot be resumed, or was begun with another arm, tool or board.
+    Raises InputError if the recording cannot be resumed, or was begun with another arm, tool or board.
     """
     devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
     if not (resume and (folder / START).exists()):

@@ -79,14 +79,10 @@ class Arm(Protocol):
     """A robot arm. Methods raise `RigFault` within 5 s rather than wait for ever."""
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the link.
+        """Open the link and return the arm's identity (model, versions, rates) as JSON.
 
-        Returns:
-            The arm's identity (model, versions, rates) as JSON. `serial` and, where the controller keeps the tool,
-            `tcp` (the tip from the flange, mm and rad) are compared when a recording is resumed.
-
-        Raises:
-            RigFault: "refused" if another program controls the arm.
+        `serial` and, where the controller keeps the tool, `tcp` (the tip from the flange, mm and rad) are compared when
+        a recording is resumed. Raises RigFault("refused") if another program controls the arm.
         """
         ...
 
@@ -130,21 +126,15 @@ class Board(Protocol):
     """An analogue-to-digital converter with C channels. Methods raise `RigFault` within 5 s."""
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the link and start sampling.
+        """Open the link, start sampling and return the board's identity (name, versions, bits ...) as JSON.
 
-        Returns:
-            The board's identity (name, versions, bits ...) as JSON. Of it are used: `rate_hz`, samples a second;
-            `channels`, the number C; `inputs`, which of the board they are; `supply_v`, the reading at full scale;
-            and `warning`, which `doctor` shows.
+        Of it are used: `rate_hz`, samples a second; `channels`, the number C; `inputs`, which of the board they are;
+        `supply_v`, the reading at full scale; and `warning`, which `doctor` shows.
         """
         ...
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, without waiting.
-
-        Raises:
-            RigFault: "stale" after 1 s without any, "lost" if the board is gone.
-        """
+        """Return all samples since the last call at once; raises RigFault("stale") after 1 s without any, or "lost"."""
         ...
 
     def close(self) -> None:
@@ -152,25 +142,16 @@ class Board(Protocol):
         ...
 
 
-def device_names(group: Group) -> list[str]:
-    """List the installed arms or boards."""
-    return sorted({point.name for point in entry_points(group=group)})
-
-
 def load_device(group: Group, name: str) -> Callable[..., Any]:
-    """Return the function that makes an arm or a board.
-
-    Raises:
-        InputError: No device has that name, or its package cannot be imported.
-    """
-    points = [point for point in entry_points(group=group) if point.name == name]
-    if not points:
-        allowed = ", ".join(device_names(group)) or "none: padforge is not installed, run pip install ."
+    """Return the function that makes an arm or a board; raises InputError if there is none that can be imported."""
+    points = {point.name: point for point in reversed(list(entry_points(group=group)))}
+    if name not in points:
+        allowed = ", ".join(sorted(points)) or "none: padforge is not installed, run pip install ."
         raise InputError(f"{group.removeprefix('padforge.')}: got {name!r}, allowed are {allowed}")
     try:
-        return points[0].load()
+        return points[name].load()
     except Exception as error:  # a third-party package may fail in any way
-        raise InputError(f"{name}: {points[0].value} cannot be loaded ({type(error).__name__}: {error})") from error
+        raise InputError(f"{name}: {points[name].value} cannot be loaded ({type(error).__name__}: {error})") from error
 
 
 def check_platform() -> None:
@@ -180,10 +161,9 @@ def check_platform() -> None:
 
 
 def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
-    """Start `python -m module` with pipes to its stdin and stdout.
+    """Start `python -m module` with pipes to its stdin and stdout; an interrupt from the keyboard does not reach it.
 
-    It finds this package wherever it is started from, and imports nothing from the current folder (`-P`). An interrupt
-    from the keyboard does not reach it: its parent decides what ends first.
+    It finds this package wherever it is started from, and imports nothing from the current folder (`-P`).
     """
     path = os.pathsep.join((str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))))
     return subprocess.Popen(
@@ -197,11 +177,7 @@ def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess
 
 
 def host_ports() -> list[Any]:
-    """List the serial ports of this host, as pyserial does: `device`, `vid`, `pid`, `serial_number`, `description`.
-
-    Raises:
-        RigFault: "refused" without pyserial.
-    """
+    """List the serial ports of this host, as pyserial does; raises RigFault("refused") without pyserial."""
     _import_pyserial()
     from serial.tools.list_ports import comports
 
@@ -212,16 +188,9 @@ class SerialStream:
     """An open serial port. Any method but `close` raises RigFault("lost") once the device is gone."""
 
     def __init__(self, port: str, baud: int, timeout_s: float, device: str = "board") -> None:
-        """Open a port for this process alone.
+        """Open a port for this process alone; `timeout_s` is the longest wait of `receive`.
 
-        Args:
-            port: its name.
-            baud: of the device.
-            timeout_s: longest wait of `receive`.
-            device: what is there, for messages.
-
-        Raises:
-            RigFault: "refused" if it cannot be opened, and why.
+        Raises RigFault("refused"), and why, if it cannot be opened.
         """
         serial = _import_pyserial()
         self.port, self._device = port, device
@@ -253,23 +222,23 @@ class SerialStream:
             self.serial.close()
 
     def _lost(self, error: OSError) -> RigFault:
-        message = f"{self.port}: the {self._device} is gone ({error})"
-        return RigFault("lost", message, "check its cable and connect again")
+        return RigFault(
+            "lost", f"{self.port}: the {self._device} is gone ({error})", "check its cable and connect again"
+        )
 
 
 def port_fault(port: str, error: Exception) -> RigFault:
     """Translate pyserial's `error` on opening `port` into a fault with advice."""
     number, text = getattr(error, "errno", None), str(error)  # Windows has the kind in the text only
+    reason, advice = f"cannot be opened ({error})", "check that it is the right port"
     if number == errno.ENOENT or "FileNotFoundError" in text:
-        advice = "check the cable; `padforge sense doctor` lists the ports there are"
-        return RigFault("refused", f"{port}: there is no such port", advice)
-    if number in (errno.EAGAIN, errno.EBUSY) or "PermissionError" in text:
-        advice = "close it; it may be the serial monitor of the Arduino IDE"
-        return RigFault("refused", f"{port}: another program uses it", advice)
-    if number in (errno.EACCES, errno.EPERM):
+        reason, advice = "there is no such port", "check the cable; `padforge sense doctor` lists the ports there are"
+    elif number in (errno.EAGAIN, errno.EBUSY) or "PermissionError" in text:
+        reason, advice = "another program uses it", "close it; it may be the serial monitor of the Arduino IDE"
+    elif number in (errno.EACCES, errno.EPERM):
+        reason = "no permission to open it"
         advice = "join the group that owns it (`sudo usermod -aG dialout $USER`) and log in again"
-        return RigFault("refused", f"{port}: no permission to open it", advice)
-    return RigFault("refused", f"{port}: cannot be opened ({error})", "check that it is the right port")
+    return RigFault("refused", f"{port}: {reason}", advice)
 
 
 def _import_pyserial() -> Any:

@@ -22,13 +22,7 @@ _RATE_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One diagnosis.
-
-    Attributes:
-        name: What was examined.
-        status: Whether it is well.
-        message: What was measured, in one line.
-    """
+    """What was examined, whether it is well, and what was measured, in one line."""
 
     name: str
     status: Status
@@ -61,10 +55,7 @@ def examine_board(board: Board, clock: Callable[[], float], sleep: Callable[[flo
 def examine_arm(
     arm: Arm, rig: RigSettings, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> list[Diagnosis]:
-    """Connect and close an arm: whether it responds, its states, and whether anything has stopped it. It does not move.
-
-    What would keep `record` from moving it fails here, too: its tool, and a force that nobody can watch.
-    """
+    """Connect and close an arm, without moving it; what would keep `record` from moving it fails here, too."""
     try:
         identity = arm.connect()
         arm.drain()
@@ -84,16 +75,12 @@ def examine_arm(
     return [
         Diagnosis("arm", "ok", _identity_text(identity)),
         Diagnosis("safety", "fail" if is_stopped else "ok", safety),
-        Diagnosis("states", _on_time(gap_s), f"{rate_hz:.0f} Hz, longest gap {1e3 * gap_s:.0f} ms"),
-        Diagnosis("age", _on_time(age_s), f"{1e3 * age_s:.1f} ms"),
+        Diagnosis("states", "ok" if gap_s < _LATE_S else "warn", f"{rate_hz:.0f} Hz, longest gap {1e3 * gap_s:.0f} ms"),
+        Diagnosis("age", "ok" if age_s < _LATE_S else "warn", f"{1e3 * age_s:.1f} ms"),
         Diagnosis("tool", "ok", f"at {position} mm"),
         *_examine_tcp(identity, rig),
         _examine_force(state.force_n, rig.max_force_n),
     ]
-
-
-def _on_time(delay_s: float) -> Status:
-    return "ok" if delay_s < _LATE_S else "warn"
 
 
 def _examine_tcp(identity: Mapping[str, Any], rig: RigSettings) -> list[Diagnosis]:

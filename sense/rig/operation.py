@@ -42,7 +42,6 @@ from padforge.sense.simulation.simulated_recording import simulate
 ADAPT_EVERY = 20  # presses between two evaluations of the localizer by an adaptive plan
 _N_CANDIDATES = 500
 _N_NEIGHBOURS = 5
-_DRY_PREFIX = "padforge-dry-"  # of the temporary folders that dry runs record into
 
 OpenedRig = AbstractContextManager[tuple[Arm, Board, RigSettings]]
 """An arm and a board, not yet connected, and the settings for them, which name the inputs of the board."""
@@ -51,11 +50,7 @@ OpenedRig = AbstractContextManager[tuple[Arm, Board, RigSettings]]
 class AdaptivePlanner:
     """Moves presses to those candidates where errors nearby, times the distance to the nearest press, are largest.
 
-    Args:
-        localizer: Calibrated on an earlier recording of the pad.
-        run: Run directory that is being written, synced after every press.
-        rng: Of the candidates.
-        free: Which of them may be pressed.
+    The localizer is calibrated on an earlier recording; `run` is being written, and synced after every press.
     """
 
     def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: PositionTest) -> None:
@@ -79,17 +74,7 @@ class AdaptivePlanner:
 
 
 def acquisition(candidates: Array, evaluated: Array, errors: Array, pressed: Array) -> Array:
-    """Score candidates: mean error of the nearest evaluated presses times the distance to the nearest press.
-
-    Args:
-        candidates: Positions; shape (K, 2).
-        evaluated: Positions whose errors are known; shape (Q, 2).
-        errors: Of those; shape (Q,).
-        pressed: All positions pressed so far, none of which scores; shape (P, 2).
-
-    Returns:
-        Scores; shape (K,).
-    """
+    """Score candidates (K, 2): mean error of the nearest evaluated presses times distance to the nearest pressed."""
     _, nearest = KDTree(evaluated).query(candidates, k=min(_N_NEIGHBOURS, len(evaluated)))
     distance, _ = KDTree(pressed).query(candidates)
     return errors[nearest].reshape(len(candidates), -1).mean(axis=1) * distance
@@ -114,9 +99,6 @@ def record_simulated(
         inputs: Files it is made from, for the provenance.
         like: See `simulate`.
         replacing: Whether a simulated recording in `out` is replaced.
-
-    Raises:
-        InputError: Settings that cannot be, a twin that reads no fibre, or a recording in the way.
     """
     if not replacing:
         check_new_folder(out)
@@ -174,12 +156,7 @@ def record(
         on_progress: Receives the number of presses done, and of all.
         on_message: Receives what a person should know before the arm moves.
 
-    Returns:
-        The recording; None of a dry run.
-
-    Raises:
-        InputError: Settings, a plan or a run directory that cannot be.
-        RigFault: The rig failed, or the plan is not safe.
+    Returns the recording; None of a dry run. Raises RigFault if the rig failed, or the plan is not safe.
     """
     with opened as (arm, board, rig):
         with Interrupts() as interrupts:
@@ -197,7 +174,7 @@ def record(
             interrupts.check()
         if rig.max_force_n is None:
             on_message('[rig] max_force_n is "unwatched": no force stops the arm')
-        folder = temporary_folder(Path(tempfile.gettempdir()), _DRY_PREFIX) if dry else nullcontext(config.out)
+        folder = temporary_folder(Path(tempfile.gettempdir()), "padforge-dry-") if dry else nullcontext(config.out)
         with folder as out:
             with open_recorder(config, rig, plan.to_rows(), out, resume, identities) as recorder:
                 on_progress(len(recorder.done), len(plan))
@@ -219,12 +196,7 @@ def diagnose(
 ) -> list[Diagnosis]:
     """Diagnose a rig, or the board alone, before a long run; nothing moves.
 
-    Args:
-        make_board: Returns the board.
-        make_arm: Returns the arm and its settings. One device is examined even if the other cannot be made.
-
-    Raises:
-        RigFault: The board is alone, and cannot be made.
+    One device is examined even if the other cannot be made; a board alone that cannot raises RigFault.
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import takewhile
 from types import FrameType
 from typing import Any, Self
 
@@ -63,8 +64,7 @@ class DiskThread:
 
     def is_idle(self, timeout_s: float = 0.0) -> bool:
         """Wait for at most `timeout_s`; return whether all calls are done. Raises what a failed call raised."""
-        done = bool(wait([self._last], timeout_s).done)
-        if done:
+        if done := bool(wait([self._last], timeout_s).done):
             self._last.result()
         return done
 
@@ -123,14 +123,7 @@ class Interrupts:
 class PressLoop:
     """Records presses with one arm and one board, both connected.
 
-    Args:
-        arm: Presses.
-        board: Reads the fibres.
-        recorder: New or resumed; presses it has are not made again.
-        rig: Settings of this rig.
-        dry: Whether the arm stays above the pad all the time.
-        clock: Returns the time, s.
-        sleep: Pauses for a time, s.
+    Presses that the recorder has are not made again; if `dry`, the arm stays above the pad all the time.
     """
 
     def __init__(
@@ -164,13 +157,8 @@ class PressLoop:
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
-        Args:
-            plan: Presses.
-            on_progress: See `OnProgress`.
-            planner: Called with the plan and the next press, from which on it may move the presses.
-
-        Raises:
-            RigFault: The plan is not safe, or the rig failed; the arm stands still and what is done is on the disk.
+        The planner is called with the plan and the next press, from which on it may move the presses. Raises RigFault
+        if the plan is not safe, or the rig failed; the arm stands still then, and what is done is on the disk.
         """
         check_plan(plan, self._rig)
         check_start_state(self._arm.state(), self._limits)
@@ -190,10 +178,7 @@ class PressLoop:
             self._await_disk()
 
     def _start_clock(self) -> None:
-        """Let times begin at 0, or a second after the last ones of a resumed recording.
-
-        What came while the devices were connected, which may take longer, is dropped.
-        """
+        """Let times begin at 0, or a second after the last ones; drop what came while the devices were connected."""
         self._board.read()
         self._arm.drain()
         last_s = self._recorder.last_s
@@ -263,9 +248,8 @@ class PressLoop:
         deadline_s = self._clock() + _DISK_DEADLINE_S
         while not self._disk.is_idle(POLL_S):
             if self._clock() >= deadline_s:
-                raise RigFault(
-                    "disk", f"the disk took more than {_DISK_DEADLINE_S:.0f} s for a press", "look at the disk"
-                )
+                message = f"the disk took more than {_DISK_DEADLINE_S:.0f} s for a press"
+                raise RigFault("disk", message, "look at the disk")
             self._poll()
 
     def _poll(self) -> None:
@@ -286,12 +270,7 @@ class PressLoop:
 
     def _count_after(self, time_s: float) -> int:
         """Count the recent readings that were taken after a time."""
-        count = 0
-        for reading_s in reversed(self._recent):
-            if reading_s <= time_s:
-                break
-            count += 1
-        return count
+        return sum(1 for _ in takewhile(lambda reading_s: reading_s > time_s, reversed(self._recent)))
 
     def _reading_after(self, time_s: float) -> int:
         """Return the index of the first reading after a time."""
@@ -327,11 +306,7 @@ class PressLoop:
         return None
 
     def _lift(self) -> None:
-        """Lift the tool straight up to its travelling height.
-
-        Raises:
-            RigFault: The tool is outside the box, the arm is stopped, or another fault.
-        """
+        """Lift the tool straight up to its travelling height; raises RigFault if it is outside the box, or stopped."""
         state = self._arm.state()
         check_state(state, self._limits, self._clock())
         if any(not low <= x <= high for x, (low, high) in zip(state.pose, self._limits.box_mm, strict=False)):

@@ -33,50 +33,35 @@ EDGE_MM = 1.0  # how far outside the box a tool may stand that was sent to its e
 class Limits:
     """What the arm may do; lengths in the base frame.
 
-    Attributes:
-        box_mm: Lowest and highest x, y and z of the tip.
-        contact_mm: z of the pad's surface; while it is None no target is safe.
-        max_depth_mm: Of the tip below the surface.
-        max_speed_mm_s: Of the tip.
-        max_acceleration_mm_s2: Of the tip.
-        tool: Rotation vector of the tool as it should be held.
-        max_tilt_deg: Between its axis and a target's.
-        max_turn_deg: About its axis, from how the arm holds it before the first move.
-        max_force_n: On the tool, in any direction; None if no force is watched.
-        max_state_age_s: Of the latest state.
-        deadline_s: Longest duration of a move.
-
-    Raises:
-        ValueError: A limit that limits nothing.
+    Raises ValueError for a limit that limits nothing.
     """
 
-    box_mm: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    contact_mm: float | None
-    max_depth_mm: float
+    box_mm: tuple[
+        tuple[float, float], tuple[float, float], tuple[float, float]
+    ]  # lowest and highest x, y, z of the tip
+    contact_mm: float | None  # z of the pad's surface; while it is None no target is safe
+    max_depth_mm: float  # of the tip below the surface
     max_speed_mm_s: float = 250.0
     max_acceleration_mm_s2: float = 1200.0
-    tool: Vector = DOWN
-    max_tilt_deg: float = 2.0
-    max_turn_deg: float = 45.0
-    max_force_n: float | None = 50.0
+    tool: Vector = DOWN  # rotation vector of the tool as it should be held
+    max_tilt_deg: float = 2.0  # between its axis and a target's
+    max_turn_deg: float = 45.0  # about its axis, from how the arm holds it before the first move
+    max_force_n: float | None = 50.0  # on the tool, in any direction; None if no force is watched
     max_state_age_s: float = 0.5
-    deadline_s: float = 30.0
+    deadline_s: float = 30.0  # of a move
 
     @classmethod
     def from_settings(cls, rig: RigSettings) -> "Limits":
         """Return the limits that `[rig]` sets; raises RigFault("refused") if the workspace is unknown."""
         if rig.box_mm is None:
-            raise RigFault(
-                "refused",
-                "[rig] box_mm is unknown, allowed are six numbers: x, y and z from and to, in the base frame",
-                "measure the workspace with the tool by hand",
-            )
+            message = "[rig] box_mm is unknown, allowed are six numbers: x, y and z from and to, in the base frame"
+            raise RigFault("refused", message, "measure the workspace with the tool by hand")
         x0, x1, y0, y1, z0, z1 = rig.box_mm
         try:
             return cls(
-                box_mm=((x0, x1), (y0, y1), (z0, z1)),
-                contact_mm=rig.contact_mm,
-                max_depth_mm=rig.max_depth_mm,
+                ((x0, x1), (y0, y1), (z0, z1)),
+                rig.contact_mm,
+                rig.max_depth_mm,
                 max_speed_mm_s=max(rig.travel_mm_s, rig.press_mm_s),
                 max_acceleration_mm_s2=rig.acceleration_mm_s2,
                 tool=rig.tool_rad,
@@ -129,11 +114,7 @@ def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_
 
 
 def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float, limits: Limits) -> None:
-    """Check a target before any motion.
-
-    Raises:
-        RigFault: "refused", naming what is out of limits, its value and what is allowed.
-    """
+    """Raise RigFault("refused") if a target is out of limits: what, its value and what is allowed."""
     check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
     if limits.contact_mm is None:
         _refuse("the height of the pad's surface unknown", "a measured height")
@@ -151,12 +132,7 @@ def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
 
 
 def check_start_state(state: ArmState, limits: Limits) -> None:
-    """Check how the arm stands before its first move.
-
-    Raises:
-        RigFault: "refused" if that move would turn the tool, and with it its cable, too far; or if the force is to be
-            watched and the arm measures none.
-    """
+    """Raise RigFault("refused") if the first move would turn tool and cable too far, or the force cannot be watched."""
     if not (turn := turn_deg(state.pose[3:], limits.tool)) <= limits.max_turn_deg:
         _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {limits.max_turn_deg:g}")
     if state.force_n is None and limits.max_force_n is not None:
@@ -164,28 +140,19 @@ def check_start_state(state: ArmState, limits: Limits) -> None:
 
 
 def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
-    """Check `[rig]` tcp_mm, the tool centre point, against the identity of a connected arm; printers keep none.
-
-    Raises:
-        RigFault: "refused" if it is unknown, or differs from the arm's.
-    """
+    """Raise RigFault("refused") unless `[rig]` tcp_mm, the tool centre point, is the arm's; printers keep none."""
     if "tcp" not in arm:
         return
     measured = tuple(round(float(value), 3) for value in arm["tcp"][:3])
     if tcp_mm is None:
         _refuse("[rig] tcp_mm is unknown", f"x, y and z of the tip as measured; the controller says {list(measured)}")
     if not all(abs(a - b) <= TCP_TOLERANCE_MM for a, b in zip(tcp_mm, measured, strict=True)):
-        _refuse(
-            f"[rig] tcp_mm is {list(tcp_mm)}", f"what the controller says, {list(measured)}, to {TCP_TOLERANCE_MM} mm"
-        )
+        allowed = f"what the controller says, {list(measured)}, to {TCP_TOLERANCE_MM} mm"
+        _refuse(f"[rig] tcp_mm is {list(tcp_mm)}", allowed)
 
 
 def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
-    """Check the latest state during a move, which has to be over at `until_s`.
-
-    Raises:
-        RigFault: "emergency_stop", "protective_stop", "stale", "force", "refused" (too deep), or "deadline".
-    """
+    """Raise RigFault if the latest state during a move, which has to be over at `until_s`, is beyond the limits."""
     advice = "look at the arm, unlock it at the pendant, then connect again"
     if state.emergency_stop:
         raise RigFault("emergency_stop", "the arm is in an emergency stop", advice)
@@ -212,18 +179,7 @@ def wait_until_still(
 ) -> ArmState:
     """Wait until the arm has ended its move; whatever goes wrong, it is stopped before that is raised.
 
-    Args:
-        arm: It moves.
-        limits: Checked at every state.
-        clock: Returns the time, s.
-        sleep: Pauses for a time, s.
-        meanwhile: Called between two states, to read a board for instance.
-
-    Returns:
-        The first state at rest.
-
-    Raises:
-        RigFault: See `check_state`, and the arm's own faults.
+    Checks the limits at every state, and calls `meanwhile` between two of them. Raises RigFault, see `check_state`.
     """
     until_s = clock() + limits.deadline_s
     try:
@@ -246,16 +202,13 @@ def retreat(
     """Lift the tool straight up, unless it is above the pad already and no force is too great.
 
     Everything is checked as in any move, except that a force or depth beyond its limit has to decrease, and that the
-    tool may stand at the edge of the box. The arm is stopped if the force does not decrease.
-
-    Raises:
-        RigFault: See `check_state` and `check_target`; "force" if the force does not fall.
+    tool may stand at the edge of the box. The arm is stopped, and RigFault("force") raised, if it does not decrease.
     """
     state = arm.state()
     if limits.contact_mm is None:
         return
     z, max_n = state.pose[2], limits.max_force_n
-    overloaded = max_n is not None and _force_n(state) > max_n
+    overloaded = max_n is not None and (state.total_force_n or 0.0) > max_n
     sides = ((low - EDGE_MM, high + EDGE_MM) for low, high in limits.box_mm[:2])
     relaxed = replace(
         limits,
@@ -271,7 +224,9 @@ def retreat(
     speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
     check_target(up, speed_mm_s, acceleration_mm_s2, relaxed)
     arm.move(up, speed_mm_s, acceleration_mm_s2)
-    meanwhile = _falling_force_check(arm, _force_n(state), max_n, clock) if overloaded and max_n else lambda: None
+    meanwhile = (
+        _falling_force_check(arm, state.total_force_n or 0.0, max_n, clock) if overloaded and max_n else lambda: None
+    )
     check_state(wait_until_still(arm, relaxed, clock, sleep, meanwhile), limits, clock())
 
 
@@ -281,7 +236,7 @@ def _falling_force_check(arm: Arm, first_n: float, max_n: float, clock: Callable
 
     def check() -> None:
         nonlocal min_n
-        force_n = _force_n(arm.state())
+        force_n = arm.state().total_force_n or 0.0
         min_n = min(min_n, force_n)
         # The allowed force falls along a line, from the first one to the limit, and stays near its minimum so far.
         remaining = min((start_s + FALL_END_S - clock()) / (FALL_END_S - FALL_START_S), 1.0)
@@ -289,10 +244,6 @@ def _falling_force_check(arm: Arm, first_n: float, max_n: float, clock: Callable
             raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
 
     return check
-
-
-def _force_n(state: ArmState) -> float:
-    return state.total_force_n or 0.0
 
 
 def _axis(rotation: Sequence[float]) -> Vector:

@@ -54,10 +54,7 @@ def localizer(calibrated: tuple[LocalizerModel, dict]) -> LocalizerModel:
 
 @pytest.fixture(scope="session")
 def deep_recording(once: Once) -> Recording:
-    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter.
-
-    How strongly it responds is what tells of the depth.
-    """
+    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter."""
     depths = tuple(np.random.default_rng(4).uniform(0.5, 5, 400).tolist())
     rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths, scatter=0)
     recording = once("deep-recording", lambda folder: simulate(Morphology.random(2, knots=3, seed=5), rig))
@@ -124,17 +121,16 @@ class Robots:
         return arm
 
     def free(self) -> None:
-        if self.arm is not None:
-            self.arm.close()
-            self.arm = None
-        if self.robot is not None:
-            asked, self.series = self.robot.dashboard_log(), ""
-            self.robot.__exit__()
-            self.robot = None
+        arm, robot, self.arm, self.robot, self.series = self.arm, self.robot, None, None, ""
+        if arm is not None:
+            arm.close()
+        if robot is not None:
+            asked = robot.dashboard_log()
+            robot.__exit__()
             assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
 
 
-def taken(address: str) -> IO[str] | None:
+def lock_address(address: str) -> IO[str] | None:
     """The lock on an address; None where another process has it."""
     lock = (Path(tempfile.gettempdir()) / f"padforge-ur-{address}.lock").open("w")
     try:
@@ -151,7 +147,7 @@ def address() -> Iterator[str]:
     end = time.monotonic() + WAIT_S
     while True:
         for address in ADDRESSES:
-            if lock := taken(address):
+            if lock := lock_address(address):
                 with lock:
                     yield address
                 return

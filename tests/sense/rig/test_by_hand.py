@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,11 +25,9 @@ from padforge.sense.rig.by_hand import (
     MAP_ROWS,
     ROUND,
     open_recorder_by_hand,
-    order_in_rounds,
     pad_view,
     plan_targets,
     record_by_hand,
-    remaining_targets,
     view_lines,
 )
 from padforge.sense.rig.config import RigConfig
@@ -42,10 +39,11 @@ from tests.sense.conftest import QUICK
 from tests.sense.rig.fakes import Time
 
 IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
-VIEW: dict[str, Any] = {"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7}
-VIEW |= {"message": "counted: x 0, y 0 mm"}
-VIEW |= {"target": (16.875, 16.875), "rejected": None}
-VIEW |= {"presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}]}
+VIEW: dict[str, Any] = {
+    **{"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7},
+    **{"message": "counted: x 0, y 0 mm", "target": (16.875, 16.875), "rejected": None},
+    "presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}],
+}
 
 
 def config_of(**settings: object) -> RigConfig:
@@ -60,17 +58,6 @@ def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
     assert ways.mean() < 0.5 * np.linalg.norm(np.diff(shuffled, axis=0), axis=1).mean()
     for first in range(0, len(positions), ROUND):
         assert (np.ptp(positions[first : first + ROUND], axis=0) > 0.6 * 45).all()
-
-
-def test_order_in_rounds_and_remaining_targets_keep_every_target() -> None:
-    positions = np.random.default_rng(2).integers(-5, 5, (2 * ROUND + 7, 2)).astype(float)
-    ordered = order_in_rounds(positions)
-    for first in range(0, len(positions), ROUND):
-        part = slice(first, first + ROUND)
-        assert sorted(map(tuple, ordered[part])) == sorted(map(tuple, positions[part]))
-    targets = np.array([[1.0, 1], [2, 2], [1, 1], [3, 3]])
-    assert remaining_targets(targets, np.array([[1.0, 1], [np.nan, np.nan], [3, 3]])).tolist() == [[2, 2], [1, 1]]
-    assert remaining_targets(targets, targets).shape == (0, 2)
 
 
 def test_plan_targets_keeps_the_order_of_a_grid_or_file(tmp_path: Path) -> None:
@@ -94,9 +81,7 @@ def test_plan_targets_rounds_none_into_a_keep_out() -> None:
 def test_pad_view_has_the_paths() -> None:
     pad = Morphology.random(2, knots=3, seed=1)
     view = json.loads(json.dumps(pad_view(pad, "hand")))
-    assert pad_view(pad, "hand", mirrored=True)["paths"] == pad_view(pad, "hand")["paths"]
     assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
-    assert len(view["paths"]) == 4
     ends = np.array([[path[0], path[-1]] for path in view["paths"]])
     np.testing.assert_allclose(ends, pad.to_mm(pad.knots[:, [0, -1]]), atol=0.051)
 
@@ -107,7 +92,6 @@ def test_view_lines_map_positions() -> None:
     assert lines[0] == "PRESS X 5, Y 5 MM"
     assert lines[1].count("#") == lines[1].count(".") == 15
     rows = lines[3 : 3 + MAP_ROWS]
-    assert {len(row) for row in rows} == {MAP_COLUMNS + 2}
     assert (rows[0][MAP_COLUMNS], rows[0][1]) == ("O", ".")  # up is up, right is right
     assert "".join(rows).count("O") == 1
     assert rows[MAP_ROWS // 2][1 + MAP_COLUMNS // 2] == "."
@@ -158,7 +142,6 @@ def test_open_recorder_by_hand_resumes_the_stored_plan(config: RigConfig) -> Non
     [
         ({"kind": "rig"}, "holds a recording of kind 'rig', not 'hand'"),
         ({"plan": {"presses": [[1, 2, 3]]}}, "its plan has shape"),
-        ({"plan": {"presses": [["a", 1]]}}, "positions of the plan"),
     ],
 )
 def test_open_recorder_by_hand_refuses_another_recording(config: RigConfig, change: dict, message: str) -> None:
@@ -167,18 +150,6 @@ def test_open_recorder_by_hand_refuses_another_recording(config: RigConfig, chan
     path.write_text(json.dumps(document | {"source": document["source"] | change}))
     with pytest.raises(InputError, match=message):
         open_recorder_by_hand(config, IDENTITY, resume=True)
-
-
-def test_record_by_hand_accepts_an_unborn_recording_only(tmp_path: Path) -> None:
-    board = Mock(connect=Mock(side_effect=RigFault("lost", "the board is gone")))
-    config = replace(config_of(), out=tmp_path / "run")
-    config.out.mkdir()
-    (config.out / "journal.ndjson").touch()
-    with pytest.raises(RigFault, match="the board is gone"):
-        record_by_hand(config, board, lambda view: None)
-    (config.out / "notes.txt").touch()
-    with pytest.raises(InputError, match="never written over"):
-        record_by_hand(config, board, lambda view: None)
 
 
 HAND_PAD = Morphology.random(3, knots=3, seed=5)
@@ -206,12 +177,7 @@ class FingerBoard:
 
 
 class Hands:
-    """Records by hand, again and again, with one finger on one pad.
-
-    Attributes:
-        messages: outcomes of presses, in order.
-        views: all that was shown.
-    """
+    """Records by hand, again and again, with one finger on one pad; keeps the views, and the outcomes in order."""
 
     def __init__(self, folder: Path, finger: type[Finger] = Finger, mishaps: float = 0.0, **settings: Any) -> None:
         rig = HAND_RIG.model_copy(update=settings)
@@ -290,8 +256,7 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     rejected, accepted = (
         Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.has_position, recording.has_position)
     )
-    assert rejected["short"] >= 2
-    assert rejected["echo"] >= 2
+    assert min(rejected["short"], rejected["echo"]) >= 2
     assert rejected["press"] <= 1
     assert accepted["short"] + accepted["echo"] + accepted["light"] == 0
     error_mm = distances_mm(recording, strokes)
@@ -349,12 +314,11 @@ def test_session_executes_commands(hands) -> None:
         return schedule.pop(len(hand.messages), []) if hand.views and hand.views[-1]["phase"] == "wait" else []
 
     recording = hand.record(commands=commands)
-    first, second, third, *others = hand.targets.tolist()
+    first, second, _, *others = hand.targets.tolist()
     assert accepted_mm(recording).tolist() == [first, second, *others]  # the second again, and the third left out
     assert len(recording.presses_mm) == 5
     journal = [json.loads(line) for line in (hand.out / "journal.ndjson").read_text().splitlines()]
     assert [event["rejected"] for event in journal if "rejected" in event] == ["it was taken back"]
-    assert third not in accepted_mm(recording).tolist()
     hand.record(resume=True)  # what was skipped is asked for again
     np.testing.assert_array_equal(np.sort(accepted_mm(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
 

@@ -92,21 +92,18 @@ def with_frame(folder, tmp_path) -> Callable[..., Path]:
     return write
 
 
-def box_of(rig: RigSettings) -> tuple[float, ...]:
-    assert rig.box_mm is not None
-    return rig.box_mm
-
-
 def test_locate_on_bed_reads_the_holder(folder, with_frame):
     rig = locate_on_bed(PRINTER, folder)
     assert (rig.pad_mm, rig.pad_angle_deg, rig.contact_mm, rig.mirrored) == ((100.0, 90.0), 0.0, 8.0, True)
     half = HALF_MM
     assert rig.box_mm == pytest.approx((100 - half, 100 + half, 90 - half, 90 + half, 3.0, 130.0), abs=1e-5)
     check_plan(make_plan(PAD, rig, np.random.default_rng(0)), rig)
-    box = box_of(locate_on_bed(PRINTER.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder))
+    box = locate_on_bed(PRINTER.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder).box_mm
+    assert box is not None
     assert (box[0], box[3]) == (95, 90)  # it ends where the nozzle does
     for angle_deg, (x, y) in ((0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))):
-        box = box_of(locate_on_bed(PRINTER, with_frame(pad_mm=[60.0, 20.0], angle_deg=angle_deg)))
+        box = locate_on_bed(PRINTER, with_frame(pad_mm=[60.0, 20.0], angle_deg=angle_deg)).box_mm
+        assert box is not None
         assert box[:4] == (100 - x, 100 + x, 90 - y, 90 + y)
 
 
@@ -114,7 +111,8 @@ def test_locate_on_bed_prefers_what_rig_sets(folder, with_frame):
     update = {"pad_mm": (50.0, 60.0), "contact_mm": 9.0, "pad_angle_deg": 90.0, "mirrored": False}
     rig = locate_on_bed(PRINTER.model_copy(update=update), folder)
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg, rig.mirrored) == ((50.0, 60.0), 9.0, 90.0, False)
-    assert box_of(rig)[0] == 50 - HALF_MM
+    assert rig.box_mm is not None
+    assert rig.box_mm[0] == 50 - HALF_MM
     complete = rig.model_copy(update={"tcp_mm": None})
     assert locate_on_bed(complete, folder / "nowhere") is complete
     assert locate_on_bed(PRINTER, with_frame(mirrored=False)).mirrored is False
@@ -142,12 +140,7 @@ def test_locate_on_bed_refuses_a_pad_without_a_holder(folder, tmp_path):
     ("key", "value", "message"),
     [
         ("centre_mm", [1.0], "centre_mm.* field required"),
-        ("surface_mm", "8", "surface_mm: got '8'"),
-        ("bed_mm", [1, 2, None], "bed_mm.2: got None"),
         ("walls_mm", 1e9, "walls_mm: got 1000000000.0"),
-        ("pad_mm", [60.0, 20.0, 5.0], "pad_mm"),
-        ("mirrored", "up", "mirrored: got 'up'"),
-        ("mirrored", None, "mirrored: got .* field required"),
     ],
 )
 def test_locate_on_bed_names_a_damaged_entry(with_frame, key, value, message):
@@ -176,14 +169,6 @@ def run(tmp_path_factory) -> Path:
     with open_recorder(config_of(out), RIG, plan.to_rows(), out, False, IDENTITIES):
         pass
     return out
-
-
-def test_make_plan_reads_a_file(tmp_path):
-    (tmp_path / "places.csv").write_text("x_mm,y_mm\n1,2\n-3.5,4\n", encoding="utf-8")
-    rig = RigSettings(plan=str(tmp_path / "places.csv"), depth_mm=3.0)
-    assert rig.plan_file == tmp_path / "places.csv"
-    assert load_or_make_plan(config_of(tmp_path / "run"), rig, resume=False).to_rows() == [[1, 2, 3], [-3.5, 4, 3]]
-    assert RigSettings(plan="grid").plan_file is None
 
 
 def test_make_plan_keeps_the_plan_of_a_resumed_recording(run, tmp_path):
@@ -234,7 +219,6 @@ def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
     ("device", "key", "value", "is_same"),
     [
         ("arm", "controller", "5.13.0", True),
-        ("board", "port", "/dev/ttyACM1", True),
         ("arm", "serial", "2019", False),
         ("arm", "model", "UR3", False),
         ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0], False),
@@ -253,7 +237,7 @@ def test_resume_refuses_another_arm_tool_or_board(run, tmp_path, device, key, va
         pass
 
 
-@pytest.mark.parametrize("source", ["[]", "5", '{"plan": 5}', "{}"])
+@pytest.mark.parametrize("source", ["[]", '{"plan": 5}'])
 def test_resume_refuses_a_recording_without_a_plan(tmp_path, source):
     text = f'{{"format": "padforge-recording/2", "fibres": 4, "source": {source}}}'
     (tmp_path / "start.json").write_text(text, encoding="utf-8")
