@@ -46,12 +46,7 @@ class SerialDevice(ABC):
     """A device at the port `port`, a pseudo-terminal, from `with` to its end."""
 
     def __init__(self, name: str, seed: int) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            name: of the thread.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; `seed` is of the noise of `garble`."""
         import tty
 
         self._rng, self._garble = np.random.default_rng(seed), 0.0
@@ -113,12 +108,7 @@ class SerialBoard(SerialDevice):
     """A board at a serial port; the noise of `garble` is on what it sends."""
 
     def __init__(self, skew_ppm: float, seed: int) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            skew_ppm: how much longer a period is than nominal.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; `skew_ppm` is how much longer a period is than nominal."""
         super().__init__("board", seed)
         self._skew_ppm = skew_ppm
         self._start_s: float | None = None
@@ -183,16 +173,7 @@ class EmulatedDue(SerialBoard):
         silent: bool = False,
         seed: int = 0,
     ) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            source: voltages of the inputs.
-            supply_v: reading at full scale.
-            skew_ppm: how much longer a period is than nominal.
-            firmware: version that it reports.
-            silent: whether it answers nothing.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; a `silent` board answers nothing."""
         super().__init__(skew_ppm, seed)
         self._source, self._supply_v = source, supply_v
         serial = b"emulated board".ljust(16, b"\0")
@@ -292,16 +273,7 @@ class EmulatedLineBoard(SerialBoard):
         silent: bool = False,
         seed: int = 0,
     ) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            source: voltages of the inputs.
-            header: what it sends as its header.
-            boot_us: its clock at the start.
-            skew_ppm: how much longer a period is than nominal.
-            silent: whether it sends nothing.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; its clock begins at `boot_us`, and a `silent` board sends nothing."""
         super().__init__(skew_ppm, seed)
         self._source, self._header, self._boot_us, self._silent = source, header, boot_us, silent
         self._columns, self.dropped = header.channels, 0

@@ -35,17 +35,11 @@ _EMERGENCY = re.compile(rb"^(?:N\d+ )?M(112|410)\b")
 
 @dataclass(frozen=True)
 class ExecutedMove:
-    """A move that was executed, perhaps not to its end.
+    """A move that was executed, perhaps not to its end."""
 
-    Attributes:
-        start_s: time of its start.
-        move: as planned.
-        duration_s: how much of it was executed.
-    """
-
-    start_s: float
-    move: StraightMove
-    duration_s: float
+    start_s: float  # time of its start
+    move: StraightMove  # as planned
+    duration_s: float  # how much of it was executed
 
     @property
     def end_s(self) -> float:
@@ -76,16 +70,7 @@ class Firmware:
         emergency_parser: bool = True,
         realtime: bool = True,
     ) -> None:
-        """Switch on a printer that was homed.
-
-        Args:
-            position: of the nozzle, mm from the true origin.
-            max_mm_s: maximum speeds of the axes.
-            max_mm_s2: maximum accelerations of the axes.
-            bed_mm: range of the axes.
-            emergency_parser: whether M112 and M410 act at once.
-            realtime: whether `M114 R` reports the real-time position.
-        """
+        """Switch on a printer that was homed; mm, mm/s and mm/s² of x, y and z."""
         self._max_mm_s, self._max_mm_s2, self._bed_mm = max_mm_s, max_mm_s2, bed_mm
         self._emergency_parser, self._realtime = emergency_parser, realtime
         self.moves: list[ExecutedMove] = [ExecutedMove(-math.inf, StraightMove(position, position, 1.0, 1.0), 0.0)]
@@ -265,14 +250,7 @@ class EmulatedPrinter(SerialDevice):
     """
 
     def __init__(self, position: Position, *, restarts: bool = False, seed: int = 0, **firmware: Any) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            position: of the nozzle.
-            restarts: whether it restarts at the first bytes from a host, as many boards do.
-            seed: of the noise of `garble`.
-            firmware: see `Firmware`.
-        """
+        """Open the pseudo-terminal; with `restarts` it restarts at the first bytes from a host, as many boards do."""
         super().__init__("printer", seed)
         self.firmware, self._restarts = Firmware(position, **firmware), restarts
         self._lock = threading.Lock()

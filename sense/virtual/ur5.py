@@ -69,16 +69,7 @@ class EmulatedUR5:
         host: str = HOST,
         tcp_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Describe the controller.
-
-        Args:
-            series: "cb3" (PolyScope 3, 125 Hz) or "e" (PolyScope 5, 500 Hz).
-            pose: of the tool at first.
-            surface_mm: height of a springy plane that the tool can press on; None for none.
-            stiffness_n_mm: of this plane.
-            host: address of this machine at which it listens.
-            tcp_mm: tip from the flange, as in the controller's installation.
-        """
+        """Describe a controller: "cb3" at 125 Hz or "e" at 500 Hz, over a springy plane at `surface_mm`."""
         self._settings = {"series": series, "pose_mm": pose, "surface_mm": surface_mm}
         self._settings |= {"stiffness_n_mm": stiffness_n_mm, "host": host, "tcp_mm": tcp_mm}
 

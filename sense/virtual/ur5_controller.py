@@ -170,15 +170,7 @@ class Controller:
         now: float = 0.0,
         tcp: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Switch it on.
-
-        Args:
-            series: of the controller.
-            pose: of the tool.
-            surface: that the tool can press on; None for none.
-            now: the time.
-            tcp: tip from the flange, as in the controller's installation.
-        """
+        """Switch it on at the time `now`, its tool at `pose`."""
         self.series: Series = series
         self._installed_tcp = tcp
         self.motion = Motion(pose)
@@ -402,11 +394,7 @@ class PoseLog:
         return copy[max(0, overwritten - first) :]
 
     def poses(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 6) poses in mm and rad at monotonic times, the newest one for later times.
-
-        Raises:
-            ValueError: for a time before the oldest row.
-        """
+        """Return the (n, 6) poses in mm and rad at monotonic times; ValueError for a time before the oldest row."""
         times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
         first_s = np.min(times, initial=np.inf)
         for max_rows in WINDOWS:

@@ -31,23 +31,14 @@ PATIENCE_S = 3.0
 
 @dataclass
 class FingerStroke:
-    """A press of the finger.
+    """A press of the finger."""
 
-    Attributes:
-        kind: "press", one of `MISHAPS`, or "echo", the second tap.
-        position_mm: of the touch; shape (2,).
-        depth_mm: when it is down.
-        down_s: time of the touch.
-        up_s: time of the lift; inf while it is unknown.
-        slide_mm: how far it slides along x within a second.
-    """
-
-    kind: str
-    position_mm: Array
-    depth_mm: float
-    down_s: float
-    up_s: float = math.inf
-    slide_mm: float = 0.0
+    kind: str  # "press", one of `MISHAPS`, or "echo", the second tap
+    position_mm: Array  # of the touch; shape (2,)
+    depth_mm: float  # when it is down
+    down_s: float  # time of the touch
+    up_s: float = math.inf  # time of the lift; inf while it is unknown
+    slide_mm: float = 0.0  # how far it slides along x within a second
 
     def contact(self, time_s: float) -> tuple[Array, float]:
         """Return position and depth at a time, mm."""
@@ -74,16 +65,7 @@ class Finger:
         scatter_mm: float = SCATTER_MM,
         mishaps: float = 0.05,
     ) -> None:
-        """Hold the finger over a pad.
-
-        Args:
-            pad: what it presses.
-            contact: what a press deforms.
-            rig: depth of the presses, noise of the pad, seed.
-            rate_hz: samples a second.
-            scatter_mm: see `SCATTER_MM`.
-            mishaps: share of presses that become one of `MISHAPS`.
-        """
+        """Hold the finger over a pad; `mishaps` is the share of presses that become one of `MISHAPS`."""
         rng = np.random.default_rng(rig.seed)
         self._model = LivePad(pad, contact, rig, rate_hz, rng)
         self._rng, self._depth_mm = rng.spawn(1)[0], rig.depth_mm
@@ -143,13 +125,7 @@ class Finger:
 
 @contextmanager
 def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Board, Finger]]:
-    """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it.
-
-    Args:
-        pad: what is pressed.
-        contact: what a press deforms.
-        rig: depth of the presses, rate of the board, noise of the pad, seed.
-    """
+    """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it."""
     finger = Finger(pad, contact, rig, rig.board_rate_hz)
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     with EmulatedDue(finger.volts) as emulated:

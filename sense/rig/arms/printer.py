@@ -56,19 +56,12 @@ _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 @dataclass(frozen=True)
 class NozzleState:
-    """State of the nozzle at one moment.
+    """State of the nozzle at one moment."""
 
-    Attributes:
-        time_s: when the printer reported it.
-        position: of the nozzle, mm.
-        speed_mm_s: >= 0.
-        moving: whether a move is under way.
-    """
-
-    time_s: float
-    position: Position
-    speed_mm_s: float
-    moving: bool
+    time_s: float  # when the printer reported it
+    position: Position  # of the nozzle, mm
+    speed_mm_s: float  # >= 0
+    moving: bool  # whether a move is under way
 
 
 class NozzleThread(threading.Thread):
@@ -115,11 +108,7 @@ class NozzleThread(threading.Thread):
         self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), _MOVE_S)
 
     def stop(self) -> None:
-        """End the move under way, by an emergency stop if the printer does not confirm a quick stop.
-
-        Raises:
-            RigFault: "lost" if it was not confirmed.
-        """
+        """End the move under way; if no quick stop is confirmed, halt the printer and raise RigFault("lost")."""
         if self._move is None or self._link.halted:
             return
         try:
@@ -319,16 +308,7 @@ class Printer:
         return np.array([[one.time_s, *self._pose(one.position), one.speed_mm_s, np.nan, 1.0] for one in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move from rest, at the speed wanted or as fast as the printer's axes can.
-
-        Args:
-            pose: x, y, z of the tip in mm, and `[rig] tool_rad`.
-            speed_mm_s: of the tip.
-            acceleration_mm_s2: of the tip.
-
-        Raises:
-            RigFault: "refused" for numbers that are no move, or another rotation of the tool; "lost", "stale".
-        """
+        """Start a straight move from rest, as fast as the axes can; RigFault("refused") also for a turn of the tool."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
             raise RigFault("refused", f"a turn of the tool to {list(pose[3:])} rad; a printer cannot turn it")

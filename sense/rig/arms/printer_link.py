@@ -60,15 +60,7 @@ def parse_position(line: str) -> Position | None:
 
 
 def parse_axis_limits(lines: list[str], code: str) -> Position | None:
-    """Return the limits of x, y and z in the answer to M503.
-
-    Args:
-        lines: the answer.
-        code: M203 for the maximum speeds, mm/s; M201 for the maximum accelerations, mm/s².
-
-    Returns:
-        Three positive numbers; None where the answer has none.
-    """
+    """Return the limits of x, y and z after M203 (mm/s) or M201 (mm/s²) in the answer to M503; None without."""
     match = re.search(rf"\b{code} X{_NUMBER} Y{_NUMBER} Z{_NUMBER}", "\n".join(lines))
     values = (float(match[1]), float(match[2]), float(match[3])) if match else None
     return values if values and min(values) > 0 else None
@@ -85,17 +77,11 @@ def _is_confirmation(line: str) -> bool:
 
 @dataclass(frozen=True)
 class PrinterInfo:
-    """Identity of a printer, from its answer to M115.
+    """Identity of a printer, from its answer to M115."""
 
-    Attributes:
-        firmware: its name with the version.
-        machine: name of the printer.
-        capabilities: those that it has, such as EMERGENCY_PARSER.
-    """
-
-    firmware: str = ""
-    machine: str = ""
-    capabilities: frozenset[str] = field(default_factory=frozenset)
+    firmware: str = ""  # its name with the version
+    machine: str = ""  # name of the printer
+    capabilities: frozenset[str] = field(default_factory=frozenset)  # those that it has, such as EMERGENCY_PARSER
 
     @classmethod
     def parse(cls, lines: list[str]) -> "PrinterInfo":
@@ -132,11 +118,7 @@ class MarlinLink:
         self._connected = self.halted = False
 
     def handshake(self, timeout_s: float) -> None:
-        """Wait until the printer answers, and count its lines from 0.
-
-        Raises:
-            RigFault: "refused" where nothing that speaks G-code answers, or the printer restarts as its port is opened.
-        """
+        """Wait until the printer answers, and count its lines from 0; RigFault("refused") without one."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             self._stream.send(b"\n" + number_line(0, "M110 N0"))
@@ -147,14 +129,7 @@ class MarlinLink:
         raise RigFault("refused", f"{self._port}: no printer answers", advice)
 
     def execute(self, command: str, timeout_s: float = ANSWER_S) -> list[str]:
-        """Have a command executed once.
-
-        Args:
-            command: G-code without number and checksum.
-            timeout_s: longest wait for the answer.
-
-        Returns:
-            Lines of the answer; none where the command was executed but noise took its answer.
+        """Have a command executed once; return the lines of its answer, none where noise took it.
 
         Raises:
             RigFault: "stale" where it is not answered in time; "lost".

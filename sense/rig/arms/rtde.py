@@ -105,10 +105,7 @@ def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list
 
 
 def stop_program(host: str, timeout_s: float) -> bool:
-    """Stop the arm's program, and with it the arm, by the dashboard; return whether no program runs any more.
-
-    A stopped program cannot go on when a person unlocks the arm; a paused one can.
-    """
+    """Stop the arm's program by the dashboard, for good; return whether no program runs any more."""
     try:
         return ask_dashboard(host, ["stop", "running"], timeout_s)[1].lower().endswith("false")
     except OSError:
@@ -117,31 +114,18 @@ def stop_program(host: str, timeout_s: float) -> bool:
 
 @dataclass(frozen=True)
 class RtdeState:
-    """A state as the controller sends it.
+    """A state as the controller sends it."""
 
-    Attributes:
-        time_s: when it was measured, on the host's monotonic clock.
-        skipped: number of states missing before it.
-        pose: m and rad.
-        speed: of the tool, m/s.
-        force_n: on the tool along z; None without a sensor.
-        sideways_n: force across z; 0 without a sensor.
-        mode: robot mode.
-        runtime: state of the program.
-        safety: status bits.
-        progress: ur-rtde's register of moves.
-    """
-
-    time_s: float
-    skipped: int
-    pose: tuple[float, ...]
-    speed: float
-    force_n: float | None
-    sideways_n: float
-    mode: int
-    runtime: int
-    safety: int
-    progress: int
+    time_s: float  # when it was measured, on the host's monotonic clock
+    skipped: int  # number of states missing before it
+    pose: tuple[float, ...]  # m and rad
+    speed: float  # of the tool, m/s
+    force_n: float | None  # on the tool along z; None without a sensor
+    sideways_n: float  # force across z; 0 without a sensor
+    mode: int  # robot mode
+    runtime: int  # state of the program
+    safety: int  # status bits
+    progress: int  # ur-rtde's register of moves
 
 
 class HostClock:
@@ -152,15 +136,7 @@ class HostClock:
         self._last_stamp = self._last_s = float("-inf")
 
     def host_time(self, stamp: float, arrival_s: float) -> float:
-        """Return the host time of a state.
-
-        Args:
-            stamp: its controller time, s.
-            arrival_s: host time at which it arrived.
-
-        Returns:
-            A time not after `arrival_s`, later than all returned before.
-        """
+        """Return the host time of a state: not after `arrival_s`, and later than all returned before."""
         drifted = self._offset + MAX_CLOCK_SKEW * max(stamp - self._last_stamp, 0.0)
         self._offset = min(drifted, arrival_s - stamp)
         self._last_stamp = stamp

@@ -225,10 +225,7 @@ class WorkerProcess:
         return self._control is not None and self._latest is not None and self._latest.runtime == PLAYING
 
     def _report_states(self, reader: RtdeReader, state: RtdeState) -> None:
-        """Send every state to the parent; end the process if they stop coming or the arm's program has ended.
-
-        It ends at once, before ur-rtde can reconnect and repeat an old command.
-        """
+        """Send every state to the parent; end before ur-rtde can reconnect and repeat an old command."""
         while True:
             self._latest = state
             self._update(state)

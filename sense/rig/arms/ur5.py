@@ -191,11 +191,7 @@ class UR5:
         return self._worker.skipped if self._worker else 0
 
     def state(self) -> ArmState:
-        """Return the latest state; see `Arm.state`.
-
-        Raises:
-            RigFault: "stale", "lost"; "deadline" if nobody asked for a state for 2 s during a move.
-        """
+        """Return the latest state; also RigFault("deadline") if nobody asked for one for 2 s during a move."""
         worker = self._connected()
         worker.supervise()
         row = worker.latest
@@ -214,10 +210,7 @@ class UR5:
         )
 
     def drain(self) -> Array:
-        """Return the (n, 10) states since the last call; those before the link was lost come before the fault.
-
-        The last 300 000 states are kept: 10 minutes at 500 Hz.
-        """
+        """Return the (n, 10) states since the last call; those before the link was lost come before the fault."""
         rows = self._worker.drain() if self._worker else []
         if not rows:
             self._connected()
@@ -228,16 +221,7 @@ class UR5:
         return np.column_stack([values[:, :9], (~values[:, 9:11].any(axis=1)).astype(np.float64)])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move from rest.
-
-        Args:
-            pose: x, y, z in mm and a rotation vector in rad.
-            speed_mm_s: of the tool.
-            acceleration_mm_s2: of the tool.
-
-        Raises:
-            RigFault: "refused" for numbers that are no move, or if the arm does not accept it; "lost", "deadline".
-        """
+        """Start a straight move from rest; RigFault("refused") if it is none or the arm does not accept it."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         worker = self._connected()
         worker.supervise()
@@ -250,11 +234,7 @@ class UR5:
         self._move_s = time.monotonic()
 
     def stop(self) -> None:
-        """Stop the arm, by ur-rtde or, if that does not answer, by its dashboard and its watchdog.
-
-        Raises:
-            RigFault: "lost" if the arm did not confirm it; the watchdog stops it 0.25 s after the last sign of life.
-        """
+        """Stop the arm by ur-rtde, or else by its dashboard and its watchdog; RigFault("lost") if unconfirmed."""
         if self._worker is None or self._worker.stopped:
             return
         try:

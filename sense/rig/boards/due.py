@@ -90,16 +90,7 @@ class DueLink:
         self._stream.send(encode(command))
 
     def request(self, command: Request | BoardSettings, kind: type[M], matches: Callable[[M], bool] | None = None) -> M:
-        """Send a command until its answer comes; all other messages are dropped.
-
-        Args:
-            command: what to send.
-            kind: of the answer.
-            matches: whether a message of this kind is the answer; any is if None.
-
-        Raises:
-            RigFault: "stale" if none has come after a second.
-        """
+        """Send a command until a message of this kind that matches comes; RigFault("stale") after a second without."""
         deadline = time.monotonic() + _ANSWER_S
         resend_s = 0.0
         while (now := time.monotonic()) < deadline:
@@ -179,23 +170,13 @@ class DueBoard:
         }
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, C columns of volts; see `Board`.
-
-        Raises:
-            RigFault: "stale" or "lost" once all samples that came before have been read, "data" if nobody has read for
-                60 s or the board has lost its place, "refused" before `connect`.
-        """
+        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
         if self._reader is None or self._assembler is None:
             raise RigFault("refused", f"{self._port}: not connected")
         return self._assembler.assemble(self._reader.drain())
 
     def statistics(self) -> dict[str, float]:
-        """Return counts since `connect`, of what has been read.
-
-        Returns:
-            blocks, damaged frames (also of what has not been read), missing samples, overruns (missing samples that the
-            board dropped), skew_ppm of the clocks.
-        """
+        """Return counts since `connect`, of what has been read; overruns are missing samples that the board dropped."""
         assembler = self._assembler
         return {
             "blocks": assembler.blocks if assembler else 0,
@@ -276,11 +257,7 @@ class DueAssembler:
         self._time_us: int | None = None
 
     def assemble(self, arrivals: Iterable[tuple[float, DueBlock]]) -> BoardSamples:
-        """Return the samples of blocks, each with the host time of its arrival.
-
-        Raises:
-            RigFault: "data" if a block cannot follow the ones before it.
-        """
+        """Return the samples of blocks with their arrival times; RigFault("data") if one cannot follow those before."""
         placed = []
         for arrival_s, block in arrivals:
             first, missing = self._place(block)

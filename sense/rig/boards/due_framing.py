@@ -73,17 +73,11 @@ class Request:
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """How to sample.
+    """How to sample."""
 
-    Attributes:
-        period_ns: from sample to sample.
-        mask: of inputs, bit 0 is A0.
-        averaging: conversions summed to a sample.
-    """
-
-    period_ns: int
-    mask: int
-    averaging: int
+    period_ns: int  # from sample to sample
+    mask: int  # of inputs, bit 0 is A0
+    averaging: int  # conversions summed to a sample
 
     def pack(self) -> bytes:
         """Return the payload."""
@@ -125,25 +119,15 @@ class Ack:
 
 @dataclass(frozen=True, eq=False)
 class DueBlock:
-    """Consecutive samples.
+    """Consecutive samples."""
 
-    Attributes:
-        counts: (n, C) sums of `averaging` conversions, n up to 16, one column for every bit of `mask`.
-        averaging: conversions summed to a sample.
-        mask: of inputs.
-        sequence: number of the block since the start.
-        first: index of the first sample since the start.
-        time_us: board time when the last sample was complete.
-        overruns: samples that the board has dropped since the start.
-    """
-
-    counts: NDArray[np.uint16]
-    averaging: int
-    mask: int
-    sequence: int
-    first: int
-    time_us: int
-    overruns: int
+    counts: NDArray[np.uint16]  # (n, C) sums of `averaging` conversions, n up to 16, one column for every bit of `mask`
+    averaging: int  # conversions summed to a sample
+    mask: int  # of inputs
+    sequence: int  # number of the block since the start
+    first: int  # index of the first sample since the start
+    time_us: int  # board time when the last sample was complete
+    overruns: int  # samples that the board has dropped since the start
 
     def pack(self) -> bytes:
         """Return the payload."""

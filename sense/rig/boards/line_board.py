@@ -50,14 +50,7 @@ class LineBoard:
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
-        """Take the settings; nothing is opened before `connect`.
-
-        Args:
-            port: name of the serial port.
-            baud: of the board.
-            rate_hz: samples a second, which the board's header must state.
-            inputs: which to read, fibre by fibre, from 0; all in order if empty.
-        """
+        """Take the settings; nothing is opened before `connect`, where the board's header must state `rate_hz`."""
         self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
         self._stream: SerialStream | None = None
         self._decoder = LineDecoder()
@@ -93,12 +86,7 @@ class LineBoard:
         }
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, C columns of volts; see `Board`.
-
-        Raises:
-            RigFault: "stale" or "lost" once all samples that came before have been read, "data" if nobody has read for
-                60 s, the board was reset or its lines are no samples, "refused" before `connect`.
-        """
+        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or reset."""
         if self._reader is None or self._assembler is None:
             raise RigFault("refused", f"{self._port}: not connected")
         return self._assembler.assemble(self._reader.drain())
@@ -182,11 +170,7 @@ class LineAssembler:
         self._n_misplaced = 0.0
 
     def assemble(self, arrivals: Iterable[tuple[float, LineBlock]]) -> BoardSamples:
-        """Return the samples of lines, each block with the host time of its arrival.
-
-        Raises:
-            RigFault: "data" if the times of the lines are impossible.
-        """
+        """Return the samples of lines with their arrival times; RigFault("data") if their times are impossible."""
         times_us, rows, gaps = [], [], []
         for arrival_s, block in arrivals:
             for time_us, counts in zip(block.times_us, block.counts, strict=True):
