@@ -32,12 +32,10 @@ from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineHeader, f
 SampleSource = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the number of inputs of the board or more."""
 
-MAX_OUT_BYTES = 65_536
-"""Bytes that wait for a slow host; what comes then is dropped, whole samples at a time."""
+MAX_OUT_BYTES = 65_536  # bytes that wait for a slow host; what comes then is dropped, whole samples at a time
 MIN_NS_PER_CONVERSION = 6000
 MAX_PERIOD_NS = 1_000_000_000
-BLOCK_NS = 20_000_000
-"""A block of the Due holds this much time, or a single sample."""
+BLOCK_NS = 20_000_000  # A block of the Due holds this much time, or a single sample
 
 _POLL_S = 0.01
 

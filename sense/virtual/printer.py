@@ -17,12 +17,9 @@ from padforge.sense.rig.arms.motion import Position, StraightMove
 from padforge.sense.rig.arms.printer_link import checksum
 from padforge.sense.virtual.boards import SerialDevice
 
-MAX_PLANNED = 16
-"""Moves that the planner holds; a further one waits."""
-START_S = 0.1
-"""How long the first move waits for others."""
-BUSY_S = 2.0
-"""Pause between two lines that say that the firmware is busy."""
+MAX_PLANNED = 16  # moves that the planner holds; a further one waits
+START_S = 0.1  # how long the first move waits for others
+BUSY_S = 2.0  # pause between two lines that say that the firmware is busy
 STEPS_PER_MM = (80, 80, 400)
 IDENTITY = (
     "FIRMWARE_NAME:Marlin 2.1.2 (emulated) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin PROTOCOL_VERSION:1.0"

@@ -16,17 +16,13 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import TRAVEL_S, LivePad
 from padforge.sense.virtual.boards import EmulatedDue
 
-SCATTER_MM = 1.5
-"""Standard deviation of the position of a press, in x and in y."""
-DEPTHS = (0.7, 1.1)
-"""Range of depths, relative to `depth_mm`."""
-REACTION_S = (0.3, 0.7)
-"""Range of the time from the request to the touch; a lift follows in half of it."""
+SCATTER_MM = 1.5  # standard deviation of the position of a press, in x and in y
+DEPTHS = (0.7, 1.1)  # range of depths, relative to `depth_mm`
+REACTION_S = (0.3, 0.7)  # range of the time from the request to the touch; a lift follows in half of it
 MISHAPS = ("short", "double", "light", "slide")
 """A press is let go at once, or followed by a second tap, or hardly felt, or slides away."""
 SHORT_S, AGAIN_S, LIGHT, SLIDE_MM = 0.3, 0.25, 0.04, 12.0
-PATIENCE_S = 3.0
-"""Time after which a press that was not detected is given up."""
+PATIENCE_S = 3.0  # time after which a press that was not detected is given up
 
 
 @dataclass

@@ -22,12 +22,9 @@ from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, Sample
 from padforge.sense.virtual.printer import EmulatedPrinter
 from padforge.sense.virtual.ur5 import HOST, EmulatedUR5
 
-STIFFNESS_N_MM = 2.0
-"""Of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press."""
-MIN_LINE_INPUTS = 16
-"""Inputs of the emulated line board, which has more if higher ones are named."""
-BED_MM = 1000.0
-"""Width, depth and height of the emulated printer: room for any pad."""
+STIFFNESS_N_MM = 2.0  # of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press
+MIN_LINE_INPUTS = 16  # inputs of the emulated line board, which has more if higher ones are named
+BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any pad
 
 _START_S = 2.0
 

@@ -4,8 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-Position = tuple[float, float, float]
-"""x, y and z, mm."""
+Position = tuple[float, float, float]  # x, y and z, mm
 
 
 @dataclass(frozen=True)

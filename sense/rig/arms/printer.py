@@ -37,8 +37,7 @@ from padforge.sense.rig.devices import ArmState, Array, Pose, RigFault
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-CONNECT_S = 3.0
-"""Longest wait for a printer that restarts as its port is opened."""
+CONNECT_S = 3.0  # longest wait for a printer that restarts as its port is opened
 STALE_S = 0.5
 SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 """Millimetres, absolute positions, speeds at 100 %, software endstops on, motors always energized."""

@@ -16,8 +16,7 @@ from padforge.sense.rig.devices import Cause, RigFault, SerialStream
 FIRMWARE = "Marlin"
 HALTED = ("halted", "kill()", "STOP called", "stopped")
 """Words of errors after which the firmware takes no further moves; other errors report a damaged line."""
-ANSWER_S = 1.0
-"""Longest wait for an answer."""
+ANSWER_S = 1.0  # longest wait for an answer
 HOMING_ADVICE = "home it at its display with the probe off, put the probe on again, and begin anew"
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"

@@ -16,12 +16,9 @@ from typing import Any, NamedTuple
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 VERSION, CONTROLLER, OUTPUTS, INPUTS, START, PAUSE, DATA = b"VvOISPU"
-PROTOCOL = 2
-"""The only version of the protocol that is used here."""
-RUNNING = 7
-"""Robot mode of an arm that is powered on and has its brakes released."""
-STOPPED, PLAYING, PAUSED = 1, 2, 4
-"""Runtime states of the program."""
+PROTOCOL = 2  # the only version of the protocol that is used here
+RUNNING = 7  # robot mode of an arm that is powered on and has its brakes released
+STOPPED, PLAYING, PAUSED = 1, 2, 4  # runtime states of the program
 PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 """Protective and safeguard stop, recovery, violation, fault: the controller does not move the arm."""
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
@@ -30,10 +27,8 @@ VARIABLES = (
     *("robot_mode", "runtime_state", "safety_status_bits", "output_int_register_2"),
 )
 """What the reader asks for."""
-FORCE_SERIES = 5
-"""First major version of PolyScope whose arms have a force sensor at the tool."""
-MAX_CLOCK_SKEW = 2e-4
-"""Relative difference of the controller's clock and the host's."""
+FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
+MAX_CLOCK_SKEW = 2e-4  # relative difference of the controller's clock and the host's
 
 _HEADER = struct.Struct(">HB")
 _CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}

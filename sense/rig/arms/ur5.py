@@ -20,24 +20,21 @@ from padforge.sense.rig.devices import ArmState, Array, Cause, RigFault, start
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-MAX_STATES = 300_000
-"""States kept for `drain`: 10 minutes at 500 Hz."""
+MAX_STATES = 300_000  # states kept for `drain`: 10 minutes at 500 Hz
 HEARTBEAT_S = 0.05
-SUPERVISION_S = 2.0
-"""How long heartbeats go on after the program last asked for a state."""
+SUPERVISION_S = 2.0  # how long heartbeats go on after the program last asked for a state
 CONNECT_S = 4.5
 MOVE_S = 1.0
 STALE_S = 0.5
-CONFIRM_S = 0.25
-"""Longest wait for the worker to confirm a stop; the dashboard is asked after that."""
-DASHBOARD_S = 0.2
-"""Longest wait for the dashboard to confirm a stop."""
+CONFIRM_S = 0.25  # longest wait for the worker to confirm a stop; the dashboard is asked after that
+DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 
 
 class RtdeWorker:
     """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed.
 
     Attributes:
+        fault: why the worker has ended; None while it runs.
         latest: last state of the arm.
         skipped: number of states that the controller left out.
         stopped: whether the arm's dashboard confirmed a stop after the worker's end.
@@ -45,7 +42,7 @@ class RtdeWorker:
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self._exit: tuple[Cause, str, str] | None = None
+        self.fault: RigFault | None = None
         self.latest: StateRow | None = None
         self.skipped = 0
         self.stopped = False
@@ -63,11 +60,6 @@ class RtdeWorker:
             thread.start()
 
     @property
-    def fault(self) -> RigFault | None:
-        """Why the worker has ended; None while it runs."""
-        return RigFault(*self._exit) if self._exit else None
-
-    @property
     def pid(self) -> int:
         """Process id."""
         return self._process.pid
@@ -77,7 +69,7 @@ class RtdeWorker:
         number = next(self._ids)
         self._write(json.dumps({"id": number, "command": command, "arguments": arguments}).encode())
         with self._received:
-            self._received.wait_for(lambda: number in self._replies or self._exit, timeout_s)
+            self._received.wait_for(lambda: number in self._replies or self.fault, timeout_s)
             reply = self._replies.pop(number, None)
         if reply is None:
             raise self.fault or RigFault("deadline", f"the arm did not {command} within {timeout_s} s", "connect again")
@@ -115,7 +107,7 @@ class RtdeWorker:
             raise self.fault or RigFault("lost", f"the link to the arm {self._host} is down", "connect again") from None
 
     def _send_heartbeats(self) -> None:
-        while not self._killed.wait(HEARTBEAT_S) and not self._exit:
+        while not self._killed.wait(HEARTBEAT_S) and not self.fault:
             if time.monotonic() < self._supervised_s + SUPERVISION_S:
                 with suppress(RigFault):
                     self._write(b"")
@@ -135,7 +127,7 @@ class RtdeWorker:
                     self._replies[message["id"]] = message
                     self._received.notify_all()
         with self._received:
-            self._exit = reason
+            self.fault = RigFault(*reason)
             self._received.notify_all()
         if self.latest is not None and not self._killed.is_set():
             self.stopped = stop_program(self._host, DASHBOARD_S)

@@ -11,14 +11,11 @@ import numpy as np
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig.devices import RigFault
 
-POLL_S = 0.1
-"""Longest wait for bytes."""
+POLL_S = 0.1  # longest wait for bytes
 SETTLE_S = 0.5
 """Time of blocks before the first samples are returned, so that their times rest on more than one arrival."""
-BUFFER_S = 60.0
-"""Time of samples that are buffered for a program that does not read."""
-QUARTZ_SKEW = 500e-6
-"""Relative difference of two quartz clocks; anything beyond is noise of the first seconds."""
+BUFFER_S = 60.0  # time of samples that are buffered for a program that does not read
+QUARTZ_SKEW = 500e-6  # relative difference of two quartz clocks; anything beyond is noise of the first seconds
 
 _START_S = 1.5
 _STALL_S = 1.0

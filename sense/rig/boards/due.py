@@ -28,10 +28,8 @@ from padforge.sense.rig.boards.due_framing import (
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
-BAUD = 115_200
-"""Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
-FIRMWARE_MAJOR = 1
-"""Boards with another first number of the firmware version speak another wire format."""
+BAUD = 115_200  # without meaning on a USB port, but never 1200: on a Due that erases the firmware
+FIRMWARE_MAJOR = 1  # boards with another first number of the firmware version speak another wire format
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 
 _FIRMWARE = "sense/rig/boards/firmware/padforge_due"

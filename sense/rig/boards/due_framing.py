@@ -31,10 +31,8 @@ from numpy.typing import NDArray
 BITS = 12
 FULL_SCALE = 2**BITS - 1
 MAX_CHANNELS = 12
-MAX_SAMPLES = 16
-"""Samples in a block."""
-MAX_AVERAGING = 16
-"""Conversions summed to a sample."""
+MAX_SAMPLES = 16  # samples in a block
+MAX_AVERAGING = 16  # conversions summed to a sample
 
 
 class Kind(IntEnum):
@@ -56,8 +54,7 @@ class Status(IntEnum):
     BAD_SETTINGS = 1
     TOO_FAST = 2
     RUNNING = 3
-    HALTED = 4
-    """Not an answer: the board has stopped by itself because conversions were lost."""
+    HALTED = 4  # not an answer: the board has stopped by itself because conversions were lost
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineDecoder, 
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
-RESONATOR_SKEW = 5e-3
-"""Relative error of a ceramic resonator, which small boards have instead of a quartz."""
+RESONATOR_SKEW = 5e-3  # relative error of a ceramic resonator, which small boards have instead of a quartz
 
 _ANSWER_S = 3.0  # opening their port resets many boards, and some wait for a new program before they start
 _RESEND_S = 0.5

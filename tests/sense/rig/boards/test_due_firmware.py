@@ -22,8 +22,7 @@ from padforge.sense.virtual.boards import check_settings
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
 FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_due"
-ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]
-"""Of inputs A0 to A11."""
+ADC_CHANNEL = [7, 6, 5, 4, 3, 2, 1, 0, 10, 11, 12, 13]  # of inputs A0 to A11
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +87,6 @@ def test_firmware_sends_every_conversion_in_its_place(program: Path, wanted: Boa
     [
         (BoardSettings(1_000_000, 0, 1), Status.BAD_SETTINGS),
         (BoardSettings(1_000_000, 0x1000, 1), Status.BAD_SETTINGS),
-        (BoardSettings(1_000_000, 1, 0), Status.BAD_SETTINGS),
         (BoardSettings(1_000_000, 1, 17), Status.BAD_SETTINGS),
         (BoardSettings(0, 1, 1), Status.BAD_SETTINGS),
         (BoardSettings(2_000_000_000, 1, 1), Status.BAD_SETTINGS),
@@ -114,9 +112,7 @@ def test_firmware_ignores_second_start_and_refuses_settings_while_running(progra
     assert [(block.first, block.mask) for block in blocks] == [(0, 0xFF), (16, 0xFF), (0, 3)]
 
 
-def test_firmware_counts_dropped_blocks_and_stops_when_port_closes(
-    program: Path,
-) -> None:
+def test_firmware_counts_dropped_blocks_and_stops_when_port_closes(program: Path) -> None:
     messages = run(program, START, f"trigger {16 * 70}", "loop 100", "trigger 16", "loop 2")
     blocks = [block for block in messages if isinstance(block, DueBlock)]
     assert [block.first for block in blocks[:64]] == list(range(0, 1024, 16))
