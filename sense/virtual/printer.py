@@ -51,10 +51,7 @@ class ExecutedMove:
 class Firmware:
     """Marlin without its port: lines in, answers out, and straight moves, at times that the caller passes.
 
-    Attributes:
-        moves: all executed moves; the first is a rest at the start position.
-        halted: whether it was killed.
-        homed: whether it knows where it is.
+    The first of `moves` is a rest at the start position.
     """
 
     def __init__(

@@ -134,16 +134,7 @@ class SpringySurface:
 
 
 class Controller:
-    """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock.
-
-    Attributes:
-        motion: of the tool.
-        inputs: registers that clients write.
-        outputs: registers that clients read.
-        remote: whether the arm is in remote control.
-        sideways_n: force that pushes the tool along x.
-        dashboard_log: every line that was sent to the dashboard.
-    """
+    """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock."""
 
     def __init__(
         self,
@@ -158,15 +149,15 @@ class Controller:
         self._installed_tcp = tcp
         self.motion = Motion(pose)
         self.surface = surface
-        self.remote, self.sideways_n = True, 0.0
+        self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
         self.dashboard_log: list[str] = []
         self.restart(now)
 
     def restart(self, now: float) -> None:
         """Restart as after a power failure: all state is lost but the pose."""
         self.motion = Motion(self.motion.pose)
-        self.inputs: defaultdict[str, float] = defaultdict(float)
-        self.outputs: dict[str, float] = {}
+        self.inputs: defaultdict[str, float] = defaultdict(float)  # registers that clients write
+        self.outputs: dict[str, float] = {}  # registers that clients read
         self.tcp: Array = np.array([*self._installed_tcp, 0.0, 0.0, 0.0])
         self._boot = self._now = now
         self._safety, self._runtime, self._mode = NORMAL, STOPPED, RUNNING

@@ -45,11 +45,7 @@ class FingerStroke:
 
 
 class Finger:
-    """A finger that looks at what is displayed (`look`) and moves as the samples go by (`volts`).
-
-    Attributes:
-        strokes: all that it has made.
-    """
+    """A finger that looks at what is displayed (`look`) and moves as the samples go by (`volts`)."""
 
     def __init__(
         self,
@@ -68,7 +64,7 @@ class Finger:
         self._scatter_mm, self._mishaps = scatter_mm, mishaps
         self._view: Mapping[str, Any] = {"phase": "settle"}
         self._now_s = -math.inf
-        self.strokes: list[FingerStroke] = []
+        self.strokes: list[FingerStroke] = []  # all that it has made
 
     def look(self, view: Mapping[str, Any]) -> None:
         """See what is displayed: its "phase" and "target", [x, y] mm."""

@@ -64,12 +64,7 @@ class NozzleState:
 
 
 class NozzleThread(threading.Thread):
-    """The thread that moves the nozzle and polls its position.
-
-    Attributes:
-        latest: the last state.
-        fault: why the position is unknown; None while all is well.
-    """
+    """The thread that moves the nozzle and polls its position."""
 
     def __init__(self, link: MarlinLink, position: Position, max_mm_s: Position, max_mm_s2: Position) -> None:
         super().__init__(name="printer", daemon=True)
@@ -80,8 +75,8 @@ class NozzleThread(threading.Thread):
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
         self._states: deque[NozzleState] = deque(maxlen=_MAX_STATES)
         self._ending = threading.Event()
-        self.fault: RigFault | None = None
-        self.latest = NozzleState(time.monotonic(), position, 0.0, False)
+        self.fault: RigFault | None = None  # why the position is unknown; None while all is well
+        self.latest = NozzleState(time.monotonic(), position, 0.0, False)  # the last state
 
     def run(self) -> None:
         """Poll, and execute commands, until the end or a fault."""

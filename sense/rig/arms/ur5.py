@@ -31,21 +31,14 @@ DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 
 
 class RtdeWorker:
-    """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed.
-
-    Attributes:
-        fault: why the worker has ended; None while it runs.
-        latest: last state of the arm.
-        skipped: number of states that the controller left out.
-        stopped: whether the arm's dashboard confirmed a stop after the worker's end.
-    """
+    """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed."""
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self.fault: RigFault | None = None
-        self.latest: StateRow | None = None
-        self.skipped = 0
-        self.stopped = False
+        self.fault: RigFault | None = None  # why the worker has ended; None while it runs
+        self.latest: StateRow | None = None  # last state of the arm
+        self.skipped = 0  # number of states that the controller left out
+        self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
         self._replies: dict[int, dict[str, Any]] = {}
         self._ids = itertools.count(1)
         self._rows: deque[StateRow] = deque(maxlen=MAX_STATES)

@@ -122,10 +122,6 @@ class DueBoard:
             inputs: which to read, fibre by fibre, 0 for A0 to 11; all in order if empty.
             supply_v: reading at full scale, V.
             averaging: conversions summed to a sample, 1 to 16.
-
-        Raises:
-            InputError: a value is out of range.
-            RigFault: "refused" for an input that the board does not have.
         """
         _check_range("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
         _check_range("averaging", averaging, 1, MAX_AVERAGING)
@@ -239,10 +235,7 @@ class DueBoard:
 class DueAssembler:
     """Makes `BoardSamples` of blocks: host times by a `SampleClock`, volts by fibre, missing samples by the index.
 
-    Attributes:
-        blocks: number of blocks so far.
-        missing: number of samples that are missing.
-        overruns: those of them that the board dropped.
+    It counts blocks, missing samples, and overruns, those of them that the board dropped.
     """
 
     def __init__(self, settings: BoardSettings, inputs: Sequence[int], supply_v: float) -> None:

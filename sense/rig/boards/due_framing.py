@@ -215,14 +215,10 @@ def _unpack_block(payload: bytes) -> DueBlock:
 
 
 class DueDecoder:
-    """Decodes the messages in a stream of bytes that comes in any portions.
-
-    Attributes:
-        damaged: pieces between two zeros, so far, that were no message.
-    """
+    """Decodes the messages in a stream of bytes that comes in any portions."""
 
     def __init__(self) -> None:
-        self.damaged = 0
+        self.damaged = 0  # pieces between two zeros, so far, that were no message
         self._tail = b""
 
     def decode(self, data: bytes) -> list[DueMessage]:

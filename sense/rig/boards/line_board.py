@@ -152,10 +152,6 @@ class LineAssembler:
 
     Every sample has its slot, a period after the one before; the slots follow the board, whose rate need not be quite
     that of its header. A line whose time fits into no slot is no sample.
-
-    Attributes:
-        samples: number of samples so far.
-        missing: number of samples that are missing.
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:

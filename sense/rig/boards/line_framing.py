@@ -80,16 +80,11 @@ def _format_line(text: str, checked: bool) -> bytes:
 
 
 class LineDecoder:
-    """Decodes headers and samples from a stream of bytes that comes in any portions.
-
-    Attributes:
-        header: the latest; before the first there are no samples.
-        damaged: lines since then that were neither.
-    """
+    """Decodes headers and samples from a stream of bytes that comes in any portions."""
 
     def __init__(self) -> None:
-        self.header: LineHeader | None = None
-        self.damaged = 0
+        self.header: LineHeader | None = None  # the latest; before the first there are no samples
+        self.damaged = 0  # lines since then that were neither
         self._errors: Counter[str] = Counter()
         self._tail = b""
 
