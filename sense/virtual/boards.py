@@ -17,16 +17,7 @@ import numpy as np
 
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due_framing import (
-    FULL_SCALE,
-    MAX_CHANNELS,
-    Ack,
-    BoardSettings,
-    DueBlock,
-    Identity,
-    Kind,
-    Status,
-)
+from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Status
 from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineHeader, format_header, format_sample
 
 SampleSource = Callable[[Array], Array]
@@ -175,7 +166,7 @@ class EmulatedDue(SerialBoard):
         super().__init__(skew_ppm, seed)
         self._source, self._supply_v = source, supply_v
         serial = b"emulated board".ljust(16, b"\0")
-        self._identity = Identity(firmware, framing.BITS, MAX_CHANNELS, "padforge-due", serial)
+        self._identity = Identity(firmware, framing.BITS, framing.MAX_CHANNELS, "padforge-due", serial)
         self._silent = silent
         self._decoder = framing.DueDecoder()
         self._settings = BoardSettings(1_000_000, 0xFF, 1)
@@ -237,8 +228,9 @@ class EmulatedDue(SerialBoard):
 
     def _block(self, first: int, times_s: Array) -> DueBlock:
         mask, averaging = self._settings.mask, self._settings.averaging
-        inputs = [i for i in range(MAX_CHANNELS) if mask >> i & 1]
-        steps = np.clip(np.rint(self._source(times_s)[:, inputs] / self._supply_v * FULL_SCALE), 0, FULL_SCALE)
+        inputs = [i for i in range(framing.MAX_CHANNELS) if mask >> i & 1]
+        volts, full_scale = self._source(times_s)[:, inputs], framing.FULL_SCALE
+        steps = np.clip(np.rint(volts / self._supply_v * full_scale), 0, full_scale)
         time_us = (first + len(times_s)) * self._settings.period_ns // 1000
         numbers = (self._sequence % 2**16, first % 2**32, time_us % 2**32, self._overruns)
         self._sequence += 1
@@ -248,7 +240,7 @@ class EmulatedDue(SerialBoard):
 def check_settings(settings: BoardSettings) -> Status:
     """Return the status with which the firmware answers settings."""
     mask, averaging, period_ns = settings.mask, settings.averaging, settings.period_ns
-    valid = 0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
+    valid = 0 < mask < 1 << framing.MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
     if not (valid and 0 < period_ns <= MAX_PERIOD_NS):
         return Status.BAD_SETTINGS
     return Status.TOO_FAST if period_ns < averaging * mask.bit_count() * MIN_NS_PER_CONVERSION else Status.OK

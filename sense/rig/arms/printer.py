@@ -245,13 +245,8 @@ class Printer:
     def connect(self) -> Mapping[str, Any]:
         """Open the port and set the printer up; nothing moves.
 
-        Returns:
-            port, baud, firmware and machine by name, the maximum speeds (mm/s) and accelerations (mm/s²) of its axes,
-            and whether it can halt at once.
-
-        Raises:
-            RigFault: "refused" where there is no printer with Marlin, it has not been homed, it restarts as its port is
-                opened, its axes are too slow for the presses, or a setting is missing; "lost", "stale".
+        RigFault("refused") where there is no printer with Marlin, it has not been homed, it restarts as its port is
+        opened, its axes are too slow for the presses, or a setting is missing.
         """
         self.close()
         rig = self._rig

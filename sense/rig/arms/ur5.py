@@ -147,13 +147,8 @@ class UR5:
     def connect(self) -> Mapping[str, Any]:
         """Open the link, ending an earlier one of this object.
 
-        Returns:
-            host, model, polyscope, serial, controller and ur_rtde versions, rate_hz, and the tool's tcp in mm and rad.
-
-        Raises:
-            RigFault: "refused" if there is no arm, it is not in remote control or not powered, another program uses it,
-                on this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop"; "deadline"
-                after 4.5 s.
+        RigFault("refused") if there is no arm, it is not in remote control or not powered, another program uses it, on
+        this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop"; "deadline" after 4.5 s.
         """
         if importlib.util.find_spec("rtde_control") is None:
             raise RigFault("refused", "the arm needs ur-rtde", "pip install 'padforge[rig]'")

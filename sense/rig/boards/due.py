@@ -9,22 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from padforge.design.common.validation import InputError
+from padforge.sense.rig.boards import due_framing as framing
 from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
-from padforge.sense.rig.boards.due_framing import (
-    FULL_SCALE,
-    MAX_AVERAGING,
-    MAX_CHANNELS,
-    Ack,
-    BoardSettings,
-    DueBlock,
-    DueDecoder,
-    DueMessage,
-    Identity,
-    Kind,
-    Request,
-    Status,
-    encode,
-)
+from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Request, Status
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
@@ -39,7 +26,7 @@ _MAX_JUMP_US = 5000  # of board time against sample index from block to block: i
 _DUE_PORTS = {0x003E: "native", 0x003D: "programming"}
 _VENDORS = (0x2341, 0x2A03)
 
-M = TypeVar("M", bound=DueMessage)
+M = TypeVar("M", bound=framing.DueMessage)
 
 
 @dataclass(frozen=True)
@@ -75,17 +62,17 @@ class DueLink:
 
     def __init__(self, port: str) -> None:
         """Open `port` exclusively; raises RigFault("refused") if that fails."""
-        self.decoder = DueDecoder()
+        self.decoder = framing.DueDecoder()
         self._stream = SerialStream(port, BAUD, POLL_S)
 
-    def receive(self) -> tuple[float, list[DueMessage]]:
+    def receive(self) -> tuple[float, list[framing.DueMessage]]:
         """Wait shortly for bytes; return the host time and the messages that they complete."""
         now_s, data = self._stream.receive()
         return now_s, self.decoder.decode(data)
 
     def send(self, command: Request | BoardSettings) -> None:
         """Send one command."""
-        self._stream.send(encode(command))
+        self._stream.send(framing.encode(command))
 
     def request(self, command: Request | BoardSettings, kind: type[M], matches: Callable[[M], bool] | None = None) -> M:
         """Send a command until a message of this kind that matches comes; RigFault("stale") after a second without."""
@@ -124,8 +111,8 @@ class DueBoard:
             averaging: conversions summed to a sample, 1 to 16.
         """
         _check_range("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        _check_range("averaging", averaging, 1, MAX_AVERAGING)
-        self._inputs = select_inputs(inputs, MAX_CHANNELS, "an Arduino Due")
+        _check_range("averaging", averaging, 1, framing.MAX_AVERAGING)
+        self._inputs = select_inputs(inputs, framing.MAX_CHANNELS, "an Arduino Due")
         self._port = port
         self._settings = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
         self._supply_v = supply_v
@@ -243,7 +230,7 @@ class DueAssembler:
         self.blocks = self.missing = self.overruns = 0
         self._settings = settings
         self._columns = [sorted(set(inputs)).index(i) for i in inputs]  # blocks hold the inputs in ascending order
-        self._volts = supply_v / (settings.averaging * FULL_SCALE)
+        self._volts = supply_v / (settings.averaging * framing.FULL_SCALE)
         self._next = 0
         self._time_us: int | None = None
 

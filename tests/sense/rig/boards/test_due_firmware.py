@@ -6,18 +6,7 @@ import numpy as np
 import pytest
 
 from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due_framing import (
-    Ack,
-    BoardSettings,
-    DueBlock,
-    DueDecoder,
-    DueMessage,
-    Identity,
-    Kind,
-    Request,
-    Status,
-    encode,
-)
+from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Request, Status
 from padforge.sense.virtual.boards import check_settings
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
@@ -30,13 +19,13 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return compile_sketch("due", FIRMWARE, tmp_path_factory.mktemp("firmware"))
 
 
-def run(program: Path, *steps: str | Request | BoardSettings) -> list[DueMessage]:
+def run(program: Path, *steps: str | Request | BoardSettings) -> list[framing.DueMessage]:
     """What the board sends as the script is run with messages of the host in it: as the program would write it."""
-    script = [step if isinstance(step, str) else f"host {encode(step).hex()}" for step in steps]
-    decoder, stream = DueDecoder(), run_sketch(program, script)
+    script = [step if isinstance(step, str) else f"host {framing.encode(step).hex()}" for step in steps]
+    decoder, stream = framing.DueDecoder(), run_sketch(program, script)
     messages = decoder.decode(stream)
     assert decoder.damaged == 0
-    assert stream == b"".join(map(encode, messages))
+    assert stream == b"".join(map(framing.encode, messages))
     return messages
 
 
@@ -130,7 +119,7 @@ def test_firmware_halts_on_lost_conversions(program: Path, trouble: list[str]) -
 
 
 def test_firmware_identifies_itself_reports_period_and_skips_damaged_commands(program: Path) -> None:
-    wanted = encode(BoardSettings(2_000_000, 3, 2))
+    wanted = framing.encode(BoardSettings(2_000_000, 3, 2))
     damaged: list[bytes] = []
     for i in range(len(wanted)):
         damaged += [wanted[:i] + bytes([wanted[i] ^ 0x10]) + wanted[i + 1 :], wanted[:i] + wanted[i + 1 :]]
