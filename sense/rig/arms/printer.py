@@ -11,6 +11,7 @@ where it was sent.
 
 import math
 import queue
+import re
 import threading
 import time
 from collections import deque
@@ -349,7 +350,7 @@ def _identify(link: MarlinLink) -> PrinterInfo:
     info = PrinterInfo.parse(link.execute("M115"))
     if FIRMWARE not in info.firmware:
         raise RigFault("refused", f"the firmware is {info.firmware or 'of no name'!r}, allowed is Marlin")
-    if info.delays_position:
+    if re.match(r"Marlin (bugfix-)?1\.", info.firmware):  # answers M114 only once all moves are over
         message = f"the firmware is {info.firmware!r}, which reports its position only once it stands"
         raise RigFault("refused", message, "allowed is Marlin 2")
     return info

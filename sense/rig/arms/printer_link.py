@@ -93,11 +93,6 @@ class PrinterInfo:
             firmware[1].strip() if firmware else "", machine[1].strip() if machine else "", frozenset(capabilities)
         )
 
-    @property
-    def delays_position(self) -> bool:
-        """Whether M114 is answered only once all moves are over, as Marlin did before version 2."""
-        return re.match(r"Marlin (bugfix-)?1\.", self.firmware) is not None
-
 
 class MarlinLink:
     """An open port. Its methods raise RigFault("lost") once the printer is gone, has restarted or has halted.

@@ -110,8 +110,10 @@ class DueBoard:
             supply_v: reading at full scale, V.
             averaging: conversions summed to a sample, 1 to 16.
         """
-        _check_range("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        _check_range("averaging", averaging, 1, framing.MAX_AVERAGING)
+        limits = ("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ), ("averaging", averaging, 1, framing.MAX_AVERAGING)
+        for name, value, low, high in limits:
+            if not low <= value <= high:
+                raise InputError(f"{name} is {value:g}, expected {low:g} to {high:g}")
         self._inputs = select_inputs(inputs, framing.MAX_CHANNELS, "an Arduino Due")
         self._port = port
         self._settings = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
@@ -269,8 +271,3 @@ class DueAssembler:
         self.missing += missing
         self.overruns = block.overruns
         return first, missing
-
-
-def _check_range(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise InputError(f"{name} is {value:g}, expected {low:g} to {high:g}")
