@@ -247,11 +247,7 @@ def check_settings(settings: BoardSettings) -> Status:
 
 
 class EmulatedLineBoard(SerialBoard):
-    """A board that speaks the line protocol.
-
-    Attributes:
-        dropped: number of lines left out because the host was too slow.
-    """
+    """A board that speaks the line protocol."""
 
     def __init__(
         self,
@@ -266,7 +262,8 @@ class EmulatedLineBoard(SerialBoard):
         """Open the pseudo-terminal; its clock begins at `boot_us`, and a `silent` board sends nothing."""
         super().__init__(skew_ppm, seed)
         self._source, self._header, self._boot_us, self._silent = source, header, boot_us, silent
-        self._columns, self.dropped = header.channels, 0
+        self._columns = header.channels
+        self.dropped = 0  # lines left out because the host was too slow
 
     def reset(self) -> None:
         """Start anew, as by its button."""

@@ -49,10 +49,7 @@ class ExecutedMove:
 
 
 class Firmware:
-    """Marlin without its port: lines in, answers out, and straight moves, at times that the caller passes.
-
-    The first of `moves` is a rest at the start position.
-    """
+    """Marlin without its port: lines in, answers out, and straight moves, at times that the caller passes."""
 
     def __init__(
         self,
@@ -237,11 +234,7 @@ class Firmware:
 
 
 class EmulatedPrinter(SerialDevice):
-    """The printer at a serial port; the noise of `garble` is on both directions.
-
-    Attributes:
-        firmware: what it runs; to be read once the printer stands or is unplugged.
-    """
+    """The printer at a serial port, its `firmware` read once it stands; the noise of `garble` is on both directions."""
 
     def __init__(self, position: Position, *, restarts: bool = False, seed: int = 0, **firmware: Any) -> None:
         """Open the pseudo-terminal; with `restarts` it restarts at the first bytes from a host, as many boards do."""

@@ -52,12 +52,9 @@ class EmulatedUR5:
     """A context: the controller runs from entry to exit.
 
     For 127.0.0.1 ur-rtde never asks whether the arm is in remote control, for other names (127.1, say) it does.
-
-    Attributes:
-        pose_log: true poses of the tip; other processes can open `PoseLog(emulator.pose_log.path)`.
     """
 
-    pose_log: PoseLog
+    pose_log: PoseLog  # true poses of the tip; other processes can open `PoseLog(emulator.pose_log.path)`
 
     def __init__(
         self,

@@ -95,11 +95,7 @@ class PrinterInfo:
 
 
 class MarlinLink:
-    """An open port. Its methods raise RigFault("lost") once the printer is gone, has restarted or has halted.
-
-    Attributes:
-        halted: whether it has restarted or halted, so that nothing moves any more.
-    """
+    """An open port. Its methods raise RigFault("lost") once the printer is gone, has restarted or has halted."""
 
     def __init__(self, port: str, baud: int) -> None:
         """Open `port` exclusively; raises RigFault("refused") where that fails."""
@@ -109,7 +105,8 @@ class MarlinLink:
         self._text = b""
         self._number = 0
         self._history: deque[bytes] = deque(maxlen=_MAX_HISTORY)
-        self._connected = self.halted = False
+        self._connected = False
+        self.halted = False  # or restarted: nothing moves any more
 
     def handshake(self, timeout_s: float) -> None:
         """Wait until the printer answers, and count its lines from 0; RigFault("refused") without one."""
@@ -125,8 +122,7 @@ class MarlinLink:
     def execute(self, command: str, timeout_s: float = ANSWER_S) -> list[str]:
         """Have a command executed once; return the lines of its answer, none where noise took it.
 
-        Raises:
-            RigFault: "stale" where it is not answered in time; "lost".
+        RigFault("stale") where it is not answered in time.
         """
         self._number += 1
         self._history.append(number_line(self._number, command))

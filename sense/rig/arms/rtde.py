@@ -140,12 +140,7 @@ class HostClock:
 
 
 class RtdeReader:
-    """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes.
-
-    Attributes:
-        version: of the controller, four numbers.
-        rate_hz: states a second.
-    """
+    """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes."""
 
     def __init__(self, host: str, timeout_s: float) -> None:
         """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
@@ -157,8 +152,8 @@ class RtdeReader:
         self._last_stamp: float | None = None
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
-        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))
-        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125
+        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of the controller
+        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # states a second
         names = ",".join(VARIABLES).encode()
         types = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + names)[1:].decode().split(",")
         if "NOT_FOUND" in types:

@@ -222,14 +222,11 @@ class DueBoard:
 
 
 class DueAssembler:
-    """Makes `BoardSamples` of blocks: host times by a `SampleClock`, volts by fibre, missing samples by the index.
-
-    It counts blocks, missing samples, and overruns, those of them that the board dropped.
-    """
+    """Makes `BoardSamples` of blocks: host times by a `SampleClock`, volts by fibre, missing samples by the index."""
 
     def __init__(self, settings: BoardSettings, inputs: Sequence[int], supply_v: float) -> None:
         self.clock = SampleClock(settings.period_ns * 1e-9)
-        self.blocks = self.missing = self.overruns = 0
+        self.blocks = self.missing = self.overruns = 0  # overruns: missing samples that the board dropped
         self._settings = settings
         self._columns = [sorted(set(inputs)).index(i) for i in inputs]  # blocks hold the inputs in ascending order
         self._volts = supply_v / (settings.averaging * framing.FULL_SCALE)
