@@ -17,27 +17,16 @@ import numpy as np
 
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due_framing import (
-    FULL_SCALE,
-    MAX_CHANNELS,
-    Ack,
-    BoardSettings,
-    DueBlock,
-    Identity,
-    Kind,
-    Status,
-)
+from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Status
 from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineHeader, format_header, format_sample
 
 SampleSource = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the number of inputs of the board or more."""
 
-MAX_OUT_BYTES = 65_536
-"""Bytes that wait for a slow host; what comes then is dropped, whole samples at a time."""
+MAX_OUT_BYTES = 65_536  # bytes that wait for a slow host; what comes then is dropped, whole samples at a time
 MIN_NS_PER_CONVERSION = 6000
 MAX_PERIOD_NS = 1_000_000_000
-BLOCK_NS = 20_000_000
-"""A block of the Due holds this much time, or a single sample."""
+BLOCK_NS = 20_000_000  # A block of the Due holds this much time, or a single sample
 
 _POLL_S = 0.01
 
@@ -46,12 +35,7 @@ class SerialDevice(ABC):
     """A device at the port `port`, a pseudo-terminal, from `with` to its end."""
 
     def __init__(self, name: str, seed: int) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            name: of the thread.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; `seed` is of the noise of `garble`."""
         import tty
 
         self._rng, self._garble = np.random.default_rng(seed), 0.0
@@ -113,12 +97,7 @@ class SerialBoard(SerialDevice):
     """A board at a serial port; the noise of `garble` is on what it sends."""
 
     def __init__(self, skew_ppm: float, seed: int) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            skew_ppm: how much longer a period is than nominal.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; `skew_ppm` is how much longer a period is than nominal."""
         super().__init__("board", seed)
         self._skew_ppm = skew_ppm
         self._start_s: float | None = None
@@ -183,20 +162,11 @@ class EmulatedDue(SerialBoard):
         silent: bool = False,
         seed: int = 0,
     ) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            source: voltages of the inputs.
-            supply_v: reading at full scale.
-            skew_ppm: how much longer a period is than nominal.
-            firmware: version that it reports.
-            silent: whether it answers nothing.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; a `silent` board answers nothing."""
         super().__init__(skew_ppm, seed)
         self._source, self._supply_v = source, supply_v
         serial = b"emulated board".ljust(16, b"\0")
-        self._identity = Identity(firmware, framing.BITS, MAX_CHANNELS, "padforge-due", serial)
+        self._identity = Identity(firmware, framing.BITS, framing.MAX_CHANNELS, "padforge-due", serial)
         self._silent = silent
         self._decoder = framing.DueDecoder()
         self._settings = BoardSettings(1_000_000, 0xFF, 1)
@@ -258,8 +228,9 @@ class EmulatedDue(SerialBoard):
 
     def _block(self, first: int, times_s: Array) -> DueBlock:
         mask, averaging = self._settings.mask, self._settings.averaging
-        inputs = [i for i in range(MAX_CHANNELS) if mask >> i & 1]
-        steps = np.clip(np.rint(self._source(times_s)[:, inputs] / self._supply_v * FULL_SCALE), 0, FULL_SCALE)
+        inputs = [i for i in range(framing.MAX_CHANNELS) if mask >> i & 1]
+        volts, full_scale = self._source(times_s)[:, inputs], framing.FULL_SCALE
+        steps = np.clip(np.rint(volts / self._supply_v * full_scale), 0, full_scale)
         time_us = (first + len(times_s)) * self._settings.period_ns // 1000
         numbers = (self._sequence % 2**16, first % 2**32, time_us % 2**32, self._overruns)
         self._sequence += 1
@@ -269,18 +240,14 @@ class EmulatedDue(SerialBoard):
 def check_settings(settings: BoardSettings) -> Status:
     """Return the status with which the firmware answers settings."""
     mask, averaging, period_ns = settings.mask, settings.averaging, settings.period_ns
-    valid = 0 < mask < 1 << MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
+    valid = 0 < mask < 1 << framing.MAX_CHANNELS and 1 <= averaging <= framing.MAX_AVERAGING
     if not (valid and 0 < period_ns <= MAX_PERIOD_NS):
         return Status.BAD_SETTINGS
     return Status.TOO_FAST if period_ns < averaging * mask.bit_count() * MIN_NS_PER_CONVERSION else Status.OK
 
 
 class EmulatedLineBoard(SerialBoard):
-    """A board that speaks the line protocol.
-
-    Attributes:
-        dropped: number of lines left out because the host was too slow.
-    """
+    """A board that speaks the line protocol."""
 
     def __init__(
         self,
@@ -292,19 +259,11 @@ class EmulatedLineBoard(SerialBoard):
         silent: bool = False,
         seed: int = 0,
     ) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            source: voltages of the inputs.
-            header: what it sends as its header.
-            boot_us: its clock at the start.
-            skew_ppm: how much longer a period is than nominal.
-            silent: whether it sends nothing.
-            seed: of the noise of `garble`.
-        """
+        """Open the pseudo-terminal; its clock begins at `boot_us`, and a `silent` board sends nothing."""
         super().__init__(skew_ppm, seed)
         self._source, self._header, self._boot_us, self._silent = source, header, boot_us, silent
-        self._columns, self.dropped = header.channels, 0
+        self._columns = header.channels
+        self.dropped = 0  # lines left out because the host was too slow
 
     def reset(self) -> None:
         """Start anew, as by its button."""

@@ -17,12 +17,9 @@ from padforge.sense.rig.arms.motion import Position, StraightMove
 from padforge.sense.rig.arms.printer_link import checksum
 from padforge.sense.virtual.boards import SerialDevice
 
-MAX_PLANNED = 16
-"""Moves that the planner holds; a further one waits."""
-START_S = 0.1
-"""How long the first move waits for others."""
-BUSY_S = 2.0
-"""Pause between two lines that say that the firmware is busy."""
+MAX_PLANNED = 16  # moves that the planner holds; a further one waits
+START_S = 0.1  # how long the first move waits for others
+BUSY_S = 2.0  # pause between two lines that say that the firmware is busy
 STEPS_PER_MM = (80, 80, 400)
 IDENTITY = (
     "FIRMWARE_NAME:Marlin 2.1.2 (emulated) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin PROTOCOL_VERSION:1.0"
@@ -35,17 +32,11 @@ _EMERGENCY = re.compile(rb"^(?:N\d+ )?M(112|410)\b")
 
 @dataclass(frozen=True)
 class ExecutedMove:
-    """A move that was executed, perhaps not to its end.
+    """A move that was executed, perhaps not to its end."""
 
-    Attributes:
-        start_s: time of its start.
-        move: as planned.
-        duration_s: how much of it was executed.
-    """
-
-    start_s: float
-    move: StraightMove
-    duration_s: float
+    start_s: float  # time of its start
+    move: StraightMove  # as planned
+    duration_s: float  # how much of it was executed
 
     @property
     def end_s(self) -> float:
@@ -58,13 +49,7 @@ class ExecutedMove:
 
 
 class Firmware:
-    """Marlin without its port: lines in, answers out, and straight moves, at times that the caller passes.
-
-    Attributes:
-        moves: all executed moves; the first is a rest at the start position.
-        halted: whether it was killed.
-        homed: whether it knows where it is.
-    """
+    """Marlin without its port: lines in, answers out, and straight moves, at times that the caller passes."""
 
     def __init__(
         self,
@@ -76,16 +61,7 @@ class Firmware:
         emergency_parser: bool = True,
         realtime: bool = True,
     ) -> None:
-        """Switch on a printer that was homed.
-
-        Args:
-            position: of the nozzle, mm from the true origin.
-            max_mm_s: maximum speeds of the axes.
-            max_mm_s2: maximum accelerations of the axes.
-            bed_mm: range of the axes.
-            emergency_parser: whether M112 and M410 act at once.
-            realtime: whether `M114 R` reports the real-time position.
-        """
+        """Switch on a printer that was homed; mm, mm/s and mm/s² of x, y and z."""
         self._max_mm_s, self._max_mm_s2, self._bed_mm = max_mm_s, max_mm_s2, bed_mm
         self._emergency_parser, self._realtime = emergency_parser, realtime
         self.moves: list[ExecutedMove] = [ExecutedMove(-math.inf, StraightMove(position, position, 1.0, 1.0), 0.0)]
@@ -258,21 +234,10 @@ class Firmware:
 
 
 class EmulatedPrinter(SerialDevice):
-    """The printer at a serial port; the noise of `garble` is on both directions.
-
-    Attributes:
-        firmware: what it runs; to be read once the printer stands or is unplugged.
-    """
+    """The printer at a serial port, its `firmware` read once it stands; the noise of `garble` is on both directions."""
 
     def __init__(self, position: Position, *, restarts: bool = False, seed: int = 0, **firmware: Any) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            position: of the nozzle.
-            restarts: whether it restarts at the first bytes from a host, as many boards do.
-            seed: of the noise of `garble`.
-            firmware: see `Firmware`.
-        """
+        """Open the pseudo-terminal; with `restarts` it restarts at the first bytes from a host, as many boards do."""
         super().__init__("printer", seed)
         self.firmware, self._restarts = Firmware(position, **firmware), restarts
         self._lock = threading.Lock()

@@ -42,8 +42,7 @@ HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
 """Where the emulated arm stands at first: 200 mm up, the tool pointing down."""
 PORTS = {"rtde": rtde.RTDE_PORT, "script": rtde.SCRIPT_PORT, "dashboard": rtde.DASHBOARD_PORT}
-MAX_BACKLOG = 1 << 16
-"""Bytes that a client may leave unread before the stream skips frames for it."""
+MAX_BACKLOG = 1 << 16  # bytes that a client may leave unread before the stream skips frames for it
 TO_MM = np.array([1000.0, 1000.0, 1000.0, 1.0, 1.0, 1.0])
 
 _LOG_PREFIX = "padforge-ur-"  # of its temporary files
@@ -53,12 +52,9 @@ class EmulatedUR5:
     """A context: the controller runs from entry to exit.
 
     For 127.0.0.1 ur-rtde never asks whether the arm is in remote control, for other names (127.1, say) it does.
-
-    Attributes:
-        pose_log: true poses of the tip; other processes can open `PoseLog(emulator.pose_log.path)`.
     """
 
-    pose_log: PoseLog
+    pose_log: PoseLog  # true poses of the tip; other processes can open `PoseLog(emulator.pose_log.path)`
 
     def __init__(
         self,
@@ -69,16 +65,7 @@ class EmulatedUR5:
         host: str = HOST,
         tcp_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Describe the controller.
-
-        Args:
-            series: "cb3" (PolyScope 3, 125 Hz) or "e" (PolyScope 5, 500 Hz).
-            pose: of the tool at first.
-            surface_mm: height of a springy plane that the tool can press on; None for none.
-            stiffness_n_mm: of this plane.
-            host: address of this machine at which it listens.
-            tcp_mm: tip from the flange, as in the controller's installation.
-        """
+        """Describe a controller: "cb3" at 125 Hz or "e" at 500 Hz, over a springy plane at `surface_mm`."""
         self._settings = {"series": series, "pose_mm": pose, "surface_mm": surface_mm}
         self._settings |= {"stiffness_n_mm": stiffness_n_mm, "host": host, "tcp_mm": tcp_mm}
 
@@ -111,30 +98,21 @@ class EmulatedUR5:
 
     protective_stop = partialmethod(_command, "protective_stop")
     """Stop the arm as after a collision: the program is paused."""
-    emergency_stop = partialmethod(_command, "emergency_stop")
-    """Press the red button."""
+    emergency_stop = partialmethod(_command, "emergency_stop")  # press the red button
     clear = partialmethod(_command, "clear")
     """Unlock the arm, power on and release the brakes, as a person does after a stop."""
-    play = partialmethod(_command, "play")
-    """Press play at the pendant: a paused program goes on."""
-    stop_program = partialmethod(_command, "stop_program")
-    """Press stop at the pendant: the program ends."""
-    drop = partialmethod(_command, "drop")
-    """Close the connections to a port; new ones are accepted."""
-    freeze = partialmethod(_command, "set", "frozen")
-    """Send no more states; all else goes on."""
+    play = partialmethod(_command, "play")  # press play at the pendant: a paused program goes on
+    stop_program = partialmethod(_command, "stop_program")  # press stop at the pendant: the program ends
+    drop = partialmethod(_command, "drop")  # close the connections to a port; new ones are accepted
+    freeze = partialmethod(_command, "set", "frozen")  # send no more states; all else goes on
     unplug = partialmethod(_command, "set", "unplugged")
     """Receive and send nothing, and close no connection: the cable is out."""
-    slow = partialmethod(_command, "slow")
-    """Delay every answer and every command by some seconds."""
-    push = partialmethod(_command, "set", "sideways_n")
-    """Push the tool sideways with a force in N."""
-    remote_control = partialmethod(_command, "set", "remote")
-    """Switch between local and remote control."""
+    slow = partialmethod(_command, "slow")  # delay every answer and every command by some seconds
+    push = partialmethod(_command, "set", "sideways_n")  # push the tool sideways with a force in N
+    remote_control = partialmethod(_command, "set", "remote")  # switch between local and remote control
     restart = partialmethod(_command, "restart")
     """Restart the controller: all connections end, and it is back after some seconds."""
-    dashboard_log = partialmethod(_command, "dashboard_log")
-    """Return every line that was sent to the dashboard."""
+    dashboard_log = partialmethod(_command, "dashboard_log")  # return every line that was sent to the dashboard
 
     def refuse(self, refused: bool) -> None:
         """Refuse new connections, or accept them again; open connections stay."""

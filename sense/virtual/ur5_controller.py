@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +20,8 @@ from padforge.sense.rig.arms.rtde import PAUSED, PLAYING, RUNNING, STOPPED
 Series = Literal["cb3", "e"]
 RATES_HZ = {"cb3": 125, "e": 500}
 VERSIONS = {"cb3": (3, 15, 8, 106339), "e": (5, 12, 2, 1101534)}
-HALT_M_S2 = 4.0
-"""Deceleration when the controller itself stops the arm."""
-START_S = 0.02
-"""From the last byte of a program to its first step."""
+HALT_M_S2 = 4.0  # deceleration when the controller itself stops the arm
+START_S = 0.02  # from the last byte of a program to its first step
 NORMAL, PROTECTIVE, EMERGENCY = 1 << 0, 1 << 2, 1 << 7
 POWER_OFF = 3
 
@@ -31,16 +29,6 @@ MOVE_L, SPEED_L, STOP_L, SET_TCP, STOP, WATCHDOG, IS_SAFE, GET_TCP, IS_STEADY, E
     3, 10, 15, 29, 33, 35, 36, 40, 47, 255,
 )  # fmt: skip
 """Commands of ur-rtde's control program that are emulated."""
-
-
-class Trajectory(Protocol):
-    """A path of the tool over time."""
-
-    duration: float
-
-    def evaluate(self, t: float) -> tuple[Array, Array]:
-        """Return pose and velocity `t` seconds after the start."""
-        ...
 
 
 class StraightTrajectory:
@@ -58,6 +46,7 @@ class StraightTrajectory:
         self.duration = self.profile.duration_s
 
     def evaluate(self, t: float) -> tuple[Array, Array]:
+        """Return pose and velocity `t` seconds after the start."""
         if t >= self.duration:
             return self.end.copy(), np.zeros(6)
         distance, speed = self.profile.evaluate(t)
@@ -81,17 +70,11 @@ class VelocityRamp:
 
 
 class Motion:
-    """Motion of the tool.
-
-    Attributes:
-        pose: at the last update.
-        velocity: at the last update.
-        moving: whether a trajectory is under way.
-    """
+    """Motion of the tool: pose and velocity at the last update."""
 
     def __init__(self, pose: Array) -> None:
         self.pose, self.velocity = pose, np.zeros(6)
-        self._trajectory: Trajectory | None = None
+        self._trajectory: StraightTrajectory | VelocityRamp | None = None
         self._start_s = 0.0
         self._interrupted: StraightTrajectory | None = None
 
@@ -134,7 +117,7 @@ class Motion:
         if t >= self._trajectory.duration:
             self._trajectory, self.velocity = None, np.zeros(6)
 
-    def _start(self, trajectory: Trajectory, now: float) -> None:
+    def _start(self, trajectory: StraightTrajectory | VelocityRamp, now: float) -> None:
         self._trajectory, self._start_s = trajectory, now
 
 
@@ -151,16 +134,7 @@ class SpringySurface:
 
 
 class Controller:
-    """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock.
-
-    Attributes:
-        motion: of the tool.
-        inputs: registers that clients write.
-        outputs: registers that clients read.
-        remote: whether the arm is in remote control.
-        sideways_n: force that pushes the tool along x.
-        dashboard_log: every line that was sent to the dashboard.
-    """
+    """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock."""
 
     def __init__(
         self,
@@ -170,28 +144,20 @@ class Controller:
         now: float = 0.0,
         tcp: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Switch it on.
-
-        Args:
-            series: of the controller.
-            pose: of the tool.
-            surface: that the tool can press on; None for none.
-            now: the time.
-            tcp: tip from the flange, as in the controller's installation.
-        """
+        """Switch it on at the time `now`, its tool at `pose`."""
         self.series: Series = series
         self._installed_tcp = tcp
         self.motion = Motion(pose)
         self.surface = surface
-        self.remote, self.sideways_n = True, 0.0
+        self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
         self.dashboard_log: list[str] = []
         self.restart(now)
 
     def restart(self, now: float) -> None:
         """Restart as after a power failure: all state is lost but the pose."""
         self.motion = Motion(self.motion.pose)
-        self.inputs: defaultdict[str, float] = defaultdict(float)
-        self.outputs: dict[str, float] = {}
+        self.inputs: defaultdict[str, float] = defaultdict(float)  # registers that clients write
+        self.outputs: dict[str, float] = {}  # registers that clients read
         self.tcp: Array = np.array([*self._installed_tcp, 0.0, 0.0, 0.0])
         self._boot = self._now = now
         self._safety, self._runtime, self._mode = NORMAL, STOPPED, RUNNING
@@ -363,10 +329,8 @@ class Controller:
         return np.array([self._read_double(index) for index in range(first, first + count)])
 
 
-COLUMNS = 8
-"""Time on the host's monotonic clock in s, pose in mm and rad, force on the tool in N."""
-ROWS = 1 << 16
-"""Length of the ring: 131 s at 500 Hz, 524 s at 125 Hz."""
+COLUMNS = 8  # time on the host's monotonic clock in s, pose in mm and rad, force on the tool in N
+ROWS = 1 << 16  # length of the ring: 131 s at 500 Hz, 524 s at 125 Hz
 WINDOWS = (256, 8192, ROWS)
 """Numbers of newest rows that are searched in turn: who asks in real time, as a board does, asks for the newest."""
 _MARGIN = 16  # rows that the writer may overwrite while a reader copies
@@ -402,11 +366,7 @@ class PoseLog:
         return copy[max(0, overwritten - first) :]
 
     def poses(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 6) poses in mm and rad at monotonic times, the newest one for later times.
-
-        Raises:
-            ValueError: for a time before the oldest row.
-        """
+        """Return the (n, 6) poses in mm and rad at monotonic times; ValueError for a time before the oldest row."""
         times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
         first_s = np.min(times, initial=np.inf)
         for max_rows in WINDOWS:

@@ -16,38 +16,25 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import TRAVEL_S, LivePad
 from padforge.sense.virtual.boards import EmulatedDue
 
-SCATTER_MM = 1.5
-"""Standard deviation of the position of a press, in x and in y."""
-DEPTHS = (0.7, 1.1)
-"""Range of depths, relative to `depth_mm`."""
-REACTION_S = (0.3, 0.7)
-"""Range of the time from the request to the touch; a lift follows in half of it."""
+SCATTER_MM = 1.5  # standard deviation of the position of a press, in x and in y
+DEPTHS = (0.7, 1.1)  # range of depths, relative to `depth_mm`
+REACTION_S = (0.3, 0.7)  # range of the time from the request to the touch; a lift follows in half of it
 MISHAPS = ("short", "double", "light", "slide")
 """A press is let go at once, or followed by a second tap, or hardly felt, or slides away."""
 SHORT_S, AGAIN_S, LIGHT, SLIDE_MM = 0.3, 0.25, 0.04, 12.0
-PATIENCE_S = 3.0
-"""Time after which a press that was not detected is given up."""
+PATIENCE_S = 3.0  # time after which a press that was not detected is given up
 
 
 @dataclass
 class FingerStroke:
-    """A press of the finger.
+    """A press of the finger."""
 
-    Attributes:
-        kind: "press", one of `MISHAPS`, or "echo", the second tap.
-        position_mm: of the touch; shape (2,).
-        depth_mm: when it is down.
-        down_s: time of the touch.
-        up_s: time of the lift; inf while it is unknown.
-        slide_mm: how far it slides along x within a second.
-    """
-
-    kind: str
-    position_mm: Array
-    depth_mm: float
-    down_s: float
-    up_s: float = math.inf
-    slide_mm: float = 0.0
+    kind: str  # "press", one of `MISHAPS`, or "echo", the second tap
+    position_mm: Array  # of the touch; shape (2,)
+    depth_mm: float  # when it is down
+    down_s: float  # time of the touch
+    up_s: float = math.inf  # time of the lift; inf while it is unknown
+    slide_mm: float = 0.0  # how far it slides along x within a second
 
     def contact(self, time_s: float) -> tuple[Array, float]:
         """Return position and depth at a time, mm."""
@@ -58,11 +45,7 @@ class FingerStroke:
 
 
 class Finger:
-    """A finger that looks at what is displayed (`look`) and moves as the samples go by (`volts`).
-
-    Attributes:
-        strokes: all that it has made.
-    """
+    """A finger that looks at what is displayed (`look`) and moves as the samples go by (`volts`)."""
 
     def __init__(
         self,
@@ -74,23 +57,14 @@ class Finger:
         scatter_mm: float = SCATTER_MM,
         mishaps: float = 0.05,
     ) -> None:
-        """Hold the finger over a pad.
-
-        Args:
-            pad: what it presses.
-            contact: what a press deforms.
-            rig: depth of the presses, noise of the pad, seed.
-            rate_hz: samples a second.
-            scatter_mm: see `SCATTER_MM`.
-            mishaps: share of presses that become one of `MISHAPS`.
-        """
+        """Hold the finger over a pad; `mishaps` is the share of presses that become one of `MISHAPS`."""
         rng = np.random.default_rng(rig.seed)
         self._model = LivePad(pad, contact, rig, rate_hz, rng)
         self._rng, self._depth_mm = rng.spawn(1)[0], rig.depth_mm
         self._scatter_mm, self._mishaps = scatter_mm, mishaps
         self._view: Mapping[str, Any] = {"phase": "settle"}
         self._now_s = -math.inf
-        self.strokes: list[FingerStroke] = []
+        self.strokes: list[FingerStroke] = []  # all that it has made
 
     def look(self, view: Mapping[str, Any]) -> None:
         """See what is displayed: its "phase" and "target", [x, y] mm."""
@@ -143,13 +117,7 @@ class Finger:
 
 @contextmanager
 def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Board, Finger]]:
-    """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it.
-
-    Args:
-        pad: what is pressed.
-        contact: what a press deforms.
-        rig: depth of the presses, rate of the board, noise of the pad, seed.
-    """
+    """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it."""
     finger = Finger(pad, contact, rig, rig.board_rate_hz)
     signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     with EmulatedDue(finger.volts) as emulated:

@@ -39,15 +39,7 @@ class VirtualPad:
         clock: Callable[[], float] = time.monotonic,
         size: PadSettings | None = None,
     ) -> None:
-        """Make the pad; sampling starts with `connect`.
-
-        Args:
-            pad: what is pressed.
-            rig: rate, presses, noise of the pad, seed.
-            contact: what a press deforms.
-            clock: time in s.
-            size: sensed area and keep-outs; those of the pad if None.
-        """
+        """Make the pad; sampling starts with `connect`. `size` has sensed area and keep-outs, the pad's own if None."""
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
             make_plan(pad, rig, rng, size)  # the presses of the recording are drawn before the pad is
@@ -94,14 +86,7 @@ class VirtualPad:
 
 
 def virtual_pad_of(model: Path) -> VirtualPad:
-    """Return the simulated pad whose recording a model was trained on.
-
-    Args:
-        model: folder of the model.
-
-    Raises:
-        InputError: the recording is not in the folder, or not of a simulated pad.
-    """
+    """Return the simulated pad whose recording a model folder was trained on; InputError if there is none."""
     path = model / RECORDED / START
     if not path.is_file():
         raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")

@@ -22,12 +22,9 @@ from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, Sample
 from padforge.sense.virtual.printer import EmulatedPrinter
 from padforge.sense.virtual.ur5 import HOST, EmulatedUR5
 
-STIFFNESS_N_MM = 2.0
-"""Of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press."""
-MIN_LINE_INPUTS = 16
-"""Inputs of the emulated line board, which has more if higher ones are named."""
-BED_MM = 1000.0
-"""Width, depth and height of the emulated printer: room for any pad."""
+STIFFNESS_N_MM = 2.0  # of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press
+MIN_LINE_INPUTS = 16  # inputs of the emulated line board, which has more if higher ones are named
+BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any pad
 
 _START_S = 2.0
 
@@ -39,17 +36,7 @@ EmulatedBoard = EmulatedDue | EmulatedLineBoard
 def emulate_ur5(
     pad: Morphology, contact: Contact, rig: RigSettings
 ) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, EmulatedBoard]]:
-    """Open drivers of an arm and a board, not yet connected, and the emulators behind them.
-
-    Args:
-        pad: under the arm, where `rig` says.
-        contact: what a press deforms.
-        rig: of `ur5_settings`; names the board and its inputs.
-
-    Raises:
-        InputError: for a board that is not emulated.
-        RigFault: for a board with too few inputs.
-    """
+    """Open drivers of arm and board, not yet connected, and the emulators behind them; `rig` is of `ur5_settings`."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
     with EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
@@ -152,16 +139,7 @@ RIGS = {
 
 @contextmanager
 def opened_virtual_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, Board, RigSettings]]:
-    """Open emulated devices behind the drivers of a rig, not yet connected, and the settings for them.
-
-    Args:
-        kind: One of `RIGS`.
-        config: What is recorded.
-        inputs: Of the board, in the order of the fibres; all of them if empty.
-
-    Raises:
-        InputError: There is no such rig.
-    """
+    """Open emulated devices behind the drivers of one of `RIGS`, not yet connected, with the settings for them."""
     if kind not in RIGS:
         raise InputError(f"--virtual-hardware: got --rig {kind}, allowed are {', '.join(RIGS)}")
     settings, emulated_devices = RIGS[kind]

@@ -4,23 +4,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-Position = tuple[float, float, float]
-"""x, y and z, mm."""
+Position = tuple[float, float, float]  # x, y and z, mm
 
 
 @dataclass(frozen=True)
 class TrapezoidalProfile:
-    """Distance and speed of a move from rest to rest over time.
+    """Distance and speed of a move from rest to rest over time."""
 
-    Attributes:
-        length: distance of the move, >= 0; mm, m or rad.
-        max_speed: in these units a second, > 0.
-        acceleration: at the start and at the end, > 0.
-    """
-
-    length: float
-    max_speed: float
-    acceleration: float
+    length: float  # distance of the move, >= 0; mm, m or rad
+    max_speed: float  # in these units a second, > 0
+    acceleration: float  # at the start and at the end, > 0
 
     @property
     def duration_s(self) -> float:
@@ -46,19 +39,12 @@ class TrapezoidalProfile:
 
 @dataclass(frozen=True)
 class StraightMove:
-    """A straight move of a nozzle.
+    """A straight move of a nozzle."""
 
-    Attributes:
-        start: position before it.
-        end: position after it.
-        speed: at most, > 0, mm/s.
-        acceleration: > 0, mm/s².
-    """
-
-    start: Position
-    end: Position
-    speed: float
-    acceleration: float
+    start: Position  # position before it
+    end: Position  # position after it
+    speed: float  # at most, > 0, mm/s
+    acceleration: float  # > 0, mm/s²
 
     @property
     def length_mm(self) -> float:

@@ -11,6 +11,7 @@ where it was sent.
 
 import math
 import queue
+import re
 import threading
 import time
 from collections import deque
@@ -37,8 +38,7 @@ from padforge.sense.rig.devices import ArmState, Array, Pose, RigFault
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-CONNECT_S = 3.0
-"""Longest wait for a printer that restarts as its port is opened."""
+CONNECT_S = 3.0  # longest wait for a printer that restarts as its port is opened
 STALE_S = 0.5
 SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 """Millimetres, absolute positions, speeds at 100 %, software endstops on, motors always energized."""
@@ -56,28 +56,16 @@ _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 @dataclass(frozen=True)
 class NozzleState:
-    """State of the nozzle at one moment.
+    """State of the nozzle at one moment."""
 
-    Attributes:
-        time_s: when the printer reported it.
-        position: of the nozzle, mm.
-        speed_mm_s: >= 0.
-        moving: whether a move is under way.
-    """
-
-    time_s: float
-    position: Position
-    speed_mm_s: float
-    moving: bool
+    time_s: float  # when the printer reported it
+    position: Position  # of the nozzle, mm
+    speed_mm_s: float  # >= 0
+    moving: bool  # whether a move is under way
 
 
 class NozzleThread(threading.Thread):
-    """The thread that moves the nozzle and polls its position.
-
-    Attributes:
-        latest: the last state.
-        fault: why the position is unknown; None while all is well.
-    """
+    """The thread that moves the nozzle and polls its position."""
 
     def __init__(self, link: MarlinLink, position: Position, max_mm_s: Position, max_mm_s2: Position) -> None:
         super().__init__(name="printer", daemon=True)
@@ -88,8 +76,8 @@ class NozzleThread(threading.Thread):
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
         self._states: deque[NozzleState] = deque(maxlen=_MAX_STATES)
         self._ending = threading.Event()
-        self.fault: RigFault | None = None
-        self.latest = NozzleState(time.monotonic(), position, 0.0, False)
+        self.fault: RigFault | None = None  # why the position is unknown; None while all is well
+        self.latest = NozzleState(time.monotonic(), position, 0.0, False)  # the last state
 
     def run(self) -> None:
         """Poll, and execute commands, until the end or a fault."""
@@ -115,11 +103,7 @@ class NozzleThread(threading.Thread):
         self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), _MOVE_S)
 
     def stop(self) -> None:
-        """End the move under way, by an emergency stop if the printer does not confirm a quick stop.
-
-        Raises:
-            RigFault: "lost" if it was not confirmed.
-        """
+        """End the move under way; if no quick stop is confirmed, halt the printer and raise RigFault("lost")."""
         if self._move is None or self._link.halted:
             return
         try:
@@ -262,13 +246,8 @@ class Printer:
     def connect(self) -> Mapping[str, Any]:
         """Open the port and set the printer up; nothing moves.
 
-        Returns:
-            port, baud, firmware and machine by name, the maximum speeds (mm/s) and accelerations (mm/s²) of its axes,
-            and whether it can halt at once.
-
-        Raises:
-            RigFault: "refused" where there is no printer with Marlin, it has not been homed, it restarts as its port is
-                opened, its axes are too slow for the presses, or a setting is missing; "lost", "stale".
+        RigFault("refused") where there is no printer with Marlin, it has not been homed, it restarts as its port is
+        opened, its axes are too slow for the presses, or a setting is missing.
         """
         self.close()
         rig = self._rig
@@ -319,16 +298,7 @@ class Printer:
         return np.array([[one.time_s, *self._pose(one.position), one.speed_mm_s, np.nan, 1.0] for one in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move from rest, at the speed wanted or as fast as the printer's axes can.
-
-        Args:
-            pose: x, y, z of the tip in mm, and `[rig] tool_rad`.
-            speed_mm_s: of the tip.
-            acceleration_mm_s2: of the tip.
-
-        Raises:
-            RigFault: "refused" for numbers that are no move, or another rotation of the tool; "lost", "stale".
-        """
+        """Start a straight move from rest, as fast as the axes can; RigFault("refused") also for a turn of the tool."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
             raise RigFault("refused", f"a turn of the tool to {list(pose[3:])} rad; a printer cannot turn it")
@@ -380,7 +350,7 @@ def _identify(link: MarlinLink) -> PrinterInfo:
     info = PrinterInfo.parse(link.execute("M115"))
     if FIRMWARE not in info.firmware:
         raise RigFault("refused", f"the firmware is {info.firmware or 'of no name'!r}, allowed is Marlin")
-    if info.delays_position:
+    if re.match(r"Marlin (bugfix-)?1\.", info.firmware):  # answers M114 only once all moves are over
         message = f"the firmware is {info.firmware!r}, which reports its position only once it stands"
         raise RigFault("refused", message, "allowed is Marlin 2")
     return info

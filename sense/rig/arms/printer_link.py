@@ -16,8 +16,7 @@ from padforge.sense.rig.devices import Cause, RigFault, SerialStream
 FIRMWARE = "Marlin"
 HALTED = ("halted", "kill()", "STOP called", "stopped")
 """Words of errors after which the firmware takes no further moves; other errors report a damaged line."""
-ANSWER_S = 1.0
-"""Longest wait for an answer."""
+ANSWER_S = 1.0  # longest wait for an answer
 HOMING_ADVICE = "home it at its display with the probe off, put the probe on again, and begin anew"
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
@@ -60,15 +59,7 @@ def parse_position(line: str) -> Position | None:
 
 
 def parse_axis_limits(lines: list[str], code: str) -> Position | None:
-    """Return the limits of x, y and z in the answer to M503.
-
-    Args:
-        lines: the answer.
-        code: M203 for the maximum speeds, mm/s; M201 for the maximum accelerations, mm/s².
-
-    Returns:
-        Three positive numbers; None where the answer has none.
-    """
+    """Return the limits of x, y and z after M203 (mm/s) or M201 (mm/s²) in the answer to M503; None without."""
     match = re.search(rf"\b{code} X{_NUMBER} Y{_NUMBER} Z{_NUMBER}", "\n".join(lines))
     values = (float(match[1]), float(match[2]), float(match[3])) if match else None
     return values if values and min(values) > 0 else None
@@ -85,17 +76,11 @@ def _is_confirmation(line: str) -> bool:
 
 @dataclass(frozen=True)
 class PrinterInfo:
-    """Identity of a printer, from its answer to M115.
+    """Identity of a printer, from its answer to M115."""
 
-    Attributes:
-        firmware: its name with the version.
-        machine: name of the printer.
-        capabilities: those that it has, such as EMERGENCY_PARSER.
-    """
-
-    firmware: str = ""
-    machine: str = ""
-    capabilities: frozenset[str] = field(default_factory=frozenset)
+    firmware: str = ""  # its name with the version
+    machine: str = ""  # name of the printer
+    capabilities: frozenset[str] = field(default_factory=frozenset)  # those that it has, such as EMERGENCY_PARSER
 
     @classmethod
     def parse(cls, lines: list[str]) -> "PrinterInfo":
@@ -108,18 +93,9 @@ class PrinterInfo:
             firmware[1].strip() if firmware else "", machine[1].strip() if machine else "", frozenset(capabilities)
         )
 
-    @property
-    def delays_position(self) -> bool:
-        """Whether M114 is answered only once all moves are over, as Marlin did before version 2."""
-        return re.match(r"Marlin (bugfix-)?1\.", self.firmware) is not None
-
 
 class MarlinLink:
-    """An open port. Its methods raise RigFault("lost") once the printer is gone, has restarted or has halted.
-
-    Attributes:
-        halted: whether it has restarted or halted, so that nothing moves any more.
-    """
+    """An open port. Its methods raise RigFault("lost") once the printer is gone, has restarted or has halted."""
 
     def __init__(self, port: str, baud: int) -> None:
         """Open `port` exclusively; raises RigFault("refused") where that fails."""
@@ -129,14 +105,11 @@ class MarlinLink:
         self._text = b""
         self._number = 0
         self._history: deque[bytes] = deque(maxlen=_MAX_HISTORY)
-        self._connected = self.halted = False
+        self._connected = False
+        self.halted = False  # or restarted: nothing moves any more
 
     def handshake(self, timeout_s: float) -> None:
-        """Wait until the printer answers, and count its lines from 0.
-
-        Raises:
-            RigFault: "refused" where nothing that speaks G-code answers, or the printer restarts as its port is opened.
-        """
+        """Wait until the printer answers, and count its lines from 0; RigFault("refused") without one."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             self._stream.send(b"\n" + number_line(0, "M110 N0"))
@@ -147,17 +120,9 @@ class MarlinLink:
         raise RigFault("refused", f"{self._port}: no printer answers", advice)
 
     def execute(self, command: str, timeout_s: float = ANSWER_S) -> list[str]:
-        """Have a command executed once.
+        """Have a command executed once; return the lines of its answer, none where noise took it.
 
-        Args:
-            command: G-code without number and checksum.
-            timeout_s: longest wait for the answer.
-
-        Returns:
-            Lines of the answer; none where the command was executed but noise took its answer.
-
-        Raises:
-            RigFault: "stale" where it is not answered in time; "lost".
+        RigFault("stale") where it is not answered in time.
         """
         self._number += 1
         self._history.append(number_line(self._number, command))

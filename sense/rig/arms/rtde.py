@@ -16,12 +16,9 @@ from typing import Any, NamedTuple
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 VERSION, CONTROLLER, OUTPUTS, INPUTS, START, PAUSE, DATA = b"VvOISPU"
-PROTOCOL = 2
-"""The only version of the protocol that is used here."""
-RUNNING = 7
-"""Robot mode of an arm that is powered on and has its brakes released."""
-STOPPED, PLAYING, PAUSED = 1, 2, 4
-"""Runtime states of the program."""
+PROTOCOL = 2  # the only version of the protocol that is used here
+RUNNING = 7  # robot mode of an arm that is powered on and has its brakes released
+STOPPED, PLAYING, PAUSED = 1, 2, 4  # runtime states of the program
 PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 """Protective and safeguard stop, recovery, violation, fault: the controller does not move the arm."""
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
@@ -30,10 +27,8 @@ VARIABLES = (
     *("robot_mode", "runtime_state", "safety_status_bits", "output_int_register_2"),
 )
 """What the reader asks for."""
-FORCE_SERIES = 5
-"""First major version of PolyScope whose arms have a force sensor at the tool."""
-MAX_CLOCK_SKEW = 2e-4
-"""Relative difference of the controller's clock and the host's."""
+FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
+MAX_CLOCK_SKEW = 2e-4  # relative difference of the controller's clock and the host's
 
 _HEADER = struct.Struct(">HB")
 _CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}
@@ -105,10 +100,7 @@ def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list
 
 
 def stop_program(host: str, timeout_s: float) -> bool:
-    """Stop the arm's program, and with it the arm, by the dashboard; return whether no program runs any more.
-
-    A stopped program cannot go on when a person unlocks the arm; a paused one can.
-    """
+    """Stop the arm's program by the dashboard, for good; return whether no program runs any more."""
     try:
         return ask_dashboard(host, ["stop", "running"], timeout_s)[1].lower().endswith("false")
     except OSError:
@@ -117,31 +109,18 @@ def stop_program(host: str, timeout_s: float) -> bool:
 
 @dataclass(frozen=True)
 class RtdeState:
-    """A state as the controller sends it.
+    """A state as the controller sends it."""
 
-    Attributes:
-        time_s: when it was measured, on the host's monotonic clock.
-        skipped: number of states missing before it.
-        pose: m and rad.
-        speed: of the tool, m/s.
-        force_n: on the tool along z; None without a sensor.
-        sideways_n: force across z; 0 without a sensor.
-        mode: robot mode.
-        runtime: state of the program.
-        safety: status bits.
-        progress: ur-rtde's register of moves.
-    """
-
-    time_s: float
-    skipped: int
-    pose: tuple[float, ...]
-    speed: float
-    force_n: float | None
-    sideways_n: float
-    mode: int
-    runtime: int
-    safety: int
-    progress: int
+    time_s: float  # when it was measured, on the host's monotonic clock
+    skipped: int  # number of states missing before it
+    pose: tuple[float, ...]  # m and rad
+    speed: float  # of the tool, m/s
+    force_n: float | None  # on the tool along z; None without a sensor
+    sideways_n: float  # force across z; 0 without a sensor
+    mode: int  # robot mode
+    runtime: int  # state of the program
+    safety: int  # status bits
+    progress: int  # ur-rtde's register of moves
 
 
 class HostClock:
@@ -152,15 +131,7 @@ class HostClock:
         self._last_stamp = self._last_s = float("-inf")
 
     def host_time(self, stamp: float, arrival_s: float) -> float:
-        """Return the host time of a state.
-
-        Args:
-            stamp: its controller time, s.
-            arrival_s: host time at which it arrived.
-
-        Returns:
-            A time not after `arrival_s`, later than all returned before.
-        """
+        """Return the host time of a state: not after `arrival_s`, and later than all returned before."""
         drifted = self._offset + MAX_CLOCK_SKEW * max(stamp - self._last_stamp, 0.0)
         self._offset = min(drifted, arrival_s - stamp)
         self._last_stamp = stamp
@@ -169,12 +140,7 @@ class HostClock:
 
 
 class RtdeReader:
-    """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes.
-
-    Attributes:
-        version: of the controller, four numbers.
-        rate_hz: states a second.
-    """
+    """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes."""
 
     def __init__(self, host: str, timeout_s: float) -> None:
         """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
@@ -186,8 +152,8 @@ class RtdeReader:
         self._last_stamp: float | None = None
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
-        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))
-        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125
+        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of the controller
+        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # states a second
         names = ",".join(VARIABLES).encode()
         types = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + names)[1:].decode().split(",")
         if "NOT_FOUND" in types:

@@ -20,22 +20,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
-from padforge.sense.rig.arms.rtde import (
-    DASHBOARD_PORT,
-    EMERGENCY_BITS,
-    PLAYING,
-    PROTECTIVE_BITS,
-    RTDE_PORT,
-    RUNNING,
-    STOPPED,
-    RtdeReader,
-    RtdeState,
-    StateRow,
-    ask_dashboard,
-    pack_reply,
-    pack_state,
-    stop_program,
-)
+from padforge.sense.rig.arms import rtde
+from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState, StateRow
 
 WATCHDOG_HZ = 4.0
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
@@ -55,19 +41,19 @@ class CommandRejected(Exception):  # noqa: N818  the parent raises it as a RigFa
 
 
 def _check_ready(state: RtdeState) -> None:
-    if state.safety & EMERGENCY_BITS:
+    if state.safety & rtde.EMERGENCY_BITS:
         raise CommandRejected("emergency_stop", "the arm is in an emergency stop", UNLOCK_ADVICE)
-    if state.safety & PROTECTIVE_BITS:
+    if state.safety & rtde.PROTECTIVE_BITS:
         raise CommandRejected("protective_stop", "the arm is in a protective stop", UNLOCK_ADVICE)
-    if state.mode != RUNNING:
-        message = f"the arm is not ready: robot mode {state.mode}, expected {RUNNING}"
+    if state.mode != rtde.RUNNING:
+        message = f"the arm is not ready: robot mode {state.mode}, expected {rtde.RUNNING}"
         raise CommandRejected("refused", message, UNLOCK_ADVICE)
 
 
 def _wait_until_idle(reader: RtdeReader, state: RtdeState) -> RtdeState:
     """Return the first state without a program on the arm; a program is someone else's, perhaps in mid-press."""
     deadline = time.monotonic() + SESSION_END_S
-    while state.runtime > STOPPED:
+    while state.runtime > rtde.STOPPED:
         if time.monotonic() > deadline:
             advice = "end the other recording, or stop the program at the pendant"
             raise CommandRejected("refused", "a program runs on the arm, or is paused there", advice)
@@ -166,7 +152,7 @@ class WorkerProcess:
             identity = self._ask_identity()
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
-            message = f"no arm answers at {self._host}, ports {RTDE_PORT} and {DASHBOARD_PORT}: {reason}"
+            message = f"no arm answers at {self._host}, ports {rtde.RTDE_PORT} and {rtde.DASHBOARD_PORT}: {reason}"
             advice = "check its address, its cable and that it is switched on"
             raise CommandRejected("refused", message, advice) from None
         threading.Thread(target=self._report_states, args=(reader, state), daemon=True).start()
@@ -187,8 +173,8 @@ class WorkerProcess:
 
     def _ask_identity(self) -> dict[str, str]:
         """Ask the dashboard what the arm is; reject an arm that a person controls."""
-        polyscope, model = ask_dashboard(self._host, ["PolyscopeVersion", "get robot model"], ANSWER_S)
-        remote, serial = ask_dashboard(self._host, ["is in remote control", "get serial number"], ANSWER_S)
+        polyscope, model = rtde.ask_dashboard(self._host, ["PolyscopeVersion", "get robot model"], ANSWER_S)
+        remote, serial = rtde.ask_dashboard(self._host, ["is in remote control", "get serial number"], ANSWER_S)
         if remote == "false":
             raise CommandRejected("refused", "the arm is not in remote control", "switch it over at the pendant")
         answers = {"polyscope": polyscope.removeprefix("URSoftware "), "model": model, "serial": serial}
@@ -210,7 +196,7 @@ class WorkerProcess:
             self._control.stopL(STOP_M_S2)
             self._new_state.clear()
             self._new_state.wait(FIRST_STATE_S)
-        elif self._control is not None and not stop_program(self._host, ANSWER_S):
+        elif self._control is not None and not rtde.stop_program(self._host, ANSWER_S):
             raise CommandRejected("lost", "the arm did not confirm the stop", "look at the arm")
         self._previous_operation = None
         self._halted.set()
@@ -222,18 +208,15 @@ class WorkerProcess:
             self._control.stopScript()
 
     def _is_playing(self) -> bool:
-        return self._control is not None and self._latest is not None and self._latest.runtime == PLAYING
+        return self._control is not None and self._latest is not None and self._latest.runtime == rtde.PLAYING
 
     def _report_states(self, reader: RtdeReader, state: RtdeState) -> None:
-        """Send every state to the parent; end the process if they stop coming or the arm's program has ended.
-
-        It ends at once, before ur-rtde can reconnect and repeat an old command.
-        """
+        """Send every state to the parent; end before ur-rtde can reconnect and repeat an old command."""
         while True:
             self._latest = state
             self._update(state)
             self._new_state.set()
-            self._write(pack_state(self._to_row(state)))
+            self._write(rtde.pack_state(self._to_row(state)))
             try:
                 state = reader.read(STREAM_TIMEOUT_S)
             except TimeoutError:
@@ -243,13 +226,13 @@ class WorkerProcess:
                 self._exit("lost", "the arm closed the link", "check that it is switched on, connect again")
 
     def _update(self, state: RtdeState) -> None:
-        stopped = bool(state.safety & (PROTECTIVE_BITS | EMERGENCY_BITS))
+        stopped = bool(state.safety & (rtde.PROTECTIVE_BITS | rtde.EMERGENCY_BITS))
         if stopped and not self._stopped_by_arm:
             # A paused program would go on with the old move as soon as a person unlocks the arm and presses play.
-            threading.Thread(target=stop_program, args=(self._host, ANSWER_S), daemon=True).start()
+            threading.Thread(target=rtde.stop_program, args=(self._host, ANSWER_S), daemon=True).start()
         elif self._stopped_by_arm and not stopped:
             self._exit("lost", "the arm was stopped and unlocked, which ends its program", "connect again")
-        elif self._control is not None and state.runtime == PLAYING:
+        elif self._control is not None and state.runtime == rtde.PLAYING:
             self._program_running.set()
         elif self._program_running.is_set() and not stopped and not self._halting:
             self._exit("lost", "the arm's program has ended", "look at the arm, then connect again")
@@ -260,13 +243,13 @@ class WorkerProcess:
             self._previous_operation = None
 
     def _to_row(self, state: RtdeState) -> StateRow:
-        emergency = bool(state.safety & EMERGENCY_BITS)
+        emergency = bool(state.safety & rtde.EMERGENCY_BITS)
         x, y, z, *rotation = state.pose
         return StateRow(
             *(state.time_s, 1e3 * x, 1e3 * y, 1e3 * z, *rotation),
             speed_mm_s=1e3 * state.speed,
             force_n=float("nan") if state.force_n is None else state.force_n,
-            protective_stop=bool(state.safety & PROTECTIVE_BITS) and not emergency,
+            protective_stop=bool(state.safety & rtde.PROTECTIVE_BITS) and not emergency,
             emergency_stop=emergency,
             moving=self._previous_operation is not None,
             skipped=state.skipped,
@@ -281,7 +264,7 @@ class WorkerProcess:
         self._exit(cause, message, "connect again")
 
     def _reply(self, reply: dict[str, Any]) -> None:
-        self._write(pack_reply(reply))
+        self._write(rtde.pack_reply(reply))
 
     def _write(self, data: bytes) -> None:
         with self._write_lock:

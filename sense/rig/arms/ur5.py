@@ -20,35 +20,25 @@ from padforge.sense.rig.devices import ArmState, Array, Cause, RigFault, start
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-MAX_STATES = 300_000
-"""States kept for `drain`: 10 minutes at 500 Hz."""
+MAX_STATES = 300_000  # states kept for `drain`: 10 minutes at 500 Hz
 HEARTBEAT_S = 0.05
-SUPERVISION_S = 2.0
-"""How long heartbeats go on after the program last asked for a state."""
+SUPERVISION_S = 2.0  # how long heartbeats go on after the program last asked for a state
 CONNECT_S = 4.5
 MOVE_S = 1.0
 STALE_S = 0.5
-CONFIRM_S = 0.25
-"""Longest wait for the worker to confirm a stop; the dashboard is asked after that."""
-DASHBOARD_S = 0.2
-"""Longest wait for the dashboard to confirm a stop."""
+CONFIRM_S = 0.25  # longest wait for the worker to confirm a stop; the dashboard is asked after that
+DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 
 
 class RtdeWorker:
-    """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed.
-
-    Attributes:
-        latest: last state of the arm.
-        skipped: number of states that the controller left out.
-        stopped: whether the arm's dashboard confirmed a stop after the worker's end.
-    """
+    """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed."""
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self._exit: tuple[Cause, str, str] | None = None
-        self.latest: StateRow | None = None
-        self.skipped = 0
-        self.stopped = False
+        self.fault: RigFault | None = None  # why the worker has ended; None while it runs
+        self.latest: StateRow | None = None  # last state of the arm
+        self.skipped = 0  # number of states that the controller left out
+        self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
         self._replies: dict[int, dict[str, Any]] = {}
         self._ids = itertools.count(1)
         self._rows: deque[StateRow] = deque(maxlen=MAX_STATES)
@@ -63,11 +53,6 @@ class RtdeWorker:
             thread.start()
 
     @property
-    def fault(self) -> RigFault | None:
-        """Why the worker has ended; None while it runs."""
-        return RigFault(*self._exit) if self._exit else None
-
-    @property
     def pid(self) -> int:
         """Process id."""
         return self._process.pid
@@ -77,7 +62,7 @@ class RtdeWorker:
         number = next(self._ids)
         self._write(json.dumps({"id": number, "command": command, "arguments": arguments}).encode())
         with self._received:
-            self._received.wait_for(lambda: number in self._replies or self._exit, timeout_s)
+            self._received.wait_for(lambda: number in self._replies or self.fault, timeout_s)
             reply = self._replies.pop(number, None)
         if reply is None:
             raise self.fault or RigFault("deadline", f"the arm did not {command} within {timeout_s} s", "connect again")
@@ -115,7 +100,7 @@ class RtdeWorker:
             raise self.fault or RigFault("lost", f"the link to the arm {self._host} is down", "connect again") from None
 
     def _send_heartbeats(self) -> None:
-        while not self._killed.wait(HEARTBEAT_S) and not self._exit:
+        while not self._killed.wait(HEARTBEAT_S) and not self.fault:
             if time.monotonic() < self._supervised_s + SUPERVISION_S:
                 with suppress(RigFault):
                     self._write(b"")
@@ -135,7 +120,7 @@ class RtdeWorker:
                     self._replies[message["id"]] = message
                     self._received.notify_all()
         with self._received:
-            self._exit = reason
+            self.fault = RigFault(*reason)
             self._received.notify_all()
         if self.latest is not None and not self._killed.is_set():
             self.stopped = stop_program(self._host, DASHBOARD_S)
@@ -162,13 +147,8 @@ class UR5:
     def connect(self) -> Mapping[str, Any]:
         """Open the link, ending an earlier one of this object.
 
-        Returns:
-            host, model, polyscope, serial, controller and ur_rtde versions, rate_hz, and the tool's tcp in mm and rad.
-
-        Raises:
-            RigFault: "refused" if there is no arm, it is not in remote control or not powered, another program uses it,
-                on this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop"; "deadline"
-                after 4.5 s.
+        RigFault("refused") if there is no arm, it is not in remote control or not powered, another program uses it, on
+        this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop"; "deadline" after 4.5 s.
         """
         if importlib.util.find_spec("rtde_control") is None:
             raise RigFault("refused", "the arm needs ur-rtde", "pip install 'padforge[rig]'")
@@ -191,11 +171,7 @@ class UR5:
         return self._worker.skipped if self._worker else 0
 
     def state(self) -> ArmState:
-        """Return the latest state; see `Arm.state`.
-
-        Raises:
-            RigFault: "stale", "lost"; "deadline" if nobody asked for a state for 2 s during a move.
-        """
+        """Return the latest state; also RigFault("deadline") if nobody asked for one for 2 s during a move."""
         worker = self._connected()
         worker.supervise()
         row = worker.latest
@@ -214,10 +190,7 @@ class UR5:
         )
 
     def drain(self) -> Array:
-        """Return the (n, 10) states since the last call; those before the link was lost come before the fault.
-
-        The last 300 000 states are kept: 10 minutes at 500 Hz.
-        """
+        """Return the (n, 10) states since the last call; those before the link was lost come before the fault."""
         rows = self._worker.drain() if self._worker else []
         if not rows:
             self._connected()
@@ -228,16 +201,7 @@ class UR5:
         return np.column_stack([values[:, :9], (~values[:, 9:11].any(axis=1)).astype(np.float64)])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move from rest.
-
-        Args:
-            pose: x, y, z in mm and a rotation vector in rad.
-            speed_mm_s: of the tool.
-            acceleration_mm_s2: of the tool.
-
-        Raises:
-            RigFault: "refused" for numbers that are no move, or if the arm does not accept it; "lost", "deadline".
-        """
+        """Start a straight move from rest; RigFault("refused") if it is none or the arm does not accept it."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         worker = self._connected()
         worker.supervise()
@@ -250,11 +214,7 @@ class UR5:
         self._move_s = time.monotonic()
 
     def stop(self) -> None:
-        """Stop the arm, by ur-rtde or, if that does not answer, by its dashboard and its watchdog.
-
-        Raises:
-            RigFault: "lost" if the arm did not confirm it; the watchdog stops it 0.25 s after the last sign of life.
-        """
+        """Stop the arm by ur-rtde, or else by its dashboard and its watchdog; RigFault("lost") if unconfirmed."""
         if self._worker is None or self._worker.stopped:
             return
         try:

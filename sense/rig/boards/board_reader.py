@@ -11,14 +11,11 @@ import numpy as np
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig.devices import RigFault
 
-POLL_S = 0.1
-"""Longest wait for bytes."""
+POLL_S = 0.1  # longest wait for bytes
 SETTLE_S = 0.5
 """Time of blocks before the first samples are returned, so that their times rest on more than one arrival."""
-BUFFER_S = 60.0
-"""Time of samples that are buffered for a program that does not read."""
-QUARTZ_SKEW = 500e-6
-"""Relative difference of two quartz clocks; anything beyond is noise of the first seconds."""
+BUFFER_S = 60.0  # time of samples that are buffered for a program that does not read
+QUARTZ_SKEW = 500e-6  # relative difference of two quartz clocks; anything beyond is noise of the first seconds
 
 _START_S = 1.5
 _STALL_S = 1.0
@@ -41,13 +38,7 @@ class BlockReader(threading.Thread, Generic[B]):
     """A thread that drains a port into a buffer, until it is stopped or something fails."""
 
     def __init__(self, port: str, receive: Callable[[], tuple[float, list[B]]], rate_hz: float) -> None:
-        """Prepare the thread; `start_settled` starts it.
-
-        Args:
-            port: its name, for messages.
-            receive: waits shortly for blocks, and returns the host time and the blocks; a RigFault ends the thread.
-            rate_hz: samples a second.
-        """
+        """Prepare the thread; `receive` waits shortly for blocks and returns host time and blocks, or ends it."""
         super().__init__(name=f"reader of {port}", daemon=True)
         self._port, self._receive = port, receive
         self._capacity = round(BUFFER_S * rate_hz)
@@ -58,14 +49,7 @@ class BlockReader(threading.Thread, Generic[B]):
         self._fault: RigFault | None = None
 
     def start_settled(self, request_start: Callable[[], object] = lambda: None) -> None:
-        """Start, and return once `SETTLE_S` of blocks have come.
-
-        Args:
-            request_start: asks the board for blocks; called until the first one comes.
-
-        Raises:
-            RigFault: "stale" if none come, or as `receive`.
-        """
+        """Start, call `request_start` until blocks come, return after `SETTLE_S`; RigFault("stale") without."""
         self.start()
         deadline = time.monotonic() + _START_S
         while self._buffered_s() < SETTLE_S:
@@ -127,16 +111,7 @@ class BlockReader(threading.Thread, Generic[B]):
 
 
 def select_inputs(inputs: Sequence[int], n_inputs: int, board: str) -> tuple[int, ...]:
-    """Return the inputs to read, fibre by fibre.
-
-    Args:
-        inputs: those of `[rig] channels`; all of them, in order, if empty.
-        n_inputs: number of inputs of the board.
-        board: its name, for the message.
-
-    Raises:
-        RigFault: "refused" for an input that the board does not have.
-    """
+    """Return the inputs to read, all in order if empty; RigFault("refused") for one that the board lacks."""
     for fibre, number in enumerate(inputs, start=1):
         if not 0 <= number < n_inputs:
             message = f"[rig] channels: fibre {fibre} is on input {number}, {board} has 0 to {n_inputs - 1}"
@@ -157,12 +132,7 @@ class SampleClock:
     """
 
     def __init__(self, period_s: float, max_skew: float = QUARTZ_SKEW) -> None:
-        """Start without arrivals.
-
-        Args:
-            period_s: of one count by the board's own clock: of a sample, or 1e-6 if it counts microseconds.
-            max_skew: relative difference by which a count may take longer or shorter.
-        """
+        """Start without arrivals; the period is of one count of the board, the skew its largest relative error."""
         self._period_s, self._max_skew = period_s, max_skew
         self._origin: tuple[int, float] | None = None
         self._bucket_min: Point | None = None
@@ -177,12 +147,7 @@ class SampleClock:
         return self._slope * 1e6
 
     def observe(self, index: int, arrival_s: float) -> None:
-        """Add the arrival of a block.
-
-        Args:
-            index: of its last sample, unwrapped.
-            arrival_s: host time.
-        """
+        """Add the arrival of a block whose last sample, or clock, has this unwrapped index."""
         if self._origin is None:
             self._origin = (index, arrival_s)
         start, start_s = self._origin
@@ -201,14 +166,7 @@ class SampleClock:
         self._offset = min(self._offset, residual)
 
     def times(self, indices: Indices) -> Array:
-        """Return the host times of samples.
-
-        Args:
-            indices: ascending, also from call to call; shape (n,). At least one block has been observed.
-
-        Returns:
-            Times in s, later than all returned before; shape (n,).
-        """
+        """Return ascending host times, s, of ascending indices, later than all before; at least one block has come."""
         if self._origin is None:
             raise ValueError("no block has been observed")
         start, start_s = self._origin

@@ -9,29 +9,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from padforge.design.common.validation import InputError
+from padforge.sense.rig.boards import due_framing as framing
 from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
-from padforge.sense.rig.boards.due_framing import (
-    FULL_SCALE,
-    MAX_AVERAGING,
-    MAX_CHANNELS,
-    Ack,
-    BoardSettings,
-    DueBlock,
-    DueDecoder,
-    DueMessage,
-    Identity,
-    Kind,
-    Request,
-    Status,
-    encode,
-)
+from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Request, Status
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
-BAUD = 115_200
-"""Without meaning on a USB port, but never 1200: on a Due that erases the firmware."""
-FIRMWARE_MAJOR = 1
-"""Boards with another first number of the firmware version speak another wire format."""
+BAUD = 115_200  # without meaning on a USB port, but never 1200: on a Due that erases the firmware
+FIRMWARE_MAJOR = 1  # boards with another first number of the firmware version speak another wire format
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 
 _FIRMWARE = "sense/rig/boards/firmware/padforge_due"
@@ -41,7 +26,7 @@ _MAX_JUMP_US = 5000  # of board time against sample index from block to block: i
 _DUE_PORTS = {0x003E: "native", 0x003D: "programming"}
 _VENDORS = (0x2341, 0x2A03)
 
-M = TypeVar("M", bound=DueMessage)
+M = TypeVar("M", bound=framing.DueMessage)
 
 
 @dataclass(frozen=True)
@@ -77,29 +62,20 @@ class DueLink:
 
     def __init__(self, port: str) -> None:
         """Open `port` exclusively; raises RigFault("refused") if that fails."""
-        self.decoder = DueDecoder()
+        self.decoder = framing.DueDecoder()
         self._stream = SerialStream(port, BAUD, POLL_S)
 
-    def receive(self) -> tuple[float, list[DueMessage]]:
+    def receive(self) -> tuple[float, list[framing.DueMessage]]:
         """Wait shortly for bytes; return the host time and the messages that they complete."""
         now_s, data = self._stream.receive()
         return now_s, self.decoder.decode(data)
 
     def send(self, command: Request | BoardSettings) -> None:
         """Send one command."""
-        self._stream.send(encode(command))
+        self._stream.send(framing.encode(command))
 
     def request(self, command: Request | BoardSettings, kind: type[M], matches: Callable[[M], bool] | None = None) -> M:
-        """Send a command until its answer comes; all other messages are dropped.
-
-        Args:
-            command: what to send.
-            kind: of the answer.
-            matches: whether a message of this kind is the answer; any is if None.
-
-        Raises:
-            RigFault: "stale" if none has come after a second.
-        """
+        """Send a command until a message of this kind that matches comes; RigFault("stale") after a second without."""
         deadline = time.monotonic() + _ANSWER_S
         resend_s = 0.0
         while (now := time.monotonic()) < deadline:
@@ -133,14 +109,12 @@ class DueBoard:
             inputs: which to read, fibre by fibre, 0 for A0 to 11; all in order if empty.
             supply_v: reading at full scale, V.
             averaging: conversions summed to a sample, 1 to 16.
-
-        Raises:
-            InputError: a value is out of range.
-            RigFault: "refused" for an input that the board does not have.
         """
-        _check_range("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        _check_range("averaging", averaging, 1, MAX_AVERAGING)
-        self._inputs = select_inputs(inputs, MAX_CHANNELS, "an Arduino Due")
+        limits = ("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ), ("averaging", averaging, 1, framing.MAX_AVERAGING)
+        for name, value, low, high in limits:
+            if not low <= value <= high:
+                raise InputError(f"{name} is {value:g}, expected {low:g} to {high:g}")
+        self._inputs = select_inputs(inputs, framing.MAX_CHANNELS, "an Arduino Due")
         self._port = port
         self._settings = BoardSettings(round(1e9 / rate_hz), sum(1 << i for i in set(self._inputs)), averaging)
         self._supply_v = supply_v
@@ -179,23 +153,13 @@ class DueBoard:
         }
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, C columns of volts; see `Board`.
-
-        Raises:
-            RigFault: "stale" or "lost" once all samples that came before have been read, "data" if nobody has read for
-                60 s or the board has lost its place, "refused" before `connect`.
-        """
+        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
         if self._reader is None or self._assembler is None:
             raise RigFault("refused", f"{self._port}: not connected")
         return self._assembler.assemble(self._reader.drain())
 
     def statistics(self) -> dict[str, float]:
-        """Return counts since `connect`, of what has been read.
-
-        Returns:
-            blocks, damaged frames (also of what has not been read), missing samples, overruns (missing samples that the
-            board dropped), skew_ppm of the clocks.
-        """
+        """Return counts since `connect`, of what has been read; overruns are missing samples that the board dropped."""
         assembler = self._assembler
         return {
             "blocks": assembler.blocks if assembler else 0,
@@ -258,29 +222,19 @@ class DueBoard:
 
 
 class DueAssembler:
-    """Makes `BoardSamples` of blocks: host times by a `SampleClock`, volts by fibre, missing samples by the index.
-
-    Attributes:
-        blocks: number of blocks so far.
-        missing: number of samples that are missing.
-        overruns: those of them that the board dropped.
-    """
+    """Makes `BoardSamples` of blocks: host times by a `SampleClock`, volts by fibre, missing samples by the index."""
 
     def __init__(self, settings: BoardSettings, inputs: Sequence[int], supply_v: float) -> None:
         self.clock = SampleClock(settings.period_ns * 1e-9)
-        self.blocks = self.missing = self.overruns = 0
+        self.blocks = self.missing = self.overruns = 0  # overruns: missing samples that the board dropped
         self._settings = settings
         self._columns = [sorted(set(inputs)).index(i) for i in inputs]  # blocks hold the inputs in ascending order
-        self._volts = supply_v / (settings.averaging * FULL_SCALE)
+        self._volts = supply_v / (settings.averaging * framing.FULL_SCALE)
         self._next = 0
         self._time_us: int | None = None
 
     def assemble(self, arrivals: Iterable[tuple[float, DueBlock]]) -> BoardSamples:
-        """Return the samples of blocks, each with the host time of its arrival.
-
-        Raises:
-            RigFault: "data" if a block cannot follow the ones before it.
-        """
+        """Return the samples of blocks with their arrival times; RigFault("data") if one cannot follow those before."""
         placed = []
         for arrival_s, block in arrivals:
             first, missing = self._place(block)
@@ -314,8 +268,3 @@ class DueAssembler:
         self.missing += missing
         self.overruns = block.overruns
         return first, missing
-
-
-def _check_range(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise InputError(f"{name} is {value:g}, expected {low:g} to {high:g}")

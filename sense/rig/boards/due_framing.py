@@ -31,10 +31,8 @@ from numpy.typing import NDArray
 BITS = 12
 FULL_SCALE = 2**BITS - 1
 MAX_CHANNELS = 12
-MAX_SAMPLES = 16
-"""Samples in a block."""
-MAX_AVERAGING = 16
-"""Conversions summed to a sample."""
+MAX_SAMPLES = 16  # samples in a block
+MAX_AVERAGING = 16  # conversions summed to a sample
 
 
 class Kind(IntEnum):
@@ -56,8 +54,7 @@ class Status(IntEnum):
     BAD_SETTINGS = 1
     TOO_FAST = 2
     RUNNING = 3
-    HALTED = 4
-    """Not an answer: the board has stopped by itself because conversions were lost."""
+    HALTED = 4  # not an answer: the board has stopped by itself because conversions were lost
 
 
 @dataclass(frozen=True)
@@ -73,17 +70,11 @@ class Request:
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """How to sample.
+    """How to sample."""
 
-    Attributes:
-        period_ns: from sample to sample.
-        mask: of inputs, bit 0 is A0.
-        averaging: conversions summed to a sample.
-    """
-
-    period_ns: int
-    mask: int
-    averaging: int
+    period_ns: int  # from sample to sample
+    mask: int  # of inputs, bit 0 is A0
+    averaging: int  # conversions summed to a sample
 
     def pack(self) -> bytes:
         """Return the payload."""
@@ -125,25 +116,15 @@ class Ack:
 
 @dataclass(frozen=True, eq=False)
 class DueBlock:
-    """Consecutive samples.
+    """Consecutive samples."""
 
-    Attributes:
-        counts: (n, C) sums of `averaging` conversions, n up to 16, one column for every bit of `mask`.
-        averaging: conversions summed to a sample.
-        mask: of inputs.
-        sequence: number of the block since the start.
-        first: index of the first sample since the start.
-        time_us: board time when the last sample was complete.
-        overruns: samples that the board has dropped since the start.
-    """
-
-    counts: NDArray[np.uint16]
-    averaging: int
-    mask: int
-    sequence: int
-    first: int
-    time_us: int
-    overruns: int
+    counts: NDArray[np.uint16]  # (n, C) sums of `averaging` conversions, n up to 16, one column for every bit of `mask`
+    averaging: int  # conversions summed to a sample
+    mask: int  # of inputs
+    sequence: int  # number of the block since the start
+    first: int  # index of the first sample since the start
+    time_us: int  # board time when the last sample was complete
+    overruns: int  # samples that the board has dropped since the start
 
     def pack(self) -> bytes:
         """Return the payload."""
@@ -234,14 +215,10 @@ def _unpack_block(payload: bytes) -> DueBlock:
 
 
 class DueDecoder:
-    """Decodes the messages in a stream of bytes that comes in any portions.
-
-    Attributes:
-        damaged: pieces between two zeros, so far, that were no message.
-    """
+    """Decodes the messages in a stream of bytes that comes in any portions."""
 
     def __init__(self) -> None:
-        self.damaged = 0
+        self.damaged = 0  # pieces between two zeros, so far, that were no message
         self._tail = b""
 
     def decode(self, data: bytes) -> list[DueMessage]:

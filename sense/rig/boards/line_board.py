@@ -12,8 +12,7 @@ from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineDecoder, 
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
-RESONATOR_SKEW = 5e-3
-"""Relative error of a ceramic resonator, which small boards have instead of a quartz."""
+RESONATOR_SKEW = 5e-3  # relative error of a ceramic resonator, which small boards have instead of a quartz
 
 _ANSWER_S = 3.0  # opening their port resets many boards, and some wait for a new program before they start
 _RESEND_S = 0.5
@@ -50,14 +49,7 @@ class LineBoard:
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
-        """Take the settings; nothing is opened before `connect`.
-
-        Args:
-            port: name of the serial port.
-            baud: of the board.
-            rate_hz: samples a second, which the board's header must state.
-            inputs: which to read, fibre by fibre, from 0; all in order if empty.
-        """
+        """Take the settings; nothing is opened before `connect`, where the board's header must state `rate_hz`."""
         self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
         self._stream: SerialStream | None = None
         self._decoder = LineDecoder()
@@ -93,12 +85,7 @@ class LineBoard:
         }
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, C columns of volts; see `Board`.
-
-        Raises:
-            RigFault: "stale" or "lost" once all samples that came before have been read, "data" if nobody has read for
-                60 s, the board was reset or its lines are no samples, "refused" before `connect`.
-        """
+        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or reset."""
         if self._reader is None or self._assembler is None:
             raise RigFault("refused", f"{self._port}: not connected")
         return self._assembler.assemble(self._reader.drain())
@@ -165,10 +152,6 @@ class LineAssembler:
 
     Every sample has its slot, a period after the one before; the slots follow the board, whose rate need not be quite
     that of its header. A line whose time fits into no slot is no sample.
-
-    Attributes:
-        samples: number of samples so far.
-        missing: number of samples that are missing.
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
@@ -182,11 +165,7 @@ class LineAssembler:
         self._n_misplaced = 0.0
 
     def assemble(self, arrivals: Iterable[tuple[float, LineBlock]]) -> BoardSamples:
-        """Return the samples of lines, each block with the host time of its arrival.
-
-        Raises:
-            RigFault: "data" if the times of the lines are impossible.
-        """
+        """Return the samples of lines with their arrival times; RigFault("data") if their times are impossible."""
         times_us, rows, gaps = [], [], []
         for arrival_s, block in arrivals:
             for time_us, counts in zip(block.times_us, block.counts, strict=True):

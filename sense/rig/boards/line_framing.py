@@ -39,23 +39,14 @@ _MAX_TIME = 2**63  # of a clock that does not wrap around
 
 @dataclass(frozen=True)
 class LineHeader:
-    """The header of a board.
+    """The header of a board."""
 
-    Attributes:
-        rate_hz: samples a second.
-        bits: of a count.
-        reference_v: voltage of the highest count.
-        channels: number of inputs.
-        checked: whether its lines have a check.
-        extra: the board's own words and their values.
-    """
-
-    rate_hz: float
-    bits: int
-    reference_v: float
-    channels: int
-    checked: bool = True
-    extra: tuple[tuple[str, str], ...] = ()
+    rate_hz: float  # samples a second
+    bits: int  # of a count
+    reference_v: float  # voltage of the highest count
+    channels: int  # number of inputs
+    checked: bool = True  # whether its lines have a check
+    extra: tuple[tuple[str, str], ...] = ()  # the board's own words and their values
 
     @property
     def full_scale(self) -> int:
@@ -89,16 +80,11 @@ def _format_line(text: str, checked: bool) -> bytes:
 
 
 class LineDecoder:
-    """Decodes headers and samples from a stream of bytes that comes in any portions.
-
-    Attributes:
-        header: the latest; before the first there are no samples.
-        damaged: lines since then that were neither.
-    """
+    """Decodes headers and samples from a stream of bytes that comes in any portions."""
 
     def __init__(self) -> None:
-        self.header: LineHeader | None = None
-        self.damaged = 0
+        self.header: LineHeader | None = None  # the latest; before the first there are no samples
+        self.damaged = 0  # lines since then that were neither
         self._errors: Counter[str] = Counter()
         self._tail = b""
 

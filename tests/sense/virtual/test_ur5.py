@@ -50,9 +50,7 @@ START, CYCLE_S = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0]), 0.008
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["paused", "stopped"])
-def test_play_resumes_paused_program_but_not_stopped_one(
-    stopped: bool,
-) -> None:
+def test_play_resumes_paused_program_but_not_stopped_one(stopped: bool) -> None:
     """Without sockets, and ur-rtde's orders written as it writes them."""
     controller, clock = Controller("cb3", START), count(1)
 

@@ -59,8 +59,6 @@ def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
         ({"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
         ({"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
         ({"morphology": {}}, "no pad that can be simulated"),
-        ({"morphology": {"pitch_mm": 1, "knots": [[1, 2]]}}, "there are 1 fibres"),
-        ({"morphology": {"pitch_mm": 1, "knots": [[1, 2], [3, 4]]}}, "knots"),
     ],
 )
 def test_virtual_pad_of_a_model_needs_its_simulated_recording(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.sense.rig.arms import printer_link as link_module
+from padforge.sense.rig.arms import printer_link
 from padforge.sense.rig.arms.printer import Printer
-from padforge.sense.rig.arms.printer_link import MarlinLink
+from padforge.sense.rig.arms.printer_link import MarlinLink, PrinterInfo
 from padforge.sense.rig.boards.line_framing import LineHeader
 from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
@@ -188,11 +188,11 @@ def test_execute_runs_every_line_once_in_order_despite_noise():
     with EmulatedPrinter((50.0, 50.0, 50.0), seed=3) as printer, closing(MarlinLink(printer.port, BAUD)) as link:
         link.handshake(2.0)
         answer = link.execute("M114")
-        assert [link_module.parse_position(line) for line in answer] == [(50, 50, 50)]
+        assert [printer_link.parse_position(line) for line in answer] == [(50, 50, 50)]
         assert link.execute("M999") == []  # unknown to the firmware, and then no line of noise
         printer.garble(5e-3)
         for x, y, z in ends.tolist():
-            link.execute(link_module.format_move((x, y, z), 500.0))
+            link.execute(printer_link.format_move((x, y, z), 500.0))
         printer.garble(0)
         link.execute("M400")
         assert np.array([move.move.end for move in printer.firmware.moves[1:]]) == pytest.approx(ends)
@@ -219,3 +219,56 @@ def test_handshake_refuses_endless_talker():
     board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), LineHeader(1000, 12, 3.3, 4))
     with board, closing(MarlinLink(board.port, BAUD)) as link:
         assert fault_of(lambda: link.handshake(0.5), "refused", "no printer answers") < 5
+
+
+M115 = [
+    "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"
+    " PROTOCOL_VERSION:1.0 MACHINE_TYPE:Ender-3 Pro EXTRUDER_COUNT:1 UUID:cede2a2f-41a2-4748-9b12-c55c62f367ff",
+    *("Cap:SERIAL_XON_XOFF:0", "Cap:EEPROM:1", "Cap:EMERGENCY_PARSER:1", "Cap:AUTOREPORT_POS:0"),
+]
+M503 = [
+    "echo:; Maximum feedrates (units/s):",
+    "echo:  M203 X500.00 Y400.00 Z5.00 E25.00",
+    "echo:; Maximum Acceleration (units/s2):",
+    "echo:  M201 X500.00 Y500.00 Z100.00 E5000.00",
+    "echo:; Acceleration (units/s2) (P<print-accel> R<retract-accel> T<travel-accel>):",
+    "echo:  M204 P500.00 R1000.00 T500.00",
+]
+
+
+def test_lines_follow_marlin_and_answers_are_parsed():
+    """A numbered line ends in the exclusive or of its bytes, a move is in mm/min."""
+    assert printer_link.number_line(0, "M110 N0") == b"N0 M110 N0*125\n"
+    assert printer_link.number_line(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
+    assert printer_link.format_move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
+    info = PrinterInfo.parse(M115)
+    assert info.firmware == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
+    assert info.machine == "Ender-3 Pro"
+    assert info.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
+    assert PrinterInfo.parse(["echo: hello"]) == PrinterInfo()
+    assert printer_link.parse_axis_limits(M503, "M203") == (500.0, 400.0, 5.0)
+    assert printer_link.parse_axis_limits(M503, "M201") == (500.0, 500.0, 100.0)
+    assert printer_link.parse_axis_limits(M503[2:], "M203") is None
+    assert printer_link.parse_axis_limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
+
+
+@pytest.mark.parametrize(
+    ("read", "line", "expected"),
+    [
+        *(
+            (printer_link.parse_resend, line, number)
+            for line, number in (("Resend: 42", 42), ("Resend:7", 7), ("rs N12", 12))
+        ),
+        (printer_link.parse_resend, "Resend: 4x", None),
+        (printer_link.parse_position, "X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
+        *((printer_link.parse_position, line, None) for line in ("X:1.00 Y:2.00 Z:3.0o E:0.00", "X:1.00 Y:2.00")),
+        (printer_link.is_halt, "Error:Printer halted. kill() called!", True),
+        (printer_link.is_halt, "Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
+        *(
+            (printer_link.is_halt, line, False)
+            for line in ("Error:checksum mismatch, Last Line: 41", "echo:Printer halted")
+        ),
+    ],
+)
+def test_parse_line(read, line, expected):
+    assert read(line) == expected

@@ -261,10 +261,7 @@ def test_connect_refuses_unsuitable_board(
 @pytest.mark.parametrize(
     ("values", "error", "match"),
     [
-        ({"rate_hz": 9}, InputError, "rate_hz is 9, expected 10 to"),
-        ({"rate_hz": 10_001}, InputError, "rate_hz is 10001"),
-        ({"averaging": 0}, InputError, "averaging is 0, expected 1 to 16"),
-        ({"inputs": (-1, 3)}, RigFault, "channels: fibre 1 is on input -1, an"),
+        ({"rate_hz": 10_001}, InputError, "rate_hz is 10001, expected 10 to"),
         ({"inputs": (3, 12)}, RigFault, "channels: fibre 2 is on input 12, an Arduino Due has 0 to 11"),
     ],
 )

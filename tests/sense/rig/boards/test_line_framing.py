@@ -1,7 +1,6 @@
 """Lines of text, written and read back, in any portions and damaged in every way; and the samples they come to."""
 
 import pickle
-from binascii import crc32
 
 import numpy as np
 import pytest
@@ -16,10 +15,6 @@ from padforge.sense.rig.devices import BoardSamples, RigFault
 HEADER = LineHeader(500, 12, 3.3, 4, extra=(("name", "my-board"),))
 SAMPLES = [LineSample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
 LINES = [format_sample(sample.time_us, sample.counts, True) for sample in SAMPLES]
-
-
-def checked(text: bytes) -> bytes:
-    return text + b"*%08x\n" % crc32(text)
 
 
 def decoded(*lines: bytes, header: bytes = format_header(HEADER)) -> tuple[list[LineHeader | LineSample], LineDecoder]:
@@ -82,10 +77,8 @@ def test_decode_never_returns_wrong_sample_for_damaged_line() -> None:
     [
         (b"2000,1,2,3,4\n", "a line has no check"),
         (format_sample(2000, (1, 2, 3), True), "has 4 numbers, expected 5: the time and the inputs"),
-        (format_sample(2000, (1, 2, 3, 4, 5), True), "has 6 numbers, expected 5"),
         (format_sample(2000, (1, 2, 3, 4096), True), "a count is 4096, its header allows 4095"),
         (format_sample(-2000, (1, 2, 3, 4), True), "begins '-2000,1,2,3,4*b292ef', expected whole numbers"),
-        *((checked(text), "expected whole numbers") for text in (b"2000,1,2,,4", b"2000,1,2,1_0,4", b"2000,1,2, 3,4")),
         (b"9" * 9000 + b"\n", "a line of more than 8192 bytes"),
         (format_sample(2**63, (1, 2, 3, 4), True), "the time of a line is beyond all clocks"),
         (LINES[0][:-2] + b"!\n", "the check does not fit"),
@@ -122,16 +115,7 @@ def test_decode_skips_comments_and_bounds_memory_of_endless_noise() -> None:
     [
         ("2 rate_hz=100 bits=10 reference_v=5 channels=2", "version 2 of the line protocol, expected 1"),
         ("1 rate_hz=100 bits=10 reference_v=5", "channels of its header is 'missing', allowed is 1 to 512"),
-        *(
-            (
-                f"1 rate_hz={match} bits=10 reference_v=5 channels=2",
-                f"rate_hz of its header is '{match}', allowed is 10",
-            )
-            for match in ("fast", "9.9", "nan")
-        ),
-        ("1 rate_hz=100 bits=10.5 reference_v=5 channels=2", "bits of its header is '10.5', allowed is 1 to 24"),
-        ("1 rate_hz=100 bits=10 reference_v=0 channels=2", "reference_v of its header is '0'"),
-        ("1 rate_hz=100 bits=10 reference_v=5 channels=513", "channels of its header is '513'"),
+        ("1 rate_hz=nan bits=10 reference_v=5 channels=2", "rate_hz of its header is 'nan', allowed is 10"),
         ("1 rate_hz=100 bits=10 reference_v=5 channels=2 check=xor", "check is 'xor', allowed are crc32 and none"),
     ],
 )
