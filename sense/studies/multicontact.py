@@ -114,13 +114,7 @@ METHODS = {
 
 
 def fit_pairs(
-    method: PairTargets,
-    inputs: Array,
-    pairs: Array,
-    rng: np.random.Generator,
-    members: int,
-    hidden: int,
-    epochs: int,
+    method: PairTargets, inputs: Array, pairs: Array, rng: np.random.Generator, members: int, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """Fit networks to signals (Q, D) of pairs (Q, 2, 2); the result predicts pairs (T, 2, 2) from signals (T, D)."""
     targets = method.encode(pairs)

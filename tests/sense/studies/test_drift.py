@@ -13,14 +13,7 @@ from padforge.sense import Recording, open_recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
-from padforge.sense.studies.drift import (
-    COMPENSATIONS,
-    FILTERS,
-    SLOW_PRESSES,
-    drift_study,
-    network_inputs,
-    press_levels,
-)
+from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, SLOW_PRESSES, drift_study, network_inputs, press_levels
 from padforge.sense.studies.study import Study, run
 
 PAD = Morphology.random(2, knots=3, seed=5)
