@@ -6,9 +6,8 @@ order.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -45,27 +44,17 @@ COUNTING = "number of contacts"
 """What stands for the method in rows that are not of pairs."""
 
 
-@dataclass(frozen=True)
-class PairTargets:
-    """How networks learn pairs of contacts.
+class PairTargets(NamedTuple):
+    """How networks learn pairs of contacts."""
 
-    Attributes:
-        encode: from pairs (Q, 2, 2) to A equally right targets; (A, Q, O).
-        decode: from the outputs of S networks (S, T, O) to pairs (T, 2, 2).
-    """
-
-    encode: Callable[[Array], Array]
-    decode: Callable[[Array], Array]
-
-
-def sort_by_x(pairs: Array) -> Array:
-    """Return pairs (Q, 2, 2) with the contact of lower x first."""
-    return np.take_along_axis(pairs, pairs[:, :, :1].argsort(axis=1), axis=1)
+    encode: Callable[[Array], Array]  # from pairs (Q, 2, 2) to A equally right targets (A, Q, O)
+    decode: Callable[[Array], Array]  # from the outputs of S networks (S, T, O) to pairs (T, 2, 2)
 
 
 def both_orders(pairs: Array) -> Array:
     """Return both orders of pairs; shape (2, Q, 4); by x first, since a constant order is easier to learn from."""
-    return np.stack([_flatten(sort_by_x(pairs)), _flatten(sort_by_x(pairs)[:, ::-1])])
+    ordered = np.take_along_axis(pairs, pairs[:, :, :1].argsort(axis=1), axis=1)
+    return np.stack([ordered, ordered[:, ::-1]]).reshape(2, -1, 4)
 
 
 def moments(pairs: Array) -> Array:
@@ -95,17 +84,13 @@ def unordered_distances(predicted: Array, pressed: Array) -> Array:
     return np.minimum(distance[:, 0, 0] + distance[:, 1, 1], distance[:, 0, 1] + distance[:, 1, 0]) / 2
 
 
-def _flatten(pairs: Array) -> Array:
-    return pairs.reshape(-1, 4)
-
-
 def _mean(outputs: Array) -> Array:
     return outputs.mean(axis=0).reshape(-1, 2, 2)
 
 
 METHODS = {
-    LABELLED: PairTargets(lambda pairs: _flatten(pairs)[None], _mean),
-    "sorted": PairTargets(lambda pairs: _flatten(sort_by_x(pairs))[None], _mean),
+    LABELLED: PairTargets(lambda pairs: pairs.reshape(1, -1, 4), _mean),
+    "sorted": PairTargets(lambda pairs: both_orders(pairs)[:1], _mean),
     "free": PairTargets(both_orders, mean_of_unordered),
     "moments": PairTargets(
         lambda pairs: moments(pairs)[None], lambda outputs: pairs_from_moments(outputs.mean(axis=0))
@@ -145,9 +130,9 @@ def multicontact_study(
         epochs: of training.
         seed: of presses, noise and networks.
     """
-    numbers = (presses, test, members, hidden, epochs, seed)
+    numbers = {"presses": presses, "test": test, "members": members, "hidden": hidden, "epochs": epochs, "seed": seed}
     tasks = [
-        Task(f"{label}, {name}", partial(work, *numbers))
+        Task(f"{label}, {name}", partial(work, **numbers))
         for label, pad in pads.items()
         for name, work in [
             *((name, partial(_localize_pairs, pad, method)) for name, method in METHODS.items()),
@@ -158,12 +143,7 @@ def multicontact_study(
         "pads": describe_pads(pads),
         "max_contacts": MAX_CONTACTS,
         "noise_counts": NOISE_COUNTS,
-        "presses": presses,
-        "test": test,
-        "members": members,
-        "hidden": hidden,
-        "epochs": epochs,
-        "seed": seed,
+        **numbers,
     }
     conclude = partial(_conclude, dict(pads), settings)
     return Study("multicontact", "Several contacts at once", settings, tasks, conclude, _draw)
