@@ -16,18 +16,13 @@ from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
-STUDY = "padforge-study-"
-"""Formats of studies begin with this."""
-N_WORST = 10
-"""Sets of failed fibres that are listed."""
+N_WORST = 10  # sets of failed fibres that are listed
 NUMBERS = ("one", "two", "three")
 CELL = 40
 MAX_NUMBERED = 16
 """Fibres up to which cells of the chart have numbers; with more, they are too small to be read on a phone."""
-LABEL_STEP = 5
-"""Fibres from label to label where cells have no numbers."""
-MAX_STRETCH = 1.7
-"""Largest scale at which the chart is shown."""
+LABEL_STEP = 5  # fibres from label to label where cells have no numbers
+MAX_STRETCH = 1.7  # largest scale at which the chart is shown
 
 Errors = Mapping[tuple[int, ...], float]
 """Mean error, mm, by indices of failed fibres, ascending."""
@@ -168,21 +163,19 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
     if fibres > MAX_FIBRES:
         raise ValueError(f"fibre {fibres} failed, of at most {MAX_FIBRES}")
     counts = sorted({len(failed) for failed in errors} - {0})
+    worst_sets = [_worst(errors, count) for count in counts]
     worst = "; ".join(
-        f"of {_fibre_count(count)}, {_names(failed)} ({errors[failed]:.2f} mm)"
-        for count in counts
-        for failed in [_worst(errors, count)]
+        f"of {_fibre_count(len(failed))}, {_names(failed)} ({errors[failed]:.2f} mm)" for failed in worst_sets
     )
     intact = f" With all fibres the error is {errors[()]:.2f} mm." if () in errors else ""
     yield paragraph(f"The worst loss: {worst}.{intact}")
     chart: list[str] = []
     if {1, 2} <= set(counts):
-        caption = (
-            "Mean error in mm without two fibres, given by the row and the column; on the diagonal, without one."
-            " Darker is worse."
-        )
         few = {failed: error for failed, error in errors.items() if len(failed) <= 2}
-        chart = [f"<figure>{loss_chart(few, fibres)}<figcaption>{caption}</figcaption></figure>"]
+        chart = [
+            f"<figure>{loss_chart(few, fibres)}<figcaption>Mean error in mm without two fibres, given by the row and"
+            " the column; on the diagonal, without one. Darker is worse.</figcaption></figure>"
+        ]
     head = ["fibre", *("alone (mm)" if count == 1 else f"with {_fibre_count(count - 1)} more" for count in counts)]
     rows = [[fibre + 1, *(_mean_with(errors, fibre, count) for count in counts)] for fibre in range(fibres)]
     means = [table(head, rows), paragraph("Mean error over the sets of failed fibres that a fibre is in.")]
@@ -302,7 +295,7 @@ def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
             document = json.loads(content.decode())
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a JSON file ({error})") from error
-        if isinstance(document, dict) and str(document.get("format")).startswith(STUDY):
+        if isinstance(document, dict) and str(document.get("format")).startswith("padforge-study-"):
             yield path, document
 
 
