@@ -196,12 +196,7 @@ def _warnings(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section of the report on an `identification.json` in `folder`.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: a figure beside it cannot be read.
-    """
+    """Write the section of the report on an `identification.json` in `folder`. Raises errors as those of `sections`."""
     rows = [
         [
             row["channel"] + 1,

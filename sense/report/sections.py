@@ -1,4 +1,8 @@
-"""Sections of the HTML report on recording, calibration, fibre loss and studies."""
+"""Sections of the HTML report on recording, calibration, fibre loss and studies.
+
+For a document that is not as padforge writes it they raise KeyError, IndexError, TypeError, ValueError or
+AttributeError, and for a figure beside it that cannot be read InputError.
+"""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,11 +33,7 @@ Errors = Mapping[tuple[int, ...], float]
 
 
 def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on the recording in `folder`, from its `start.json`.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-    """
+    """Write the section on the recording in `folder`, from its `start.json`."""
     source = document["source"]
     kind = source.get("kind")
     names = {"simulated": "the simulated rig", "rig": "a rig", "hand": "presses by hand"}
@@ -72,12 +72,7 @@ def _measures_table(folder: Path) -> list[str]:
 
 
 def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on a `calibration.json` in `folder`; and one on fibre loss, if `fibre_loss.json` is missing.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: a figure beside it cannot be read.
-    """
+    """Write the section on a `calibration.json` in `folder`; and one on fibre loss, if `fibre_loss.json` is missing."""
     rows = document["errors"]
     idle = [f"{share:.0%}" for share in document["idle_share"]]
     simulated = document["provenance"].get("recording_kind") == "simulated"
@@ -131,12 +126,7 @@ def _measure_errors(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on fibre loss, from a `fibre_loss.json` or `calibration.json`; none if no fibre failed.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: a figure beside it cannot be read.
-    """
+    """Write the section on fibre loss, from a `fibre_loss.json` or `calibration.json`; none if no fibre failed."""
     methods: Mapping[str, Any] = document.get("methods") or {"": document}
     body = []
     for name, method in methods.items():
@@ -283,11 +273,7 @@ def _shade(share: float) -> str:
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the studies in `folder` and in its folder `studies`, by path, with their documents.
-
-    Raises:
-        InputError: a .json file cannot be read, so that it may be a study or not.
-    """
+    """Yield the studies in `folder` and its folder `studies`, by path; InputError for a .json that cannot be read."""
     paths = sorted([*folder.glob("[!.]*.json"), *(folder / "studies").glob("[!.]*.json")])
     for path in filter(Path.is_file, paths):
         content = read_bytes(path)
@@ -300,12 +286,7 @@ def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
 
 
 def study_pieces(path: Path, document: Mapping[str, Any]) -> list[str]:
-    """Write the HTML of a study: its text, the figure NAME.png beside NAME.json, if it is there, and its table.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: the figure cannot be read.
-    """
+    """Write the HTML of a study: its text, the figure NAME.png beside NAME.json, if it is there, and its table."""
     title, text, rows = document["title"], document["text"], document["rows"]
     if not isinstance(title, str) or not isinstance(text, list) or not isinstance(rows, list):
         raise TypeError("title, text or rows is of another kind")

@@ -248,21 +248,20 @@ def _conclude(
             state = next(results)
             for number, compensation in enumerate(COMPENSATIONS):
                 test, last = state[f"test_{number}"], state[f"last_{number}"]
-                rows.append(
-                    {
-                        "recording": label,
-                        "kind": kind,
-                        "filter": name,
-                        "compensation": compensation,
-                        "mean_mm": float(test.mean()),
-                        "median_mm": float(np.median(test)),
-                        "p95_mm": float(np.percentile(test, 95)),
-                        "std_mm": float(test.mean(axis=1).std()),
-                        "mean_last_mm": float(last.mean()),
-                        "std_last_mm": float(last.mean(axis=1).std()),
-                        "seconds_per_10000": None if name == RAW else float(state["seconds"]),
-                    }
-                )
+                row = {
+                    "recording": label,
+                    "kind": kind,
+                    "filter": name,
+                    "compensation": compensation,
+                    "mean_mm": float(test.mean()),
+                    "median_mm": float(np.median(test)),
+                    "p95_mm": float(np.percentile(test, 95)),
+                    "std_mm": float(test.mean(axis=1).std()),
+                    "mean_last_mm": float(last.mean()),
+                    "std_last_mm": float(last.mean(axis=1).std()),
+                    "seconds_per_10000": None if name == RAW else float(state["seconds"]),
+                }
+                rows.append(row)
             if name in (RAW, AS_PUBLISHED):
                 what = f"{kind} readings" if name == RAW else f"{kind} readings, filtered"
                 idle.append({"label": label, "kind": what, "idle_percent": 100 * float(state["idle"])})

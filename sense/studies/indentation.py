@@ -158,22 +158,21 @@ def _conclude_force(
             depth_known_mm, one_depth_mm = (float(case_errors.mean() * unit_mm) for case_errors in others)
             force_guess_n = float(np.abs(force_n(middle) - force_n(depth)).mean())
             force_error_n = float(np.abs(force_n(predicted) - force_n(depth)).mean())
-            rows.append(
-                {
-                    "pad": label,
-                    "noise_counts": noise,
-                    "position_grid": float(errors.mean()),
-                    "position_mm": float(errors.mean() * unit_mm),
-                    "position_depth_known_mm": depth_known_mm,
-                    "position_one_depth_mm": one_depth_mm,
-                    "depth_grid": float(np.abs(predicted - depth).mean()),
-                    "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
-                    "depth_guessed_mm": float(np.abs(depth - middle).mean() * unit_mm),
-                    "force_n": force_error_n,
-                    "force_percent": 100 * force_error_n / force_range_n,
-                    "force_guessed_percent": 100 * force_guess_n / force_range_n,
-                }
-            )
+            row = {
+                "pad": label,
+                "noise_counts": noise,
+                "position_grid": float(errors.mean()),
+                "position_mm": float(errors.mean() * unit_mm),
+                "position_depth_known_mm": depth_known_mm,
+                "position_one_depth_mm": one_depth_mm,
+                "depth_grid": float(np.abs(predicted - depth).mean()),
+                "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
+                "depth_guessed_mm": float(np.abs(depth - middle).mean() * unit_mm),
+                "force_n": force_error_n,
+                "force_percent": 100 * force_error_n / force_range_n,
+                "force_guessed_percent": 100 * force_guess_n / force_range_n,
+            }
+            rows.append(row)
             bins = np.digitize(depth, edges[1:-1])
             means = [errors[bins == bin].mean() * unit_mm if (bins == bin).any() else None for bin in range(BINS)]
             curves.append(
@@ -341,18 +340,17 @@ def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any],
             counts, errors = next(results)["confusions"], next(results)
             recall = np.diag(counts) / np.maximum(counts.sum(axis=1), 1)
             worst = int(np.argmin(recall))
-            rows.append(
-                {
-                    "pad": label,
-                    "shapes": kind,
-                    "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-                    "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
-                    "worst": shapes[worst],
-                    "worst_percent": float(100 * recall[worst]),
-                    "position_mm": float(errors["unknown"] * pad.unit_mm),
-                    "position_shape_known_mm": float(errors["known"] * pad.unit_mm),
-                }
-            )
+            row = {
+                "pad": label,
+                "shapes": kind,
+                "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
+                "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
+                "worst": shapes[worst],
+                "worst_percent": float(100 * recall[worst]),
+                "position_mm": float(errors["unknown"] * pad.unit_mm),
+                "position_shape_known_mm": float(errors["known"] * pad.unit_mm),
+            }
+            rows.append(row)
             confusions.append({"pad": label, "shapes": kind, "names": list(shapes), "counts": counts.tolist()})
     return StudyResult(rows, _describe_shape(settings, rows), {"confusions": confusions})
 

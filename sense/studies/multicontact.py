@@ -7,6 +7,7 @@ order.
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,31 +193,29 @@ def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], state
             half = np.linalg.norm(state["pressed"][:, 0] - state["pressed"][:, 1], axis=1) / 2
             as_labelled = np.linalg.norm(state["predicted"] - state["pressed"], axis=2).mean()
             curve = _errors_by_distance(errors * pad.unit_mm, 2 * half * pad.unit_mm)
-            rows.append(
-                {
-                    "pad": label,
-                    "method": method,
-                    "error_grid": float(errors.mean()),
-                    "error_mm": float(errors.mean() * pad.unit_mm),
-                    "of_fixed_labels": float(errors.mean() / labelled),
-                    "error_by_labels_mm": float(as_labelled * pad.unit_mm) if method == LABELLED else None,
-                    "midpoint_error_mm": float(half.mean() * pad.unit_mm),
-                    "resolution_mm": _resolution_mm(curve),
-                    "accuracy_percent": None,
-                    "majority_percent": None,
-                }
-            )
+            row = {
+                "pad": label,
+                "method": method,
+                "error_grid": float(errors.mean()),
+                "error_mm": float(errors.mean() * pad.unit_mm),
+                "of_fixed_labels": float(errors.mean() / labelled),
+                "error_by_labels_mm": float(as_labelled * pad.unit_mm) if method == LABELLED else None,
+                "midpoint_error_mm": float(half.mean() * pad.unit_mm),
+                "resolution_mm": _resolution_mm(curve),
+                "accuracy_percent": None,
+                "majority_percent": None,
+            }
+            rows.append(row)
             curves.append({"pad": label, "method": method, **curve})
         counts = next(results)["confusions"]
-        rows.append(
-            {
-                **dict.fromkeys(rows[-1]),
-                "pad": label,
-                "method": COUNTING,
-                "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-                "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
-            }
-        )
+        row = {
+            **dict.fromkeys(rows[-1]),
+            "pad": label,
+            "method": COUNTING,
+            "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
+            "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
+        }
+        rows.append(row)
         confusions.append({"pad": label, "counts": counts.tolist()})
     return StudyResult(rows, _describe(settings, rows), {"curves": curves, "confusions": confusions})
 
@@ -232,12 +231,9 @@ def _errors_by_distance(errors_mm: Array, distances_mm: Array) -> dict[str, list
 
 def _resolution_mm(curve: Mapping[str, list[float]]) -> float | None:
     """Return the distance from which on the mean error is less than a quarter of it; None if it never is."""
-    resolution = None
-    for distance, error in zip(reversed(curve["distance_mm"]), reversed(curve["error_mm"]), strict=True):
-        if error >= distance / 4:
-            break
-        resolution = distance
-    return resolution
+    farthest_first = zip(reversed(curve["distance_mm"]), reversed(curve["error_mm"]), strict=True)
+    resolved = list(takewhile(lambda pair: pair[1] < pair[0] / 4, farthest_first))
+    return resolved[-1][0] if resolved else None
 
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
@@ -254,18 +250,18 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         by_method = {row["method"]: row for row in pairs}
         labelled, best = by_method[LABELLED], min(pairs, key=lambda row: row["error_mm"])
         errors = ", ".join(f"{method} {row['error_mm']:.2f} mm" for method, row in by_method.items())
+        resolved = "a quarter of the distance of the two or more even for the farthest pairs"
+        if (from_mm := best["resolution_mm"]) is not None:
+            resolved = (
+                "less than a quarter of the distance of the two, half of that of the midpoint, from about "
+                f"{from_mm:.1f} mm on"
+            )
         text.append(
             f"{label}: {errors}. In the order of its labels the error of the published method is "
             f"{labelled['error_by_labels_mm']:.2f} mm; with the midpoint of the two for both it would be "
             f"{labelled['midpoint_error_mm']:.2f} mm. Free has {by_method['free']['of_fixed_labels']:.2f} of the error "
             f"of fixed labels; least is that of {best['method']}, {best['of_fixed_labels']:.2f} of it, which is "
-            + (
-                "a quarter of the distance of the two or more even for the farthest pairs. "
-                if best["resolution_mm"] is None
-                else "less than a quarter of the distance of the two, half of that of the midpoint, from about "
-                f"{best['resolution_mm']:.1f} mm on. "
-            )
-            + f"Of up to {settings['max_contacts']} contacts, read with noise of {settings['noise_counts']:g} of "
+            f"{resolved}. Of up to {settings['max_contacts']} contacts, read with noise of {settings['noise_counts']:g} of "
             f"{ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted correctly (always the most "
             f"frequent number: {counting['majority_percent']:.1f} %)."
         )

@@ -139,20 +139,19 @@ def _conclude(
         (left, low), (right, high) = between_fibres(pad.layout)
         for level in range(sizes.max() + 1):
             means = fresh[sizes == level]
-            rows.append(
-                {
-                    "pad": label,
-                    "n_failed": level,
-                    "subsets": len(means),
-                    "of": math.comb(pad.layout.fibres, level),
-                    "mean": float(means.mean()),
-                    "std": float(means.std()),
-                    "max": float(means.max()),
-                    "mean_mm": float(means.mean() * pad.unit_mm),
-                    "max_mm": float(means.max() * pad.unit_mm),
-                    "mean_trained_on": float(training[sizes == level].mean()),
-                }
-            )
+            row = {
+                "pad": label,
+                "n_failed": level,
+                "subsets": len(means),
+                "of": math.comb(pad.layout.fibres, level),
+                "mean": float(means.mean()),
+                "std": float(means.std()),
+                "max": float(means.max()),
+                "mean_mm": float(means.mean() * pad.unit_mm),
+                "max_mm": float(means.max() * pad.unit_mm),
+                "mean_trained_on": float(training[sizes == level].mean()),
+            }
+            rows.append(row)
             worst = int(np.flatnonzero(sizes == level)[means.argmax()])
             cells = np.round(errors[worst].reshape(SIDE, SIDE), 3).tolist()
             panel = {"failed": list(failures[worst]), "extent": [left, right, low, high], "errors": cells}

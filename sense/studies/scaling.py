@@ -156,19 +156,18 @@ def _conclude(cases: list[tuple[int, str, str]], settings: Mapping[str, Any], st
     for label, method, grid in product(settings["pads"], METHODS, settings["grids"]):
         state = by_case[grid, label, method]
         errors = state["errors"]
-        rows.append(
-            {
-                "pad": label,
-                "method": method,
-                "grid": grid,
-                "mean": float(errors.mean()),
-                "median": float(np.median(errors)),
-                "p95": float(np.quantile(errors, 0.95)),
-                "percent_of_side": float(100 * errors.mean() / grid),
-                "epochs": int(state["epochs"]),
-                "seconds": round(float(state["seconds"]), 2),
-            }
-        )
+        row = {
+            "pad": label,
+            "method": method,
+            "grid": grid,
+            "mean": float(errors.mean()),
+            "median": float(np.median(errors)),
+            "p95": float(np.quantile(errors, 0.95)),
+            "percent_of_side": float(100 * errors.mean() / grid),
+            "epochs": int(state["epochs"]),
+            "seconds": round(float(state["seconds"]), 2),
+        }
+        rows.append(row)
         if method == SPREAD:
             maps.append({"pad": label, "grid": grid, "errors": _error_map(grid, state).tolist()})
     return StudyResult(rows, _describe(settings, rows), {"maps": maps})

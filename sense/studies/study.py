@@ -192,13 +192,12 @@ def load_recordings(names: Sequence[str]) -> dict[str, Recording]:
     """Load recordings as `open_recording`, by label; raises InputError as it does, and for a label twice."""
     from padforge.sense.formats.import_export import open_recording
 
-    def label(path: Path) -> str:
-        return path.resolve().parent.name if path.name == "recording" else path.stem
+    paths = [Path(name) for name in names]
+    labels = [path.resolve().parent.name if path.name == "recording" else path.stem for path in paths]
+    return _label([(name, label, open_recording(name)) for name, label in zip(names, labels, strict=True)])
 
-    return _label([(name, label(Path(name)), open_recording(name)) for name in names])
 
-
-def _label(parts: list[tuple[str, str, Any]]) -> dict[str, Any]:
+def _label(parts: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     """Return objects by label, from the user's names, labels and objects."""
     labelled: dict[str, Any] = {}
     for name, label, part in parts:
