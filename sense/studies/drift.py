@@ -36,14 +36,10 @@ from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads
 
 Rows = Sequence[Mapping[str, Any]]
 
-MEMBERS = 3
-"""Networks whose errors are averaged: they differ by their first weights."""
-SIDE = 32
-"""Presses along a side of the published serpentine on which idle shares are simulated."""
-SETTLED = 10
-"""Readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40."""
-SLOW_PRESSES = 15
-"""Presses, with the last one, over whose rest levels the median is the slow baseline."""
+MEMBERS = 3  # networks whose errors are averaged: they differ by their first weights
+SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
+SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
+SLOW_PRESSES = 15  # with the last one, over whose rest levels the median is the slow baseline
 EXCERPT_PRESSES = 5  # in the figure's excerpt of readings
 MAX_LEVELS = 400  # presses by which the figure shows the drift of a whole recording
 COLUMNS = 2  # recordings side by side whose errors are drawn

@@ -27,8 +27,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.studies.study import draw_error_map, failed_label
 
 FORMAT = "padforge-fibre-loss/3"
-ONE, RETRAINED = "one network", "retrained"
-"""The two methods, as the document calls them."""
+ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document calls them
 BAR_WIDTH = 0.36
 
 Failed = tuple[int, ...]

@@ -21,6 +21,7 @@ from padforge.sense.studies.study import (
     Study,
     StudyResult,
     Task,
+    classification_scores,
     confusion_matrix,
     describe_pads,
     fit_ensemble,
@@ -31,20 +32,16 @@ from padforge.sense.studies.study import (
 LOG_SCALE = 4.0
 """Counts below which the logarithm of a reading becomes linear, since there it would be one of noise. To logarithms a
 deeper press adds, as it multiplies all signals."""
-DEPTHS = (0.1, 0.45)
-"""Least and greatest depth, grid units."""
-BINS = 7
-"""Depths by which the error of the position is drawn."""
-COLUMNS = 4
-"""Pads side by side in the figure of the force."""
+DEPTHS = (0.1, 0.45)  # least and greatest, grid units
+BINS = 7  # depths by which the error of the position is drawn
+COLUMNS = 4  # pads side by side in the figure of the force
 INDENTERS = {
     "sphere": Indenter("sphere", radius=0.7),
     "cone": Indenter("cone", angle_deg=22),
     "flat punch": Indenter("flat", radius=0.44),
 }
 """Of about the same contact radius at the middle depth, 0.44 grid units, so that they differ by profile alone."""
-FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}
-"""Sides of each polygon; None for a circle."""
+FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}  # sides of each polygon; None for a circle
 SIZES = np.linspace(0.5, 0.9, 17)
 """Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""
 SHAPE_NOISE_COUNTS = 1.0
@@ -343,8 +340,7 @@ def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any],
             row = {
                 "pad": label,
                 "shapes": kind,
-                "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-                "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
+                **classification_scores(counts),
                 "worst": shapes[worst],
                 "worst_percent": float(100 * recall[worst]),
                 "position_mm": float(errors["unknown"] * pad.unit_mm),

@@ -24,12 +24,9 @@ from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-learning-curve/3"
-SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Shares of the training presses."""
-MIN_PRESSES = 10
-"""Training presses of the smallest localizer."""
-EXPONENTS = np.linspace(0.1, 1.5, 57)
-"""Exponents b that are tried."""
+SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the training presses
+MIN_PRESSES = 10  # training presses of the smallest localizer
+EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried
 RESAMPLINGS = 400
 
 

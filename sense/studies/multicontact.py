@@ -26,6 +26,7 @@ from padforge.sense.studies.study import (
     Study,
     StudyResult,
     Task,
+    classification_scores,
     confusion_matrix,
     describe_pads,
     fit_ensemble,
@@ -34,15 +35,11 @@ from padforge.sense.studies.study import (
 )
 
 LABELLED = "fixed labels"
-EPOCHS = 100
-MAX_CONTACTS = 3
-"""Contacts at once, where they are counted."""
+MAX_CONTACTS = 3  # at once, where they are counted
 NOISE_COUNTS = 1.0
 """Noise of the readings by which contacts are counted, in counts of a 12-bit converter; positions are without."""
-BINS = 16
-"""Groups of equally many pairs, by the distance of the two contacts."""
-COUNTING = "number of contacts"
-"""What stands for the method in rows that are not of pairs."""
+BINS = 16  # groups of equally many pairs, by the distance of the two contacts
+COUNTING = "number of contacts"  # stands for the method in rows that are not of pairs
 
 
 class PairTargets(NamedTuple):
@@ -115,21 +112,13 @@ def multicontact_study(
     test: int = 2000,
     hidden: int = 60,
     members: int = MEMBERS,
-    epochs: int = EPOCHS,
+    epochs: int = 100,
     seed: int = 0,
 ) -> Study:
     """Localize two contacts at once by each of METHODS, and count up to MAX_CONTACTS contacts.
 
-    Signals of contacts add, and contacts are drawn uniformly and independently.
-
-    Args:
-        pads: by label.
-        presses: training presses.
-        test: test presses.
-        hidden: neurons of a network.
-        members: networks whose mean is taken.
-        epochs: of training.
-        seed: of presses, noise and networks.
+    Signals of contacts add, and contacts are drawn uniformly and independently. The mean of `members` networks is
+    taken; other arguments are as of `force_study`.
     """
     numbers = {"presses": presses, "test": test, "members": members, "hidden": hidden, "epochs": epochs, "seed": seed}
     tasks = [
@@ -208,14 +197,7 @@ def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], state
             rows.append(row)
             curves.append({"pad": label, "method": method, **curve})
         counts = next(results)["confusions"]
-        row = {
-            **dict.fromkeys(rows[-1]),
-            "pad": label,
-            "method": COUNTING,
-            "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-            "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
-        }
-        rows.append(row)
+        rows.append(dict.fromkeys(rows[-1]) | {"pad": label, "method": COUNTING} | classification_scores(counts))
         confusions.append({"pad": label, "counts": counts.tolist()})
     return StudyResult(rows, _describe(settings, rows), {"curves": curves, "confusions": confusions})
 
@@ -261,9 +243,9 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
             f"{labelled['error_by_labels_mm']:.2f} mm; with the midpoint of the two for both it would be "
             f"{labelled['midpoint_error_mm']:.2f} mm. Free has {by_method['free']['of_fixed_labels']:.2f} of the error "
             f"of fixed labels; least is that of {best['method']}, {best['of_fixed_labels']:.2f} of it, which is "
-            f"{resolved}. Of up to {settings['max_contacts']} contacts, read with noise of {settings['noise_counts']:g} of "
-            f"{ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted correctly (always the most "
-            f"frequent number: {counting['majority_percent']:.1f} %)."
+            f"{resolved}. Of up to {settings['max_contacts']} contacts, read with noise of "
+            f"{settings['noise_counts']:g} of {ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted "
+            f"correctly (always the most frequent number: {counting['majority_percent']:.1f} %)."
         )
     return text
 
@@ -296,9 +278,8 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.set_title(title, loc="left", color=INK, fontsize=10)
         axes.set_xlabel("contacts predicted", color=INK)
         axes.set_ylabel("" if column else "contacts pressed", color=INK)
-    settings = document["settings"]
-    title = f"{settings['test']} presses never trained on: positions of two contacts, number of up to "
-    add_title(figure, f"{title}{settings['max_contacts']}")
+    test, most = document["settings"]["test"], document["settings"]["max_contacts"]
+    add_title(figure, f"{test} presses never trained on: positions of two contacts, number of up to {most}")
     return figure
 
 

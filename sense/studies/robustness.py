@@ -32,10 +32,8 @@ RULES = {"published": signals_quantized, "exact": signals}
 MIN_NETWORKS = 16
 """Networks of a level: where there are fewer sets of failed fibres, each is trained several times, since the error of a
 single network depends on its first weights."""
-MAX_SETS = 1024
-"""Sets of failed fibres of a size that are evaluated; of more, a sample is drawn."""
-SIDE = 33
-"""Cells along a side of an error map."""
+MAX_SETS = 1024  # of failed fibres of a size that are evaluated; of more, a sample is drawn
+SIDE = 33  # cells along a side of an error map
 
 
 def robustness_study(

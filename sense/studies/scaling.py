@@ -41,8 +41,7 @@ METHODS = (PUBLISHED, SPREAD, SHARED)
 HIDDEN = 70
 EPOCHS = 60
 TEST = 4096
-CELLS = 16
-"""Cells along a side of an error map."""
+CELLS = 16  # along a side of an error map
 
 
 def scaling_study(

@@ -272,6 +272,15 @@ def confusion_matrix(true: Indices, predicted: Indices, classes: int) -> State:
     return {"confusions": counts.reshape(classes, classes)}
 
 
+def classification_scores(confusions: Array) -> dict[str, float]:
+    """Return the share of correct classifications, and that of always guessing the most frequent class, per cent."""
+    total = confusions.sum()
+    return {
+        "accuracy_percent": float(100 * np.trace(confusions) / total),
+        "majority_percent": float(100 * confusions.sum(axis=1).max() / total),
+    }
+
+
 def failed_label(failed: Sequence[int]) -> str:
     """Title of a result without some fibres."""
     return f"without {'+'.join(str(fibre + 1) for fibre in failed)}" if failed else "all fibres"

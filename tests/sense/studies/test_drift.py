@@ -114,14 +114,6 @@ def test_study_computes_idle_shares(document: dict[str, Any]) -> None:
     assert shares["square", "simulated readings, filtered"] > shares["square", "simulated readings"]
 
 
-@pytest.mark.slow
-def test_study_without_drift_gains_nothing_from_compensation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drift, "FILTERS", {name: FILTERS[name] for name in (drift.RAW, drift.AS_PUBLISHED)})
-    steady = STRONG.model_copy(update={"drift_mv": 0.0})
-    document = run(drift_study({"winding": PAD}, {}, rig=steady, presses=240, hidden=10, epochs=30), tmp_path)
-    assert errors(document, "winding", "none")[1] < 1.3 * errors(document, "winding", "baseline")[1]
-
-
 def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording) -> None:
     with pytest.raises(InputError, match="a: label of a morphology and of a recording"):
         drift_study({"a": PAD}, {"a": recorded})

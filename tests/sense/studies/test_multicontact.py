@@ -1,5 +1,7 @@
 """Several contacts at once, in small: targets without an order localize pairs better, whichever comes first."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -19,14 +21,7 @@ from padforge.sense.studies.study import run
 
 PAD = Morphology.random(4, 3, 0)
 PADS = {"square": Morphology.straight(4), "random": PAD}
-MAX_RATIO = 0.7
-"""Largest error of targets without an order, as a share of that of fixed labels."""
-
-
-@pytest.fixture(scope="module")
-def document(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    study = multicontact_study(PADS, presses=1000, test=300, hidden=20, members=2, epochs=15)
-    return run(study, tmp_path_factory.mktemp("multicontact"))
+MAX_RATIO = 0.7  # largest error of targets without an order, as a share of that of fixed labels
 
 
 @pytest.fixture
@@ -35,7 +30,8 @@ def pairs() -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(document: dict) -> None:
+def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(tmp_path: Path) -> None:
+    document = run(multicontact_study(PADS, presses=1000, test=300, hidden=20, members=2, epochs=15), tmp_path)
     rows = {(row["pad"], row["method"]): row for row in document["rows"]}
     assert list(rows) == [(label, method) for label in PADS for method in [*METHODS, COUNTING]]
     for label, pad in PADS.items():
@@ -52,7 +48,6 @@ def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(docum
     for row, curve in zip(located, document["curves"], strict=True):
         assert (row["pad"], row["method"]) == (curve["pad"], curve["method"])
         assert np.mean(curve["error_mm"]) == pytest.approx(row["error_mm"], rel=0.05)
-        assert np.mean(curve["distance_mm"]) / 2 == pytest.approx(row["midpoint_error_mm"], rel=0.05)
         if row["resolution_mm"] is not None:
             at = curve["distance_mm"].index(row["resolution_mm"])
             assert np.all(np.array(curve["error_mm"]) < np.array(curve["distance_mm"]) / 4, where=np.arange(16) >= at)
