@@ -97,8 +97,7 @@ def _document(result: Identification) -> dict[str, Any]:
 def _draw_responses(result: Identification, path: Path) -> None:
     """Draw held-out responses of each live channel by position: measured, predicted and residual, on one scale."""
     held_out, pad = result.held_out, result.fit.pad
-    predicted = pad.predict(held_out.positions_mm)
-    channels = len(result.live)
+    predicted, channels = pad.predict(held_out.positions_mm), len(result.live)
     figure = Figure(figsize=(7.2, 0.5 + 1.9 * channels), layout="constrained")
     panels = figure.subplots(channels, 3, squeeze=False, sharex=True, sharey=True)
     for row in range(channels):
@@ -187,10 +186,8 @@ def _warnings(document: Mapping[str, Any]) -> Iterator[str]:
             for row in document["channels"]
             if row["alternative_fibres"]
         )
-        yield (
-            f"ambiguous: {document['n_alternatives']} other poses and wirings explain the presses as well"
-            + (f" ({channels})" if channels else "")
-        )
+        where = f" ({channels})" if channels else ""
+        yield f"ambiguous: {document['n_alternatives']} other poses and wirings explain the presses as well{where}"
     straight = document["explained_by_straight"]
     if straight is not None and document["explained_on_plan"] < straight + MIN_ADVANTAGE:
         yield (
@@ -199,12 +196,7 @@ def _warnings(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section of the report on an `identification.json` in `folder`.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: a figure beside it cannot be read.
-    """
+    """Write the section of the report on an `identification.json` in `folder`. Raises errors as those of `sections`."""
     rows = [
         [
             row["channel"] + 1,
@@ -231,11 +223,8 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
         (folder / "twin_responses.png", "Responses of each channel by position: measured, predicted, residual."),
     ]
     body = [paragraph(summary), *map(paragraph, _warnings(document)), table(head, rows), figures(pictures)]
-    return [
-        PageSection(
-            "The pad as built", body, [(f"{document['explained']:.0%}", "of the responses explained by the twin")]
-        )
-    ]
+    result = (f"{document['explained']:.0%}", "of the responses explained by the twin")
+    return [PageSection("The pad as built", body, [result])]
 
 
 def _fibre(row: Mapping[str, Any]) -> str:
@@ -253,10 +242,6 @@ def _pose(document: Mapping[str, Any]) -> str:
         side = "as planned, which [rig] mirrored denies" if frame["mirrored"] else "turned over, as [rig] mirrored says"
     else:
         side = "turned over" if frame["mirrored"] else "as planned"
-    shift = ", ".join(map(_tenths, frame["shift_mm"]))
-    return f"{side}, rotated {_tenths(frame['turn_deg'])} degrees, shifted {shift} mm, scale {frame['scale']:.3f}"
-
-
-def _tenths(value: float) -> str:
-    """Format to one digit, 0 without a sign."""
-    return f"{round(value, 1) + 0.0:.1f}"
+    # z: 0 without a sign
+    turn, *shift = (f"{value:z.1f}" for value in (frame["turn_deg"], *frame["shift_mm"]))
+    return f"{side}, rotated {turn} degrees, shifted {', '.join(shift)} mm, scale {frame['scale']:.3f}"

@@ -1,4 +1,8 @@
-"""Sections of the HTML report on recording, calibration, fibre loss and studies."""
+"""Sections of the HTML report on recording, calibration, fibre loss and studies.
+
+For a document that is not as padforge writes it they raise KeyError, IndexError, TypeError, ValueError or
+AttributeError, and for a figure beside it that cannot be read InputError.
+"""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,29 +20,20 @@ from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
-STUDY = "padforge-study-"
-"""Formats of studies begin with this."""
-N_WORST = 10
-"""Sets of failed fibres that are listed."""
+N_WORST = 10  # sets of failed fibres that are listed
 NUMBERS = ("one", "two", "three")
 CELL = 40
 MAX_NUMBERED = 16
 """Fibres up to which cells of the chart have numbers; with more, they are too small to be read on a phone."""
-LABEL_STEP = 5
-"""Fibres from label to label where cells have no numbers."""
-MAX_STRETCH = 1.7
-"""Largest scale at which the chart is shown."""
+LABEL_STEP = 5  # fibres from label to label where cells have no numbers
+MAX_STRETCH = 1.7  # largest scale at which the chart is shown
 
 Errors = Mapping[tuple[int, ...], float]
 """Mean error, mm, by indices of failed fibres, ascending."""
 
 
 def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on the recording in `folder`, from its `start.json`.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-    """
+    """Write the section on the recording in `folder`, from its `start.json`."""
     source = document["source"]
     kind = source.get("kind")
     names = {"simulated": "the simulated rig", "rig": "a rig", "hand": "presses by hand"}
@@ -77,12 +72,7 @@ def _measures_table(folder: Path) -> list[str]:
 
 
 def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on a `calibration.json` in `folder`; and one on fibre loss, if `fibre_loss.json` is missing.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: a figure beside it cannot be read.
-    """
+    """Write the section on a `calibration.json` in `folder`; and one on fibre loss, if `fibre_loss.json` is missing."""
     rows = document["errors"]
     idle = [f"{share:.0%}" for share in document["idle_share"]]
     simulated = document["provenance"].get("recording_kind") == "simulated"
@@ -136,12 +126,7 @@ def _measure_errors(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on fibre loss, from a `fibre_loss.json` or `calibration.json`; none if no fibre failed.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: a figure beside it cannot be read.
-    """
+    """Write the section on fibre loss, from a `fibre_loss.json` or `calibration.json`; none if no fibre failed."""
     methods: Mapping[str, Any] = document.get("methods") or {"": document}
     body = []
     for name, method in methods.items():
@@ -168,21 +153,19 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
     if fibres > MAX_FIBRES:
         raise ValueError(f"fibre {fibres} failed, of at most {MAX_FIBRES}")
     counts = sorted({len(failed) for failed in errors} - {0})
+    worst_sets = [_worst(errors, count) for count in counts]
     worst = "; ".join(
-        f"of {_fibre_count(count)}, {_names(failed)} ({errors[failed]:.2f} mm)"
-        for count in counts
-        for failed in [_worst(errors, count)]
+        f"of {_fibre_count(len(failed))}, {_names(failed)} ({errors[failed]:.2f} mm)" for failed in worst_sets
     )
     intact = f" With all fibres the error is {errors[()]:.2f} mm." if () in errors else ""
     yield paragraph(f"The worst loss: {worst}.{intact}")
     chart: list[str] = []
     if {1, 2} <= set(counts):
-        caption = (
-            "Mean error in mm without two fibres, given by the row and the column; on the diagonal, without one."
-            " Darker is worse."
-        )
         few = {failed: error for failed, error in errors.items() if len(failed) <= 2}
-        chart = [f"<figure>{loss_chart(few, fibres)}<figcaption>{caption}</figcaption></figure>"]
+        chart = [
+            f"<figure>{loss_chart(few, fibres)}<figcaption>Mean error in mm without two fibres, given by the row and"
+            " the column; on the diagonal, without one. Darker is worse.</figcaption></figure>"
+        ]
     head = ["fibre", *("alone (mm)" if count == 1 else f"with {_fibre_count(count - 1)} more" for count in counts)]
     rows = [[fibre + 1, *(_mean_with(errors, fibre, count) for count in counts)] for fibre in range(fibres)]
     means = [table(head, rows), paragraph("Mean error over the sets of failed fibres that a fibre is in.")]
@@ -290,11 +273,7 @@ def _shade(share: float) -> str:
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the studies in `folder` and in its folder `studies`, by path, with their documents.
-
-    Raises:
-        InputError: a .json file cannot be read, so that it may be a study or not.
-    """
+    """Yield the studies in `folder` and its folder `studies`, by path; InputError for a .json that cannot be read."""
     paths = sorted([*folder.glob("[!.]*.json"), *(folder / "studies").glob("[!.]*.json")])
     for path in filter(Path.is_file, paths):
         content = read_bytes(path)
@@ -302,17 +281,12 @@ def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
             document = json.loads(content.decode())
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a JSON file ({error})") from error
-        if isinstance(document, dict) and str(document.get("format")).startswith(STUDY):
+        if isinstance(document, dict) and str(document.get("format")).startswith("padforge-study-"):
             yield path, document
 
 
 def study_pieces(path: Path, document: Mapping[str, Any]) -> list[str]:
-    """Write the HTML of a study: its text, the figure NAME.png beside NAME.json, if it is there, and its table.
-
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
-        InputError: the figure cannot be read.
-    """
+    """Write the HTML of a study: its text, the figure NAME.png beside NAME.json, if it is there, and its table."""
     title, text, rows = document["title"], document["text"], document["rows"]
     if not isinstance(title, str) or not isinstance(text, list) or not isinstance(rows, list):
         raise TypeError("title, text or rows is of another kind")

@@ -36,20 +36,13 @@ from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads
 
 Rows = Sequence[Mapping[str, Any]]
 
-MEMBERS = 3
-"""Networks whose errors are averaged: they differ by their first weights."""
-SIDE = 32
-"""Presses along a side of the published serpentine on which idle shares are simulated."""
-SETTLED = 10
-"""Readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40."""
-SLOW_PRESSES = 15
-"""Presses, with the last one, over whose rest levels the median is the slow baseline."""
-EXCERPT_PRESSES = 5
-"""Presses in the figure's excerpt of readings."""
-MAX_LEVELS = 400
-"""Presses by which the figure shows the drift of a whole recording."""
-COLUMNS = 2
-"""Recordings side by side whose errors are drawn."""
+MEMBERS = 3  # networks whose errors are averaged: they differ by their first weights
+SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
+SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
+SLOW_PRESSES = 15  # with the last one, over whose rest levels the median is the slow baseline
+EXCERPT_PRESSES = 5  # in the figure's excerpt of readings
+MAX_LEVELS = 400  # presses by which the figure shows the drift of a whole recording
+COLUMNS = 2  # recordings side by side whose errors are drawn
 PHASES = (("before", INK), ("pressed", ALARM), ("after", CURVES[2]))
 RAW, AS_PUBLISHED = "none", "robust TV"
 """No filter, and the published one."""
@@ -60,15 +53,8 @@ FILTERS: dict[str, Callable[[Array], Array]] = {
     "squares TV": partial(total_variation, lam=0.01, fidelity="squares"),
 }
 """Filters of (R, C) volts. The last one's lam is in volts: a press of 20 readings is lowered by 1 mV."""
-SIMULATED = "simulated"
-"""Kind of a simulated recording, in its source and in rows."""
-COMPENSATIONS = ("none", "baseline", "slow baseline", "published", "windows")
-"""Kinds of drift compensation, see `network_inputs`."""
-TABLE_III = (
-    "Table III of the paper has 78 % (square) and 77 % (N = 5) in its experiment, by the rule of 2 %. Its published "
-    "recording of the pad of N = 5 gives 16 to 18 % by that rule, whether readings are filtered or not: the table "
-    "cannot be reproduced from the data."
-)
+SIMULATED = "simulated"  # kind of a recording, in its source and in rows
+COMPENSATIONS = ("none", "baseline", "slow baseline", "published", "windows")  # see `network_inputs`
 
 
 class PressSplit(NamedTuple):
@@ -93,8 +79,6 @@ def drift_study(
 ) -> Study:
     """Evaluate every filter with every kind of drift compensation, and how often fibres are idle.
 
-    Results are reproducible, except for the time that the filters take.
-
     Args:
         pads: by label, each recorded by the simulated rig.
         recordings: by label.
@@ -115,9 +99,9 @@ def drift_study(
     rig_seed = int(np.random.default_rng([6, seed]).integers(2**32))
     rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": rig_seed})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
-    sources |= {label: (lambda recording=recording: recording) for label, recording in recordings.items()}
     kinds, n_presses = dict.fromkeys(pads, SIMULATED), dict.fromkeys(pads, presses)
     for label, recording in recordings.items():
+        sources[label] = lambda recording=recording: recording
         kinds[label] = SIMULATED if recording.source.get("kind") == SIMULATED else "recorded"
         n_presses[label] = int(recording.has_position.sum())
     for label, count in n_presses.items():
@@ -156,23 +140,15 @@ def _split(presses: Indices, share: float, seed: int) -> PressSplit:
 
 
 def press_levels(readings: Array, down_command: Indices, up_command: Indices) -> Array:
-    """Take the level of each fibre before, in and after each press, SETTLED readings from the probe's commands.
-
-    Where a cycle is too short, it is the nearest reading that belongs neither to another phase nor to another press.
-
-    Args:
-        readings: V; shape (R, C).
-        down_command: first reading after the probe was sent down; shape (Q,).
-        up_command: the same of up; shape (Q,).
-
-    Returns:
-        V; shape (Q, C, 3).
-    """
+    """Take the levels (Q, C, 3) of each fibre before, in and after each press, from readings (R, C)."""
     return np.stack([readings[rows] for rows in _level_indices(len(readings), down_command, up_command)], axis=2)
 
 
 def _level_indices(readings: int, down_command: Indices, up_command: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return which readings (Q,) are the levels before, in and after each press."""
+    """Return which readings (Q,) are the levels before, in and after each press: SETTLED from the probe's commands.
+
+    Where a cycle is too short, it is the nearest reading that belongs neither to another phase nor to another press.
+    """
     previous, following = np.append(0, up_command[:-1]), np.append(down_command[1:], readings)
     return (
         np.maximum(down_command - SETTLED, previous),
@@ -184,19 +160,10 @@ def _level_indices(readings: int, down_command: Indices, up_command: Indices) ->
 def network_inputs(
     compensation: str, readings: Array, down_command: Indices, up_command: Indices, training: Indices
 ) -> Array:
-    """Compute the inputs (Q, D) of the network for each press.
-
-    "windows" are principal components of the windows of `compute_features`, as many as "published" has inputs: else the
-    networks would differ in size.
-
-    Args:
-        compensation: of COMPENSATIONS.
-        readings: V, none missing; shape (R, C).
-        down_command: as `press_levels`.
-        up_command: as `press_levels`.
-        training: presses that the principal components are fitted to.
-    """
+    """Compute the inputs (Q, D) of the network for each press, by one of COMPENSATIONS."""
     if compensation == "windows":
+        # principal components, fitted to the training presses; as many as "published" has inputs, else the networks
+        # would differ in size
         inputs = compute_features(readings, down_command, up_command, "press_and_release")
         windows = inputs.windows.reshape(len(down_command), -1)
         components = np.linalg.eigh(np.cov(windows[training], rowvar=False))[1]
@@ -231,14 +198,8 @@ def _evaluate(source: Callable[[], Recording], name: str, share: float, hidden: 
         inputs = network_inputs(compensation, filtered, down_command, up_command, split.training)
         rngs = np.random.default_rng([8, seed]).spawn(MEMBERS)
         validation = np.broadcast_to(inputs[split.validation], (MEMBERS, len(split.validation), inputs.shape[1]))
-        networks = fit_batch(
-            inputs[split.training],
-            positions_mm[split.training],
-            rngs,
-            hidden,
-            epochs,
-            (validation, positions_mm[split.validation]),
-        )
+        stop_by = (validation, positions_mm[split.validation])
+        networks = fit_batch(inputs[split.training], positions_mm[split.training], rngs, hidden, epochs, stop_by)
         for part, rows in (("test", split.test), ("last", split.last)):
             errors = [distances(network(inputs[rows]), positions_mm[rows]) for network in networks]
             state[f"{part}_{number}"] = np.stack(errors)
@@ -283,21 +244,20 @@ def _conclude(
             state = next(results)
             for number, compensation in enumerate(COMPENSATIONS):
                 test, last = state[f"test_{number}"], state[f"last_{number}"]
-                rows.append(
-                    {
-                        "recording": label,
-                        "kind": kind,
-                        "filter": name,
-                        "compensation": compensation,
-                        "mean_mm": float(test.mean()),
-                        "median_mm": float(np.median(test)),
-                        "p95_mm": float(np.percentile(test, 95)),
-                        "std_mm": float(test.mean(axis=1).std()),
-                        "mean_last_mm": float(last.mean()),
-                        "std_last_mm": float(last.mean(axis=1).std()),
-                        "seconds_per_10000": None if name == RAW else float(state["seconds"]),
-                    }
-                )
+                row = {
+                    "recording": label,
+                    "kind": kind,
+                    "filter": name,
+                    "compensation": compensation,
+                    "mean_mm": float(test.mean()),
+                    "median_mm": float(np.median(test)),
+                    "p95_mm": float(np.percentile(test, 95)),
+                    "std_mm": float(test.mean(axis=1).std()),
+                    "mean_last_mm": float(last.mean()),
+                    "std_last_mm": float(last.mean(axis=1).std()),
+                    "seconds_per_10000": None if name == RAW else float(state["seconds"]),
+                }
+                rows.append(row)
             if name in (RAW, AS_PUBLISHED):
                 what = f"{kind} readings" if name == RAW else f"{kind} readings, filtered"
                 idle.append({"label": label, "kind": what, "idle_percent": 100 * float(state["idle"])})
@@ -317,19 +277,19 @@ def _describe(settings: Mapping[str, Any], rows: Rows, idle: Rows) -> list[str]:
     ]
     for label in dict.fromkeys(row["recording"] for row in rows):
         text.append(_describe_recording([row for row in rows if row["recording"] == label]))
-    model = [row for row in idle if row["kind"] == "contact model"]
-    if model:
+    if model := [row for row in idle if row["kind"] == "contact model"]:
         shares = _listed([f"{row['idle_percent']:.1f} % ({row['label']})" for row in model])
         text.append(f"By the contact model a fibre is idle in {shares} of the presses of the published serpentine.")
-    shares = _listed(
-        [f"{row['idle_percent']:.1f} % ({row['label']}, {row['kind']})" for row in idle if row not in model]
-    )
-    text.append(
+    others = [row for row in idle if row not in model]
+    shares = _listed([f"{row['idle_percent']:.1f} % ({row['label']}, {row['kind']})" for row in others])
+    return [
+        *text,
         f"By its readings, where a change of at most {100 * ACTIVE:g} % of its range over all presses counts as idle, "
-        f"a fibre is idle in {shares} of the presses: noise beyond that counts as a response."
-    )
-    text.append(TABLE_III)
-    return text
+        f"a fibre is idle in {shares} of the presses: noise beyond that counts as a response.",
+        "Table III of the paper has 78 % (square) and 77 % (N = 5) in its experiment, by the rule of 2 %. Its "
+        "published recording of the pad of N = 5 gives 16 to 18 % by that rule, whether readings are filtered or not: "
+        "the table cannot be reproduced from the data.",
+    ]
 
 
 def _describe_recording(rows: Rows) -> str:
@@ -340,7 +300,7 @@ def _describe_recording(rows: Rows) -> str:
     filtered = min((row for row in same if row is not raw), key=lambda row: row["mean_mm"])
     by_compensation = [
         min((row for row in rows if row["compensation"] == compensation), key=lambda row: row["mean_mm"])
-        for compensation in dict.fromkeys(row["compensation"] for row in rows)
+        for compensation in COMPENSATIONS
     ]
     errors = _listed([f"{row['mean_mm']:.2f} mm ({_method(row)})" for row in by_compensation])
     return (
@@ -373,7 +333,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     excerpts = list(by_kind.values())
     labels = list(dict.fromkeys(row["recording"] for row in rows))
     lines = -(-len(labels) // COLUMNS)
-    height = 0.62 * len(document["settings"]["compensations"]) + 0.9
+    height = 0.62 * len(COMPENSATIONS) + 0.9
     figure = Figure(figsize=(11, 2.7 * len(excerpts) + height * lines + 0.9), layout="constrained")
     grid = figure.add_gridspec(len(excerpts) + lines, 6, height_ratios=[2.7] * len(excerpts) + [height] * lines)
     for number, excerpt in enumerate(excerpts):
@@ -423,15 +383,13 @@ def _draw_readings(axes: Axes, excerpt: Mapping[str, Any]) -> None:
 
 def _draw_errors(axes: Axes, label: str, rows: Rows) -> None:
     """Draw a dot for every method: filled for presses at random, hollow for the last ones."""
-    compensations = list(dict.fromkeys(row["compensation"] for row in rows))
-    filters = list(dict.fromkeys(row["filter"] for row in rows))
-    for number, name in enumerate(filters):
+    for number, name in enumerate(FILTERS):
         cases = [row for row in rows if row["filter"] == name]
-        heights = np.arange(len(compensations)) + 0.6 * ((number + 0.5) / len(filters) - 0.5)
+        heights = np.arange(len(COMPENSATIONS)) + 0.6 * ((number + 0.5) / len(FILTERS) - 0.5)
         for part, face in (("", CURVES[number]), ("_last", "none")):
             means, stds = ([row[f"{what}{part}_mm"] for row in cases] for what in ("mean", "std"))
             dot: dict[str, Any] = {"fmt": "o", "color": CURVES[number], "markerfacecolor": face, "markersize": 4.5}
             axes.errorbar(means, heights, xerr=stds, elinewidth=1, label=None if part else f"filter: {name}", **dot)
-    axes.set_yticks(range(len(compensations)), compensations)
-    limits = {"ylim": (len(compensations) - 0.5, -0.5), "xlim": (0, None)}
+    axes.set_yticks(range(len(COMPENSATIONS)), COMPENSATIONS)
+    limits = {"ylim": (len(COMPENSATIONS) - 0.5, -0.5), "xlim": (0, None)}
     label_axes(axes, f"{label}, {rows[0]['kind']}", "x", xlabel="mean error (mm)", **limits)

@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_path, check_type, short_repr
+from padforge.design.common.validation import InputError, check_int, short_repr
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
-from padforge.sense.arrays import MAX_FIBRES, Array, Indices
+from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_unseen
 from padforge.sense.localizer.evaluation import errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
@@ -28,8 +27,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.studies.study import draw_error_map, failed_label
 
 FORMAT = "padforge-fibre-loss/3"
-ONE, RETRAINED = "one network", "retrained"
-"""The two methods, as the document calls them."""
+ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document calls them
 BAR_WIDTH = 0.36
 
 Failed = tuple[int, ...]
@@ -68,15 +66,9 @@ def fibre_loss_study(
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
             that does not suit the localizer, a localizer without fibre dropout, or checkpoints of other settings.
     """
-    check_type("retrain", retrain, bool)
     if localizer is None and not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
-    check_type("recording", recording, Recording)
-    if localizer is not None:
-        check_type("localizer", localizer, LocalizerModel)
-    checkpoints = None if checkpoints is None else check_path("checkpoints", checkpoints)
-    options = or_default("options", options, settings.LocalizerSettings)
-    max_failures = check_int("max_failures", max_failures, 0, MAX_FIBRES)
+    options = options or settings.LocalizerSettings()
     fibres = recording.fibres
     chosen = tuple(sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in failed}))
     if len(chosen) == fibres:
@@ -157,9 +149,8 @@ def train_without(
     """Train on the other fibres alone, and predict the test presses; independent of all other trainings."""
     remaining = np.setdiff1d(np.arange(recording.fibres), failed)
     partial_recording = replace(recording, readings=recording.readings[:, remaining])
-    localizer = fit_recording(
-        partial_recording, training, options, np.random.default_rng([options.seed, _bit_mask(failed)])
-    )
+    rng = np.random.default_rng([options.seed, _bit_mask(failed)])
+    localizer = fit_recording(partial_recording, training, options, rng)
     return localizer.predict_features(localizer.scaled_features(partial_recording)[test])
 
 
@@ -208,9 +199,10 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
             axes.text(x, 0.03, f"{row['mean_mm']:.2f}", color=INK, fontsize=9, ha="center", va="bottom")
     axes.legend(frameon=False, loc="upper left")
     label_failures(axes, next(iter(methods.values()))["errors"], f"Fibre loss, {document['test_presses']}")
-    panels = [(row, column, panel) for row, m in enumerate(methods.values()) for column, panel in enumerate(m["maps"])]
-    highest = max(cell["mean_mm"] for _, _, panel in panels for cell in panel["by_position"])
-    for row, column, panel in panels:
+    panels = [panel for method in methods.values() for panel in method["maps"]]
+    highest = max(cell["mean_mm"] for panel in panels for cell in panel["by_position"])
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, columns)
         axes = figure.add_subplot(grid[1 + row, column], aspect="equal")
         errors, extent = _error_grid(panel["by_position"])
         image = draw_error_map(axes, errors, failed_label(panel["failed"]), highest, extent)

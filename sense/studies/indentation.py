@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from padforge.sense.studies.study import (
     Study,
     StudyResult,
     Task,
+    classification_scores,
     confusion_matrix,
     describe_pads,
     fit_ensemble,
@@ -28,30 +30,22 @@ from padforge.sense.studies.study import (
 )
 
 LOG_SCALE = 4.0
-"""Counts below which the logarithm of a reading becomes linear, since there it would be one of noise."""
-DEPTHS = (0.1, 0.45)
-"""Least and greatest depth, grid units."""
-BINS = 7
-"""Depths by which the error of the position is drawn."""
-COLUMNS = 4
-"""Pads side by side in the figure of the force."""
+"""Counts below which the logarithm of a reading becomes linear, since there it would be one of noise. To logarithms a
+deeper press adds, as it multiplies all signals."""
+DEPTHS = (0.1, 0.45)  # least and greatest, grid units
+BINS = 7  # depths by which the error of the position is drawn
+COLUMNS = 4  # pads side by side in the figure of the force
 INDENTERS = {
     "sphere": Indenter("sphere", radius=0.7),
     "cone": Indenter("cone", angle_deg=22),
     "flat punch": Indenter("flat", radius=0.44),
 }
 """Of about the same contact radius at the middle depth, 0.44 grid units, so that they differ by profile alone."""
-FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}
-"""Sides of each polygon; None for a circle."""
+FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}  # sides of each polygon; None for a circle
 SIZES = np.linspace(0.5, 0.9, 17)
 """Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""
 SHAPE_NOISE_COUNTS = 1.0
 SETS = {"indenters": tuple(INDENTERS), "footprints": tuple(FOOTPRINTS)}
-
-
-def log_counts(counts: Array) -> Array:
-    """Return logarithms of readings, to which a deeper press adds, as it multiplies all signals."""
-    return np.log1p(counts / LOG_SCALE)
 
 
 def force_study(
@@ -88,10 +82,11 @@ def force_study(
     indenter.contact_radius(depths)
     middle = float(np.mean(depths))
     cases = (("depth unknown", depths, False), ("depth known", depths, True), ("one depth", (middle, middle), False))
+    numbers = {"presses": presses, "test": test, "hidden": hidden, "epochs": epochs, "seed": seed}
     tasks = [
         Task(
             f"{label}, noise of {_counts(noise)}, {name}",
-            partial(_estimate_depth, pad, indenter, case_depths, is_known, noise, presses, test, hidden, epochs, seed),
+            partial(_estimate_depth, pad, indenter, case_depths, is_known, noise, **numbers),
         )
         for label, pad in pads.items()
         for noise in noise_counts
@@ -104,11 +99,7 @@ def force_study(
         "noise_counts": list(noise_counts),
         "reduced_modulus_kpa": REDUCED_MODULUS_KPA,
         "members": MEMBERS,
-        "presses": presses,
-        "test": test,
-        "hidden": hidden,
-        "epochs": epochs,
-        "seed": seed,
+        **numbers,
     }
     conclude = partial(_conclude_force, dict(pads), indenter, settings)
     return Study("force", "Depth and force of a press, besides its position", settings, tasks, conclude, _draw_force)
@@ -120,26 +111,24 @@ def _estimate_depth(
     depths: tuple[float, float],
     is_known: bool,
     noise_counts: float,
-    training: int,
+    *,
+    presses: int,
     test: int,
     hidden: int,
     epochs: int,
     seed: int,
 ) -> State:
-    """Return x, y and depth of the test presses, "pressed" and "predicted", without the depth where it is known.
-
-    The full scale of a fibre is its largest signal in the training presses; shapes (T, 3) or (T, 2), grid units.
-    """
+    """Return x, y and depth of the test presses, "pressed" and "predicted", grid units; no depth where it is known."""
     rng = np.random.default_rng([3, seed])
-    positions = fresh_presses(between_fibres(pad.layout), training + test, int(rng.integers(2**32)))
-    depth = rng.uniform(*depths, training + test)
+    positions = fresh_presses(between_fibres(pad.layout), presses + test, int(rng.integers(2**32)))
+    depth = rng.uniform(*depths, presses + test)
     responses = indented_signals(pad, positions, depth, indenter)
-    inputs = log_counts(quantize(responses, responses[:training].max(axis=0), noise_counts, rng))
+    inputs = np.log1p(quantize(responses, responses[:presses].max(axis=0), noise_counts, rng) / LOG_SCALE)
     targets = np.column_stack([positions, depth])
     if is_known:
         inputs, targets = np.column_stack([inputs, depth]), positions
-    predict = fit_ensemble(inputs[:training], targets[:training], rng, hidden, epochs)
-    return {"pressed": targets[training:], "predicted": predict(inputs[training:])}
+    predict = fit_ensemble(inputs[:presses], targets[:presses], rng, hidden, epochs)
+    return {"pressed": targets[presses:], "predicted": predict(inputs[presses:])}
 
 
 def _counts(number: float) -> str:
@@ -158,28 +147,29 @@ def _conclude_force(
         unit_mm, force_n = pad.unit_mm, partial(indenter.force_n, unit_mm=pad.unit_mm)
         force_range_n = float(force_n(high) - force_n(low))
         for noise in settings["noise_counts"]:
-            depth_unknown, depth_known, one_depth = next(results), next(results), next(results)
-            depth, predicted = depth_unknown["pressed"][:, 2], np.clip(depth_unknown["predicted"][:, 2], low, high)
-            errors = _position_errors(depth_unknown)
-            force_error_n = float(np.abs(force_n(predicted) - force_n(depth)).mean())
-            rows.append(
-                {
-                    "pad": label,
-                    "noise_counts": noise,
-                    "position_grid": float(errors.mean()),
-                    "position_mm": float(errors.mean() * unit_mm),
-                    "position_depth_known_mm": float(_position_errors(depth_known).mean() * unit_mm),
-                    "position_one_depth_mm": float(_position_errors(one_depth).mean() * unit_mm),
-                    "depth_grid": float(np.abs(predicted - depth).mean()),
-                    "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
-                    "depth_guessed_mm": float(np.abs(depth - middle).mean() * unit_mm),
-                    "force_n": force_error_n,
-                    "force_percent": 100 * force_error_n / force_range_n,
-                    "force_guessed_percent": float(
-                        100 * np.abs(force_n(middle) - force_n(depth)).mean() / force_range_n
-                    ),
-                }
+            cases = [next(results) for _ in range(3)]
+            depth, predicted = cases[0]["pressed"][:, 2], np.clip(cases[0]["predicted"][:, 2], low, high)
+            errors, *others = (
+                np.linalg.norm(case["predicted"][:, :2] - case["pressed"][:, :2], axis=1) for case in cases
             )
+            depth_known_mm, one_depth_mm = (float(case_errors.mean() * unit_mm) for case_errors in others)
+            force_guess_n = float(np.abs(force_n(middle) - force_n(depth)).mean())
+            force_error_n = float(np.abs(force_n(predicted) - force_n(depth)).mean())
+            row = {
+                "pad": label,
+                "noise_counts": noise,
+                "position_grid": float(errors.mean()),
+                "position_mm": float(errors.mean() * unit_mm),
+                "position_depth_known_mm": depth_known_mm,
+                "position_one_depth_mm": one_depth_mm,
+                "depth_grid": float(np.abs(predicted - depth).mean()),
+                "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
+                "depth_guessed_mm": float(np.abs(depth - middle).mean() * unit_mm),
+                "force_n": force_error_n,
+                "force_percent": 100 * force_error_n / force_range_n,
+                "force_guessed_percent": 100 * force_guess_n / force_range_n,
+            }
+            rows.append(row)
             bins = np.digitize(depth, edges[1:-1])
             means = [errors[bins == bin].mean() * unit_mm if (bins == bin).any() else None for bin in range(BINS)]
             curves.append(
@@ -193,11 +183,6 @@ def _conclude_force(
                 }
             )
     return StudyResult(rows, _describe_force(indenter, settings, rows), {"curves": curves})
-
-
-def _position_errors(state: State) -> Array:
-    """Return the errors of the position (T,), grid units."""
-    return np.linalg.norm(state["predicted"][:, :2] - state["pressed"][:, :2], axis=1)
 
 
 def _describe_force(indenter: Indenter, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
@@ -273,17 +258,10 @@ def shape_study(
     """Classify the object: indenters of unknown depth, and footprints of unknown size, the position unknown too.
 
     Indenters follow the indentation model, footprints the published contact: polygons of one orientation.
-
-    Args:
-        pads: by label.
-        presses: training presses, over all shapes of a set.
-        test: test presses.
-        hidden: neurons of a network.
-        epochs: of training.
-        seed: of presses, noise and networks.
+    Arguments are as of `force_study`.
     """
     tasks = [
-        Task(f"{label}, {kind}, {name}", partial(work, pad, kind, presses, test, seed, hidden, epochs))
+        Task(f"{label}, {kind}, {name}", partial(work, pad, kind, presses, test, hidden, epochs, seed))
         for label, pad in pads.items()
         for kind in SETS
         for name, work in (("shape", _classify), ("position", _localize))
@@ -305,10 +283,10 @@ def shape_study(
 
 
 def _simulate_shapes(
-    pad: Morphology, kind: str, count: int, training: int, seed: int
+    pad: Morphology, kind: str, training: int, test: int, seed: int
 ) -> tuple[Array, Array, Indices, np.random.Generator]:
     """Return network inputs (Q, C), positions (Q, 2), indices of the shapes (Q,), and the generator to go on with."""
-    rng = np.random.default_rng([4, seed, list(SETS).index(kind)])
+    rng, count = np.random.default_rng([4, seed, list(SETS).index(kind)]), training + test
     positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
     shape = rng.integers(len(SETS[kind]), size=count)
     responses = np.empty((count, pad.layout.fibres))
@@ -319,13 +297,12 @@ def _simulate_shapes(
             responses[rows] = indented_signals(pad, positions[rows], depths[rows], indenter)
     else:
         size = rng.integers(len(SIZES), size=count)
-        for index, sides in enumerate(FOOTPRINTS.values()):
-            for size_index, radius in enumerate(SIZES):
-                rows = (shape == index) & (size == size_index)
-                contact = Contact(radius=radius * circumradius(sides), sides=sides)
-                responses[rows] = signals(pad, positions[rows], contact)
+        for (index, sides), (size_index, radius) in product(enumerate(FOOTPRINTS.values()), enumerate(SIZES)):
+            rows = (shape == index) & (size == size_index)
+            contact = Contact(radius=radius * circumradius(sides), sides=sides)
+            responses[rows] = signals(pad, positions[rows], contact)
     counts = quantize(responses, responses[:training].max(axis=0), SHAPE_NOISE_COUNTS, rng)
-    return log_counts(counts) if kind == "indenters" else counts, positions, shape, rng
+    return np.log1p(counts / LOG_SCALE) if kind == "indenters" else counts, positions, shape, rng
 
 
 def circumradius(sides: int | None) -> float:
@@ -333,17 +310,17 @@ def circumradius(sides: int | None) -> float:
     return 1.0 if sides is None else float(np.sqrt(2 * np.pi / (sides * np.sin(2 * np.pi / sides))))
 
 
-def _classify(pad: Morphology, kind: str, training: int, test: int, seed: int, hidden: int, epochs: int) -> State:
+def _classify(pad: Morphology, kind: str, training: int, test: int, hidden: int, epochs: int, seed: int) -> State:
     """Return the confusions (K, K) of shapes on the test presses."""
-    inputs, _, shape, rng = _simulate_shapes(pad, kind, training + test, training, seed)
+    inputs, _, shape, rng = _simulate_shapes(pad, kind, training, test, seed)
     classes = len(SETS[kind])
     classify = fit_ensemble(inputs[:training], np.eye(classes)[shape[:training]], rng, hidden, epochs)
     return confusion_matrix(shape[training:], classify(inputs[training:]).argmax(axis=1), classes)
 
 
-def _localize(pad: Morphology, kind: str, training: int, test: int, seed: int, hidden: int, epochs: int) -> State:
+def _localize(pad: Morphology, kind: str, training: int, test: int, hidden: int, epochs: int, seed: int) -> State:
     """Return mean errors of the position on the test presses, grid units: shape "unknown", or "known" as an input."""
-    inputs, positions, shape, rng = _simulate_shapes(pad, kind, training + test, training, seed)
+    inputs, positions, shape, rng = _simulate_shapes(pad, kind, training, test, seed)
     with_shape = np.column_stack([inputs, np.eye(len(SETS[kind]))[shape]])
     errors = {}
     for name, features, member_rng in zip(("unknown", "known"), (inputs, with_shape), rng.spawn(2), strict=True):
@@ -360,18 +337,16 @@ def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any],
             counts, errors = next(results)["confusions"], next(results)
             recall = np.diag(counts) / np.maximum(counts.sum(axis=1), 1)
             worst = int(np.argmin(recall))
-            rows.append(
-                {
-                    "pad": label,
-                    "shapes": kind,
-                    "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-                    "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
-                    "worst": shapes[worst],
-                    "worst_percent": float(100 * recall[worst]),
-                    "position_mm": float(errors["unknown"] * pad.unit_mm),
-                    "position_shape_known_mm": float(errors["known"] * pad.unit_mm),
-                }
-            )
+            row = {
+                "pad": label,
+                "shapes": kind,
+                **classification_scores(counts),
+                "worst": shapes[worst],
+                "worst_percent": float(100 * recall[worst]),
+                "position_mm": float(errors["unknown"] * pad.unit_mm),
+                "position_shape_known_mm": float(errors["known"] * pad.unit_mm),
+            }
+            rows.append(row)
             confusions.append({"pad": label, "shapes": kind, "names": list(shapes), "counts": counts.tolist()})
     return StudyResult(rows, _describe_shape(settings, rows), {"confusions": confusions})
 
@@ -413,11 +388,10 @@ def _draw_shape(document: Mapping[str, Any]) -> Figure:
         axes, names = panels[line, column], matrix["names"]
         draw_confusions(axes, matrix["counts"])
         axes.set_xticks(range(len(names)), names, fontsize=8, color=INK)
-        visible = [""] * len(names) if column else names
-        axes.set_yticks(range(len(names)), visible, fontsize=8, color=INK, rotation=90, va="center")
+        y_names = [""] * len(names) if column else names
+        axes.set_yticks(range(len(names)), y_names, fontsize=8, color=INK, rotation=90, va="center")
         axes.set_title(f"{matrix['pad']}: {row['accuracy_percent']:.0f} %", loc="left", color=INK, fontsize=10)
-        if column == 0:
-            axes.set_ylabel("pressed", color=INK)
+        axes.set_ylabel("" if column else "pressed", color=INK)
         axes.set_xlabel("predicted" if line == len(SETS) - 1 else "", color=INK)
     add_title(figure, f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on")
     return figure

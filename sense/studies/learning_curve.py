@@ -16,8 +16,7 @@ from scipy.optimize import nnls
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_type
+from padforge.design.common.validation import InputError
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_presses
@@ -25,12 +24,9 @@ from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-learning-curve/3"
-SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Shares of the training presses."""
-MIN_PRESSES = 10
-"""Training presses of the smallest localizer."""
-EXPONENTS = np.linspace(0.1, 1.5, 57)
-"""Exponents b that are tried."""
+SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the training presses
+MIN_PRESSES = 10  # training presses of the smallest localizer
+EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried
 RESAMPLINGS = 400
 
 
@@ -56,8 +52,7 @@ def learning_curve(
     Raises:
         InputError: too few presses for a curve.
     """
-    check_type("recording", recording, Recording)
-    options = or_default("options", options, settings.LocalizerSettings)
+    options = options or settings.LocalizerSettings()
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)
     training, test = (presses[part] for part in split_presses(len(presses), options.split, options.test_share, rng))
@@ -113,9 +108,8 @@ def _predict(
             joint.update(number, round(step / total * steps[number]))
 
         training = trainings[number]
-        localizer = fit_recording(
-            recording, training, options, np.random.default_rng([options.seed, len(training)]), report
-        )
+        rng = np.random.default_rng([options.seed, len(training)])
+        localizer = fit_recording(recording, training, options, rng, report)
         return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
 
     longest_first = reversed(range(len(steps)))
@@ -125,15 +119,7 @@ def _predict(
 
 
 def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:
-    """Fit errors c + a n^-b, by least squares of relative errors.
-
-    Args:
-        presses: n > 0; shape (P,).
-        errors: > 0; shape (P,).
-
-    Returns:
-        Floor c >= 0, factor a >= 0 and exponent b.
-    """
+    """Fit c + a n^-b to errors (P,) by numbers of presses (P,): least squares of relative errors, c and a >= 0."""
 
     def solve(exponent: float) -> tuple[Array, float]:
         terms = np.column_stack([np.ones_like(presses), (presses / presses[-1]) ** -exponent])

@@ -6,9 +6,9 @@ order.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from itertools import takewhile
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,6 +26,7 @@ from padforge.sense.studies.study import (
     Study,
     StudyResult,
     Task,
+    classification_scores,
     confusion_matrix,
     describe_pads,
     fit_ensemble,
@@ -34,38 +35,24 @@ from padforge.sense.studies.study import (
 )
 
 LABELLED = "fixed labels"
-EPOCHS = 100
-MAX_CONTACTS = 3
-"""Contacts at once, where they are counted."""
+MAX_CONTACTS = 3  # at once, where they are counted
 NOISE_COUNTS = 1.0
 """Noise of the readings by which contacts are counted, in counts of a 12-bit converter; positions are without."""
-BINS = 16
-"""Groups of equally many pairs, by the distance of the two contacts."""
-COUNTING = "number of contacts"
-"""What stands for the method in rows that are not of pairs."""
+BINS = 16  # groups of equally many pairs, by the distance of the two contacts
+COUNTING = "number of contacts"  # stands for the method in rows that are not of pairs
 
 
-@dataclass(frozen=True)
-class PairTargets:
-    """How networks learn pairs of contacts.
+class PairTargets(NamedTuple):
+    """How networks learn pairs of contacts."""
 
-    Attributes:
-        encode: from pairs (Q, 2, 2) to A equally right targets; (A, Q, O).
-        decode: from the outputs of S networks (S, T, O) to pairs (T, 2, 2).
-    """
-
-    encode: Callable[[Array], Array]
-    decode: Callable[[Array], Array]
-
-
-def sort_by_x(pairs: Array) -> Array:
-    """Return pairs (Q, 2, 2) with the contact of lower x first."""
-    return np.take_along_axis(pairs, pairs[:, :, :1].argsort(axis=1), axis=1)
+    encode: Callable[[Array], Array]  # from pairs (Q, 2, 2) to A equally right targets (A, Q, O)
+    decode: Callable[[Array], Array]  # from the outputs of S networks (S, T, O) to pairs (T, 2, 2)
 
 
 def both_orders(pairs: Array) -> Array:
     """Return both orders of pairs; shape (2, Q, 4); by x first, since a constant order is easier to learn from."""
-    return np.stack([_flatten(sort_by_x(pairs)), _flatten(sort_by_x(pairs)[:, ::-1])])
+    ordered = np.take_along_axis(pairs, pairs[:, :, :1].argsort(axis=1), axis=1)
+    return np.stack([ordered, ordered[:, ::-1]]).reshape(2, -1, 4)
 
 
 def moments(pairs: Array) -> Array:
@@ -95,17 +82,13 @@ def unordered_distances(predicted: Array, pressed: Array) -> Array:
     return np.minimum(distance[:, 0, 0] + distance[:, 1, 1], distance[:, 0, 1] + distance[:, 1, 0]) / 2
 
 
-def _flatten(pairs: Array) -> Array:
-    return pairs.reshape(-1, 4)
-
-
 def _mean(outputs: Array) -> Array:
     return outputs.mean(axis=0).reshape(-1, 2, 2)
 
 
 METHODS = {
-    LABELLED: PairTargets(lambda pairs: _flatten(pairs)[None], _mean),
-    "sorted": PairTargets(lambda pairs: _flatten(sort_by_x(pairs))[None], _mean),
+    LABELLED: PairTargets(lambda pairs: pairs.reshape(1, -1, 4), _mean),
+    "sorted": PairTargets(lambda pairs: both_orders(pairs)[:1], _mean),
     "free": PairTargets(both_orders, mean_of_unordered),
     "moments": PairTargets(
         lambda pairs: moments(pairs)[None], lambda outputs: pairs_from_moments(outputs.mean(axis=0))
@@ -114,13 +97,7 @@ METHODS = {
 
 
 def fit_pairs(
-    method: PairTargets,
-    inputs: Array,
-    pairs: Array,
-    rng: np.random.Generator,
-    members: int,
-    hidden: int,
-    epochs: int,
+    method: PairTargets, inputs: Array, pairs: Array, rng: np.random.Generator, members: int, hidden: int, epochs: int
 ) -> Callable[[Array], Array]:
     """Fit networks to signals (Q, D) of pairs (Q, 2, 2); the result predicts pairs (T, 2, 2) from signals (T, D)."""
     targets = method.encode(pairs)
@@ -135,25 +112,17 @@ def multicontact_study(
     test: int = 2000,
     hidden: int = 60,
     members: int = MEMBERS,
-    epochs: int = EPOCHS,
+    epochs: int = 100,
     seed: int = 0,
 ) -> Study:
     """Localize two contacts at once by each of METHODS, and count up to MAX_CONTACTS contacts.
 
-    Signals of contacts add, and contacts are drawn uniformly and independently.
-
-    Args:
-        pads: by label.
-        presses: training presses.
-        test: test presses.
-        hidden: neurons of a network.
-        members: networks whose mean is taken.
-        epochs: of training.
-        seed: of presses, noise and networks.
+    Signals of contacts add, and contacts are drawn uniformly and independently. The mean of `members` networks is
+    taken; other arguments are as of `force_study`.
     """
-    numbers = (presses, test, members, hidden, epochs, seed)
+    numbers = {"presses": presses, "test": test, "members": members, "hidden": hidden, "epochs": epochs, "seed": seed}
     tasks = [
-        Task(f"{label}, {name}", partial(work, *numbers))
+        Task(f"{label}, {name}", partial(work, **numbers))
         for label, pad in pads.items()
         for name, work in [
             *((name, partial(_localize_pairs, pad, method)) for name, method in METHODS.items()),
@@ -164,12 +133,7 @@ def multicontact_study(
         "pads": describe_pads(pads),
         "max_contacts": MAX_CONTACTS,
         "noise_counts": NOISE_COUNTS,
-        "presses": presses,
-        "test": test,
-        "members": members,
-        "hidden": hidden,
-        "epochs": epochs,
-        "seed": seed,
+        **numbers,
     }
     conclude = partial(_conclude, dict(pads), settings)
     return Study("multicontact", "Several contacts at once", settings, tasks, conclude, _draw)
@@ -218,31 +182,22 @@ def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], state
             half = np.linalg.norm(state["pressed"][:, 0] - state["pressed"][:, 1], axis=1) / 2
             as_labelled = np.linalg.norm(state["predicted"] - state["pressed"], axis=2).mean()
             curve = _errors_by_distance(errors * pad.unit_mm, 2 * half * pad.unit_mm)
-            rows.append(
-                {
-                    "pad": label,
-                    "method": method,
-                    "error_grid": float(errors.mean()),
-                    "error_mm": float(errors.mean() * pad.unit_mm),
-                    "of_fixed_labels": float(errors.mean() / labelled),
-                    "error_by_labels_mm": float(as_labelled * pad.unit_mm) if method == LABELLED else None,
-                    "midpoint_error_mm": float(half.mean() * pad.unit_mm),
-                    "resolution_mm": _resolution_mm(curve),
-                    "accuracy_percent": None,
-                    "majority_percent": None,
-                }
-            )
+            row = {
+                "pad": label,
+                "method": method,
+                "error_grid": float(errors.mean()),
+                "error_mm": float(errors.mean() * pad.unit_mm),
+                "of_fixed_labels": float(errors.mean() / labelled),
+                "error_by_labels_mm": float(as_labelled * pad.unit_mm) if method == LABELLED else None,
+                "midpoint_error_mm": float(half.mean() * pad.unit_mm),
+                "resolution_mm": _resolution_mm(curve),
+                "accuracy_percent": None,
+                "majority_percent": None,
+            }
+            rows.append(row)
             curves.append({"pad": label, "method": method, **curve})
         counts = next(results)["confusions"]
-        rows.append(
-            {
-                **dict.fromkeys(rows[-1]),
-                "pad": label,
-                "method": COUNTING,
-                "accuracy_percent": float(100 * np.trace(counts) / counts.sum()),
-                "majority_percent": float(100 * counts.sum(axis=1).max() / counts.sum()),
-            }
-        )
+        rows.append(dict.fromkeys(rows[-1]) | {"pad": label, "method": COUNTING} | classification_scores(counts))
         confusions.append({"pad": label, "counts": counts.tolist()})
     return StudyResult(rows, _describe(settings, rows), {"curves": curves, "confusions": confusions})
 
@@ -258,12 +213,9 @@ def _errors_by_distance(errors_mm: Array, distances_mm: Array) -> dict[str, list
 
 def _resolution_mm(curve: Mapping[str, list[float]]) -> float | None:
     """Return the distance from which on the mean error is less than a quarter of it; None if it never is."""
-    resolution = None
-    for distance, error in zip(reversed(curve["distance_mm"]), reversed(curve["error_mm"]), strict=True):
-        if error >= distance / 4:
-            break
-        resolution = distance
-    return resolution
+    farthest_first = zip(reversed(curve["distance_mm"]), reversed(curve["error_mm"]), strict=True)
+    resolved = list(takewhile(lambda pair: pair[1] < pair[0] / 4, farthest_first))
+    return resolved[-1][0] if resolved else None
 
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
@@ -280,20 +232,20 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         by_method = {row["method"]: row for row in pairs}
         labelled, best = by_method[LABELLED], min(pairs, key=lambda row: row["error_mm"])
         errors = ", ".join(f"{method} {row['error_mm']:.2f} mm" for method, row in by_method.items())
+        resolved = "a quarter of the distance of the two or more even for the farthest pairs"
+        if (from_mm := best["resolution_mm"]) is not None:
+            resolved = (
+                "less than a quarter of the distance of the two, half of that of the midpoint, from about "
+                f"{from_mm:.1f} mm on"
+            )
         text.append(
             f"{label}: {errors}. In the order of its labels the error of the published method is "
             f"{labelled['error_by_labels_mm']:.2f} mm; with the midpoint of the two for both it would be "
             f"{labelled['midpoint_error_mm']:.2f} mm. Free has {by_method['free']['of_fixed_labels']:.2f} of the error "
             f"of fixed labels; least is that of {best['method']}, {best['of_fixed_labels']:.2f} of it, which is "
-            + (
-                "a quarter of the distance of the two or more even for the farthest pairs. "
-                if best["resolution_mm"] is None
-                else "less than a quarter of the distance of the two, half of that of the midpoint, from about "
-                f"{best['resolution_mm']:.1f} mm on. "
-            )
-            + f"Of up to {settings['max_contacts']} contacts, read with noise of {settings['noise_counts']:g} of "
-            f"{ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted correctly (always the most "
-            f"frequent number: {counting['majority_percent']:.1f} %)."
+            f"{resolved}. Of up to {settings['max_contacts']} contacts, read with noise of "
+            f"{settings['noise_counts']:g} of {ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted "
+            f"correctly (always the most frequent number: {counting['majority_percent']:.1f} %)."
         )
     return text
 
@@ -326,9 +278,8 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes.set_title(title, loc="left", color=INK, fontsize=10)
         axes.set_xlabel("contacts predicted", color=INK)
         axes.set_ylabel("" if column else "contacts pressed", color=INK)
-    settings = document["settings"]
-    title = f"{settings['test']} presses never trained on: positions of two contacts, number of up to "
-    add_title(figure, f"{title}{settings['max_contacts']}")
+    test, most = document["settings"]["test"], document["settings"]["max_contacts"]
+    add_title(figure, f"{test} presses never trained on: positions of two contacts, number of up to {most}")
     return figure
 
 

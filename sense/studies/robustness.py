@@ -16,7 +16,6 @@ from padforge.design.morphology import Morphology
 from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
-from padforge.sense.arrays import Array
 from padforge.sense.studies.study import (
     Study,
     StudyResult,
@@ -25,6 +24,7 @@ from padforge.sense.studies.study import (
     draw_error_map,
     failed_label,
     label_axes,
+    label_map_row,
 )
 
 RULES = {"published": signals_quantized, "exact": signals}
@@ -32,10 +32,8 @@ RULES = {"published": signals_quantized, "exact": signals}
 MIN_NETWORKS = 16
 """Networks of a level: where there are fewer sets of failed fibres, each is trained several times, since the error of a
 single network depends on its first weights."""
-MAX_SETS = 1024
-"""Sets of failed fibres of a size that are evaluated; of more, a sample is drawn."""
-SIDE = 33
-"""Cells along a side of an error map."""
+MAX_SETS = 1024  # of failed fibres of a size that are evaluated; of more, a sample is drawn
+SIDE = 33  # cells along a side of an error map
 
 
 def robustness_study(
@@ -74,13 +72,8 @@ def robustness_study(
         for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
         for part in split_batches(failure_subsets(pad.layout.fibres, level, MAX_SETS))
     ]
-    tasks = [
-        Task(
-            f"{label}, {len(part[0])} failed",
-            partial(_evaluate, pads[label], contact, rule, part, hidden, side, test, seed),
-        )
-        for label, part in parts
-    ]
+    evaluate = partial(_evaluate, contact=contact, rule=rule, hidden=hidden, side=side, test=test, seed=seed)
+    tasks = [Task(f"{label}, {len(part[0])} failed", partial(evaluate, pads[label], part)) for label, part in parts]
     settings = {
         "pads": describe_pads(pads),
         "contact": contact.model_dump(mode="json"),
@@ -97,23 +90,17 @@ def robustness_study(
 
 def _evaluate(
     pad: Morphology,
+    failures: list[FailureSet],
+    *,
     contact: Contact,
     rule: str,
-    failures: list[FailureSet],
     hidden: int,
     side: int,
     test: int,
     seed: int,
 ) -> State:
-    """Compute errors with each of L sets of failed fibres, grid units.
-
-    Returns:
-        Mean errors on "fresh" presses (L,) and on those of the "training" (L,); and "maps" (L, SIDE^2).
-    """
-
-    def respond(positions: Array) -> Array:
-        return RULES[rule](pad, positions, contact)
-
+    """Compute errors with each of L sets of failed fibres, grid units: "fresh" (L,), "training" (L,), "maps" (L, Q)."""
+    respond = partial(RULES[rule], pad, contact=contact)
     presses = SimulatedPresses.simulate(pad, side, test, seed, respond)
     positions = grid_positions(between_fibres(pad.layout), SIDE)
     responses = respond(positions)
@@ -147,27 +134,26 @@ def _conclude(
             np.concatenate([state[name] for _, state in results]) for name in ("fresh", "training", "maps")
         )
         sizes = np.array([len(failed) for failed in failures])
+        (left, low), (right, high) = between_fibres(pad.layout)
         for level in range(sizes.max() + 1):
             means = fresh[sizes == level]
-            rows.append(
-                {
-                    "pad": label,
-                    "n_failed": level,
-                    "subsets": len(means),
-                    "of": math.comb(pad.layout.fibres, level),
-                    "mean": float(means.mean()),
-                    "std": float(means.std()),
-                    "max": float(means.max()),
-                    "mean_mm": float(means.mean() * pad.unit_mm),
-                    "max_mm": float(means.max() * pad.unit_mm),
-                    "mean_trained_on": float(training[sizes == level].mean()),
-                }
-            )
+            row = {
+                "pad": label,
+                "n_failed": level,
+                "subsets": len(means),
+                "of": math.comb(pad.layout.fibres, level),
+                "mean": float(means.mean()),
+                "std": float(means.std()),
+                "max": float(means.max()),
+                "mean_mm": float(means.mean() * pad.unit_mm),
+                "max_mm": float(means.max() * pad.unit_mm),
+                "mean_trained_on": float(training[sizes == level].mean()),
+            }
+            rows.append(row)
             worst = int(np.flatnonzero(sizes == level)[means.argmax()])
-            (left, low), (right, high) = between_fibres(pad.layout)
             cells = np.round(errors[worst].reshape(SIDE, SIDE), 3).tolist()
-            extent = [left, right, low, high]
-            maps.append({"pad": label, "failed": list(failures[worst]), "extent": extent, "errors": cells})
+            panel = {"failed": list(failures[worst]), "extent": [left, right, low, high], "errors": cells}
+            maps.append({"pad": label} | panel)
         by_subset += [
             {"pad": label, "failed": list(failed), "mean": float(mean)}
             for failed, mean in zip(failures, fresh, strict=True)
@@ -223,15 +209,13 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     axes.set_xticks(range(levels), [f"{level} failed" if level else "all fibres" for level in range(levels)])
     label_axes(axes, grid="y", ylabel="mean error (grid units)")
     axes.legend(frameon=False, fontsize=8)
-    title = "bar: mean over the sets; line: their standard deviation; dash: the worst set"
-    axes.set_title(title, loc="left", fontsize=8.5)
+    caption = "bar: mean over the sets; line: their standard deviation; dash: the worst set"
+    axes.set_title(caption, loc="left", fontsize=8.5)
     highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.99))
     for number, label in enumerate(labels):
         for column, panel in enumerate(panel for panel in document["maps"] if panel["pad"] == label):
             axes = figure.add_subplot(grid[1 + number, column], aspect="equal")
-            title = failed_label(panel["failed"])
-            image = draw_error_map(axes, panel["errors"], title, highest, panel["extent"])
+            image = draw_error_map(axes, panel["errors"], failed_label(panel["failed"]), highest, panel["extent"])
             if column == 0:
-                axes.set_ylabel(label, fontsize=8, color=INK)
-                figure.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
+                label_map_row(axes, image, label)
     return figure

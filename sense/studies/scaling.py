@@ -11,6 +11,7 @@ presses, whatever their tile, so neither its size nor its error need grow with t
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,15 @@ from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
 from padforge.sense.arrays import Array
-from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map, label_axes
+from padforge.sense.studies.study import (
+    Study,
+    StudyResult,
+    Task,
+    describe_pads,
+    draw_error_map,
+    label_axes,
+    label_map_row,
+)
 
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"
@@ -32,8 +41,7 @@ METHODS = (PUBLISHED, SPREAD, SHARED)
 HIDDEN = 70
 EPOCHS = 60
 TEST = 4096
-CELLS = 16
-"""Cells along a side of an error map."""
+CELLS = 16  # along a side of an error map
 
 
 def scaling_study(
@@ -56,10 +64,10 @@ def scaling_study(
         for grid in grids:
             if grid % pad.grid:
                 raise InputError(f"grids has {grid}, expected multiples of {pad.grid}, the grid of {label}")
-    cases = [(label, grid, method) for grid in grids[::-1] for label in pads for method in METHODS]
+    cases = list(product(grids[::-1], pads, METHODS))
     tasks = [
         Task(f"{label}, {grid} x {grid}, {method}", partial(_evaluate, pads[label], grid, method, side, seed))
-        for label, grid, method in cases
+        for grid, label, method in cases
     ]
     settings = {
         "pads": describe_pads(pads),
@@ -70,7 +78,7 @@ def scaling_study(
         "test": TEST,
         "seed": seed,
     }
-    return Study("scaling", "Larger surfaces", settings, tasks, partial(_conclude, dict(pads), cases, settings), _draw)
+    return Study("scaling", "Larger surfaces", settings, tasks, partial(_conclude, cases, settings), _draw)
 
 
 def spread_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
@@ -90,10 +98,9 @@ def family_shares(responses: Array) -> Array:
 
 
 def tile_inputs(responses: Array, tile: int) -> tuple[Array, Array]:
-    """Select the signals of the tile of each press and of its neighbours.
+    """Select the signals of the tile of each press and of its neighbours; beyond the edge they are 0.
 
-    In each family it is the tile with the largest sum of signals, and the middle one if all are 0. Beyond the edge
-    signals are 0.
+    In each family it is the tile with the largest sum of signals, and the middle one if all are 0.
 
     Args:
         responses: signals; shape (Q, 2M).
@@ -142,31 +149,26 @@ def _evaluate(tile: Morphology, grid: int, method: str, side: int, seed: int) ->
     return {"errors": errors, "positions": test, "seconds": np.array(seconds), "epochs": np.array(network.epochs)}
 
 
-def _conclude(
-    pads: Mapping[str, Morphology], cases: list[tuple[str, int, str]], settings: Mapping[str, Any], states: list[State]
-) -> StudyResult:
+def _conclude(cases: list[tuple[int, str, str]], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
     rows, maps = [], []
     by_case = dict(zip(cases, states, strict=True))
-    for label in pads:
-        for method in METHODS:
-            for grid in settings["grids"]:
-                state = by_case[label, grid, method]
-                errors = state["errors"]
-                rows.append(
-                    {
-                        "pad": label,
-                        "method": method,
-                        "grid": grid,
-                        "mean": float(errors.mean()),
-                        "median": float(np.median(errors)),
-                        "p95": float(np.quantile(errors, 0.95)),
-                        "percent_of_side": float(100 * errors.mean() / grid),
-                        "epochs": int(state["epochs"]),
-                        "seconds": round(float(state["seconds"]), 2),
-                    }
-                )
-                if method == SPREAD:
-                    maps.append({"pad": label, "grid": grid, "errors": _error_map(grid, state).tolist()})
+    for label, method, grid in product(settings["pads"], METHODS, settings["grids"]):
+        state = by_case[grid, label, method]
+        errors = state["errors"]
+        row = {
+            "pad": label,
+            "method": method,
+            "grid": grid,
+            "mean": float(errors.mean()),
+            "median": float(np.median(errors)),
+            "p95": float(np.quantile(errors, 0.95)),
+            "percent_of_side": float(100 * errors.mean() / grid),
+            "epochs": int(state["epochs"]),
+            "seconds": round(float(state["seconds"]), 2),
+        }
+        rows.append(row)
+        if method == SPREAD:
+            maps.append({"pad": label, "grid": grid, "errors": _error_map(grid, state).tolist()})
     return StudyResult(rows, _describe(settings, rows), {"maps": maps})
 
 
@@ -174,10 +176,9 @@ def _error_map(grid: int, state: State) -> Array:
     """Return mean errors by cell; shape (CELLS, CELLS)."""
     low = 1 if grid > 1 else 0.5
     cells = np.clip(((state["positions"] - low) / max(grid - 1, 1) * CELLS).astype(int), 0, CELLS - 1)
-    total, count = np.zeros((2, CELLS, CELLS))
-    np.add.at(total, (cells[:, 1], cells[:, 0]), state["errors"])
-    np.add.at(count, (cells[:, 1], cells[:, 0]), 1)
-    return np.round(total / np.maximum(count, 1), 4)
+    number = cells[:, 1] * CELLS + cells[:, 0]
+    total, count = (np.bincount(number, weights, CELLS**2) for weights in (state["errors"], None))
+    return np.round(total / np.maximum(count, 1), 4).reshape(CELLS, CELLS)
 
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
@@ -189,17 +190,16 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         "shared method learns from the same presses the position in the tile, by one network for all tiles. Errors are "
         "in grid units."
     ]
-    for label in settings["pads"]:
-        for method in METHODS:
-            cases = [row for row in rows if (row["pad"], row["method"]) == (label, method)]
-            below = ", ".join(str(row["grid"]) for row in cases if row["mean"] < 0.5)
-            half = f"below half a grid unit on grids {below}" if below else "above half throughout"
-            first, last = cases[0], cases[-1]
-            text.append(
-                f"{label}, {method}: {first['mean']:.3f} at {first['grid']} x {first['grid']} to {last['mean']:.3f} at "
-                f"{last['grid']} x {last['grid']}, {first['percent_of_side']:.2f} % to {last['percent_of_side']:.2f} % "
-                f"of the side; {half}. The largest took {last['seconds']:.0f} s."
-            )
+    for label, method in product(settings["pads"], METHODS):
+        cases = [row for row in rows if (row["pad"], row["method"]) == (label, method)]
+        below = ", ".join(str(row["grid"]) for row in cases if row["mean"] < 0.5)
+        half = f"below half a grid unit on grids {below}" if below else "above half throughout"
+        first, last = cases[0], cases[-1]
+        text.append(
+            f"{label}, {method}: {first['mean']:.3f} at {first['grid']} x {first['grid']} to {last['mean']:.3f} at "
+            f"{last['grid']} x {last['grid']}, {first['percent_of_side']:.2f} % to {last['percent_of_side']:.2f} % "
+            f"of the side; {half}. The largest took {last['seconds']:.0f} s."
+        )
     grid = max(settings["grids"])
     largest = [row for row in rows if row["grid"] == grid and row["method"] != PUBLISHED]
     best, *_, worst = sorted(largest, key=lambda row: row["mean"])
@@ -240,6 +240,5 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         axes = panels[row, column]
         image = draw_error_map(axes, panel["errors"], f"{panel['grid']} x {panel['grid']}", highest)
         if column == 0:
-            axes.set_ylabel(panel["pad"], fontsize=8, color=INK)
-            lower.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
+            label_map_row(axes, image, panel["pad"])
     return figure

@@ -41,12 +41,9 @@ def sensitivity_study(
     """
     objects = [Contact(radius=radius, sides=shape) for shape, radius in product(sides, radii)]
     tasks = [
-        Task(
-            f"{label}, trained with K {trained.radius:g}, D {trained.sides}",
-            partial(_evaluate, pad, trained, objects, seed),
-        )
+        Task(f"{label}, trained with K {each.radius:g}, D {each.sides}", partial(_evaluate, pad, each, objects, seed))
         for label, pad in pads.items()
-        for trained in objects
+        for each in objects
     ]
     settings = {
         "pads": describe_pads(pads),

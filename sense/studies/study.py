@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import io
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,12 +37,7 @@ GRID = 4
 
 @dataclass(frozen=True)
 class Task:
-    """Part of a study's work that is done in one go.
-
-    Attributes:
-        name: shown while it runs.
-        compute: computes its result, arrays by name; independent of all other tasks.
-    """
+    """Part of a study's work: `compute` returns arrays by name, and depends on no other task."""
 
     name: str
     compute: Callable[[], State]
@@ -51,38 +45,23 @@ class Task:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Result of a study.
+    """Result of a study."""
 
-    Attributes:
-        rows: of its table, all with the same keys; JSON values.
-        text: paragraphs without markup.
-        extra: further JSON that the figure needs, by name.
-    """
-
-    rows: list[dict[str, Any]]
-    text: list[str]
-    extra: dict[str, Any] = field(default_factory=dict)
+    rows: list[dict[str, Any]]  # of its table, all with the same keys; JSON values
+    text: list[str]  # paragraphs without markup
+    extra: dict[str, Any] = field(default_factory=dict)  # further JSON that the figure needs
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study, ready to be run.
+    """A study, ready to be run."""
 
-    Attributes:
-        name: stem of its files.
-        title: of its text.
-        settings: all that its results depend on, as JSON; only a run with the same settings is resumed.
-        tasks: its work.
-        conclude: makes the result from those of the tasks, in their order.
-        draw: draws the figure from the finished document.
-    """
-
-    name: str
+    name: str  # stem of its files
     title: str
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # all that its results depend on, as JSON; only a run with the same settings is resumed
     tasks: Sequence[Task]
-    conclude: Callable[[list[State]], StudyResult]
-    draw: Callable[[Mapping[str, Any]], "Figure"]
+    conclude: Callable[[list[State]], StudyResult]  # from the results of the tasks, in their order
+    draw: Callable[[Mapping[str, Any]], "Figure"]  # from the document
 
 
 def run(
@@ -137,8 +116,13 @@ def run(
         }
         with files.atomic_files(out) as folder:
             save_figure(study.draw(document), folder / f"{study.name}.png")
-            files.write_text(folder / f"{study.name}.csv", _csv(result.rows))
             files.write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
+            with (folder / f"{study.name}.csv").open(
+                "w", encoding="utf-8", errors="backslashreplace", newline=""
+            ) as file:
+                writer = csv.DictWriter(file, list(result.rows[0]), lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(result.rows)
             files.write_json(folder / f"{study.name}.json", document)
         checkpoints.clear()
     return document
@@ -177,19 +161,11 @@ def study_lines(document: Mapping[str, Any]) -> list[str]:
 
 def _table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Format rows as text, the first one their keys."""
-    return [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
 
+    def cell(value: object) -> str:
+        return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
-def _cell(value: object) -> str:
-    return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return [list(rows[0]), *(list(map(cell, row.values())) for row in rows)]
 
 
 def _markdown(document: Mapping[str, Any], figure: str) -> str:
@@ -203,14 +179,11 @@ def _markdown(document: Mapping[str, Any], figure: str) -> str:
 
 
 def load_pads(names: Sequence[str], seed: int) -> dict[str, Morphology]:
-    """Load or make pads, by the labels of tables and figures.
+    """Load or make pads, by the labels of tables and figures; raises InputError for unknown names and a label twice.
 
     Args:
         names: files, `square`, `random-N`, `optimised`, `optimised-N` or `genetic-N` (`square@8`: with a grid of 8).
         seed: of random pads and searches.
-
-    Raises:
-        InputError: no such file or name, a file that is no morphology, or a label twice.
     """
     return _label([(name, *_load_pad(name, seed)) for name in names])
 
@@ -219,13 +192,12 @@ def load_recordings(names: Sequence[str]) -> dict[str, Recording]:
     """Load recordings as `open_recording`, by label; raises InputError as it does, and for a label twice."""
     from padforge.sense.formats.import_export import open_recording
 
-    def label(path: Path) -> str:
-        return path.resolve().parent.name if path.name == "recording" else path.stem
+    paths = [Path(name) for name in names]
+    labels = [path.resolve().parent.name if path.name == "recording" else path.stem for path in paths]
+    return _label([(name, label, open_recording(name)) for name, label in zip(names, labels, strict=True)])
 
-    return _label([(name, label(Path(name)), open_recording(name)) for name in names])
 
-
-def _label(parts: list[tuple[str, str, Any]]) -> dict[str, Any]:
+def _label(parts: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     """Return objects by label, from the user's names, labels and objects."""
     labelled: dict[str, Any] = {}
     for name, label, part in parts:
@@ -250,23 +222,20 @@ def _load_pad(name: str, seed: int) -> tuple[str, Morphology]:
             f"{name}: no such file, and none of square, optimised, random-N, optimised-N, genetic-N (N from 1 to 99 "
             "knots; 64 where they are searched for)"
         )
-    grid, method, knots = int(named[5] or GRID), named[2] or named[3], int(named[4]) if named[4] else None
-    if method is None:
+    grid, kind = int(named[5] or GRID), named[2] or named[3]
+    if kind is None:
         return name, Morphology.straight(grid)
-    if method == "random":
-        return name, Morphology.random(grid, knots or 0, seed)
-    return name, _search(grid, "genetic" if method == "genetic" else "descent", knots, seed)
-
-
-def _search(grid: int, method: Literal["descent", "genetic"], knots: int | None, seed: int) -> Morphology:
-    """Search for a pad under the published contact: by descent from a single start, or genetic as published."""
+    if kind == "random":
+        return name, Morphology.random(grid, int(named[4]), seed)
     from padforge.design.optimize.search import search
     from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, SearchSettings
 
+    # under the published contact: by descent from a single start, or genetic as published
     pad = PUBLISHED_PAD.model_copy(update={"grid": grid})
-    overrides = {"starts": 1, "seed": seed, "method": method} | ({} if knots is None else {"knots": knots})
+    method = "genetic" if kind == "genetic" else "descent"
+    overrides = {"starts": 1, "seed": seed, "method": method} | ({"knots": int(named[4])} if named[4] else {})
     settings = validate(SearchSettings, PUBLISHED_SEARCH.model_dump() | overrides, f"{method} search")
-    return search(pad, PUBLISHED_CONTACT, settings).morphology
+    return name, search(pad, PUBLISHED_CONTACT, settings).morphology
 
 
 def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
@@ -282,17 +251,7 @@ def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
 
 
 def quantize(signals: Array, full_scale: Array, noise_counts: float, rng: np.random.Generator) -> Array:
-    """Read signals with a noisy 12-bit converter.
-
-    Args:
-        signals: shape (Q, C).
-        full_scale: largest signal of each fibre; shape (C,). A fibre with 0 reads its noise.
-        noise_counts: standard deviation of the noise, counts.
-        rng: draws the noise.
-
-    Returns:
-        Whole counts from 0 to ADC_COUNTS; shape (Q, C).
-    """
+    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a fibre of full scale 0 reads its noise."""
     share = np.divide(signals, full_scale, out=np.zeros(signals.shape), where=full_scale > 0)
     return np.clip(np.rint(ADC_COUNTS * share + rng.normal(0, noise_counts, signals.shape)), 0, ADC_COUNTS)
 
@@ -309,9 +268,17 @@ def fit_ensemble(
 
 def confusion_matrix(true: Indices, predicted: Indices, classes: int) -> State:
     """Count how often each class, by row, was predicted as each, by column."""
-    confusions = np.zeros((classes, classes), dtype=np.int64)
-    np.add.at(confusions, (true, predicted), 1)
-    return {"confusions": confusions}
+    counts = np.bincount(true * classes + predicted, minlength=classes**2)
+    return {"confusions": counts.reshape(classes, classes)}
+
+
+def classification_scores(confusions: Array) -> dict[str, float]:
+    """Return the share of correct classifications, and that of always guessing the most frequent class, per cent."""
+    total = confusions.sum()
+    return {
+        "accuracy_percent": float(100 * np.trace(confusions) / total),
+        "majority_percent": float(100 * confusions.sum(axis=1).max() / total),
+    }
 
 
 def failed_label(failed: Sequence[int]) -> str:
@@ -336,3 +303,9 @@ def draw_error_map(
     axes.set(xticks=[], yticks=[])
     axes.set_title(title, fontsize=8, color=INK)
     return axes.imshow(errors, origin="lower", extent=extent, cmap="magma_r", vmin=0, vmax=highest)
+
+
+def label_map_row(axes: Any, image: Any, label: str) -> None:
+    """Label the first of a row of error maps, with the colour scale of all to its left."""
+    axes.set_ylabel(label, fontsize=8, color=INK)
+    axes.figure.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)

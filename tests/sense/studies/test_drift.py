@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,7 @@ from padforge.sense import Recording, open_recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
-from padforge.sense.studies.drift import (
-    COMPENSATIONS,
-    FILTERS,
-    SLOW_PRESSES,
-    drift_study,
-    network_inputs,
-    press_levels,
-)
+from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, network_inputs, press_levels
 from padforge.sense.studies.study import Study, run
 
 PAD = Morphology.random(2, knots=3, seed=5)
@@ -72,9 +66,7 @@ def test_press_levels_are_the_readings_10_30_and_50_of_a_cycle() -> None:
     assert levels.shape == (CYCLES, 2, 3)
     np.testing.assert_array_equal(levels[1], [[50, 70, 90], [-50, -70, -90]])
     np.testing.assert_array_equal(levels[-1, 0], [170, 190, 199])  # there are no readings after the last press
-
-
-def test_press_levels_of_short_cycles_stay_within_their_phase() -> None:
+    # those of short cycles stay within their phase
     levels = press_levels(np.arange(20.0)[:, None], np.array([3, 9, 15]), np.array([6, 12, 18]))
     np.testing.assert_array_equal(levels[:, 0], [[0, 5, 8], [6, 11, 14], [12, 17, 19]])
 
@@ -87,7 +79,6 @@ def test_network_inputs_subtract_the_baseline_of_their_compensation() -> None:
     np.testing.assert_array_equal(inputs["none"], pressed)
     np.testing.assert_array_equal(inputs["baseline"], pressed - before)
     np.testing.assert_array_equal(inputs["published"], np.hstack([before, pressed, after]))
-    assert SLOW_PRESSES >= CYCLES
     slow = [np.median(before[: press + 1], axis=0) for press in range(CYCLES)]
     np.testing.assert_allclose(inputs["slow baseline"], pressed - slow)
     assert inputs["windows"].shape == inputs["published"].shape
@@ -98,13 +89,8 @@ def test_network_inputs_subtract_the_baseline_of_their_compensation() -> None:
 @pytest.mark.slow
 def test_study_finds_that_compensation_reduces_errors(document: dict[str, Any]) -> None:
     """Errors are means over filters: two networks on presses that scatter may be off by a fifth with one."""
-    kinds = {"winding": "simulated", "square": "simulated", "real": "recorded"}
-    cases = [(row["recording"], row["kind"], row["filter"], row["compensation"]) for row in document["rows"]]
-    assert cases == [(label, kind, name, c) for label, kind in kinds.items() for name in FILTERS for c in COMPENSATIONS]
-    for row in document["rows"]:
-        assert 0 < row["median_mm"] < row["p95_mm"]
-        assert row["std_mm"] >= 0
-        assert (row["seconds_per_10000"] is None) == (row["filter"] == "none")
+    cases = [(row["recording"], row["filter"], row["compensation"]) for row in document["rows"]]
+    assert cases == list(product(("winding", "square", "real"), FILTERS, COMPENSATIONS))
     for key in ("mean_mm", "mean_last_mm"):
         plain, baseline, slow = (
             np.mean(errors(document, "winding", compensation, key))
@@ -112,15 +98,6 @@ def test_study_finds_that_compensation_reduces_errors(document: dict[str, Any]) 
         )
         assert baseline < 0.7 * plain
         assert slow < plain
-
-
-@pytest.mark.slow
-def test_study_shows_an_excerpt_of_every_recording(document: dict[str, Any]) -> None:
-    assert [excerpt["recording"] for excerpt in document["excerpts"]] == ["winding", "square", "real"]
-    for excerpt in document["excerpts"]:
-        times_s, _, filtered = np.array(excerpt["readings"])
-        for time_s, volts in np.array(excerpt["samples"]).reshape(-1, 2):
-            assert filtered[np.flatnonzero(times_s == time_s)] == pytest.approx([volts])
 
 
 @pytest.mark.slow
@@ -137,26 +114,11 @@ def test_study_computes_idle_shares(document: dict[str, Any]) -> None:
     assert shares["square", "simulated readings, filtered"] > shares["square", "simulated readings"]
 
 
-@pytest.mark.slow
-def test_study_without_drift_gains_nothing_from_compensation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drift, "FILTERS", {name: FILTERS[name] for name in (drift.RAW, drift.AS_PUBLISHED)})
-    steady = STRONG.model_copy(update={"drift_mv": 0.0})
-    document = run(drift_study({"winding": PAD}, {}, rig=steady, presses=240, hidden=10, epochs=30), tmp_path)
-    assert errors(document, "winding", "none")[1] < 1.3 * errors(document, "winding", "baseline")[1]
-
-
-def test_drift_study_rejects_missing_duplicate_and_short_recordings(recorded: Recording) -> None:
-    with pytest.raises(InputError, match="neither a morphology nor a recording"):
-        drift_study({}, {})
+def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording) -> None:
     with pytest.raises(InputError, match="a: label of a morphology and of a recording"):
         drift_study({"a": PAD}, {"a": recorded})
     with pytest.raises(InputError, match="few: recording has 3 presses of known"):
         drift_study({}, {"few": first_presses(recorded, 3)})
-
-
-def test_drift_study_settings_differ_between_recordings(recorded: Recording) -> None:
-    other = replace(recorded, readings=recorded.readings + 0.1)
-    assert small_study(recorded).settings["recordings"] != small_study(other).settings["recordings"]
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """The studies of force and of shape, in small: estimates are better than guesses."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -14,14 +16,9 @@ MIDDLE_ERROR_MM = UNIT_MM * 0.38
 """Mean distance of presses from the middle of the pad."""
 
 
-@pytest.fixture(scope="module")
-def force(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    study = force_study(PADS, noise_counts=(1.0, 30.0), presses=300, test=120, hidden=12, epochs=25)
-    return run(study, tmp_path_factory.mktemp("force"))
-
-
 @pytest.mark.slow
-def test_force_study_estimates_depth_and_force_better_than_guessing(force: dict) -> None:
+def test_force_study_estimates_depth_and_force_better_than_guessing(tmp_path: Path) -> None:
+    force = run(force_study(PADS, noise_counts=(1.0, 30.0), presses=300, test=120, hidden=12, epochs=25), tmp_path)
     expected = [(label, noise) for label in PADS for noise in (1.0, 30.0)]
     assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == expected
     for row in force["rows"]:
@@ -32,16 +29,11 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(force: dict)
     for quiet, noisy in zip(force["rows"][::2], force["rows"][1::2], strict=True):
         assert quiet["depth_mm"] < noisy["depth_mm"]
         assert quiet["position_one_depth_mm"] < noisy["position_one_depth_mm"]
-
-
-@pytest.mark.slow
-def test_force_study_gives_the_presses_behind_its_rows(force: dict) -> None:
     curve, row, indenter = force["curves"][0], force["rows"][0], Indenter()
     pressed_n, predicted_n = (
         indenter.force_n(np.array(curve[key]) / UNIT_MM, UNIT_MM) for key in ("pressed_mm", "predicted_mm")
     )
     assert np.abs(predicted_n - pressed_n).mean() == pytest.approx(row["force_n"], rel=1e-3)
-    assert len(curve["bin_position_mm"]) == len(curve["bin_depth_mm"])
 
 
 def test_force_study_rejects_depths_beyond_the_indenter() -> None:
@@ -57,8 +49,8 @@ def test_circumradius_gives_polygons_of_one_area(sides: int | None) -> None:
 
 
 @pytest.mark.slow
-def test_shape_study_classifies_better_than_chance(tmp_path_factory: pytest.TempPathFactory) -> None:
-    shapes = run(shape_study(PADS, presses=500, test=200, hidden=12, epochs=25), tmp_path_factory.mktemp("shape"))
+def test_shape_study_classifies_better_than_chance(tmp_path: Path) -> None:
+    shapes = run(shape_study(PADS, presses=500, test=200, hidden=12, epochs=25), tmp_path)
     assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, kind) for label in PADS for kind in SETS]
     for row, matrix in zip(shapes["rows"], shapes["confusions"], strict=True):
         counts = np.array(matrix["counts"])
@@ -66,6 +58,5 @@ def test_shape_study_classifies_better_than_chance(tmp_path_factory: pytest.Temp
         assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 200)
         assert row["accuracy_percent"] > row["majority_percent"] + 5
         assert row["worst_percent"] == pytest.approx((100 * np.diag(counts) / counts.sum(axis=1)).min())
-        assert row["worst"] in SETS[row["shapes"]]
         assert 0 < row["position_mm"] < MIDDLE_ERROR_MM
         assert 0 < row["position_shape_known_mm"] < MIDDLE_ERROR_MM

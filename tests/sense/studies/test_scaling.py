@@ -12,14 +12,11 @@ from padforge.sense.studies.study import run
 
 
 @pytest.mark.slow
-def test_study_finds_that_a_network_for_all_tiles_keeps_its_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_for_all_tiles_keeps_its_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("TEST", 600), ("HIDDEN", 30), ("EPOCHS", 30)):
         monkeypatch.setattr(scaling, name, value)
     document = run(scaling_study({"square": Morphology.straight(2)}, grids=(4, 16), side=32), tmp_path)
     rows = {(row["method"], row["grid"]): row for row in document["rows"]}
-    assert list(rows) == [(method, grid) for method in scaling.METHODS for grid in (4, 16)]
     assert rows["shared", 16]["mean"] < 1.3 * rows["shared", 4]["mean"] < 0.4
     assert rows["shared", 16]["percent_of_side"] == pytest.approx(100 * rows["shared", 16]["mean"] / 16)
 
