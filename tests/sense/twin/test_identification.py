@@ -67,7 +67,7 @@ def test_twin_responds_as_the_fitted_pad(result: Identification) -> None:
     twin, positions_mm = result.twin, result.held_out.positions_mm
     stretch = twin.as_built_stretch(positions_mm)
     volts = np.column_stack([twin.channels[c].gain_v * stretch[:, twin.channels[c].fibre] for c in result.live])
-    fitted = result.fit.pad.predict(positions_mm) - result.fit.pad.rest_v
+    fitted = result.fit.pad.predict(positions_mm) - result.fit.pad.channel_values[:, 1]
     assert volts == pytest.approx(fitted, abs=0.05 * np.abs(fitted).max())
 
 
