@@ -1,8 +1,8 @@
 """`padforge sense live`: presses are localized while they happen, and shown and sent at once."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ import click
 
 from padforge.design.common.command_line import json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
-from padforge.sense.cli.options import redrawn_lines
+from padforge.sense.cli.options import FOLDER, redrawn_lines
 from padforge.sense.cli.rig import rig_option
 
 if TYPE_CHECKING:
@@ -22,24 +22,8 @@ if TYPE_CHECKING:
     from padforge.sense.rig.devices import Board
     from padforge.sense.rig.streams import ReadingStream
 
-    Show = Callable[[dict[str, Any], Sequence[Event]], None]  # takes `Live.view()` and the latest events
-
 PORT = 8321
 BAR = 12  # characters of a fibre's bar on a terminal, to either side
-
-
-def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of outputs to other programs, and of who may listen."""
-    options = (
-        click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any."),
-        click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address."),
-        click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name."),
-        click.option("--host", default=HOST, show_default=True, help="Of page and --tcp; for others with a --token."),
-        click.option("--token", default="", envvar="PADFORGE_TOKEN", help="What must be known to listen."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
 
 
 @click.command()
@@ -49,14 +33,18 @@ def _output_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option(
     "--model",
     "models",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     multiple=True,
     default=("out/pad",),
     show_default=True,
     help="Folder that calibrate wrote; may be given again for one that answers earlier, or better.",
 )
 @click.option("--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Of the page; 0: any.")
-@_output_options
+@click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any.")
+@click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address.")
+@click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name.")
+@click.option("--host", default=HOST, show_default=True, help="Of page and --tcp; for others with a --token.")
+@click.option("--token", default="", envvar="PADFORGE_TOKEN", help="What must be known to listen.")
 @spec_option
 @json_option
 def live(
@@ -89,22 +77,27 @@ def live(
     A faulty fibre is masked from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
+    from padforge.sense.formats.import_export import open_recording
     from padforge.sense.live.outputs import LivePage, MessageBuilder, broadcast
     from padforge.sense.live.pipeline import Live
     from padforge.sense.localizer.model import LocalizerModel
+    from padforge.sense.rig.streams import stream_recording
 
     localizers = [LocalizerModel.load(model) for model in models]
     with ExitStack() as stack:
         if replay is None:
             stream, mirrored = _stream_rig(stack, rig, models[0], localizers[0], spec)
         else:
-            stream, mirrored = _stream_replay(replay, speed)
+            recording = open_recording(replay)
+            stream, mirrored = stream_recording(recording, speed), recording.mirrored
         pipeline = Live(localizers, _load_health(models[0]), stream.fibres, stream.rate_hz)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
         outputs, builder = _open_outputs(stack, stream, **output), MessageBuilder(pipeline, mirrored)
-        show = _show_json if as_json else stack.enter_context(_terminal())
-        pad = _pad_view(f"{replay or f'{rig} rig'}, {models[0]}", localizers[0], mirrored)
+        draw = None if as_json else stack.enter_context(redrawn_lines())
+        scaler, title = localizers[0].scaler, f"{replay or f'{rig} rig'}, {models[0]}"
+        half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
+        pad = {"title": title, "origin_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
 
         @stack.push
         def show_end(kind: object, error: BaseException | None, trace: object) -> None:
@@ -115,7 +108,10 @@ def live(
             if len(times_s):
                 view = pad | pipeline.view() | {"ended": ""}
                 page.show(view)
-                show(view, events)
+                if draw is None:
+                    _echo_events(events, as_json)
+                else:
+                    draw(view_lines(view))
                 if outputs:
                     broadcast(outputs, builder.build(times_s, readings, events))
 
@@ -129,30 +125,16 @@ def _stream_rig(
 
     options = load_spec(spec).section(RigSettings)
     mirrored = is_pad_mirrored(model, options)
-    board = _make_board(rig, model, localizer, options)
-    stack.callback(board.close)
-    return stream_board(board, localizer.rate_hz), mirrored
+    board: Board  # alone, not yet connected: a person presses the pad, not the arm
+    if rig == "simulated":
+        from padforge.sense.virtual.virtual_pad import virtual_pad_of
 
+        board = virtual_pad_of(model)
+    else:
+        from padforge.sense.rig.devices import load_device
 
-def _stream_replay(replay: Path, speed: float) -> "tuple[ReadingStream, bool]":
-    """Return the readings of a recording, and whether the pad lay with its tracks up."""
-    from padforge.sense.formats.import_export import open_recording
-    from padforge.sense.rig.streams import stream_recording
-
-    recording = open_recording(replay)
-    return stream_recording(recording, speed), recording.mirrored
-
-
-def _pad_view(title: str, localizer: "LocalizerModel", mirrored: bool) -> dict[str, Any]:
-    """Return the part of the view that stays the same."""
-    scaler = localizer.scaler
-    half_mm = scaler.half_size_mm
-    return {
-        "title": title,
-        "origin_mm": scaler.origin_mm.tolist(),
-        "half_mm": [scaler.scale_mm] * 2 if not half_mm.any() else half_mm.tolist(),
-        "mirrored": mirrored,
-    }
+        board = load_device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
+    return stream_board(stack.enter_context(closing(board)), localizer.rate_hz), mirrored
 
 
 def _open_outputs(
@@ -173,17 +155,6 @@ def _open_outputs(
     return outputs
 
 
-def _make_board(rig: str, model: Path, localizer: "LocalizerModel", options: Any) -> "Board":
-    """Return the board alone, not yet connected: a person presses the pad, not the arm."""
-    if rig == "simulated":
-        from padforge.sense.virtual.virtual_pad import virtual_pad_of
-
-        return virtual_pad_of(model)
-    from padforge.sense.rig.devices import load_device
-
-    return load_device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
-
-
 def _load_health(model: Path) -> "HealthModel | None":
     """Load the health model in the folder of a model, if there is one."""
     from padforge.sense.health.fault_detector import FaultDetector, has_health
@@ -194,24 +165,13 @@ def _load_health(model: Path) -> "HealthModel | None":
     return FaultDetector.load(model).live_model_
 
 
-def _show_json(view: dict[str, Any], events: "Sequence[Event]") -> None:
+def _echo_events(events: "Sequence[Event]", as_json: bool) -> None:
     from padforge.sense.live.pipeline import Estimate
 
     for event in events:
         values = event.to_dict() if isinstance(event, Estimate) else asdict(event)
-        click.echo(json.dumps({"event": type(event).__name__.lower()} | values))
-
-
-def _show_lines(view: dict[str, Any], events: "Sequence[Event]") -> None:
-    for event in events:
-        click.echo(event.text)  # which flushes, so that each line appears at once
-
-
-@contextmanager
-def _terminal() -> "Iterator[Show]":
-    """Yield what draws the view again and again, or prints a line an event where stdout is no terminal."""
-    with redrawn_lines() as draw:
-        yield _show_lines if draw is None else lambda view, events: draw(view_lines(view))
+        # `click.echo` flushes, so that each line appears at once
+        click.echo(json.dumps({"event": type(event).__name__.lower()} | values) if as_json else event.text)
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:

@@ -1,6 +1,7 @@
 """Commands of `padforge sense` that fit models to recordings, evaluate and apply them."""
 
 import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from padforge.sense.cli.options import (
     FILE,
     FOLDER,
     METHODS,
-    FibreNumbers,
+    SPLITS,
     fibre_indices,
+    fibres_option,
     max_failures_option,
     model_option,
     progress_bar,
@@ -28,9 +30,7 @@ from padforge.sense.cli.options import (
 @recording_argument
 @click.option("--method", type=click.Choice(METHODS), help="ensemble: one localizer for all failures; or as published.")
 @click.option("--features", type=click.Choice(FEATURES), help="Windows of press and release, to its end, of its onset.")
-@click.option(
-    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="Presses held out for the test."
-)
+@click.option("--test-split", "split", type=click.Choice(SPLITS), help="Presses held out for the test.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
@@ -38,15 +38,7 @@ from padforge.sense.cli.options import (
 @common.force_option
 @common.json_option
 @common.profile_option
-def calibrate(
-    recording: Path,
-    time_budget: float | None,
-    spec: Path | None,
-    out: Path | None,
-    force: bool,
-    as_json: bool,
-    **overrides: Any,
-) -> None:
+def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: bool, **options: Any) -> None:
     """Train a localizer on RECORDING, and test it on held-out presses.
 
     \b
@@ -61,20 +53,12 @@ def calibrate(
     from padforge.sense.report.calibration import calibrate_into
     from padforge.sense.settings import LocalizerSettings
 
-    folder = out or common.pad_folder(recording)
+    folder, warn = out or common.pad_folder(recording), partial(click.echo, err=True)
+    run = {name: options.pop(name) for name in ("time_budget", "force")}
     with locked_folder(folder):
-        options = common.load_spec(spec).section(LocalizerSettings, **overrides)
-        presses = read_recording(recording)
+        settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
         with progress_bar("training") as show:
-            document = calibrate_into(
-                presses,
-                folder,
-                options,
-                time_budget=time_budget,
-                on_progress=show,
-                on_message=partial(click.echo, err=True),
-                force=force,
-            )
+            document = calibrate_into(presses, folder, settings, on_progress=show, on_message=warn, **run)
     common.show_result(document, calibration_lines(document), as_json)
 
 
@@ -92,22 +76,19 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 
     On the recording that the model was trained on, only the held-out presses count.
     """
-    from padforge.sense.localizer.evaluation import calibration_lines
-    from padforge.sense.localizer.evaluation import evaluate as test
+    from padforge.sense.localizer import evaluation
     from padforge.sense.localizer.model import LocalizerModel
 
     localizer = LocalizerModel.load(model)
     levels = range(min(max_failures, localizer.fibres - 1) + 1)
-    document = test(localizer, read_recording(recording), levels)
-    common.show_result(document, calibration_lines(document), as_json)
+    document = evaluation.evaluate(localizer, read_recording(recording), levels)
+    common.show_result(document, evaluation.calibration_lines(document), as_json)
 
 
 @click.command()
 @model_option
 @recording_argument
-@click.option(
-    "--exclude-fibres", type=FibreNumbers(), default=(), help="Fibres to leave out, by number, the first is 1."
-)
+@fibres_option("--exclude-fibres", "Fibres to leave out, by number, the first is 1.")
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option
 def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
@@ -126,8 +107,7 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
 
     file = out or common.pad_folder(recording) / "places.csv"
     localizer = LocalizerModel.load(model)
-    failed = fibre_indices(exclude_fibres, localizer.fibres)
-    opened = read_recording(recording)
+    failed, opened = fibre_indices(exclude_fibres, localizer.fibres), read_recording(recording)
     findings = FaultDetector.load(model).predict(opened) if has_health(model) else []
     for finding in findings:
         click.echo(f"{finding.text}; left out from there on", err=True)
@@ -154,8 +134,7 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
 
     from padforge.sense.health.fault_detector import FaultDetector, fault_lines
 
-    opened = read_recording(recording)
-    detector = FaultDetector.load(model)
+    opened, detector = read_recording(recording), FaultDetector.load(model)
     findings = detector.predict(opened)
     document = {
         "format": "padforge-findings/3",
@@ -167,25 +146,22 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     context.exit(int(bool(findings)))
 
 
-class Bytes(click.ParamType):
-    """A number of bytes, as `65536`, `64k` or `1M`."""
+def _parse_bytes(context: click.Context, param: click.Parameter, value: str) -> int:
+    match = re.fullmatch(r"(\d{1,9})([kM]?)", value)
+    if match is None:
+        raise click.BadParameter(f"got {value!r}, expected bytes, as 65536, 64k or 1M")
+    return int(match[1]) * {"": 1, "k": 2**10, "M": 2**20}[match[2]]
 
-    name = "BYTES"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        if isinstance(value, int):
-            return value
-        match = re.fullmatch(r"(\d{1,9})([kM]?)", value)
-        if match is None:
-            self.fail(f"got {value!r}, expected bytes, as 65536, 64k or 1M", param, ctx)
-        return int(match[1]) * {"": 1, "k": 2**10, "M": 2**20}[match[2]]
+def _bytes_option(name: str, default: str, text: str) -> Callable[..., Any]:
+    return click.option(name, metavar="BYTES", callback=_parse_bytes, default=default, show_default=True, help=text)
 
 
 @click.command()
 @model_option
 @click.argument("files", nargs=-1, required=True, metavar="[RECORDING] OUT", type=click.Path(path_type=Path))
-@click.option("--flash", type=Bytes(), default="256k", show_default=True, help="For code and tables of a .h.")
-@click.option("--ram", type=Bytes(), default="64k", show_default=True, help="For the state of a .h.")
+@_bytes_option("--flash", "256k", "For code and tables of a .h.")
+@_bytes_option("--ram", "64k", "For the state of a .h.")
 @click.option("--quantize", type=click.Choice(["int8"]), help="Weights of a .h as int8, not float32.")
 @common.spec_option
 @common.profile_option
@@ -282,21 +258,13 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 @click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for all failures.")
 @click.option("--retrain", is_flag=True, help="As published: another network for every set of failed fibres.")
 @max_failures_option
-@click.option("--failed", type=FibreNumbers(), default=(), help="Map errors without these fibres too, from 1: as 2,5.")
+@fibres_option("--failed", "Map errors without these fibres too, from 1: as 2,5.")
 @common.seed_option
 @common.spec_option
 @common.out_option()
 @common.json_option
 def fibre_loss(
-    recording: Path,
-    model: Path | None,
-    retrain: bool,
-    max_failures: int,
-    failed: tuple[int, ...],
-    seed: int | None,
-    spec: Path | None,
-    out: Path | None,
-    as_json: bool,
+    recording: Path, model: Path | None, failed: tuple[int, ...], out: Path | None, as_json: bool, **options: Any
 ) -> None:
     """Errors on RECORDING for every set of failed fibres, by one network, by networks retrained for each, or by both.
 
@@ -314,24 +282,18 @@ def fibre_loss(
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies.fibre_loss import draw_fibre_loss, fibre_loss_lines, fibre_loss_study
 
+    retrain = options["retrain"]
     if not (model or retrain):
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
     target = out or common.pad_folder(recording)
     unfinished = target / "unfinished"
     check_writable(target)
     localizer = LocalizerModel.load(model) if model else None
-    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
+    settings = common.load_spec(options.pop("spec")).section(LocalizerSettings, seed=options.pop("seed"))
+    opened = open_recording(recording)
+    options |= {"failed": fibre_indices(failed, opened.fibres), "checkpoints": unfinished}
     with progress_bar("networks") as show:
-        document = fibre_loss_study(
-            opened,
-            localizer,
-            retrain=retrain,
-            options=options,
-            max_failures=max_failures,
-            failed=fibre_indices(failed, opened.fibres),
-            checkpoints=unfinished,
-            on_progress=show,
-        )
+        document = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
     with atomic_files(target) as folder:
         write_json(folder / "fibre_loss.json", document)
         draw_fibre_loss(document, folder / "fibre_loss.png")
@@ -358,7 +320,6 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies import learning_curve as study
-    from padforge.sense.studies.learning_curve import draw_learning_curve
 
     target = out or common.pad_folder(recording)
     check_writable(target)
@@ -367,7 +328,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
         document = study.learning_curve(opened, options, on_progress=show)
     with atomic_files(target) as folder:
         write_json(folder / "learning_curve.json", document)
-        draw_learning_curve(document, folder / "learning_curve.png")
+        study.draw_learning_curve(document, folder / "learning_curve.png")
     common.show_result(document, study.learning_curve_lines(document), as_json)
 
 
@@ -392,16 +353,14 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     from padforge.design.morphology import Morphology
     from padforge.sense.report.identification import identification_lines, identify_into
 
-    folder = out or common.pad_folder(recording)
-    pad = Morphology.load(morphology)
+    folder, pad = out or common.pad_folder(recording), Morphology.load(morphology)
+    inputs = [path for path in (recording, morphology) if not path.is_dir()]
     with locked_folder(folder), common.progress() as bar:
         task = bar.add_task("identify", total=None, note="")
 
         def show(what: str, done: int, total: int) -> None:
             bar.update(task, completed=done, total=total, note=what)
 
-        inputs = [path for path in (recording, morphology) if not path.is_dir()]
-        document = identify_into(
-            read_recording(recording), pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force
-        )
+        opened = read_recording(recording)
+        document = identify_into(opened, pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force)
     common.show_result(document, identification_lines(document, folder), as_json)

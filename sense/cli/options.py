@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from padforge.sense.recording.recording import Recording
 
 
-METHODS, FEATURES = ("ensemble", "published"), ("press_and_release", "causal", "onset", "published")
+METHODS, SPLITS = ("ensemble", "published"), ("random", "chronological")
+FEATURES = ("press_and_release", "causal", "onset", "published")
 REFRESH_HZ = 15
 """How often lines on a terminal are redrawn."""
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -29,18 +30,17 @@ max_failures_option = click.option(
 )
 
 
-class FibreNumbers(click.ParamType):
-    """Comma-separated numbers of fibres, as `1,4`; they count from 1."""
+def fibres_option(name: str, text: str) -> Callable[..., Any]:
+    """Make an option that takes numbers of fibres, from 1, with commas between them."""
 
-    name = "N,N,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        if isinstance(value, tuple):
-            return value
+    def parse(context: click.Context, param: click.Parameter, value: str) -> tuple[int, ...]:
         try:
             return tuple(int(part) for part in value.split(",") if part.strip())
         except ValueError:
-            self.fail(f"got {value!r}, expected whole numbers with commas between them", param, ctx)
+            message = f"got {value!r}, expected whole numbers with commas between them"
+            raise click.BadParameter(message) from None
+
+    return click.option(name, metavar="N,N,...", default="", callback=parse, help=text)
 
 
 def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:

@@ -18,9 +18,7 @@ _PATH = click.Path(path_type=Path)
 
 @click.command("import")
 @click.argument("file", type=_PATH)
-@click.option(
-    "--columns", "columns", default="", metavar="QUANTITY=NAME,...", help="What columns, datasets or topics hold."
-)
+@click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="What columns, datasets or topics hold.")
 @out_option(what="Folder of the recording; must be new or empty")
 def import_(file: Path, columns: str, out: Path | None) -> None:
     """Make a recording of FILE, a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a bag of ROS 2: an .mcap, a .db3
@@ -120,9 +118,9 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
     from padforge.sense.localizer.model import LocalizerModel
 
     detector = FaultDetector.load(model) if has_health(model) else None
-    faults = [] if detector is None else detector.predict(recording)
-    localizer = LocalizerModel.load(model)
-    fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
+    findings, localizer = detector.predict(recording) if detector else [], LocalizerModel.load(model)
+    faults = [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in findings]
+    fibre_mask = mask_faults(findings, len(recording.down_command), localizer.fibres)
     prediction = localizer.predict(recording, fibre_mask=fibre_mask)
     depth = prediction.measures.get("depth_mm")
     unknown = np.full(len(prediction.r90_mm), np.nan)
@@ -132,8 +130,6 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
         r90_mm=prediction.r90_mm,
         depths_mm=unknown if depth is None else depth.values,
         depths_r90_mm=unknown if depth is None else depth.r90,
-        faults=None
-        if detector is None
-        else [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in faults],
-        dead=() if detector is None else detector.model_.dead,
+        faults=faults if detector else None,
+        dead=detector.model_.dead if detector else (),
     )

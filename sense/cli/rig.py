@@ -21,13 +21,8 @@ if TYPE_CHECKING:
     from padforge.sense.rig.operation import OpenedRig
 
 
-rig_option = click.option(
-    "--rig",
-    metavar="NAME",
-    default="simulated",
-    show_default=True,
-    help="simulated, ur5, printer, hand, or an installed arm.",
-)
+_RIGS = "simulated, ur5, printer, hand, or an installed arm."
+rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
 _warn = partial(click.echo, err=True)
 virtual_hardware_option = click.option(
     "--virtual-hardware", is_flag=True, help="Emulated devices in real time, behind the drivers of the real ones."
@@ -97,7 +92,9 @@ def record(
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --virtual-hardware")
     like = Twin.load(twin) if twin else None
     if not (rig == "simulated" or virtual_hardware or morphology):
-        morphology = _morphology_beside(target)
+        morphology = target.parent / "morphology.json"  # a real pad is named, never guessed
+        if not morphology.is_file():
+            raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
         folder = common.pad_folder(morphology)
     pad = _load_pad(morphology, settings.section(PadSettings))
     inputs = [path for path in (morphology, twin, spec) if path is not None]
@@ -126,14 +123,6 @@ def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morpholo
     return Morphology.load(morphology) if morphology else Morphology.straight(pad_settings.layout)
 
 
-def _morphology_beside(recording: Path) -> Path:
-    """The morphology.json in the folder that a recording goes to: a real pad is named, never guessed."""
-    path = recording.parent / "morphology.json"
-    if not path.is_file():
-        raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {path}")
-    return path
-
-
 def _record_with(
     rig: str, config: "RigConfig", model: Path | None, dry_run: bool, resume: bool, virtual_hardware: bool
 ) -> "Recording | None":
@@ -148,9 +137,9 @@ def _record_with(
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
         return _record_by_hand(config, resume, virtual_hardware)
     opened = _opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)), virtual_hardware)
-    with progress_bar("presses") as on_progress:
+    with progress_bar("presses") as show:
         return operation.record(
-            config, opened, model=model, dry=dry_run, resume=resume, on_progress=on_progress, on_message=_warn
+            config, opened, model=model, dry=dry_run, resume=resume, on_progress=show, on_message=_warn
         )
 
 
@@ -239,9 +228,8 @@ def doctor(
     pad, options = _load_pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
     has_pad = morphology is not None or rig == "simulated" or virtual_hardware
     inputs = options.inputs(len(pad.knots)) if has_pad else options.channels
-    config = RigConfig(
-        pad, settings.section(Contact), options, Path(), "padforge sense doctor", folder=common.pad_folder(morphology)
-    )
+    contact, folder = settings.section(Contact), common.pad_folder(morphology)
+    config = RigConfig(pad, contact, options, Path(), "padforge sense doctor", folder=folder)
     diagnoses = _diagnose(rig, config, inputs, virtual_hardware)
     passed = all(diagnosis.status != "fail" for diagnosis in diagnoses)
     lines = [f"{diagnosis.status:<4} {diagnosis.name}: {diagnosis.message}" for diagnosis in diagnoses]

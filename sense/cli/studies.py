@@ -1,7 +1,6 @@
 """`padforge study ...`: the paper's figures and tables for any pads, and beyond."""
 
 import os
-import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -68,9 +67,7 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
                         document = run(study, out, jobs=jobs, executor=executor, resume=resume, on_progress=show)
                 except KeyboardInterrupt:
                     bar.stop()
-                    print(
-                        "padforge: interrupted; --resume continues with the finished tasks", file=sys.stderr, flush=True
-                    )
+                    click.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
                     # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
                     os._exit(common.INTERRUPTED)
             common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)

@@ -54,11 +54,7 @@ def spline_weights(f: float, out: Any) -> None:
 
 @njit(cache=True, error_model="numpy")
 def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
-    """Evaluate cubic B-splines, from end to end of a row of elements.
-
-    Args:
-        coefficients: of n curves; shape (n, J).
-        elements: number of elements F.
+    """Evaluate cubic B-splines of coefficients (n, J) from end to end of F elements.
 
     Returns:
         Values at each element, and their change over it; shape (2, n, F). First coefficient that each element depends
@@ -82,21 +78,12 @@ def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def channel_response(
-    path: Any,
-    tangent: Any,
-    length: Any,
-    lateral_offset: Any,
-    log_sensitivity: Any,
-    positions: Any,
-    profile: Any,
-    step: float,
+    fibre: Any, lateral_offset: Any, log_sensitivity: Any, positions: Any, profile: Any, step: float
 ) -> Any:
     """Compute the responses of one fibre, and their derivatives; grid units.
 
     Args:
-        path: middles of the planned elements, evenly spaced along the fibre; shape (F, 2).
-        tangent: unit tangents; shape (F, 2).
-        length: lengths; shape (F,).
+        fibre: middles (F, 2), unit tangents (F, 2) and lengths (F,) of its planned elements, evenly spaced.
         lateral_offset: spline coefficients of the offset in x and in y, which also stretches the fibre; shape (2, J).
         log_sensitivity: spline coefficients; shape (1, J').
         positions: presses; shape (Q, 2).
@@ -107,6 +94,7 @@ def channel_response(
         Responses (Q,), and their derivatives by profile (Q, 2, K), lateral offset (Q, 2, J), log-sensitivity (Q, J')
         and position (Q, 2).
     """
+    path, tangent, length = fibre
     elements, splines, presses = len(path), profile.shape[1], len(positions)
     end = (splines + 1) * step
     signal, by_profile, by_position = np.zeros(presses), np.zeros((presses, 2, splines)), np.zeros((presses, 2))
@@ -160,68 +148,44 @@ def channel_response(
 
 @dataclass(frozen=True)
 class PadPlan:
-    """Planned fibres, cut into N_ELEMENTS elements that are evenly spaced along each; grid units.
+    """Planned fibres, cut into N_ELEMENTS elements that are evenly spaced along each; grid units."""
 
-    Attributes:
-        paths: middles of the elements; shape (fibres, N_ELEMENTS, 2).
-        tangents: unit tangents; shape (fibres, N_ELEMENTS, 2).
-        lengths: shape (fibres, N_ELEMENTS).
-        layout: as of the morphology.
-    """
-
-    paths: Array
-    tangents: Array
-    lengths: Array
+    paths: Array  # (fibres, N_ELEMENTS, 2), middles of the elements
+    tangents: Array  # (fibres, N_ELEMENTS, 2), unit vectors
+    lengths: Array  # (fibres, N_ELEMENTS)
     layout: Layout
 
     @classmethod
     def from_morphology(cls, pad: Morphology) -> "PadPlan":
         """Cut the fibres of a morphology into elements."""
-        paths, tangents, lengths = [], [], []
+        ends = []
         for line in flatten(pad, FLAT_TOLERANCE):
             arc = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
-            ends = np.linspace(0, arc[-1], N_ELEMENTS + 1)
-            points = np.column_stack([np.interp(ends, arc, line[:, axis]) for axis in range(2)])
-            step = np.diff(points, axis=0)
-            size = np.hypot(*step.T)
-            paths.append((points[:-1] + points[1:]) / 2)
-            tangents.append(step / size[:, None])
-            lengths.append(size)
-        return cls(np.array(paths), np.array(tangents), np.array(lengths), pad.layout)
+            along = np.linspace(0, arc[-1], N_ELEMENTS + 1)
+            ends.append(np.column_stack([np.interp(along, arc, line[:, axis]) for axis in range(2)]))
+        points = np.array(ends)
+        step = np.diff(points, axis=1)
+        lengths = np.hypot(step[..., 0], step[..., 1])
+        return cls((points[:, :-1] + points[:, 1:]) / 2, step / lengths[..., None], lengths, pad.layout)
 
     def to_grid(self, positions_mm: Array) -> Array:
         """Convert positions (Q, 2) on the plan from mm from its middle to grid units from its corner."""
-        return positions_mm / self.unit_mm + self.middle
-
-    @property
-    def unit_mm(self) -> float:
-        """Grid unit, mm."""
-        return self.layout.unit_mm
-
-    @property
-    def middle(self) -> Array:
-        """Middle of the pad, grid units from its corner; shape (2,)."""
-        return np.array(self.layout.extent) / 2
+        return positions_mm / self.layout.unit_mm + np.array(self.layout.extent) / 2
 
 
 @dataclass(frozen=True)
 class AsBuiltPad:
     """Parameters of a pad of C channels.
 
-    Attributes:
-        plan: the planned fibres.
-        fibres: index of the fibre that each channel reads; C of them.
-        mirrored: whether the plan transform is.
-        step: distance of the splines of the profiles, grid units.
-        values: all parameters: turn (rad), shift (mm) and scale; splines of w and of v; then for each channel gain (V
-            per grid unit), rest (V), splines of the lateral offset (grid units, x before y) and of the
-            log-sensitivity; shape (N_SHARED + C N_CHANNEL,).
+    `values` (N_SHARED + C N_CHANNEL,) holds turn (rad), shift (mm) and scale; splines of w and of v; then for each
+    channel gain (V per grid unit), rest (V), splines of the lateral offset (grid units, x before y) and of the
+    log-sensitivity.
     """
 
     plan: PadPlan
-    fibres: tuple[int, ...]
-    mirrored: bool
-    step: float
+    fibres: tuple[int, ...]  # the fibre that each channel reads
+    mirrored: bool  # the plan transform
+    step: float  # distance of the splines of the profiles, grid units
     values: Array
 
     @classmethod
@@ -252,20 +216,13 @@ class AsBuiltPad:
         """Parameters of each channel; shape (C, N_CHANNEL)."""
         return self.values[N_SHARED:].reshape(-1, N_CHANNEL)
 
-    @property
-    def rest_v(self) -> Array:
-        """Response of each channel far from any fibre, V; shape (C,)."""
-        return self.channel_values[:, 1]
-
     def profile(self, distance: Array) -> Array:
         """Evaluate w and v at distances (n,) in grid units; shape (2, n)."""
         return self.values[4:N_SHARED].reshape(2, N_SPLINES) @ _profile_basis(distance / self.step).T
 
     def path(self, channel: int) -> tuple[Array, Array]:
         """Return the middles (N_ELEMENTS, 2), grid units, and sensitivities (N_ELEMENTS,) of a channel's fibre."""
-        lateral_offset, log_sensitivity = self._curves(channel)
-        offset = evaluate_along_fibre(lateral_offset, N_ELEMENTS)[0][0]
-        log_gain = evaluate_along_fibre(log_sensitivity, N_ELEMENTS)[0][0]
+        offset, log_gain = (evaluate_along_fibre(curves, N_ELEMENTS)[0][0] for curves in self._curves(channel))
         return self.plan.paths[self.fibres[channel]] + offset.T, np.exp(log_gain[0])
 
     def _curves(self, channel: int) -> tuple[Array, Array]:
@@ -279,20 +236,20 @@ class AsBuiltPad:
 
     def predict_with_jacobian(self, positions_mm: Array) -> tuple[Array, list[Array]]:
         """Predict responses (Q, C), and return for each channel their derivatives (Q, N_SHARED + N_CHANNEL)."""
-        transform, unit_mm = self.transform, self.plan.unit_mm
-        positions = np.ascontiguousarray(self.plan.to_grid(transform.to_plan(positions_mm)))
+        transform, plan = self.transform, self.plan
+        positions = np.ascontiguousarray(plan.to_grid(transform.to_plan(positions_mm)))
         rotated = transform.rotate(positions_mm)
         by_transform = np.zeros((len(positions), 2, 4))  # of positions, by turn, shift and scale
         by_transform[:, 0, 0], by_transform[:, 1, 0] = -transform.scale * rotated[:, 1], transform.scale * rotated[:, 0]
         by_transform[:, 0, 1] = by_transform[:, 1, 2] = 1
         by_transform[:, :, 3] = rotated
-        by_transform /= unit_mm
+        by_transform /= plan.layout.unit_mm
         profile = self.values[4:N_SHARED].reshape(2, N_SPLINES)
         volts, jacobians = np.empty((len(positions), len(self.fibres))), []
         for c, (fibre, (gain, rest_v, *_)) in enumerate(zip(self.fibres, self.channel_values, strict=True)):
-            elements = self.plan.paths[fibre], self.plan.tangents[fibre], self.plan.lengths[fibre]
+            elements = plan.paths[fibre], plan.tangents[fibre], plan.lengths[fibre]
             signal, by_profile, by_offset, by_sensitivity, by_position = channel_response(
-                *elements, *self._curves(c), positions, profile, self.step
+                elements, *self._curves(c), positions, profile, self.step
             )
             volts[:, c] = rest_v + gain * signal
             by_shared = [np.einsum("qx,qxp->qp", by_position, by_transform), by_profile.reshape(len(positions), -1)]
@@ -308,11 +265,9 @@ class AsBuiltPad:
 
     def mean_squared_slope(self, positions_mm: Array) -> Array:
         """Return the squared slope of each channel over the position, mean over positions (Q, 2); V^2/mm^2; (C,)."""
-        slopes = [
-            (self.predict(positions_mm + step) - self.predict(positions_mm - step)) / (2 * SLOPE_STEP_MM)
-            for step in SLOPE_STEP_MM * np.eye(2)
-        ]
-        return np.sum(np.square(slopes), axis=0).mean(axis=0)
+        steps = SLOPE_STEP_MM * np.eye(2)
+        differences = [self.predict(positions_mm + step) - self.predict(positions_mm - step) for step in steps]
+        return np.sum(np.square(np.divide(differences, 2 * SLOPE_STEP_MM)), axis=0).mean(axis=0)
 
     def with_values(self, values: Array) -> "AsBuiltPad":
         """Return the pad of other parameters, with w scaled to 1 at its largest and gains to match."""
@@ -340,7 +295,8 @@ class AsBuiltPad:
         built = np.concatenate([self.path(channel)[0] for channel in range(len(self.fibres))])
         within = ((planned >= low) & (planned <= high)).all(axis=1)
         # 1. rotation and shift that bring the fibres as built closest to the plan
-        turn = _best_rotation(built[within], planned[within])
+        a, b = (points[within] - points[within].mean(axis=0) for points in (built, planned))
+        turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
         rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         rotated = built @ rotation
         shift = (planned - rotated)[within].mean(axis=0)
@@ -349,10 +305,10 @@ class AsBuiltPad:
         basis = evaluate_along_fibre(np.eye(N_OFFSET), N_ELEMENTS)[0][0].T
         coefficients = np.linalg.lstsq(basis, offset.transpose(1, 0, 2).reshape(N_ELEMENTS, -1), rcond=None)[0]
         # 3. the transform rotates about the middle of the pad, step 1 about its corner
-        values, middle = self.values.copy(), self.plan.middle
+        values, middle = self.values.copy(), np.array(self.plan.layout.extent) / 2
         values[0] += turn
         centring = middle[0] * (rotation.sum(axis=0) - 1) + (middle[1] - middle[0]) * (rotation[1] - [0, 1])
-        values[1:3] = values[1:3] @ rotation + self.plan.unit_mm * (centring + shift)
+        values[1:3] = values[1:3] @ rotation + self.plan.layout.unit_mm * (centring + shift)
         rows = values[N_SHARED:].reshape(-1, N_CHANNEL)
         rows[:, OFFSET] = coefficients.reshape(N_OFFSET, len(self.fibres), 2).transpose(1, 2, 0).reshape(len(rows), -1)
         return replace(self, values=values)
@@ -363,17 +319,10 @@ def channel_indices(channel: int) -> Indices:
     return N_SHARED + channel * N_CHANNEL + np.arange(N_CHANNEL)
 
 
-def _best_rotation(points: Array, targets: Array) -> float:
-    """Return the angle by which points (n, 2), rotated about their middle, lie closest to targets (n, 2)."""
-    a, b = points - points.mean(axis=0), targets - targets.mean(axis=0)
-    return float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-
-
 def _profile_basis(distance: Array) -> Array:
     """Evaluate the splines of a profile, mirrored at 0, at distances (n,) in steps; shape (n, N_SPLINES)."""
-    basis = np.zeros((len(distance), N_SPLINES))
-    for k in range(N_SPLINES):
-        for centre in {k, -k}:
-            far = np.abs(distance - centre)
-            basis[:, k] += np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, np.maximum(2 - far, 0) ** 3 / 6)
+    far = np.abs(distance[:, None] - np.arange(1 - N_SPLINES, N_SPLINES))
+    splines = np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, np.maximum(2 - far, 0) ** 3 / 6)
+    basis = splines[:, N_SPLINES - 1 :]
+    basis[:, 1:] += splines[:, N_SPLINES - 2 :: -1]
     return basis

@@ -51,17 +51,11 @@ MIN_PAIRS = 30
 
 @dataclass(frozen=True)
 class Priors:
-    """Prior standard deviations of deviations from the plan; 0 where there are none.
-
-    Attributes:
-        lateral_offset_mm: of the lateral offset of fibres, mm.
-        log_sensitivity: of the log-sensitivity along a fibre.
-        angular: whether the response may depend on the angle between fibre and press.
-    """
+    """Prior standard deviations of deviations from the plan; 0 where there are none."""
 
     lateral_offset_mm: float = 0.0
     log_sensitivity: float = 0.0
-    angular: bool = False
+    angular: bool = False  # whether the response may depend on the angle between fibre and press
 
     def free_mask(self, channels: int) -> Mask:
         """Return which of `AsBuiltPad.values` are fitted."""
@@ -74,27 +68,19 @@ class Priors:
 
 @dataclass(frozen=True)
 class AsBuiltFit:
-    """A fitted pad and its uncertainty.
-
-    Attributes:
-        pad: maximum a posteriori.
-        priors: as estimated.
-        covariance: of `pad.values`; 0 for those that were not fitted.
-        log_evidence: logarithm of the marginal likelihood, to compare fits to the same presses.
-    """
+    """A fitted pad, maximum a posteriori, and its uncertainty."""
 
     pad: AsBuiltPad
     priors: Priors
-    covariance: Array
-    log_evidence: float
+    covariance: Array  # of `pad.values`; 0 for those that were not fitted
+    log_evidence: float  # logarithm of the marginal likelihood, to compare fits to the same presses
 
     def offset_std(self, channel: int) -> Array:
         """Compute the standard deviation of the lateral offset along a channel's fibre (N_ELEMENTS,), grid units."""
         _, first, values = evaluate_along_fibre(np.zeros((1, N_OFFSET)), N_ELEMENTS)
         basis = np.zeros((N_ELEMENTS, N_OFFSET))
         np.put_along_axis(basis, first[:, None] + np.arange(4), values[0], axis=1)
-        axes = np.split(channel_indices(channel)[OFFSET], 2)
-        blocks = [self.covariance[np.ix_(axis, axis)] for axis in axes]
+        blocks = [self.covariance[np.ix_(axis, axis)] for axis in np.split(channel_indices(channel)[OFFSET], 2)]
         return np.sqrt(np.maximum(sum(np.einsum("fj,jk,fk->f", basis, block, basis) for block in blocks), 0))
 
 
@@ -110,8 +96,7 @@ def fit_as_built(
         noise_inflation: factor on the noise of each channel (C,), since residuals of neighbouring presses are
             correlated where the model is wrong.
     """
-    free = np.flatnonzero(priors.free_mask(len(start.fibres)))
-    damping = 1e-3
+    free, damping = np.flatnonzero(priors.free_mask(len(start.fibres))), 1e-3
     current = _Objective(start, responses, priors, noise_inflation, np.sqrt(responses.variance) / 2)
     for step in range(MAX_STEPS):
         hessian, gradient = current.normal_equations()
@@ -151,28 +136,18 @@ def _smooth_precision(count: int) -> Array:
     return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
-def _profile_precision() -> Array:
-    """Return the prior precision (N_SPLINES, N_SPLINES) of a profile, mirrored at 0 and 0 from its end on."""
-    second_difference = np.diag(np.full(N_SPLINES, -2.0)) + np.eye(N_SPLINES, k=1) + np.eye(N_SPLINES, k=-1)
-    second_difference[0, 1] = 2.0
-    return second_difference.T @ second_difference / PROFILE_BEND**2
-
-
 OFFSET_PRECISION = np.kron(np.eye(2), _smooth_precision(N_OFFSET)).astype(np.float64)
 SENSITIVITY_PRECISION = _smooth_precision(N_SENSITIVITY)
-PROFILE_PRECISION = _profile_precision()
+_second_difference = np.eye(N_SPLINES, k=1) + np.eye(N_SPLINES, k=-1) - 2 * np.eye(N_SPLINES)
+_second_difference[0, 1] = 2.0  # a profile is mirrored at 0, and 0 from its end on
+PROFILE_PRECISION = _second_difference.T @ _second_difference / PROFILE_BEND**2
 
 
 class _Objective:
     """Twice the negative log-posterior of a pad, given responses and the noise (C,) of their residuals, V."""
 
     def __init__(
-        self,
-        pad: AsBuiltPad,
-        responses: Responses,
-        priors: Priors,
-        noise_inflation: Array | float,
-        noise: Array,
+        self, pad: AsBuiltPad, responses: Responses, priors: Priors, noise_inflation: Array | float, noise: Array
     ) -> None:
         self.pad, self.priors, self.noise = pad, priors, noise
         self._responses, self._noise_inflation = responses, noise_inflation
@@ -201,17 +176,15 @@ class _Objective:
 
     def update_noise(self, covariance: Array | None) -> "_Objective":
         """Re-estimate the noise and, given the covariance of the parameters, the priors; return the objective."""
-        counts = np.maximum(self._responses.valid.sum(axis=0), 1)
-        std = np.sqrt((self._residual**2).sum(axis=0) / counts)
+        std = np.sqrt((self._residual**2).sum(axis=0) / np.maximum(self._responses.valid.sum(axis=0), 1))
         self.noise = np.maximum(self._noise_inflation * std, MIN_SCALE_V)
         if covariance is not None:
-            offset_mm = self._curve_std(covariance, OFFSET, OFFSET_PRECISION) * self.pad.plan.unit_mm
-            sensitivity = self._curve_std(covariance, SENSITIVITY, SENSITIVITY_PRECISION)
-            self.priors = replace(
-                self.priors,
-                lateral_offset_mm=float(np.clip(offset_mm, *OFFSET_RANGE_MM)) if self.priors.lateral_offset_mm else 0.0,
-                log_sensitivity=float(np.clip(sensitivity, *SENSITIVITY_RANGE)) if self.priors.log_sensitivity else 0.0,
-            )
+            if self.priors.lateral_offset_mm:
+                std_mm = self._curve_std(covariance, OFFSET, OFFSET_PRECISION) * self.pad.plan.layout.unit_mm
+                self.priors = replace(self.priors, lateral_offset_mm=float(np.clip(std_mm, *OFFSET_RANGE_MM)))
+            if self.priors.log_sensitivity:
+                std = self._curve_std(covariance, SENSITIVITY, SENSITIVITY_PRECISION)
+                self.priors = replace(self.priors, log_sensitivity=float(np.clip(std, *SENSITIVITY_RANGE)))
             self._precision, self._deviation = self._prior()
         self.value = self._evaluate()
         return self
@@ -233,15 +206,15 @@ class _Objective:
         precision, deviation = np.zeros((size, size)), pad.values.copy()
         quarter = np.pi / 2
         deviation[:4] -= [np.round(deviation[0] / quarter) * quarter, 0.0, 0.0, 1.0]
-        diagonal = np.zeros(N_SHARED)
-        diagonal[:4], diagonal[4 + N_SPLINES :] = TRANSFORM_STD**-2.0, ANGULAR_STD**-2.0
-        precision[np.arange(N_SHARED), np.arange(N_SHARED)] = diagonal
+        diagonal = np.repeat([0.0, ANGULAR_STD**-2.0], [4 + N_SPLINES, N_SPLINES])
+        diagonal[:4] = TRANSFORM_STD**-2.0
+        precision[:N_SHARED, :N_SHARED] = np.diag(diagonal)
         for profile in (slice(4, 4 + N_SPLINES), slice(4 + N_SPLINES, N_SHARED)):
             precision[profile, profile] += PROFILE_PRECISION
         for c in range(len(pad.fibres)):
             indices = channel_indices(c)
             for rows, block, std in (
-                (indices[OFFSET], OFFSET_PRECISION, self.priors.lateral_offset_mm / pad.plan.unit_mm),
+                (indices[OFFSET], OFFSET_PRECISION, self.priors.lateral_offset_mm / pad.plan.layout.unit_mm),
                 (indices[SENSITIVITY], SENSITIVITY_PRECISION, self.priors.log_sensitivity),
             ):
                 if std > 0:
@@ -261,22 +234,20 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
 
     Half the squared difference of the residuals of two neighbouring presses is their variance, whatever smooth
     function of position is left in them: floor^2 + share^2 x^2 for responses x, a straight line over x^2. Where
-    channels share a part of it, products of their differences are common share^2 x_c x_c'.
+    channels share a part of it, products of their differences are common share^2 x_c x_c'. Too few presses give
+    constant noise.
 
     Args:
         pad: as fitted to the presses.
         responses: of its channels.
         noise_v: standard deviation of each channel's total scatter; shape (C,).
-
-    Returns:
-        The scatter; that of constant noise where there are too few presses.
     """
     valid = np.flatnonzero(responses.valid.all(axis=1))
     if len(valid) < 2 * MIN_PAIRS:
         return TwinScatter()
     pairs = valid[KDTree(responses.positions_mm[valid]).query(responses.positions_mm[valid], 2)[1]]
     first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
-    expected = pad.predict(responses.positions_mm) - pad.rest_v
+    expected = pad.predict(responses.positions_mm) - pad.channel_values[:, 1]
     residual = responses.volts - expected
     difference = (residual[first] - residual[second]) / noise_v
     response = (expected[first] + expected[second]) / 2 / noise_v

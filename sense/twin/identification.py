@@ -8,22 +8,23 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment, minimize
 from threadpoolctl import threadpool_limits
 
 from padforge.design import Morphology
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import sensed_rectangle
-from padforge.design.twin import MAX_INFORMATION_GAIN, Twin, TwinChannel, TwinReadings, TwinScatter
+from padforge.design.twin import MAX_INFORMATION_GAIN, PlanTransform, Twin, TwinChannel, TwinReadings, TwinScatter
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.simulated_recording import measure_rig_settings
 from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
 from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built
 from padforge.sense.twin.responses import Responses, compute_responses, fisher_information, fit_gp, select_one_depth
-from padforge.sense.twin.wiring import Wiring, find_wirings
 
 PROFILE_POINTS, MIN_WEIGHT = 13, 0.01
 """Points of the sensitivity profile of a twin, and the least weight that counts."""
@@ -47,40 +48,147 @@ MIN_ANGULAR_GAIN = 0.01
 MIN_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else the recording is of another pad."""
 
+PROFILE_WIDTH = 0.55
+"""Standard deviation of the Gaussian profile that is tried first, grid units."""
+N_SCORED = 400
+"""Presses by which transforms are scored."""
+ELEMENT_STRIDE = 4
+"""Every such element of a fibre is used."""
+SHIFTS = (-0.8, -0.4, 0.0, 0.4, 0.8)
+"""Shifts that are tried along each axis, grid units."""
+N_REFINED = 24
+"""Transforms of the grid that are refined."""
+FIRST_STEPS = np.array([0.06, 0.25, 0.25, 0.03, 0.15])
+"""First steps of the refinement: turn (rad), shift (grid units), scale, and logarithm of the profile's width."""
+STEP_COST = 0.002
+"""Cost of a change by one such step in all, in shares of the variance explained."""
+
 OnProgress = Callable[[str, int, int], None]
 """Called with (what is being done, steps done, total)."""
 
 
 @dataclass(frozen=True)
-class Identification:
-    """An identified pad; C' channels of the recording are live.
+class Wiring:
+    """A candidate for the wiring and pose of a pad."""
 
-    Attributes:
-        pad: as planned.
-        fit: as built, with its uncertainty; its channels are the live ones.
-        live: their indices in the recording; shape (C',).
-        explained: share of the variance of held-out responses; shape (C',).
-        explained_on_plan: the same if every fibre lay as planned, mean over channels.
-        explained_by_straight: the same of straight fibres in their best pose and wiring; None for a straight plan.
-        noise_v: scatter of each channel's responses that neither position nor history explains; shape (C,).
-        noise: that of live channels as a share of full scale.
-        alternatives: other wirings that the presses do not rule out.
-        readings: statistics of the readings; None where there are too few presses.
-        scatter: part of the noise that grows with the response.
-        training: responses of the live channels that were fitted.
-        held_out: responses of the live channels that were held out.
+    transform: PlanTransform
+    width: float  # standard deviation of the Gaussian profile, grid units
+    fibres: tuple[int, ...]  # the fibre that each channel reads
+    match: float  # mean squared correlation, 0 to 1
+
+
+class _Scorer:
+    """Finds the best wiring for a plan transform, by correlation with responses under a Gaussian profile.
+
+    A transform is scored by the mean over channels of squared correlations of one sign, each channel assigned to
+    another fibre.
     """
 
-    pad: Morphology
+    def __init__(self, plan: PadPlan, responses: Responses, rng: np.random.Generator) -> None:
+        rows = np.sort(rng.choice(len(responses), min(N_SCORED, len(responses)), replace=False))
+        self._plan, self._responses = plan, responses.select(rows)
+        self._paths, self._lengths = plan.paths[:, ::ELEMENT_STRIDE], plan.lengths[:, ::ELEMENT_STRIDE]
+        self._volts = _standardize(self._responses.volts, self._responses.valid)
+
+    def __call__(self, transform: PlanTransform, width: float) -> Wiring:
+        positions = self._plan.to_grid(transform.to_plan(self._responses.positions_mm))
+        points = self._paths.reshape(-1, 2)
+        squares = (points**2).sum(axis=1) + (positions**2).sum(axis=1)[:, None] - 2 * positions @ points.T
+        weights = np.exp(squares * (-0.5 / width**2)).reshape(len(positions), *self._lengths.shape)
+        signals, valid = np.einsum("qfi,fi->qf", weights, self._lengths), self._responses.valid
+        if valid.all():
+            correlations = _standardize(signals, valid[:, :1]).T @ self._volts
+        else:
+            columns = enumerate(self._volts.T)
+            correlations = np.column_stack([_standardize(signals, valid[:, c, None]).T @ volts for c, volts in columns])
+        match, fibres = assign_fibres(correlations)
+        return Wiring(transform, width, fibres, match)
+
+
+def _standardize(values: Array, valid: Mask) -> Array:
+    """Centre the columns of values (Q, n) and scale them to unit length; 0 where invalid, or all the same."""
+    mean = np.where(valid, values, 0).sum(axis=0) / np.maximum(np.sum(valid, axis=0), 1)
+    values = np.where(valid, values - mean, 0.0)
+    norms = np.linalg.norm(values, axis=0)
+    return np.divide(values, norms, out=np.zeros_like(values), where=norms > 0)
+
+
+def assign_fibres(correlations: Array) -> tuple[float, tuple[int, ...]]:
+    """Return the mean squared correlation and the fibre of each channel, for the largest ones (F, C) of one sign."""
+    best: tuple[float, tuple[int, ...]] = (-1.0, ())
+    for sign in (1, -1):
+        squares = np.maximum(sign * correlations, 0) ** 2
+        fibres, channels = linear_sum_assignment(-squares)
+        match = float(squares[fibres, channels].mean())
+        if match > best[0]:
+            best = match, tuple(fibres[np.argsort(channels)].tolist())
+    return best
+
+
+def find_wirings(
+    plan: PadPlan,
+    responses: Responses,
+    rng: np.random.Generator,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Wiring]:
+    """Search for wirings of the channels of `responses`, best first, each with its best transform.
+
+    Transforms on a grid are tried, and the best refined by Nelder-Mead; there is no first guess.
+    `rng` draws presses where there are many, and `on_progress` is called with (refined, total).
+    """
+    scorer, unit_mm = _Scorer(plan, responses, rng), plan.layout.unit_mm
+    middle_mm = responses.positions_mm.min(axis=0) / 2 + responses.positions_mm.max(axis=0) / 2
+    tried = []
+    for mirrored, quarter, x, y in product((False, True), range(4), SHIFTS, SHIFTS):
+        transform = PlanTransform(mirrored, 90.0 * quarter)
+        pressed_mm = transform.rotate(middle_mm[None])[0]
+        if np.abs(pressed_mm).max() <= unit_mm:  # the arm's frame is about the pad's own middle
+            pressed_mm = np.zeros(2)
+        shift_mm = np.array([x, y]) * unit_mm - pressed_mm
+        tried.append(scorer(replace(transform, shift_mm=tuple(shift_mm.tolist())), PROFILE_WIDTH))
+    tried.sort(key=lambda wiring: -wiring.match)
+    best: dict[tuple[bool, tuple[int, ...]], Wiring] = {}
+    for number, wiring in enumerate(tried[:N_REFINED]):
+        on_progress(number, N_REFINED)
+        refined = _refine(scorer, wiring, unit_mm)
+        key = refined.transform.mirrored, refined.fibres
+        if key not in best or best[key].match < refined.match:
+            best[key] = refined
+    return sorted(best.values(), key=lambda wiring: -wiring.match)
+
+
+def _refine(scorer: _Scorer, wiring: Wiring, unit_mm: float) -> Wiring:
+    """Return the best wiring near one."""
+    start, unit = wiring.transform, FIRST_STEPS * [1, unit_mm, unit_mm, 1, 1]
+
+    def evaluate(change: Array) -> Wiring:
+        turn, x, y, scale, width = (change * unit).tolist()
+        turn_deg, shift_mm = start.turn_deg + float(np.degrees(turn)), (start.shift_mm[0] + x, start.shift_mm[1] + y)
+        transform = PlanTransform(start.mirrored, turn_deg, shift_mm, max(start.scale + scale, 0.5))
+        return scorer(transform, wiring.width * float(np.exp(width)))
+
+    def cost(change: Array) -> float:
+        return -evaluate(change).match + STEP_COST * float(change @ change) / len(change)
+
+    simplex = np.vstack([np.zeros(len(unit)), np.eye(len(unit))])
+    options = {"maxfev": 120, "initial_simplex": simplex}
+    return evaluate(minimize(cost, np.zeros(len(unit)), method="Nelder-Mead", options=options).x)
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified pad; C' channels of the recording are live, and only these in `fit`, `training` and `held_out`."""
+
+    pad: Morphology  # as planned
     fit: AsBuiltFit
-    live: Indices
-    explained: Array
-    explained_on_plan: float
-    explained_by_straight: float | None
-    noise_v: Array
-    noise: float
-    alternatives: list[Wiring]
-    readings: TwinReadings | None
+    live: Indices  # (C',)
+    explained: Array  # (C',), share of the variance of held-out responses
+    explained_on_plan: float  # the same if every fibre lay as planned, mean over channels
+    explained_by_straight: float | None  # the same of straight fibres in their best pose; None for a straight plan
+    noise_v: Array  # (C,), scatter of the responses that neither position nor history explains
+    noise: float  # that of live channels as a share of full scale
+    alternatives: list[Wiring]  # those that the presses do not rule out
+    readings: TwinReadings | None  # None where there are too few presses
     scatter: TwinScatter
     training: Responses
     held_out: Responses
@@ -89,8 +197,7 @@ class Identification:
         """Compute how far each live channel's fibre lies to the left of its plan.
 
         Returns:
-            For each: offset of its elements (F,), mm; standard deviation (F,), mm; and mask (F,) of those within what
-            was pressed.
+            For each: offset (F,) of its elements, mm; standard deviation (F,), mm; mask (F,) of those pressed.
         """
         built, unit_mm = self.fit.pad, self.pad.unit_mm
         pressed = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))
@@ -151,10 +258,7 @@ def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array]:
 
 
 def identify(
-    recording: Recording,
-    pad: Morphology,
-    seed: int = 0,
-    on_progress: OnProgress = lambda what, done, total: None,
+    recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = lambda what, done, total: None
 ) -> Twin:
     """Identify the twin of a printed pad: its wiring, pose, fibres as built and sensitivity profile.
 
@@ -176,15 +280,10 @@ def identify(
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def identify_pad(
-    recording: Recording,
-    pad: Morphology,
-    seed: int = 0,
-    on_progress: OnProgress = lambda what, done, total: None,
+    recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = lambda what, done, total: None
 ) -> Identification:
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
-    check_type("recording", recording, Recording)
-    check_type("pad", pad, Morphology)
-    rng = np.random.default_rng(check_int("seed", seed, 0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
     recording = select_one_depth(recording)
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
@@ -197,8 +296,14 @@ def identify_pad(
     rows = rng.permutation(np.flatnonzero(~held_out_mask))[:MAX_PRESSES]
 
     # 2. Live channels
-    gp = fit_gp(responses.select(rows), pad.unit_mm)
-    live = _live_channels(gp.log_bayes_factor, len(pad.knots))
+    noise_v, log_bayes_factor = fit_gp(responses.select(rows), pad.unit_mm)
+    live = np.flatnonzero(log_bayes_factor > MIN_LOG_BAYES_FACTOR)
+    if not len(live):
+        raise InputError("no channel of the recording responds to where the pad is pressed")
+    if len(live) > len(pad.knots):
+        raise InputError(
+            f"{len(live)} channels of the recording respond to presses, the pad has {len(pad.knots)} fibres"
+        )
     training, held_out = responses.select(rows, live), responses.select(np.flatnonzero(held_out_mask), live)
     compared = training.select(np.arange(min(N_COMPARED, len(training))))
 
@@ -221,9 +326,9 @@ def identify_pad(
     # 4. All presses
     on_progress("paths", 0, 3)
     fit = _fit_all(best.pad, training, on_progress)
-    noise_v = np.nan_to_num(gp.noise)
-    noise_v[live] = fit_gp(fit.pad.residuals(training), pad.unit_mm).noise
-    full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.rest_v).max(axis=0)
+    noise_v = np.nan_to_num(noise_v)
+    noise_v[live] = fit_gp(fit.pad.residuals(training), pad.unit_mm)[0]
+    full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
     return Identification(
         pad=pad,
         fit=fit,
@@ -259,15 +364,6 @@ def _check_positions(positions_mm: Array, pad: Morphology) -> None:
         raise InputError(f"the presses lie within {spans[0]:.0f} x {spans[1]:.0f} mm, allowed is what spans {allowed}")
 
 
-def _live_channels(log_bayes_factor: Array, fibres: int) -> Indices:
-    live = np.flatnonzero(log_bayes_factor > MIN_LOG_BAYES_FACTOR)
-    if not len(live):
-        raise InputError("no channel of the recording responds to where the pad is pressed")
-    if len(live) > fibres:
-        raise InputError(f"{len(live)} channels of the recording respond to presses, the pad has {fibres} fibres")
-    return live
-
-
 def _fit_candidates(
     plan: PadPlan, training: Responses, compared: Responses, rng: np.random.Generator, on_progress: OnProgress
 ) -> list[tuple[Wiring, AsBuiltFit]]:
@@ -279,10 +375,7 @@ def _fit_candidates(
 
 
 def _rank_as_built(candidates: list[tuple[Wiring, AsBuiltFit]], compared: Responses) -> list[tuple[Wiring, AsBuiltFit]]:
-    """Fit the candidates as built, and sort them by evidence.
-
-    Among equally good ones, as on a pad of straight fibres, the one that is rotated least comes first.
-    """
+    """Fit the candidates as built, and sort them by evidence; of equally good ones, the one rotated least is first."""
     fits = [(wiring, fit_as_built(on_plan.pad, compared, FIRST_PRIORS)) for wiring, on_plan in candidates]
     best = max(fit.log_evidence for _, fit in fits)
 
@@ -319,12 +412,9 @@ def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> A
 
 
 def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
-    """Return the factor (C,) on the noise by which residuals that are a function of position weigh N_COMPARED presses.
-
-    More presses would tell nothing new about them.
-    """
+    """Return the factor (C,) on the noise by which residuals smooth in position weigh N_COMPARED presses."""
     residuals = pad.residuals(responses)
-    noise_var = fit_gp(residuals, pad.plan.unit_mm).noise ** 2
+    noise_var = fit_gp(residuals, pad.plan.layout.unit_mm)[0] ** 2
     systematic_var = np.maximum(residuals.variance - noise_var, 0)
     repeats = max(len(responses) / N_COMPARED, 1)
     return np.sqrt((noise_var + systematic_var * repeats) / (noise_var + systematic_var))

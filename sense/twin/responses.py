@@ -8,13 +8,12 @@ the covariance of its residuals on presses that it was not fitted to.
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, compute_features
+from padforge.sense.localizer.features import DOWN, PressFeatures, compute_features
 from padforge.sense.localizer.response_model import GRID_CELLS, ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
@@ -36,17 +35,11 @@ MIN_GP_PRESSES = 10
 
 @dataclass(frozen=True)
 class Responses:
-    """Responses of C channels to Q presses.
+    """Responses of C channels to Q presses."""
 
-    Attributes:
-        positions_mm: in the arm's frame; shape (Q, 2).
-        volts: shape (Q, C).
-        valid: whether the channel gave enough readings; shape (Q, C).
-    """
-
-    positions_mm: Array
-    volts: Array
-    valid: Mask
+    positions_mm: Array  # (Q, 2), in the arm's frame
+    volts: Array  # (Q, C)
+    valid: Mask  # (Q, C), whether the channel gave enough readings
 
     def __len__(self) -> int:
         return len(self.positions_mm)
@@ -87,16 +80,8 @@ def select_one_depth(recording: Recording) -> Recording:
 
 
 def compute_responses(recording: Recording, training: Mask) -> Responses:
-    """Compute the responses to all presses of known position.
-
-    Args:
-        recording: readings and presses.
-        training: of these presses, those that the effect of a channel's history is fitted to; shape (Q,).
-    """
-    known = recording.has_position
-    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
-    positions_mm = recording.presses_mm[known]
-    normalized = _normalize(positions_mm)
+    """Compute the responses to all Q presses of known position; history is fitted to those in the mask `training`."""
+    positions_mm, normalized, inputs = _positions_and_features(recording, "causal")
     model = ResponseModel.fit(
         normalized[training], inputs.windows[training], inputs.history[training], inputs.fibre_mask[training]
     )
@@ -107,38 +92,23 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
 def fisher_information(recording: Recording, channels: Indices) -> Array:
     """Compute the Fisher information on the position in all windows of a press, mean over the pressed area.
 
-    Args:
-        recording: readings and presses.
-        channels: indices; shape (C',). Each counts by the presses in which it gave enough readings.
-
     Returns:
-        Trace of the information of each channel, 1/mm^2; shape (C',).
+        Trace of the information of each of the channels (C',), 1/mm^2, from presses in which it gave enough readings.
     """
-    known = recording.has_position
-    inputs = compute_features(
-        recording.readings, recording.down_command[known], recording.up_command[known], "press_and_release"
-    )
-    positions = _normalize(recording.presses_mm[known])
-    side_mm = np.ptp(recording.presses_mm[known], axis=0).max()
+    positions_mm, positions, inputs = _positions_and_features(recording, "press_and_release")
     information = []
     for channel in channels.tolist():
         valid = inputs.fibre_mask[:, channel]
-        information.append(
-            _channel_information(positions[valid], inputs.windows[valid, channel], inputs.history[valid, channel])
-        )
-    return np.array(information) * (2 / side_mm) ** 2
+        windows, history = inputs.windows[valid, channel], inputs.history[valid, channel]
+        information.append(_channel_information(positions[valid], windows, history))
+    return np.array(information) * (2 / np.ptp(positions_mm, axis=0).max()) ** 2
 
 
 def _channel_information(positions: Array, windows: Array, history: Array) -> float:
-    """Return the trace of the Fisher information of one channel.
+    """Return the trace of the Fisher information of one channel from positions (Q, 2), windows (Q, F), history (Q, J).
 
     Two response models are fitted to half the presses each. Residuals are those on the other half, and slopes of the
     two are multiplied: noise that one model takes for a slope is not in the other.
-
-    Args:
-        positions: within [-1, 1]; shape (Q, 2).
-        windows: V; shape (Q, F).
-        history: V; shape (Q, J).
     """
     windows, history, fibre_mask = windows[:, None], history[:, None], np.ones((len(positions), 1), bool)
     grid, odd = np.linspace(-1, 1, GRID_CELLS + 1), np.arange(len(positions)) % 2 == 1
@@ -146,9 +116,8 @@ def _channel_information(positions: Array, windows: Array, history: Array) -> fl
     for half in (odd, ~odd):
         model = ResponseModel.fit(positions[half], windows[half], history[half], fibre_mask[half])
         expected = RegularGridInterpolator((grid, grid), model.table)(positions[~half])
-        residual[~half] = (
-            remove_history(windows[~half], history[~half], model.history_coef, model.history_mean_v) - expected
-        )
+        settled = remove_history(windows[~half], history[~half], model.history_coef, model.history_mean_v)
+        residual[~half] = settled - expected
         tables.append(model.table[:, :, 0])
     # pseudo-inverse, since short presses have the same reading in two windows
     precision, trace = np.linalg.pinv(np.cov(residual[:, 0].T), hermitian=True), 0.0
@@ -158,31 +127,25 @@ def _channel_information(positions: Array, windows: Array, history: Array) -> fl
     return max(trace, 0.0)
 
 
-def _normalize(positions_mm: Array) -> Array:
-    """Return positions (Q, 2) in the square [-1, 1] about all of them."""
+def _positions_and_features(recording: Recording, features: str) -> tuple[Array, Array, PressFeatures]:
+    """Return positions (Q, 2) in mm, the same in the square [-1, 1] about all of them, and the features of presses."""
+    known = recording.has_position
+    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], features)
+    positions_mm = recording.presses_mm[known]
     middle = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
-    return (positions_mm - middle) / np.abs(positions_mm - middle).max()
+    return positions_mm, (positions_mm - middle) / np.abs(positions_mm - middle).max(), inputs
 
 
-class GpFit(NamedTuple):
-    """Gaussian process over the position, for each channel.
-
-    Attributes:
-        noise: standard deviation of what no smooth function of position explains; shape (C,); NaN where too few
-            presses are valid.
-        log_bayes_factor: log-likelihood of a smooth function minus that of noise alone; shape (C,).
-    """
-
-    noise: np.ndarray
-    log_bayes_factor: np.ndarray
-
-
-def fit_gp(responses: Responses, unit_mm: float) -> GpFit:
-    """Fit a Gaussian process to each channel, by maximum likelihood over kernel width and signal-to-noise ratio.
+def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
+    """Fit a Gaussian process over the position to each channel, by maximum likelihood over kernel width and noise.
 
     Args:
         responses: of any kind, such as residuals.
         unit_mm: grid unit, mm.
+
+    Returns:
+        Standard deviation of what no smooth function of position explains; shape (C,); NaN where too few presses are
+        valid. Log-likelihood of a smooth function minus that of noise alone, the log Bayes factor; shape (C,).
     """
     positions = responses.positions_mm[:GP_PRESSES] / unit_mm
     squares = ((positions[:, None, :] - positions) ** 2).sum(axis=2)
@@ -201,7 +164,7 @@ def fit_gp(responses: Responses, unit_mm: float) -> GpFit:
         volts = responses.volts[:GP_PRESSES, channel][valid]
         fits = [_fit_ratio(*eigen(valid.tobytes(), width), volts - volts.mean()) for width in GP_WIDTHS]
         noise[channel], log_bayes_factor[channel] = max(fits, key=lambda fit: fit[1])
-    return GpFit(noise, log_bayes_factor)
+    return noise, log_bayes_factor
 
 
 def _fit_ratio(eigenvalues: np.ndarray, eigenvectors: np.ndarray, volts: np.ndarray) -> tuple[float, float]:

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 import padforge.sense.cli.localizer
-import padforge.sense.report.calibration
 from padforge.sense.localizer import training
 
 
@@ -55,19 +54,6 @@ def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPat
     assert code == 130
     assert "interrupted" in err
     assert not Path("new").exists()
-
-
-def test_calibrate_that_fails_at_its_last_figure_changes_nothing(few, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = files_in("model")
-
-    def full(document: object, path: Path) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(padforge.sense.report.calibration, "draw_error_by_loss", full)
-    code, _, err = few("calibrate", "rec", "--seed", "5", "--out", "model")
-    assert code == 2
-    assert "model: cannot be written (No space left on device)" in err.splitlines()[-1]
-    assert files_in("model") == before
 
 
 def test_evaluate_warns_of_a_torn_recording(few) -> None:

@@ -20,15 +20,11 @@ from tests.sense.live.conftest import first_presses
 
 
 @pytest.fixture
-def live(padforge_sense, model: Path) -> Callable[..., tuple[int, str, str]]:
-    return lambda *words: padforge_sense("live", "--port", "0", "--model", str(model), *words)
-
-
-@pytest.fixture
-def replay(live, brief: Recording) -> Callable[..., tuple[int, str, str]]:
+def replay(padforge_sense, model: Path, brief: Recording) -> Callable[..., tuple[int, str, str]]:
     """Of a pad that lay with its tracks up."""
     replace(brief, source={"rig": {"mirrored": True}}).save("mirrored", {})
-    return lambda *words: live("--replay", "mirrored", "--speed", "1e6", *words)
+    command = ("live", "--port", "0", "--model", str(model), "--replay", "mirrored", "--speed", "1e6")
+    return lambda *words: padforge_sense(*command, *words)
 
 
 @pytest.fixture
@@ -91,7 +87,6 @@ def test_live_shows_a_rig_until_it_ends(padforge_sense, model, views, monkeypatc
 
 
 def test_live_lines_number_fibres_from_one() -> None:
-    """From 1, as the page does, and faults are told."""
     fibres = [{"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (None, "dead"))]
     lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "faults": ["fibre 2 was dead"]})
     assert lines[:2] == ["waiting for a press", "no press yet"]

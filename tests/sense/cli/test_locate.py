@@ -12,10 +12,8 @@ from padforge.sense.localizer.model import LocalizerModel
 
 
 def test_locate_excludes_fibres_by_number(few) -> None:
-    assert few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")[:2] == (
-        0,
-        "60 positions -> places.csv\n",
-    )
+    code, out, _ = few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")
+    assert (code, out) == (0, "60 positions -> places.csv\n")
     table = np.genfromtxt("places.csv", delimiter=",", names=True)
     assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm")
     assert len(table) == 60

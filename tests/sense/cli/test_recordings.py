@@ -57,13 +57,8 @@ def topics(path: str) -> dict[str, int]:
 def test_export_writes_a_bag_with_predictions_that_import_reads(few) -> None:
     assert few("export", "rec", "r.mcap", "--model", "model") == (0, "rec -> r.mcap\n", "")
     recording = Recording.open("rec")
-    assert topics("r.mcap") == {
-        "/pad/recording": 1,
-        "/pad/readings": len(recording.readings),
-        "/pad/pressed": 2 * 60,
-        "/pad/place": 60,
-        "/pad/touches": 60,
-    }
+    presses = {"/pad/pressed": 2 * 60, "/pad/place": 60, "/pad/touches": 60}
+    assert topics("r.mcap") == {"/pad/recording": 1, "/pad/readings": len(recording.readings)} | presses
     code, out, err = few("import", "r.mcap")
     assert (code, err) == (0, "")
     assert out.startswith("60 presses, 2400 readings")

@@ -48,15 +48,11 @@ def test_record_simulates_a_twin(padforge_sense) -> None:
     assert Recording.open("other").fibres == 6
 
 
-PRINTER = (
-    "[pad]\ngrid = 2\n[rig]\nrate_hz = 50\nreadings_per_press = 30\nclearance_mm = 1\ndepth_mm = 1\ntravel_mm_s = 400\n"
-)
-
-
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 def test_record_with_a_virtual_printer(padforge_sense) -> None:
     pytest.importorskip("serial")
-    Path("pad.toml").write_text(PRINTER)
+    rig = "rate_hz = 50\nreadings_per_press = 30\nclearance_mm = 1\ndepth_mm = 1\ntravel_mm_s = 400\n"
+    Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{rig}")
     Morphology.straight(2).save("morphology.json")
     pad = ("--morphology", "morphology.json", "--spec", "pad.toml")
     code, out, _ = padforge_sense("record", "--rig", "printer", "--virtual-hardware", "--presses", "2", *pad)

@@ -15,7 +15,6 @@ from padforge.sense.twin.as_built import (
     PadPlan,
     channel_indices,
     channel_response,
-    evaluate_along_fibre,
 )
 from padforge.sense.twin.responses import Responses
 
@@ -34,9 +33,7 @@ def pad() -> AsBuiltPad:
 
 def test_jacobian_and_slope_agree_with_differences(pad):
     jacobians = pad.predict_with_jacobian(POSITIONS_MM)[1]
-    for index in range(len(pad.values)):
-        step = np.zeros(len(pad.values))
-        step[index] = 1e-6
+    for index, step in enumerate(1e-6 * np.eye(len(pad.values))):
         ahead, behind = (replace(pad, values=pad.values + sign * step).predict(POSITIONS_MM) for sign in (1, -1))
         slope = (ahead - behind) / 2e-6
         for channel in range(3):
@@ -86,9 +83,7 @@ def fibre() -> dict[str, np.ndarray]:
     step = np.diff(line, axis=0)
     length = np.hypot(*step.T)
     return {
-        "path": (line[1:] + line[:-1]) / 2,
-        "tangent": step / length[:, None],
-        "length": length,
+        "fibre": ((line[1:] + line[:-1]) / 2, step / length[:, None], length),
         "lateral_offset": 0.1 * rng.standard_normal((2, J)),
         "log_sensitivity": 0.2 * rng.standard_normal((1, J)),
         "positions": np.column_stack([rng.uniform(0, 4, 9), rng.uniform(-1, 1, 9)]),
@@ -105,22 +100,12 @@ def test_channel_response_moves_with_the_fibre_and_ends_with_the_profile(fibre):
 
 
 def test_channel_response_grows_with_the_length_of_a_stretched_fibre(fibre):
-    straight = {**fibre, "path": np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])}
-    straight |= {
-        "tangent": np.tile([1.0, 0.0], (F, 1)),
-        "length": np.full(F, 1 / F),
-        "log_sensitivity": np.zeros((1, J)),
-    }
+    path = np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])
+    elements = path, np.tile([1.0, 0.0], (F, 1)), np.full(F, 1 / F)
+    straight = {**fibre, "fibre": elements, "log_sensitivity": np.zeros((1, J))}
     straight |= {"profile": np.ones((2, K)) * [[1.0], [0.0]], "positions": np.array([[0.5, 0.0]])}
     stretched = {**straight, "lateral_offset": np.vstack([0.1 * (np.arange(J) - 1) / (J - 3), np.zeros(J)])}
     plain = {**straight, "lateral_offset": np.zeros((2, J))}
     # within one step of the press all splines of weight 1 add up to 1, so the response is the length
     assert channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
     assert channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
-
-
-def test_evaluate_along_fibre_reproduces_constants_and_lines():
-    (value, change), _, _ = evaluate_along_fibre(np.array([np.full(J, 2.0), np.arange(J, dtype=float)]), F)
-    assert value[0] == pytest.approx(2.0)
-    assert change[0] == pytest.approx(0.0, abs=1e-12)
-    assert np.diff(value[1]) == pytest.approx(change[1][0])

@@ -7,8 +7,8 @@ import pytest
 
 from padforge.sense.twin.as_built import OFFSET, SENSITIVITY, AsBuiltPad, PadPlan
 from padforge.sense.twin.fitting import Priors, estimate_scatter, fit_as_built
+from padforge.sense.twin.identification import find_wirings
 from padforge.sense.twin.responses import Responses
-from padforge.sense.twin.wiring import assign_fibres, find_wirings
 
 from .conftest import PLAN, simulate_responses
 
@@ -36,6 +36,9 @@ def test_fit_explains_fresh_presses_better_than_the_plan(printed, on_plan, fitte
     explained, explained_on_plan = (
         fresh.explained_variance(fit.pad.predict(fresh.positions_mm)) for fit in (fitted, on_plan)
     )
+    assert not on_plan.pad.channel_values[:, OFFSET].any()
+    assert not on_plan.pad.channel_values[:, SENSITIVITY].any()
+    assert not on_plan.pad.profile(np.linspace(0, 1, 9))[1].any()
     assert explained.min() > 0.97
     assert explained.mean() > explained_on_plan.mean()
 
@@ -51,17 +54,10 @@ def test_fit_recovers_lateral_offsets(printed, fitted):
     assert np.std(np.concatenate(errors)) < 0.7 * np.std(np.concatenate(offsets))
 
 
-def test_fit_on_plan_has_no_offset_sensitivity_or_angular_term(on_plan):
-    assert not on_plan.pad.channel_values[:, OFFSET].any()
-    assert not on_plan.pad.channel_values[:, SENSITIVITY].any()
-    assert not on_plan.pad.profile(np.linspace(0, 1, 9))[1].any()
-
-
 def test_noise_inflation_shrinks_offsets_and_widens_their_std(fitted, responses):
     inflated = fit_as_built(fitted.pad, responses, FREE, noise_inflation=20.0)
-    assert (
-        np.square(inflated.pad.channel_values[:, OFFSET]).sum() < np.square(fitted.pad.channel_values[:, OFFSET]).sum()
-    )
+    small, large = (np.square(fit.pad.channel_values[:, OFFSET]).sum() for fit in (inflated, fitted))
+    assert small < large
     assert inflated.offset_std(0).mean() > fitted.offset_std(0).mean()
 
 
@@ -89,10 +85,6 @@ def test_estimate_scatter_recovers_share_common_and_floor(printed, fitted, share
         assert scatter.common == pytest.approx(common, abs=0.15)
 
 
-def test_estimate_scatter_of_few_presses_is_constant_noise(printed, start):
-    assert estimate_scatter(start, simulate_responses(printed, 20), np.ones(len(start.fibres))).share == 0.0
-
-
 @pytest.mark.parametrize("missing", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_find_wirings_puts_the_true_one_first(printed, responses, missing) -> None:
     if missing:
@@ -104,10 +96,3 @@ def test_find_wirings_puts_the_true_one_first(printed, responses, missing) -> No
     assert best.transform.mirrored
     assert np.hypot(*np.subtract(best.transform.shift_mm, printed.frame.shift_mm)) < 1.0
     assert best.match > 0.9
-
-
-def test_assign_fibres_gives_each_channel_another_fibre_by_correlations_of_one_sign():
-    correlations = -np.array([[0.9, 0.8], [0.8, 0.1], [-1.0, -1.0]])
-    match, fibres = assign_fibres(correlations)
-    assert fibres == (1, 0)
-    assert match == np.mean([0.8**2, 0.8**2])
