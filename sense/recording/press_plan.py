@@ -74,7 +74,8 @@ def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -
     if pad_settings.keep_out_mm:
         import shapely
 
-        sensed = shapely.box(*np.ravel(pad_settings.sensed))
+        (left, low), (right, high) = pad_settings.sensed
+        sensed = shapely.box(left, low, right, high)
         share = sensed.difference(shapely.union_all(keep_outs(pad_settings))).area / sensed.area
         if share < MIN_PRESSABLE:
             raise InputError(f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {MIN_PRESSABLE:.0%}")
