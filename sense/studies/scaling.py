@@ -149,7 +149,7 @@ def _evaluate(tile: Morphology, grid: int, method: str, side: int, seed: int) ->
     return {"errors": errors, "positions": test, "seconds": np.array(seconds), "epochs": np.array(network.epochs)}
 
 
-def _conclude(cases: list[tuple[int, str, str]], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
+def _conclude(cases: Sequence[tuple[int, str, str]], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
     rows, maps = [], []
     by_case = dict(zip(cases, states, strict=True))
     for label, method, grid in product(settings["pads"], METHODS, settings["grids"]):
