@@ -21,7 +21,8 @@ PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 
 
 def tiny(pads: Mapping[str, Morphology], **options: Any) -> Study:
-    return robustness_study(pads, **{"max_failures": 1, "hidden": 4, "presses": 16, "test": 20} | options)
+    small: dict[str, Any] = {"max_failures": 1, "hidden": 4, "presses": 16, "test": 20}
+    return robustness_study(pads, **small | options)
 
 
 @pytest.fixture(scope="module")
