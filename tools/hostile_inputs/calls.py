@@ -20,7 +20,7 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-CALLBACKS = {"progress", "on_progress", "report", "warn", "executor", "keep_in"}
+CALLBACKS = {"progress", "on_progress", "on_message", "executor", "checkpoints"}
 """Parameters that are left alone: what is called back may raise what it likes."""
 
 
@@ -86,35 +86,35 @@ def sound() -> dict[str, Any]:
 def _elsewhere(found: dict[str, Any]) -> dict[tuple[str, str], Any]:
     """Arguments that suit where a name means something else than elsewhere."""
     return {
-        ("padforge.sense.locate", "lost"): (1,),
-        ("sense.Live", "localizers"): found["localizers"],
+        ("padforge.sense.Live", "localizers"): found["localizers"],
         ("padforge.design.search", "pad"): design.PadSettings(grid=1),
         ("padforge.design.search", "search"): found["search"],
         ("padforge.design.search", "contact"): found["contact"],
         ("padforge.fabricate.check_mesh", "path"): "pad/mould.stl",
-        ("design.Morphology.load", "path"): "pad/morphology.json",
-        ("design.Twin.load", "path"): "pad/twin.json",
+        ("padforge.design.Morphology.load", "path"): "pad/morphology.json",
+        ("padforge.design.Twin.load", "path"): "pad/twin.json",
         ("padforge.sense.open_recording", "path"): "pad/recording",
-        ("sense.Recording.open", "path"): Path("pad/recording"),
+        ("padforge.sense.Recording.open", "path"): Path("pad/recording"),
         ("padforge.sense.import_csv", "path"): "presses.csv",
-        ("sense.import_hdf5", "path"): "presses.h5",
+        ("padforge.sense.import_hdf5", "path"): "presses.h5",
         ("padforge.sense.import_mat", "path"): "pad.mat",
         ("padforge.sense.import_bag", "path"): Path("presses.mcap"),
         ("padforge.sense.export_csv", "path"): "new.csv",
-        ("sense.export_hdf5", "path"): "new.h5",
+        ("padforge.sense.export_hdf5", "path"): "new.h5",
         ("padforge.sense.export_bag", "path"): Path("new.mcap"),
         ("padforge.sense.export_lerobot", "path"): Path("new"),
-        ("padforge.sense.export_bag", "findings"): None,
-        ("padforge.sense.export_lerobot", "findings"): None,
-        ("design.Spec.load", "path"): Path("pad.toml"),
-        ("design.Spec.section", "model"): design.Contact,
-        ("design.Spec.given", "model"): design.Contact,
-        ("sense.HealthModel.load", "folder"): Path("pad"),
-        ("sense.Localizer.load", "folder"): Path("pad"),
+        ("padforge.sense.export_bag", "annotations"): None,
+        ("padforge.sense.export_lerobot", "annotations"): None,
+        ("padforge.design.Spec.load", "path"): Path("pad.toml"),
+        ("padforge.design.Spec.section", "model"): design.Contact,
+        ("padforge.design.Spec.stated", "model"): design.Contact,
+        ("padforge.sense.HealthModel.load", "folder"): Path("pad"),
+        ("padforge.sense.LocalizerModel.load", "folder"): Path("pad"),
+        ("padforge.sense.Localizer.load", "folder"): Path("pad"),
     }
 
 
-_OF_CLASS = {"Morphology": "pad", "Twin": "twin", "Recording": "recording", "Localizer": "localizer"}
+_OF_CLASS = {"Morphology": "pad", "Twin": "twin", "Recording": "recording", "LocalizerModel": "localizer"}
 _OF_CLASS |= {"Indenter": "indenter", "HealthModel": "health"}
 """Sound arguments that are of a class, whose methods are called as well."""
 
@@ -143,7 +143,7 @@ def functions() -> dict[str, Callable[..., Any]]:
             if not is_dataclass(thing) or hasattr(thing, "__post_init__"):
                 found[full] = thing
             for key, method in inspect.getmembers(thing, callable):
-                inherited = (getattr(method, "__module__", "") or "").partition(".")[0] != package.__name__
+                inherited = not (getattr(method, "__module__", "") or "").startswith(f"{package.__name__}.")
                 if key.startswith("_") or inherited:
                     continue
                 if inspect.ismethod(method) or isinstance(inspect.getattr_static(thing, key), staticmethod):
