@@ -124,6 +124,9 @@ class RigSettings(Settings):
     def inputs(self, n_fibres: int) -> tuple[int, ...]:
         """Return the input of the board that each fibre of a pad is on.
 
+        Args:
+            n_fibres: number of fibres of the pad.
+
         Raises:
             InputError: `channels` names more or fewer inputs than the pad has fibres, or one twice.
         """

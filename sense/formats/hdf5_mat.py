@@ -38,7 +38,15 @@ CYCLE, DOWN_AT = 40, 20
 
 
 def export_hdf5(recording: Recording, path: str | Path) -> None:
-    """Write a recording as HDF5, atomically; importing it gives the same numbers."""
+    """Write a recording as HDF5, atomically; importing it gives the same numbers.
+
+    Args:
+        recording: to write.
+        path: of the file, which is replaced.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     import h5py
 
     path = check_export(recording, path)

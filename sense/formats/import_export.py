@@ -28,7 +28,14 @@ FORMATS = ("lerobot",)
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Open a recording: a run directory, finished or not, or a file that `import_file` reads without a mapping."""
+    """Open a recording.
+
+    Args:
+        path: of a run directory, finished or not, or of a file that `import_file` reads without a mapping.
+
+    Raises:
+        InputError: neither, or damaged.
+    """
     path = check_path("path", path)
     is_file = path.suffix.lower() in _READERS and not path.is_dir()
     return import_file(path) if is_file or _is_bag_folder(path) else Recording.open(path)

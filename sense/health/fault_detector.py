@@ -88,7 +88,11 @@ class _PressRecord(NamedTuple):
 
 
 class FaultMonitor:
-    """Detect faulty fibres press by press, by a model of the healthy pad; they are masked from then on."""
+    """Detects faulty fibres press by press; they are masked from then on.
+
+    Args:
+        model: of the healthy pad.
+    """
 
     def __init__(self, model: HealthModel) -> None:
         self.model = check_type("model", model, HealthModel)
@@ -313,6 +317,9 @@ class FaultDetector:
     def predict(self, recording: Recording) -> list[FibreFault]:
         """Detect faults in a recording of the same pad; return them in the order of their detection.
 
+        Args:
+            recording: of a pad with the fibres and the rate of the training.
+
         Raises:
             InputError: another number of fibres, or another rate, than trained on; or `fit` or `load` was not called.
         """
@@ -330,13 +337,27 @@ class FaultDetector:
         return faults
 
     def save(self, folder: str | Path) -> None:
-        """Write both models to a folder; raises as `HealthModel.save`."""
+        """Write both models.
+
+        Args:
+            folder: where to; its models are replaced.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
         self.model_.save(folder, COMMANDED)
         self.live_model_.save(folder, DETECTED)
 
     @classmethod
     def load(cls, folder: str | Path) -> "FaultDetector":
-        """Read what `save` wrote; raises as `HealthModel.load`."""
+        """Read what `save` wrote.
+
+        Args:
+            folder: that was passed to `save`.
+
+        Raises:
+            InputError: as `HealthModel.load`.
+        """
         model, live_model = HealthModel.load(folder, COMMANDED), HealthModel.load(folder, DETECTED)
         detector = cls(model.false_alarm_rate)
         detector.model_, detector.live_model_ = model, live_model

@@ -94,6 +94,10 @@ class HealthModel:
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
         """Write NAME.safetensors and NAME.json; `load` restores every bit.
 
+        Args:
+            folder: where to.
+            name: of the files.
+
         Raises:
             InputError: the provenance is no JSON, or the folder cannot be written.
         """
@@ -108,6 +112,10 @@ class HealthModel:
     @classmethod
     def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":
         """Read what `save` wrote.
+
+        Args:
+            folder: that was passed to `save`.
+            name: of the files.
 
         Raises:
             InputError: a file is missing, torn or of another kind, a value is out of range, or the two files do not

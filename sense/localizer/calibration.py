@@ -14,7 +14,7 @@ from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_float
+from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
@@ -98,6 +98,7 @@ def calibrate(
         InputError: an option out of range, a time budget for the published method, too few presses, or a training
             that diverged.
     """
+    check_type("recording", recording, Recording)
     options = or_default("options", options, LocalizerSettings)
     time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
     if options.method == "published":

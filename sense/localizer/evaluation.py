@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_int
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import FEATURES, interpolate_gaps, window_means
@@ -41,10 +41,11 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         InputError: no level, one that leaves no fibre, no press of known position, or a recording that does not suit
             the localizer or was seen in its recalibration.
     """
-    levels = tuple(levels)
+    check_type("model", model, LocalizerModel)
+    levels = tuple(check_type("levels", levels, Iterable))
     if not levels:
         raise InputError(f"levels name no number of failed fibres, expected one or more of 0 to {model.fibres - 1}")
-    digest = recording.digest
+    digest = check_type("recording", recording, Recording).digest
     if digest in model.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     is_training = digest == model.training_recording_sha256

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common.settings import validate
-from padforge.design.common.validation import InputError, check_float
+from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model
 from padforge.sense.localizer.evaluation import distances, evaluate
@@ -50,16 +50,28 @@ class Localizer:
 
     @classmethod
     def from_settings(cls, settings: LocalizerSettings) -> "Localizer":
-        """Make a localizer of the section `[localizer]` of `pad.toml`."""
-        options = settings.model_dump()
+        """Make a localizer.
+
+        Args:
+            settings: the section `[localizer]` of `pad.toml`.
+        """
+        options = check_type("settings", settings, LocalizerSettings).model_dump()
         return cls(random_state=options.pop("seed"), **options)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Return the arguments of the constructor by name."""
+        """Return the arguments of the constructor by name.
+
+        Args:
+            deep: without effect; scikit-learn passes it.
+        """
         return {name: getattr(self, name) for name in ("max_failures", "random_state", *OPTIONS)}
 
     def set_params(self, **params: Any) -> "Localizer":
-        """Set arguments of the constructor."""
+        """Set arguments of the constructor.
+
+        Args:
+            **params: arguments by name; the others stay.
+        """
         self.__init__(**{**self.get_params(), **params})
         return self
 
@@ -145,22 +157,52 @@ class Localizer:
         return -float(np.nanmean(distances(predicted, true)))
 
     def evaluate(self, recording: Recording, max_failures: int | None = None) -> list[dict[str, Any]]:
-        """Return the rows "errors" of `evaluation_report`, one a number of failed fibres."""
+        """Evaluate for every set of up to `max_failures` failed fibres.
+
+        Args:
+            recording: of the pad; of the recording of the training, only the presses that were held back count.
+            max_failures: most fibres that fail at once; None for as many as in training.
+
+        Returns:
+            Rows of `evaluation.error_row`, one a number of failed fibres.
+
+        Raises:
+            InputError: not fitted, or as `evaluation.evaluate`.
+        """
         return self.evaluation_report(recording, max_failures)["errors"]
 
     def evaluation_report(self, recording: Recording, max_failures: int | None = None) -> dict[str, Any]:
-        """Return the document of `evaluation.evaluate` for up to `max_failures` fibres, or as many as in training."""
+        """Evaluate, and return the whole document of `evaluation.evaluate`.
+
+        Args:
+            recording: as `evaluate`.
+            max_failures: as `evaluate`.
+        """
         model = self._fitted
         most = len(model.interval_factors) - 1 if max_failures is None else max_failures
         return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))
 
     def save(self, folder: str | Path) -> None:
-        """Write `localizer.json` and `localizer.safetensors`; raises as `LocalizerModel.save`, or if not fitted."""
+        """Write `localizer.json` and `localizer.safetensors`.
+
+        Args:
+            folder: where to; its localizer is replaced.
+
+        Raises:
+            InputError: not fitted, or the folder cannot be written.
+        """
         self._fitted.save(folder)
 
     @classmethod
     def load(cls, folder: str | Path) -> "Localizer":
-        """Read what `save` wrote; options that the files do not hold have their defaults."""
+        """Read what `save` wrote; options that the files do not hold have their defaults.
+
+        Args:
+            folder: that was passed to `save`.
+
+        Raises:
+            InputError: as `LocalizerModel.load`.
+        """
         model = LocalizerModel.load(folder)
         options = {} if model.features == "array" else {"features": model.features}
         localizer = cls(len(model.interval_factors) - 1, method=model.method, split=model.split, **options)

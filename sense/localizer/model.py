@@ -139,14 +139,26 @@ class LocalizerModel(LocalizerDocument):
         return len(self.scaler.mean_v)
 
     def raw_features(self, recording: Recording) -> PressFeatures:
-        """Return the features in volts of every press of a recording of the same pad, which is checked."""
+        """Return the features of every press, V.
+
+        Args:
+            recording: of a pad with the fibres and the rate of the training.
+
+        Raises:
+            InputError: another pad, or a localizer that was fitted to arrays.
+        """
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
+        check_type("recording", recording, Recording)
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         return compute_features(recording.readings, recording.down_command, recording.up_command, self.features)
 
     def scaled_features(self, recording: Recording) -> ScaledFeatures:
-        """Return the scaled features of every press; raises as `raw_features`."""
+        """Return the scaled features of every press.
+
+        Args:
+            recording: as `raw_features`, and raises as it does.
+        """
         return self.scaler.transform(self.raw_features(recording))
 
     def predict(self, recording: Recording, failed: ArrayLike = (), fibre_mask: Mask | None = None) -> Localization:
@@ -162,7 +174,12 @@ class LocalizerModel(LocalizerDocument):
         """
         features = self.scaled_features(recording)
         if fibre_mask is not None:
-            features = replace(features, fibre_mask=features.fibre_mask & fibre_mask)
+            mask = np.asarray(fibre_mask)
+            if mask.dtype != bool or mask.shape != features.fibre_mask.shape:
+                raise InputError(
+                    f"fibre_mask is {mask.dtype} of shape {mask.shape}, expected bool {features.fibre_mask.shape}"
+                )
+            features = replace(features, fibre_mask=features.fibre_mask & mask)
         return self.predict_features(features, failed)
 
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
@@ -175,6 +192,7 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: `failed` are no such fibres, or all; or some, and the method is "published".
         """
+        check_type("presses", presses, ScaledFeatures)
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
         networks, parts = (self.method, self.bayes, self.residual_network), []
@@ -217,7 +235,14 @@ class LocalizerModel(LocalizerDocument):
         return working
 
     def save(self, folder: str | Path) -> None:
-        """Write `localizer.json` and `localizer.safetensors`, both or none; `load` reads the same to the last bit."""
+        """Write `localizer.json` and `localizer.safetensors`, both or none; `load` reads the same to the last bit.
+
+        Args:
+            folder: where to; its localizer is replaced.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
         document = {"format": FORMAT, **_DOCUMENT.dump_python(self, warnings=False)}
         arrays = {**self.weights, TABLE: self.table}
         if self.bayes is not None:
@@ -226,7 +251,14 @@ class LocalizerModel(LocalizerDocument):
 
     @classmethod
     def load(cls, folder: str | Path) -> "LocalizerModel":
-        """Read what `save` wrote, and check that the files belong together and every value is in range."""
+        """Read what `save` wrote.
+
+        Args:
+            folder: that was passed to `save`.
+
+        Raises:
+            InputError: a file is missing or torn, the two do not belong together, or a value is out of range.
+        """
         files = files_of(folder, NAME)
         document, digest = _read_document(read_json(files.document, FORMAT), str(files.document))
         scaler, method = document.scaler, document.method

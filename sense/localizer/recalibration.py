@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.files import provenance
-from padforge.design.common.validation import InputError, check_int
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.evaluation import Measures, conformal, distances, error_row
@@ -72,7 +72,8 @@ def recalibrate(
     Raises:
         InputError: too few presses of known position, or a recording that does not suit the localizer.
     """
-    known = np.flatnonzero(recording.has_position)
+    check_type("model", model, LocalizerModel)
+    known = np.flatnonzero(check_type("recording", recording, Recording).has_position)
     seed = check_int("seed", seed, 0, 2**32 - 1)
     if len(known) < MIN_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known position, expected at least {MIN_PRESSES}")

@@ -145,7 +145,11 @@ class Recording:
     def open(cls, path: str | Path) -> "Recording":
         """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
 
-        A torn end of the readings is cut off, with the presses in it; other damage raises InputError.
+        Args:
+            path: of the run directory. A torn end of its readings is cut off, with the presses in it.
+
+        Raises:
+            InputError: other damage, or no run directory.
         """
         path = check_path("path", path)
         rows, _ = read_blocks(path / READINGS, read_fibres(path))

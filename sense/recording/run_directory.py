@@ -171,7 +171,14 @@ class Recorder:
 
     @classmethod
     def resume(cls, path: Path) -> "Recorder":
-        """Continue an unfinished run directory; torn tails are cut off, and other damage or links refused."""
+        """Continue an unfinished run directory; torn ends are cut off.
+
+        Args:
+            path: of the run directory.
+
+        Raises:
+            InputError: other damage, a link in it, or a recording that is finished.
+        """
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
         with reraise_write_error(path):
@@ -208,7 +215,12 @@ class Recorder:
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add (n,) times in s and (n, C) volts; after an OSError (the disk is full or gone) nothing was added."""
+        """Add readings; after an OSError (the disk is full or gone) nothing was added.
+
+        Args:
+            times_s: (n,) ascending.
+            readings: (n, C) V.
+        """
         times, volts = check_numbers(times_s, np.float64, "times"), check_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
             raise InputError(
@@ -221,7 +233,11 @@ class Recorder:
         self.n_readings += len(rows)
 
     def append_states(self, rows: Array) -> None:
-        """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
+        """Add states of the arm.
+
+        Args:
+            rows: (n, 10), by `STATE_COLUMNS`.
+        """
         if self._states is None:
             file = (self._path / STATES).open("xb", buffering=0)
             self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
@@ -266,7 +282,11 @@ class Recorder:
         self._press, self._is_down = self._press + 1, False
 
     def abort(self, reason: str) -> None:
-        """Note that the press that was begun, if any, did not come to its end."""
+        """Note that the press that has begun, if any, did not come to its end.
+
+        Args:
+            reason: in words.
+        """
         if self._is_down:
             self._is_down = False
             self._write_event("aborted", self._press, self.n_readings, reason=reason)

@@ -146,7 +146,11 @@ class TotalVariation:
         return np.array([channel.latest for channel in self._channels])
 
     def update(self, readings: ArrayLike) -> Array:
-        """Process readings (n, C), as in `total_variation`; return the (m, C) values that have become final."""
+        """Process readings, and return the (m, C) values that have become final.
+
+        Args:
+            readings: (n, C), as in `total_variation`.
+        """
         for channel, column in zip(self._channels, _check_block(readings, len(self._channels)), strict=True):
             channel.update(column)
         return self._pop_final()
@@ -214,7 +218,11 @@ class RunningMedian:
         self._n_returned = 0  # of these, whose median has been returned
 
     def update(self, readings: ArrayLike) -> Array:
-        """Process readings (n, C), as in `running_median`; return the (m, C) medians that have become known."""
+        """Process readings, and return the (m, C) medians that have become known.
+
+        Args:
+            readings: (n, C), as in `running_median`.
+        """
         self._readings = np.concatenate([self._readings, _check_block(readings, len(self._readings))], axis=1)
         return self._pop_medians(max(self._readings.shape[1] - self._after, 0))
 

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
-from padforge.design.common.validation import InputError, check_int, short_repr
+from padforge.design.common.settings import or_default
+from padforge.design.common.validation import InputError, check_int, check_type, short_repr
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
@@ -68,8 +69,8 @@ def fibre_loss_study(
     """
     if localizer is None and not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
-    options = options or settings.LocalizerSettings()
-    fibres = recording.fibres
+    options = or_default("options", options, settings.LocalizerSettings)
+    fibres = check_type("recording", recording, Recording).fibres
     chosen = tuple(sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in failed}))
     if len(chosen) == fibres:
         raise InputError(f"failed are all {fibres} fibres, at least one must be left")

@@ -16,7 +16,8 @@ from scipy.optimize import nnls
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
-from padforge.design.common.validation import InputError
+from padforge.design.common.settings import or_default
+from padforge.design.common.validation import InputError, check_type
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_presses
@@ -52,7 +53,8 @@ def learning_curve(
     Raises:
         InputError: too few presses for a curve.
     """
-    options = options or settings.LocalizerSettings()
+    check_type("recording", recording, Recording)
+    options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)
     training, test = (presses[part] for part in split_presses(len(presses), options.split, options.test_share, rng))

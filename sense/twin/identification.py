@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from threadpoolctl import threadpool_limits
 
 from padforge.design import Morphology
-from padforge.design.common.validation import InputError
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import sensed_rectangle
 from padforge.design.twin import MAX_INFORMATION_GAIN, PlanTransform, Twin, TwinChannel, TwinReadings, TwinScatter
@@ -283,8 +283,9 @@ def identify_pad(
     recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = lambda what, done, total: None
 ) -> Identification:
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
-    rng = np.random.default_rng(seed)
-    recording = select_one_depth(recording)
+    rng = np.random.default_rng(check_int("seed", seed, 0, 2**64 - 1))
+    check_type("pad", pad, Morphology)
+    recording = select_one_depth(check_type("recording", recording, Recording))
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
 

@@ -51,6 +51,9 @@ def test_stream_board_averages_to_the_rate(still: Time) -> None:
             times_s = np.arange(still(), still() + 0.01, 0.001)[:10]
             return BoardSamples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
 
+        def close(self) -> None:
+            """Nothing to close."""
+
     stream = stream_board(Ramp(), 13.4)
     assert (stream.fibres, stream.rate_hz) == (2, pytest.approx(1000 / 75))
     blocks = [next(stream.blocks) for _ in range(100)]

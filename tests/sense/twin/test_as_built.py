@@ -1,6 +1,7 @@
 """The parametric model of a pad: derivatives against differences, closed forms, transform and path."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def test_align_transform_moves_common_offsets_into_the_transform(pad):
 
 
 @pytest.fixture
-def fibre() -> dict[str, np.ndarray]:
+def fibre() -> dict[str, Any]:
     rng = np.random.default_rng(1)
     x = np.linspace(0, 4, F + 1)
     line = np.column_stack([x, 0.4 * np.sin(2 * x)])
