@@ -186,7 +186,7 @@ class Morphology:
             provenance: origin of the morphology; free JSON.
         """
         check_type("layout", layout, Layout)
-        return cls(knots, layout.pitch_mm, provenance or {}, layout.counts)
+        return cls(knots, layout.pitch_mm, {} if provenance is None else provenance, layout.counts)
 
     @classmethod
     def straight(cls, fibres: Counts | Layout, pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Morphology":

@@ -46,7 +46,7 @@ def find_segment_starts(times_s: ArrayLike, max_interval_s: float) -> Indices:
         InputError: times that are not finite, are beyond 1e10 s or do not ascend, or an interval that is not above 0.
     """
     times = check_numbers(times_s, np.float64, "times_s")
-    check_magnitude("times_s", times[:, None], MAX_S, "s")
+    check_magnitude("times_s", times.reshape(-1, 1), MAX_S, "s")
     if times.ndim != 1 or (np.diff(times) < 0).any():
         raise InputError(f"times_s are {short_repr(times_s)}, expected finite numbers that ascend")
     if not (interval := check_float("max_interval_s", max_interval_s, 0.0, 1e300)):

@@ -4,7 +4,7 @@ Both methods are tested on the same presses. The published one (paper, figure 9 
 fibres will fail, and trains on the others alone: 42 networks for 6 fibres of which up to 3 fail.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_int, check_type, short_repr
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import MAX_FIBRES, Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_unseen
 from padforge.sense.localizer.evaluation import errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
@@ -67,15 +67,20 @@ def fibre_loss_study(
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
             that does not suit the localizer, a localizer without fibre dropout, or checkpoints of other settings.
     """
-    if localizer is None and not retrain:
+    if localizer is not None:
+        check_type("localizer", localizer, LocalizerModel)
+    elif not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
     options = or_default("options", options, settings.LocalizerSettings)
     fibres = check_type("recording", recording, Recording).fibres
-    chosen = tuple(sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in failed}))
+    most = min(check_int("max_failures", max_failures, 0, MAX_FIBRES), fibres - 1)
+    chosen = tuple(
+        sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in check_type("failed", failed, Iterable)})
+    )
     if len(chosen) == fibres:
         raise InputError(f"failed are all {fibres} fibres, at least one must be left")
     training, test = split_unseen(recording, localizer, options)
-    levels = range(min(max_failures, fibres - 1) + 1)
+    levels = range(most + 1)
     positions_mm = recording.presses_mm[test]
     evaluate = partial(_evaluate, fibres, levels, chosen, positions_mm)
     methods: dict[str, Any] = {}
