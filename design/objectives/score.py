@@ -202,6 +202,7 @@ def score(
     size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
     noise, stated = SearchSettings(noise=noise).noise, {"max_failures": max_failures}
     if scatter is not None:
+        check_type("scatter", scatter, Scatter)
         stated |= {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
     search = SearchSettings(**stated)
     check_comparisons(len(pad.knots), PER_SPAN * (pad.knots.shape[1] - 1) + 1)

@@ -67,6 +67,7 @@ def fibre_loss_study(
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
             that does not suit the localizer, a localizer without fibre dropout, or checkpoints of other settings.
     """
+    check_type("retrain", retrain, bool)
     if localizer is not None:
         check_type("localizer", localizer, LocalizerModel)
     elif not retrain:
