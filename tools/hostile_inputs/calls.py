@@ -198,6 +198,6 @@ def drawn(rng: Rng) -> tuple[Callable[[], None], str]:
                 function(**given)
             except (InputError, Fault) as error:
                 print(f"padforge: {error}".encode(errors="backslashreplace").decode(), file=sys.stderr)
-                raise SystemExit(2) from error
+                raise SystemExit(1 if isinstance(error, Fault) else 2) from error  # as on the command line
 
     return call, told
