@@ -69,6 +69,12 @@ class ArmState:
     moving: bool
     sideways_n: float = 0.0
 
+    def to_row(self) -> list[float]:
+        """Return the row of the state, by `STATE_COLUMNS`."""
+        force_n = math.nan if self.force_n is None else self.force_n
+        stopped = self.protective_stop or self.emergency_stop
+        return [self.time_s, *self.pose, self.speed_mm_s, force_n, float(not stopped)]
+
     @property
     def total_force_n(self) -> float | None:
         """Magnitude of the force on the tool, >= 0; None without a sensor."""

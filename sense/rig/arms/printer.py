@@ -34,7 +34,7 @@ from padforge.sense.rig.arms.printer_link import (
     parse_axis_limits,
     parse_position,
 )
-from padforge.sense.rig.devices import ArmState, Array, Pose, RigFault
+from padforge.sense.rig.devices import ArmState, Array, RigFault
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
@@ -287,7 +287,7 @@ class Printer:
         if (age_s := time.monotonic() - state.time_s) > STALE_S:
             message = f"the printer's last answer is {age_s:.2f} s old; allowed {STALE_S} s"
             raise RigFault("stale", message, "it may be busy: look at its display")
-        return ArmState(state.time_s, self._pose(state.position), state.speed_mm_s, None, False, False, state.moving)
+        return self._to_arm_state(state)
 
     def drain(self) -> Array:
         """Return the (n, 10) states since the last call; those before a fault come before it."""
@@ -295,7 +295,7 @@ class Printer:
         if not states:
             self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
-        return np.array([[one.time_s, *self._pose(one.position), one.speed_mm_s, np.nan, 1.0] for one in states])
+        return np.array([self._to_arm_state(state).to_row() for state in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move from rest, as fast as the axes can; RigFault("refused") also for a turn of the tool."""
@@ -327,9 +327,10 @@ class Printer:
             raise self._thread.fault
         return self._thread
 
-    def _pose(self, nozzle: Position) -> Pose:
-        x, y, z = (a + b for a, b in zip(nozzle, self._tcp, strict=True))
-        return (x, y, z, *self._rig.tool_rad)
+    def _to_arm_state(self, state: NozzleState) -> ArmState:
+        x, y, z = (a + b for a, b in zip(state.position, self._tcp, strict=True))
+        pose = (x, y, z, *self._rig.tool_rad)
+        return ArmState(state.time_s, pose, state.speed_mm_s, None, False, False, state.moving)
 
     def _check_press_time(self, max_mm_s: Position, max_mm_s2: Position) -> None:
         """Refuse presses that would be over before the tip is down."""

@@ -1,27 +1,12 @@
 """The wire format of the Arduino Due board: messages between host and board as frames, the same both ways.
 
-On the wire a frame is `00 coded check 00`. `coded` is the payload with its zeros taken out by COBS (consistent overhead
-byte stuffing), so a zero is always the edge of a frame and a decoder falls in step again at the next one. With zeros on
-both sides a damaged edge costs one frame only. `check` is the CRC-16/CCITT-FALSE of `coded`, in three bytes of 2, 7 and
-7 bits with the top bit set, so that it holds no zero either. It covers the coded bytes and not the payload because one
-flipped bit among the COBS counts would alter several bytes of the payload: as it is, up to three flipped bits and every
-burst of up to 16 bits are detected for certain.
-
-A payload is a kind (one byte) and a body, little-endian:
-
-    01 identify, 03 start, 04 stop    to the board, without a body
-    02 settings    to the board: period of a sample u32 ns, mask of inputs u16 (bit 0 is A0), conversions a sample u8
-    81 identity    firmware version 3 x u8, bits u8, inputs u8, name 16 bytes, serial number 16 bytes
-    82 ack         kind of the command u8, status u8, settings in force as in 02
-    90 block       samples n u8, conversions a sample u8, mask u16, sequence number u16, index of the first sample u32,
-                   board time at the last sample u32 us, samples dropped by the board u32, n x C sums u16
-
-Indices, times and sequence numbers wrap around. A sum of conversions is at most 16 x 4095, so averaging loses no
-resolution.
+`firmware/padforge_due/README.md` describes it. A frame is checked by its CRC over the coded bytes and not the payload,
+because one flipped bit among the COBS counts would alter several bytes of the payload.
 """
 
 import struct
 from binascii import crc_hqx
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -126,6 +111,9 @@ class DueBlock:
     time_us: int  # board time when the last sample was complete
     overruns: int  # samples that the board has dropped since the start
 
+    def __len__(self) -> int:
+        return len(self.counts)
+
     def pack(self) -> bytes:
         """Return the payload."""
         fields = (self.averaging, self.mask, self.sequence, self.first, self.time_us, self.overruns)
@@ -218,24 +206,19 @@ class DueDecoder:
     """Decodes the messages in a stream of bytes that comes in any portions."""
 
     def __init__(self) -> None:
-        self.damaged = 0  # pieces between two zeros, so far, that were no message
         self._tail = b""
 
     def decode(self, data: bytes) -> list[DueMessage]:
         """Return the messages that `data` completes, in order."""
         *pieces, tail = (self._tail + data).split(b"\0")
         self._tail = tail[: _MAX_FRAME + 1]  # one byte too long is damaged whatever follows
-        return [message for piece in pieces if piece and (message := self._decode_piece(piece)) is not None]
-
-    def _decode_piece(self, piece: bytes) -> DueMessage | None:
-        coded, check = piece[:-_CHECK_BYTES], piece[-_CHECK_BYTES:]
-        try:
-            if len(piece) > _MAX_FRAME or check != _check(coded):
-                raise ValueError("the check does not fit")
-            return unpack(cobs_decode(coded))
-        except ValueError:
-            self.damaged += 1
-            return None
+        messages = []
+        for piece in pieces:
+            coded, check = piece[:-_CHECK_BYTES], piece[-_CHECK_BYTES:]
+            if coded and len(piece) <= _MAX_FRAME and check == _check(coded):
+                with suppress(ValueError):  # what passes the check by chance, and is no message
+                    messages.append(unpack(cobs_decode(coded)))
+        return messages
 
 
 def _check(coded: bytes) -> bytes:

@@ -2,12 +2,11 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
+from padforge.sense.rig.boards.board_reader import BoardDriver, SampleClock, select_inputs
 from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineDecoder, LineHeader, LineSample
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
@@ -34,15 +33,7 @@ def find_line_port(rig: RigSettings) -> str:
     return ports[0]
 
 
-@dataclass(frozen=True)
-class LineBlock:
-    """Samples that came together: n board times, and (n, C) counts."""
-
-    times_us: list[int]
-    counts: list[tuple[int, ...]]
-
-
-class LineBoard:
+class LineBoard(BoardDriver):
     """A board at a serial port that sends samples as lines; implements `Board`.
 
     The host time of a sample is when it was measured by the board's clock, but for the least delay of the port.
@@ -50,29 +41,24 @@ class LineBoard:
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
         """Take the settings; nothing is opened before `connect`, where the board's header must state `rate_hz`."""
-        self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
-        self._stream: SerialStream | None = None
+        super().__init__(port, baud)
+        self._rate_hz, self._inputs = rate_hz, inputs
         self._decoder = LineDecoder()
-        self._reader: BlockReader[LineBlock] | None = None
-        self._assembler: LineAssembler | None = None
+        self._settled, self._last_sample_s = False, 0.0
 
     @classmethod
     def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
         """Return the board that `[rig]` names; see `__init__` and `find_line_port`."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
 
-    def connect(self) -> dict[str, Any]:
-        """Open the port, ask the board for its header and start to read; see `Board`."""
-        self.close()
-        self._stream, self._decoder = SerialStream(self._port, self._baud, POLL_S), LineDecoder()
-        try:
-            header = self._identify(self._stream)
-            inputs = select_inputs(self._inputs, header.channels, "the board")
-            self._assembler = LineAssembler(header, inputs)
-            self._start(self._stream, header)
-        except BaseException:
-            self.close()
-            raise
+    def _start(self, stream: SerialStream) -> dict[str, Any]:
+        self._decoder, self._settled = LineDecoder(), False
+        header = self._identify(stream)
+        inputs = select_inputs(self._inputs, header.channels, "the board")
+        assembler = LineAssembler(header, inputs)
+        self._last_sample_s = time.monotonic()
+        self._read_blocks(lambda: self._receive_blocks(stream, header), header.rate_hz, assembler.assemble)
+        self._settled = True
         return {
             **dict(header.extra),
             "channels": len(inputs),
@@ -83,30 +69,6 @@ class LineBoard:
             "port": self._port,
             **({} if header.checked else {"warning": "its lines have no check: a damaged one may pass for a sample"}),
         }
-
-    def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or reset."""
-        if self._reader is None or self._assembler is None:
-            raise RigFault("refused", f"{self._port}: not connected")
-        return self._assembler.assemble(self._reader.drain())
-
-    def statistics(self) -> dict[str, float]:
-        """Return counts since `connect`, of what has been read: samples, damaged lines, missing samples, skew_ppm."""
-        assembler = self._assembler
-        return {
-            "samples": assembler.samples if assembler else 0,
-            "damaged": self._decoder.damaged,
-            "missing": assembler.missing if assembler else 0,
-            "skew_ppm": assembler.clock.skew_ppm if assembler else 0.0,
-        }
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        if self._reader is not None:
-            self._reader.stop()
-        if self._stream is not None:
-            self._stream.close()
-        self._reader = None
 
     def _identify(self, stream: SerialStream) -> LineHeader:
         deadline, resend_s = time.monotonic() + _ANSWER_S, 0.0
@@ -124,27 +86,19 @@ class LineBoard:
             raise RigFault("refused", message, f"set board_rate_hz = {header.rate_hz:g}")
         return header
 
-    def _start(self, stream: SerialStream, header: LineHeader) -> None:
-        settled, last_sample_s = False, time.monotonic()
-
-        def receive() -> tuple[float, list[LineBlock]]:
-            nonlocal last_sample_s
-            now_s, data = stream.receive()
-            items = self._decoder.decode(data)
-            headers = [item for item in items if isinstance(item, LineHeader)]
-            if headers and (settled or headers[-1] != header):  # before, it answers a request that was repeated
-                raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
-            if self._decoder.n_errors >= _MIN_BAD_LINES and now_s - last_sample_s > _BAD_S:
-                raise RigFault("data", f"{self._port}: {self._decoder.error}", "line after line; look at the board")
-            samples = [item for item in items if isinstance(item, LineSample)]
-            if not samples:
-                return now_s, []
-            last_sample_s = now_s
-            return now_s, [LineBlock([sample.time_us for sample in samples], [sample.counts for sample in samples])]
-
-        self._reader = BlockReader(self._port, receive, header.rate_hz)
-        self._reader.start_settled()
-        settled = True
+    def _receive_blocks(self, stream: SerialStream, header: LineHeader) -> tuple[float, list[list[LineSample]]]:
+        now_s, data = stream.receive()
+        items = self._decoder.decode(data)
+        headers = [item for item in items if isinstance(item, LineHeader)]
+        if headers and (self._settled or headers[-1] != header):  # before, it answers a request that was repeated
+            raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
+        if self._decoder.n_errors >= _MIN_BAD_LINES and now_s - self._last_sample_s > _BAD_S:
+            raise RigFault("data", f"{self._port}: {self._decoder.error}", "line after line; look at the board")
+        samples = [item for item in items if isinstance(item, LineSample)]
+        if not samples:
+            return now_s, []
+        self._last_sample_s = now_s
+        return now_s, [samples]
 
 
 class LineAssembler:
@@ -155,8 +109,7 @@ class LineAssembler:
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
-        self.clock = SampleClock(1e-6, RESONATOR_SKEW)
-        self.samples = self.missing = 0
+        self._clock = SampleClock(1e-6, RESONATOR_SKEW)
         self._columns = list(inputs)
         self._volts = header.reference_v / header.full_scale
         self._period_us = 1e6 / header.rate_hz
@@ -164,21 +117,19 @@ class LineAssembler:
         self._slot_us = 0.0
         self._n_misplaced = 0.0
 
-    def assemble(self, arrivals: Iterable[tuple[float, LineBlock]]) -> BoardSamples:
+    def assemble(self, arrivals: Iterable[tuple[float, list[LineSample]]]) -> BoardSamples:
         """Return the samples of lines with their arrival times; RigFault("data") if their times are impossible."""
         times_us, rows, gaps = [], [], []
         for arrival_s, block in arrivals:
-            for time_us, counts in zip(block.times_us, block.counts, strict=True):
-                if (missing := self._place(time_us)) is not None:
+            for sample in block:
+                if (missing := self._place(sample.time_us)) is not None:
                     times_us.append(self._last_us)
-                    rows.append([counts[column] for column in self._columns])
+                    rows.append([sample.counts[column] for column in self._columns])
                     gaps.append(missing)
             if times_us:
-                self.clock.observe(times_us[-1], arrival_s)
-        self.samples += len(rows)
-        self.missing += sum(gaps)
+                self._clock.observe(times_us[-1], arrival_s)
         return BoardSamples(
-            self.clock.times(np.array(times_us)) if times_us else np.empty(0),
+            self._clock.times(np.array(times_us)) if times_us else np.empty(0),
             np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._volts,
             np.array(gaps, np.int64),
         )

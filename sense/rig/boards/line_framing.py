@@ -1,19 +1,6 @@
 """The line protocol: samples as lines of text, so plain that any board can be programmed to speak it.
 
-    # padforge-line 1 name=my-board rate_hz=500 bits=12 reference_v=3.3 channels=4 check=crc32*f0771b8a
-    2000,2048,1991,870,2003*1503e78d
-    4000,2049,1990,871,2004*fbc86327
-
-The board sends the header when it starts, and whenever the host sends a question mark. `rate_hz` is the number of
-samples a second, `bits` the resolution of a count, `reference_v` the voltage of the highest count, `channels` the
-number of inputs. `name`, `serial` and other words are the board's own.
-
-A sample is the board's time in us, a whole ascending number that may wrap around at 2^32, and a count of every input. A
-sample that cannot be sent is left out: its time is missing, and so it is counted as lost.
-
-With `check=crc32` all lines end in a star and eight hexadecimal digits: the CRC-32 (zlib's) of the text before the
-star, so that a damaged line never passes for another. Lines end in LF or CR LF; other lines that begin with `#` are
-comments.
+docs/devices.md describes it.
 """
 
 from binascii import crc32
@@ -84,7 +71,6 @@ class LineDecoder:
 
     def __init__(self) -> None:
         self.header: LineHeader | None = None  # the latest; before the first there are no samples
-        self.damaged = 0  # lines since then that were neither
         self._errors: Counter[str] = Counter()
         self._tail = b""
 
@@ -114,7 +100,6 @@ class LineDecoder:
                 item = _parse_sample(line, self.header)
         except ValueError as error:
             self._errors[str(error)] += 1
-            self.damaged += self.header is not None
             return None
         self._errors.clear()
         return item

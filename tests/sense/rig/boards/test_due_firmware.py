@@ -24,7 +24,6 @@ def run(program: Path, *steps: str | Request | BoardSettings) -> list[framing.Du
     script = [step if isinstance(step, str) else f"host {framing.encode(step).hex()}" for step in steps]
     decoder, stream = framing.DueDecoder(), run_sketch(program, script)
     messages = decoder.decode(stream)
-    assert decoder.damaged == 0
     assert stream == b"".join(map(framing.encode, messages))
     return messages
 
