@@ -12,8 +12,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards.due import DueBoard
-from padforge.sense.rig.boards.line_board import LineBoard
-from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import Arm, Board
 from padforge.sense.settings import RigSettings

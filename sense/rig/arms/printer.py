@@ -29,9 +29,9 @@ from padforge.sense.rig.arms.printer_link import (
     FIRMWARE,
     HOMING_ADVICE,
     MarlinLink,
-    PrinterInfo,
     format_move,
     parse_axis_limits,
+    parse_identity,
     parse_position,
 )
 from padforge.sense.rig.devices import ArmState, Array, RigFault
@@ -260,7 +260,7 @@ class Printer:
         self._link = link = MarlinLink(rig.printer_port, rig.printer_baud)
         try:
             link.handshake(CONNECT_S)
-            info = _identify(link)
+            identity = _identify(link)
             max_mm_s, max_mm_s2 = _read_axis_limits(link)
             self._check_press_time(max_mm_s, max_mm_s2)
             for command in SETTINGS:
@@ -274,11 +274,9 @@ class Printer:
         return {
             "port": rig.printer_port,
             "baud": rig.printer_baud,
-            "firmware": info.firmware,
-            "machine": info.machine,
+            **identity,
             "max_mm_s": list(max_mm_s),
             "max_mm_s2": list(max_mm_s2),
-            "halts_at_once": "EMERGENCY_PARSER" in info.capabilities,
         }
 
     def state(self) -> ArmState:
@@ -347,14 +345,17 @@ class Printer:
             )
 
 
-def _identify(link: MarlinLink) -> PrinterInfo:
-    info = PrinterInfo.parse(link.execute("M115"))
-    if FIRMWARE not in info.firmware:
-        raise RigFault("refused", f"the firmware is {info.firmware or 'of no name'!r}, allowed is Marlin")
-    if re.match(r"Marlin (bugfix-)?1\.", info.firmware):  # answers M114 only once all moves are over
-        message = f"the firmware is {info.firmware!r}, which reports its position only once it stands"
+def _identify(link: MarlinLink) -> dict[str, Any]:
+    """Return what the printer is; RigFault("refused") unless its firmware is Marlin 2."""
+    lines = link.execute("M115")
+    firmware = parse_identity(lines, "FIRMWARE_NAME")
+    if FIRMWARE not in firmware:
+        raise RigFault("refused", f"the firmware is {firmware or 'of no name'!r}, allowed is Marlin")
+    if re.match(r"Marlin (bugfix-)?1\.", firmware):  # answers M114 only once all moves are over
+        message = f"the firmware is {firmware!r}, which reports its position only once it stands"
         raise RigFault("refused", message, "allowed is Marlin 2")
-    return info
+    machine, halts_at_once = parse_identity(lines, "MACHINE_TYPE"), "Cap:EMERGENCY_PARSER:1" in lines
+    return {"firmware": firmware, "machine": machine, "halts_at_once": halts_at_once}
 
 
 def _read_axis_limits(link: MarlinLink) -> tuple[Position, Position]:

@@ -11,8 +11,8 @@ import pytest
 
 from padforge.sense.rig.arms import printer_link
 from padforge.sense.rig.arms.printer import Printer
-from padforge.sense.rig.arms.printer_link import MarlinLink, PrinterInfo
-from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.arms.printer_link import MarlinLink
+from padforge.sense.rig.boards.line_board import LineHeader
 from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.virtual import printer as firmware
@@ -54,6 +54,7 @@ def test_connect_reports_identity_and_axis_limits():
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         identity = arm.connect()
         assert identity["firmware"].startswith("Marlin")
+        assert identity["halts_at_once"]
         assert identity["max_mm_s"] == [500.0, 500.0, 15.0]
         state = arm.state()
         assert state.pose == pytest.approx(pose(110, 110, 40))
@@ -224,7 +225,7 @@ def test_handshake_refuses_endless_talker():
 M115 = [
     "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"
     " PROTOCOL_VERSION:1.0 MACHINE_TYPE:Ender-3 Pro EXTRUDER_COUNT:1 UUID:cede2a2f-41a2-4748-9b12-c55c62f367ff",
-    *("Cap:SERIAL_XON_XOFF:0", "Cap:EEPROM:1", "Cap:EMERGENCY_PARSER:1", "Cap:AUTOREPORT_POS:0"),
+    "Cap:EMERGENCY_PARSER:1",
 ]
 M503 = [
     "echo:; Maximum feedrates (units/s):",
@@ -241,11 +242,9 @@ def test_lines_follow_marlin_and_answers_are_parsed():
     assert printer_link.number_line(0, "M110 N0") == b"N0 M110 N0*125\n"
     assert printer_link.number_line(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
     assert printer_link.format_move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
-    info = PrinterInfo.parse(M115)
-    assert info.firmware == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
-    assert info.machine == "Ender-3 Pro"
-    assert info.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
-    assert PrinterInfo.parse(["echo: hello"]) == PrinterInfo()
+    assert printer_link.parse_identity(M115, "FIRMWARE_NAME") == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
+    assert printer_link.parse_identity(M115, "MACHINE_TYPE") == "Ender-3 Pro"
+    assert printer_link.parse_identity(["echo: hello"], "FIRMWARE_NAME") == ""
     assert printer_link.parse_axis_limits(M503, "M203") == (500.0, 400.0, 5.0)
     assert printer_link.parse_axis_limits(M503, "M201") == (500.0, 500.0, 100.0)
     assert printer_link.parse_axis_limits(M503[2:], "M203") is None

@@ -14,8 +14,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense.rig.boards import board_reader, due, line_board
 from padforge.sense.rig.boards.due import DueBoard
-from padforge.sense.rig.boards.line_board import LineBoard
-from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of

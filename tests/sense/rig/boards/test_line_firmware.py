@@ -5,13 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.boards import line_framing as framing
-from padforge.sense.rig.boards.line_board import LineAssembler
-from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, LineSample, format_header, format_sample
+from padforge.sense.rig.boards import line_board
+from padforge.sense.rig.boards.line_board import (
+    LineAssembler,
+    LineDecoder,
+    LineHeader,
+    LineSample,
+    format_header,
+    format_sample,
+)
 from padforge.sense.rig.devices import BoardSamples
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
-FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"
+FIRMWARE = Path(line_board.__file__).parent / "firmware" / "padforge_line"
 PAGE = Path(__file__).parents[4] / "docs" / "devices.md"
 NAME = (("name", "padforge-line"),)
 HEADERS = {

@@ -8,8 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.boards.line_board import LineAssembler
-from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, LineSample, format_header, format_sample
+from padforge.sense.rig.boards.line_board import (
+    LineAssembler,
+    LineDecoder,
+    LineHeader,
+    LineSample,
+    format_header,
+    format_sample,
+)
 from padforge.sense.rig.devices import BoardSamples, RigFault
 
 PAGE = Path(__file__).parents[4] / "docs" / "devices.md"
