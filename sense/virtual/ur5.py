@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.devices import Array, Pose, RigFault
-from padforge.sense.virtual.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series, SpringySurface
+from padforge.sense.virtual.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
 
 HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
@@ -79,9 +79,10 @@ class EmulatedUR5:
         tcp_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Describe a controller: "cb3" at 125 Hz or "e" at 500 Hz, over a springy plane at `surface_mm`."""
-        surface = None if surface_mm is None else SpringySurface(surface_mm / 1e3, stiffness_n_mm * 1e3)
+        surface_m = -np.inf if surface_mm is None else surface_mm / 1e3
         x, y, z = (value / 1e3 for value in tcp_mm)
-        self._controller = Controller(series, np.array(pose) / TO_MM, surface, time.monotonic(), (x, y, z))
+        pose_m = np.array(pose) / TO_MM
+        self._controller = Controller(series, pose_m, surface_m, stiffness_n_mm * 1e3, time.monotonic(), (x, y, z))
         self.pose_log = PoseLog()  # true poses of the tip
         self._host = host
         self._connections: list[Connection] = []
@@ -101,6 +102,7 @@ class EmulatedUR5:
             self._close_all()
             message = f"no emulated arm at {self._host}: {error.strerror}"
             raise RigFault("refused", message, "is there another one?") from error
+        self._run_cycle(time.monotonic())  # so that there is a pose from the start on
         self._thread.start()
         return self
 
@@ -204,8 +206,7 @@ class EmulatedUR5:
             self._controller.restart(now)
             self._listen()
         self._controller.tick(now)
-        pose, surface = self._controller.motion.pose, self._controller.surface
-        self.pose_log.append(now, pose * TO_MM, surface.force(pose) if surface else 0.0)
+        self.pose_log.append(now, self._controller.motion.pose * TO_MM, self._controller.surface_force())
         if self._frozen or self._unplugged:
             return
         state = self._controller.state()

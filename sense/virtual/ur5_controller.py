@@ -6,7 +6,6 @@ Lengths are m and angles rad, poses and velocities have six numbers. The true po
 import threading
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -109,18 +108,6 @@ class Motion:
             self._trajectory, self.velocity = None, np.zeros(6)
 
 
-@dataclass(frozen=True)
-class SpringySurface:
-    """A plane that yields like a spring: its height in m, its stiffness in N/m."""
-
-    height: float
-    stiffness: float
-
-    def force(self, pose: Array) -> float:
-        """Return the force on the tool, N, upwards."""
-        return self.stiffness * max(0.0, self.height - float(pose[2]))
-
-
 class Controller:
     """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock."""
 
@@ -128,15 +115,16 @@ class Controller:
         self,
         series: Series,
         pose: Array,
-        surface: SpringySurface | None = None,
+        surface: float = -np.inf,
+        stiffness: float = 2000.0,
         now: float = 0.0,
         tcp: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Switch it on at the time `now`, its tool at `pose`."""
+        """Switch it on at the time `now`, its tool at `pose`, above a springy plane; its height in m and N/m."""
         self.series: Series = series
         self._tcp = tcp
         self.motion = Motion(pose)
-        self.surface = surface
+        self._surface, self._stiffness = surface, stiffness
         self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
         self.dashboard_log: list[str] = []
         self.restart(now)
@@ -224,10 +212,13 @@ class Controller:
             answers |= {"get serial number": "20185500000", "is in remote control": str(self.remote).lower()}
         return answers.get(line, f"could not understand: '{line}'")
 
+    def surface_force(self) -> float:
+        """Return the force of the plane on the tool, N, upwards."""
+        return self._stiffness * max(0.0, self._surface - float(self.motion.pose[2]))
+
     def state(self) -> dict[str, Any]:
         """Return the variables that are not zero, by name."""
-        force = np.zeros(6)
-        force[0], force[2] = self.sideways_n, self.surface.force(self.motion.pose) if self.surface else 0.0
+        force = np.array([self.sideways_n, 0.0, self.surface_force(), 0.0, 0.0, 0.0])
         return self.outputs | {
             "timestamp": self._now - self._boot,
             "actual_TCP_pose": self.motion.pose,

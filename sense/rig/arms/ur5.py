@@ -45,17 +45,12 @@ class RtdeWorker:
         self._received = threading.Condition()
         self._supervised_s = time.monotonic()
         self._killed = threading.Event()
-        self._process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
-        assert self._process.stdin is not None
-        os.set_blocking(self._process.stdin.fileno(), False)
+        self.process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
+        assert self.process.stdin is not None
+        os.set_blocking(self.process.stdin.fileno(), False)
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._receive, self._send_heartbeats)]
         for thread in self._threads:
             thread.start()
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
 
     def request(self, command: str, *arguments: Any, timeout_s: float) -> Any:
         """Send a command and return its result; RigFault if it fails, the worker ends, or it is late."""
@@ -84,18 +79,18 @@ class RtdeWorker:
     def kill(self) -> None:
         """Kill the worker and wait for its end; never raises."""
         self._killed.set()
-        self._process.kill()
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
         for thread in self._threads:
             thread.join()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 pipe.close()
 
     def _write(self, line: bytes) -> None:
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         try:
-            os.write(self._process.stdin.fileno(), line + b"\n")
+            os.write(self.process.stdin.fileno(), line + b"\n")
         except (OSError, ValueError):
             raise self.fault or RigFault("lost", f"the link to the arm {self._host} is down", "connect again") from None
 
@@ -106,9 +101,9 @@ class RtdeWorker:
                     self._write(b"")
 
     def _receive(self) -> None:
-        assert self._process.stdout is not None
+        assert self.process.stdout is not None
         reason: tuple[Cause, str, str] = ("lost", "the process that holds ur-rtde has ended", "connect again")
-        for line in self._process.stdout:
+        for line in self.process.stdout:
             try:
                 message = json.loads(line)
             except ValueError:  # it ended in the middle of a line
@@ -167,7 +162,7 @@ class UR5:
     @property
     def worker_pid(self) -> int | None:
         """Process id of the worker, None before `connect`."""
-        return self._worker.pid if self._worker else None
+        return self._worker.process.pid if self._worker else None
 
     def state(self) -> ArmState:
         """Return the latest state; also RigFault("deadline") if nobody asked for one for 2 s during a move."""

@@ -98,9 +98,9 @@ def test_reader_converts_state() -> None:
         (stream(types=["NOT_FOUND", *TYPES[1:]]), "the controller has no timestamp"),
         (stream(types=TYPES[::-1]), "the controller would send"),
         (stream(rtde.pack_frame(rtde.DATA, b"\x01" + b"x" * 10)), "sent 10 bytes, expected 168"),
-        *((stream(state(*VALUES[:k], value, *VALUES[k + 1 :])), "NaN") for k in (3, 15) for value in (np.nan, np.inf)),
+        (stream(state(*VALUES[:15], np.inf, *VALUES[16:])), "NaN"),
     ],
-    ids=range(8),
+    ids=range(5),
 )
 def test_reader_refuses_other_controller_and_impossible_state(sent: list[bytes], match: str) -> None:
     with pytest.raises(ValueError, match=match):

@@ -52,7 +52,6 @@ def check_blocks(blocks: list[DueBlock], wanted: BoardSettings) -> None:
 @pytest.mark.parametrize(
     "wanted",
     [
-        BoardSettings(1_000_000, 0xFF, 1),
         BoardSettings(1_000_000, 0xFFF, 8),
         BoardSettings(100_000, 0xFF, 1),
         BoardSettings(75_000_000, 0b1000_0000_0101, 16),

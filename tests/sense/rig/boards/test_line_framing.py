@@ -82,12 +82,10 @@ def test_decode_never_returns_wrong_sample_for_damaged_line() -> None:
     ("line", "error"),
     [
         (b"2000,1,2,3,4\n", "a line has no check"),
-        (format_sample(2000, (1, 2, 3), True), "has 4 numbers, expected 5: the time and the inputs"),
         (format_sample(2000, (1, 2, 3, 4096), True), "a count is 4096, its header allows 4095"),
         (format_sample(-2000, (1, 2, 3, 4), True), "begins '-2000,1,2,3,4*b292ef', expected whole numbers"),
         (b"9" * 9000 + b"\n", "a line of more than 8192 bytes"),
         (format_sample(2**63, (1, 2, 3, 4), True), "the time of a line is beyond all clocks"),
-        (LINES[0][:-2] + b"!\n", "the check does not fit"),
     ],
 )
 def test_decode_counts_and_describes_bad_line(line: bytes, error: str) -> None:
@@ -120,7 +118,6 @@ def test_decode_skips_comments_and_bounds_memory_of_endless_noise() -> None:
     ("text", "error"),
     [
         ("2 rate_hz=100 bits=10 reference_v=5 channels=2", "version 2 of the line protocol, expected 1"),
-        ("1 rate_hz=100 bits=10 reference_v=5", "channels of its header is 'missing', allowed is 1 to 512"),
         ("1 rate_hz=nan bits=10 reference_v=5 channels=2", "rate_hz of its header is 'nan', allowed is 10"),
         ("1 rate_hz=100 bits=10 reference_v=5 channels=2 check=xor", "check is 'xor', allowed are crc32 and none"),
     ],
@@ -179,11 +176,10 @@ def test_assemble_follows_inexact_rate_and_late_lines(share: float) -> None:
     [
         (10**6, np.arange(1, 20) * 1000, "a line came -[0-9]+ us after another by the board's clock, not 1000; it was"),
         (2**31 + 10**7, np.arange(1, 20) * 1000, "it was reset"),
-        (10**6, 4e6 + np.arange(1, 20) * 1000, "a line came [0-9]+ us after"),
         (10**6, 2e6 + np.arange(1, 20), "a line came [1-8] us after another .* its rate is not that of its header"),
         (10**6, 2e6 + np.arange(1, 200) * 700, "us after another by the board's clock, not 1000"),
     ],
-    ids=["reset", "reset after half the range", "far away", "milliseconds", "too fast"],
+    ids=["reset", "reset after half the range", "milliseconds", "too fast"],
 )
 def test_assemble_raises_for_repeatedly_impossible_times(before_us: int, after: np.ndarray, match: str) -> None:
     assembler = LineAssembler(THREE, (0, 1, 2))
