@@ -16,9 +16,8 @@ from typing import Self
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due import SUPPLY_V
-from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Status
+from padforge.sense.rig.boards import due as framing
+from padforge.sense.rig.boards.due import SUPPLY_V, Ack, BoardSettings, DueBlock, Identity, Kind, Status
 from padforge.sense.rig.boards.line_board import HEADER_REQUEST, LineHeader, format_header, format_sample
 
 SampleSource = Callable[[Array], Array]
@@ -254,14 +253,13 @@ class EmulatedLineBoard(SerialBoard):
         source: SampleSource,
         header: LineHeader,
         *,
-        boot_us: int = 0,
         skew_ppm: float = 0.0,
         silent: bool = False,
         seed: int = 0,
     ) -> None:
-        """Open the pseudo-terminal; its clock begins at `boot_us`, and a `silent` board sends nothing."""
+        """Open the pseudo-terminal; a `silent` board sends nothing."""
         super().__init__(skew_ppm, seed)
-        self._source, self._header, self._boot_us, self._silent = source, header, boot_us, silent
+        self._source, self._header, self._silent = source, header, silent
         self._columns = header.channels
 
     def reset(self) -> None:
@@ -296,5 +294,5 @@ class EmulatedLineBoard(SerialBoard):
         for k, row in zip(index.tolist(), counts.tolist(), strict=True):
             if len(self._out) > MAX_OUT_BYTES:
                 break
-            time_us = self._boot_us + round((k + 1) * 1e6 * self._period_s())
+            time_us = round((k + 1) * 1e6 * self._period_s())
             self._send(format_sample(time_us % 2**32, row, self._header.checked))

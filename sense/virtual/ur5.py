@@ -28,7 +28,6 @@ HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
 """Where the emulated arm stands at first: 200 mm up, the tool pointing down."""
 PORTS = {"rtde": rtde.RTDE_PORT, "script": rtde.SCRIPT_PORT, "dashboard": rtde.DASHBOARD_PORT}
-MAX_BACKLOG = 1 << 16  # bytes that a client may leave unread before the stream skips frames for it
 TO_MM = np.array([1000.0, 1000.0, 1000.0, 1.0, 1.0, 1.0])
 COMMAND_S = 5.0  # longest wait for a command to be executed
 
@@ -45,13 +44,6 @@ class Connection:
         self.streaming = False
         self.splitter = rtde.FrameSplitter()
         self.text = b""
-        self.backlog = b""
-
-    def send(self, data: bytes) -> None:
-        """Send what the socket accepts and keep the remainder for the next call."""
-        self.backlog += data
-        with suppress(BlockingIOError):
-            self.backlog = self.backlog[self.link.send(self.backlog) :]
 
     def pack_state(self, state: dict[str, Any]) -> bytes:
         """Return the values of the output recipe."""
@@ -211,8 +203,7 @@ class EmulatedUR5:
             return
         state = self._controller.state()
         for connection in [connection for connection in self._connections if connection.streaming]:
-            if len(connection.backlog) < MAX_BACKLOG:
-                self._send(connection, rtde.pack_frame(rtde.DATA, connection.pack_state(state)))
+            self._send(connection, rtde.pack_frame(rtde.DATA, connection.pack_state(state)))
 
     def _poll(self, timeout: float) -> None:
         """Wait for the sockets."""
@@ -288,9 +279,10 @@ class EmulatedUR5:
         self._do(lambda: self._send(connection, data))
 
     def _send(self, connection: Connection, data: bytes) -> None:
+        """Send bytes, or close the connection to a client that has left too many unread."""
         if connection in self._connections:
             try:
-                connection.send(data)
+                connection.link.sendall(data)
             except OSError:
                 self._close(connection)
 

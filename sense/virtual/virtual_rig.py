@@ -33,9 +33,12 @@ def emulate_ur5(
     """Open drivers of arm and board, not yet connected, and the emulators behind them; `rig` is of `ur5_settings`."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
-    with EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
-        with _emulate_board(pad, contact, rig, robot.true_poses) as (driver, board), closing(UR5(HOST)) as arm:
-            yield arm, driver, robot, board
+    with (
+        EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot,
+        _emulate_board(pad, contact, rig, robot.true_poses) as (driver, board),
+        closing(UR5(HOST)) as arm,
+    ):
+        yield arm, driver, robot, board
 
 
 @contextmanager

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Request, Status
+from padforge.sense.rig.boards import due as framing
+from padforge.sense.rig.boards.due import Ack, BoardSettings, DueBlock, Identity, Kind, Request, Status
 from padforge.sense.virtual.boards import check_settings
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 

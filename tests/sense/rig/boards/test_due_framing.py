@@ -12,9 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due import DueAssembler
-from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, DueDecoder, Identity, Kind, Request
+from padforge.sense.rig.boards import due as framing
+from padforge.sense.rig.boards.due import (
+    Ack,
+    BoardSettings,
+    DueAssembler,
+    DueBlock,
+    DueDecoder,
+    Identity,
+    Kind,
+    Request,
+)
 from padforge.sense.rig.devices import RigFault
 
 U8, U16, U32 = st.integers(0, 2**8 - 1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
