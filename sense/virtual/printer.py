@@ -172,13 +172,14 @@ class Firmware:
 
     def _do_g1(self, words: dict[str, str], now_s: float) -> None:
         start = self._planned_position()
-        x, y, z = (float(words.get(axis, value)) for axis, value in zip("XYZ", self._to_reported(start), strict=True))
-        end = self._to_true((x, y, z))
+        reported = (float(words.get(axis, value)) for axis, value in zip("XYZ", self._to_reported(start), strict=True))
+        x, y, z = (value + origin for value, origin in zip(reported, self._origin, strict=True))
         if self.homed:  # software endstops clip axes that were homed
-            x, y, z = (min(max(value, 0.0), limit) for value, limit in zip(end, self._bed_mm, strict=True))
-            end = x, y, z
+            x, y, z = (min(max(value, 0.0), limit) for value, limit in zip((x, y, z), self._bed_mm, strict=True))
         self._feed = float(words["F"]) / 60 if "F" in words else self._feed
-        move = StraightMove(start, end, self._feed, self._acceleration).limit_axes(self._max_mm_s, self._max_mm_s2)
+        move = StraightMove(start, (x, y, z), self._feed, self._acceleration).limit_axes(
+            self._max_mm_s, self._max_mm_s2
+        )
         if move.length_mm:
             start_s = max(now_s + START_S, self.moves[-1].end_s)
             self.moves.append(ExecutedMove(start_s, move, move.duration_s))
@@ -224,10 +225,6 @@ class Firmware:
 
     def _to_reported(self, position: Position) -> Position:
         x, y, z = (value - origin for value, origin in zip(position, self._origin, strict=True))
-        return x, y, z
-
-    def _to_true(self, position: Position) -> Position:
-        x, y, z = (value + origin for value, origin in zip(position, self._origin, strict=True))
         return x, y, z
 
     def _say(self, *lines: str) -> None:

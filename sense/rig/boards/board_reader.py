@@ -191,11 +191,6 @@ class SampleClock:
         self._slope = 0.0
         self._last: tuple[int, float] | None = None
 
-    @property
-    def skew_ppm(self) -> float:
-        """How much longer than its nominal period a sample takes by the host's clock, in millionths."""
-        return self._slope * 1e6
-
     def observe(self, index: int, arrival_s: float) -> None:
         """Add the arrival of a block whose last sample, or clock, has this unwrapped index."""
         if self._origin is None:

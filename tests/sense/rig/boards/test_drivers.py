@@ -216,13 +216,6 @@ def test_read_raises_when_line_board_resets(garbled: float) -> None:
         check(read_for(driver, 0.1), board)
 
 
-def test_read_raises_for_lines_of_other_columns() -> None:
-    board = EmulatedLineBoard(waves, HEADER)
-    with connected(board) as driver:
-        board.send_columns(15)
-        assert fault_of(driver.read, "data", "a line has 16 numbers, expected 17: .* line after line") < 2
-
-
 @pytest.mark.parametrize(
     ("kind", "board_options", "rate_hz", "options", "match"),
     [
