@@ -32,42 +32,32 @@ ROOT = Path(__file__).parents[3]
 
 
 class RigFault(Fault):
-    """A fault of the rig that ends or prevents a recording: what happened, and what a person can do about it.
-
-    Attributes:
-        cause: Kind of fault, for programs.
-        exit_code: Of a command that ends with it: 2 if nothing was begun, otherwise 1.
-    """
+    """A fault of the rig that ends or prevents a recording: what happened, and what a person can do about it."""
 
     def __init__(self, cause: Cause, message: str, advice: str = "") -> None:
         super().__init__(f"{message}; {advice}" if advice else message)
-        self.cause: Cause = cause
-        self.exit_code = 2 if cause == "refused" else 1
+        self.cause: Cause = cause  # for programs
+        self.exit_code = 2 if cause == "refused" else 1  # of a command that ends with it: 2 if nothing was begun
 
 
 @dataclass(frozen=True)
 class ArmState:
-    """State of the arm at one moment.
+    """State of the arm at one moment."""
 
-    Attributes:
-        time_s: When it arrived.
-        pose: Of the tool.
-        speed_mm_s: Of the tool, >= 0.
-        force_n: At the tool, along z; None without a sensor, which `[rig] max_force_n` has to permit.
-        protective_stop: Whether the controller has stopped the arm.
-        emergency_stop: Whether a person has stopped the arm.
-        moving: Whether the last move is still under way.
-        sideways_n: Force on the tool across z, >= 0; 0 without a sensor.
-    """
+    time_s: float  # when it arrived
+    pose: Pose  # of the tool
+    speed_mm_s: float  # of the tool, >= 0
+    force_n: float | None  # at the tool, along z; None without a sensor, which `[rig] max_force_n` has to permit
+    protective_stop: bool  # whether the controller has stopped the arm
+    emergency_stop: bool  # whether a person has stopped the arm
+    moving: bool  # whether the last move is still under way
+    sideways_n: float = 0.0  # force on the tool across z, >= 0; 0 without a sensor
 
-    time_s: float
-    pose: Pose
-    speed_mm_s: float
-    force_n: float | None
-    protective_stop: bool
-    emergency_stop: bool
-    moving: bool
-    sideways_n: float = 0.0
+    def to_row(self) -> list[float]:
+        """Return the row of the state, by `STATE_COLUMNS`."""
+        force_n = math.nan if self.force_n is None else self.force_n
+        stopped = self.protective_stop or self.emergency_stop
+        return [self.time_s, *self.pose, self.speed_mm_s, force_n, float(not stopped)]
 
     @property
     def total_force_n(self) -> float | None:
@@ -109,17 +99,11 @@ class Arm(Protocol):
 
 @dataclass(frozen=True)
 class BoardSamples:
-    """Samples as a board delivers them.
+    """Samples as a board delivers them."""
 
-    Attributes:
-        times_s: Host times, ascending; shape (n,).
-        volts: Readings of C channels; shape (n, C).
-        missing: Number of samples lost before each of them; shape (n,). A gap is never filled.
-    """
-
-    times_s: Array
-    volts: Array
-    missing: Indices
+    times_s: Array  # (n,) host times, ascending
+    volts: Array  # (n, C) readings of C channels
+    missing: Indices  # (n,) number of samples lost before each of them; a gap is never filled
 
 
 class Board(Protocol):

@@ -16,9 +16,9 @@ from typing import Self
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, Identity, Kind, Status
-from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineHeader, format_header, format_sample
+from padforge.sense.rig.boards import due as framing
+from padforge.sense.rig.boards.due import SUPPLY_V, Ack, BoardSettings, DueBlock, Identity, Kind, Status
+from padforge.sense.rig.boards.line_board import HEADER_REQUEST, LineHeader, format_header, format_sample
 
 SampleSource = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the number of inputs of the board or more."""
@@ -156,7 +156,6 @@ class EmulatedDue(SerialBoard):
         self,
         source: SampleSource,
         *,
-        supply_v: float = 3.3,
         skew_ppm: float = 0.0,
         firmware: tuple[int, int, int] = (1, 0, 0),
         silent: bool = False,
@@ -164,7 +163,7 @@ class EmulatedDue(SerialBoard):
     ) -> None:
         """Open the pseudo-terminal; a `silent` board answers nothing."""
         super().__init__(skew_ppm, seed)
-        self._source, self._supply_v = source, supply_v
+        self._source = source
         serial = b"emulated board".ljust(16, b"\0")
         self._identity = Identity(firmware, framing.BITS, framing.MAX_CHANNELS, "padforge-due", serial)
         self._silent = silent
@@ -230,7 +229,7 @@ class EmulatedDue(SerialBoard):
         mask, averaging = self._settings.mask, self._settings.averaging
         inputs = [i for i in range(framing.MAX_CHANNELS) if mask >> i & 1]
         volts, full_scale = self._source(times_s)[:, inputs], framing.FULL_SCALE
-        steps = np.clip(np.rint(volts / self._supply_v * full_scale), 0, full_scale)
+        steps = np.clip(np.rint(volts / SUPPLY_V * full_scale), 0, full_scale)
         time_us = (first + len(times_s)) * self._settings.period_ns // 1000
         numbers = (self._sequence % 2**16, first % 2**32, time_us % 2**32, self._overruns)
         self._sequence += 1
@@ -254,16 +253,14 @@ class EmulatedLineBoard(SerialBoard):
         source: SampleSource,
         header: LineHeader,
         *,
-        boot_us: int = 0,
         skew_ppm: float = 0.0,
         silent: bool = False,
         seed: int = 0,
     ) -> None:
-        """Open the pseudo-terminal; its clock begins at `boot_us`, and a `silent` board sends nothing."""
+        """Open the pseudo-terminal; a `silent` board sends nothing."""
         super().__init__(skew_ppm, seed)
-        self._source, self._header, self._boot_us, self._silent = source, header, boot_us, silent
+        self._source, self._header, self._silent = source, header, silent
         self._columns = header.channels
-        self.dropped = 0  # lines left out because the host was too slow
 
     def reset(self) -> None:
         """Start anew, as by its button."""
@@ -296,7 +293,6 @@ class EmulatedLineBoard(SerialBoard):
         counts = np.clip(np.rint(volts / self._header.reference_v * scale), 0, scale).astype(np.int64)
         for k, row in zip(index.tolist(), counts.tolist(), strict=True):
             if len(self._out) > MAX_OUT_BYTES:
-                self.dropped += 1
-                continue
-            time_us = self._boot_us + round((k + 1) * 1e6 * self._period_s())
+                break
+            time_us = round((k + 1) * 1e6 * self._period_s())
             self._send(format_sample(time_us % 2**32, row, self._header.checked))

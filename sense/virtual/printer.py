@@ -7,6 +7,7 @@ import time
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partialmethod
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ class Firmware:
         self._busy_until_s = -math.inf
         self._say("start", "Marlin 2.1.2", "echo: Last Updated: 2023-07-16 | Author: (none, default config)")
 
-    def home(self) -> None:
+    def home(self, now_s: float) -> None:
         """Learn the true position, as after a person has homed it."""
         self._origin, self.homed = (0.0, 0.0, 0.0), True
 
@@ -171,13 +172,14 @@ class Firmware:
 
     def _do_g1(self, words: dict[str, str], now_s: float) -> None:
         start = self._planned_position()
-        x, y, z = (float(words.get(axis, value)) for axis, value in zip("XYZ", self._to_reported(start), strict=True))
-        end = self._to_true((x, y, z))
+        reported = (float(words.get(axis, value)) for axis, value in zip("XYZ", self._to_reported(start), strict=True))
+        x, y, z = (value + origin for value, origin in zip(reported, self._origin, strict=True))
         if self.homed:  # software endstops clip axes that were homed
-            x, y, z = (min(max(value, 0.0), limit) for value, limit in zip(end, self._bed_mm, strict=True))
-            end = x, y, z
+            x, y, z = (min(max(value, 0.0), limit) for value, limit in zip((x, y, z), self._bed_mm, strict=True))
         self._feed = float(words["F"]) / 60 if "F" in words else self._feed
-        move = StraightMove(start, end, self._feed, self._acceleration).limit_axes(self._max_mm_s, self._max_mm_s2)
+        move = StraightMove(start, (x, y, z), self._feed, self._acceleration).limit_axes(
+            self._max_mm_s, self._max_mm_s2
+        )
         if move.length_mm:
             start_s = max(now_s + START_S, self.moves[-1].end_s)
             self.moves.append(ExecutedMove(start_s, move, move.duration_s))
@@ -225,10 +227,6 @@ class Firmware:
         x, y, z = (value - origin for value, origin in zip(position, self._origin, strict=True))
         return x, y, z
 
-    def _to_true(self, position: Position) -> Position:
-        x, y, z = (value + origin for value, origin in zip(position, self._origin, strict=True))
-        return x, y, z
-
     def _say(self, *lines: str) -> None:
         self._out += "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
 
@@ -242,25 +240,14 @@ class EmulatedPrinter(SerialDevice):
         self.firmware, self._restarts = Firmware(position, **firmware), restarts
         self._lock = threading.Lock()
 
-    def halt(self) -> None:
-        """Make the firmware find a fault and stop for good."""
+    def _change(self, name: str, seconds: float = 0.0) -> None:
         with self._lock:
-            self.firmware.kill(time.monotonic())
+            getattr(self.firmware, name)(time.monotonic() + seconds)
 
-    def restart(self) -> None:
-        """Restart the printer: it no longer knows where it is."""
-        with self._lock:
-            self.firmware.restart(time.monotonic())
-
-    def home(self) -> None:
-        """Home it, as a person does at the display."""
-        with self._lock:
-            self.firmware.home()
-
-    def busy(self, seconds: float) -> None:
-        """Take no command for some seconds: a person is at the display."""
-        with self._lock:
-            self.firmware.busy(time.monotonic() + seconds)
+    halt = partialmethod(_change, "kill")  # the firmware finds a fault and stops for good
+    restart = partialmethod(_change, "restart")  # it no longer knows where it is
+    home = partialmethod(_change, "home")  # as a person does at the display
+    busy = partialmethod(_change, "busy")  # take no command for some seconds: a person is at the display
 
     def true_positions(self, times_s: ArrayLike) -> Array:
         """Return the (n, 3) true positions of the nozzle at (n,) monotonic times, mm."""

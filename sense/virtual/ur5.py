@@ -1,126 +1,35 @@
-"""An emulated UR controller on this machine, in a process of its own, with faults that can be injected at any moment.
+"""An emulated UR controller on this machine, in a thread of its own, with faults that can be injected at any moment.
 
-The process is `python -m padforge.sense.virtual.ur5`; commands and answers are JSON lines on its stdin and stdout, and
-the end of stdin ends it. Its clock catches up on cycles that the process has slept through, so that the stream has no
-gap.
+Its clock catches up on cycles that the thread has slept through, so that the stream has no gap.
 """
 
-import heapq
-import itertools
-import json
+import queue
 import re
 import select
 import socket
 import struct
-import sys
-import tempfile
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from concurrent.futures import Future
+from contextlib import suppress
 from functools import partialmethod
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.files import temporary_file
 from padforge.sense.rig.arms import rtde
-from padforge.sense.rig.devices import Array, Pose, RigFault, start
-from padforge.sense.virtual.ur5_controller import (
-    RATES_HZ,
-    VERSIONS,
-    Controller,
-    PoseLog,
-    PoseLogWriter,
-    Series,
-    SpringySurface,
-    create_pose_log,
-)
+from padforge.sense.rig.devices import Array, Pose, RigFault
+from padforge.sense.virtual.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
 
 HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
 """Where the emulated arm stands at first: 200 mm up, the tool pointing down."""
 PORTS = {"rtde": rtde.RTDE_PORT, "script": rtde.SCRIPT_PORT, "dashboard": rtde.DASHBOARD_PORT}
-MAX_BACKLOG = 1 << 16  # bytes that a client may leave unread before the stream skips frames for it
 TO_MM = np.array([1000.0, 1000.0, 1000.0, 1.0, 1.0, 1.0])
-
-_LOG_PREFIX = "padforge-ur-"  # of its temporary files
-
-
-class EmulatedUR5:
-    """A context: the controller runs from entry to exit.
-
-    For 127.0.0.1 ur-rtde never asks whether the arm is in remote control, for other names (127.1, say) it does.
-    """
-
-    pose_log: PoseLog  # true poses of the tip; other processes can open `PoseLog(emulator.pose_log.path)`
-
-    def __init__(
-        self,
-        series: Series = "cb3",
-        pose: Pose = HOME,
-        surface_mm: float | None = None,
-        stiffness_n_mm: float = 2.0,
-        host: str = HOST,
-        tcp_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
-        """Describe a controller: "cb3" at 125 Hz or "e" at 500 Hz, over a springy plane at `surface_mm`."""
-        self._settings = {"series": series, "pose_mm": pose, "surface_mm": surface_mm}
-        self._settings |= {"stiffness_n_mm": stiffness_n_mm, "host": host, "tcp_mm": tcp_mm}
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            path = stack.enter_context(temporary_file(Path(tempfile.gettempdir()), prefix=_LOG_PREFIX))
-            create_pose_log(path)
-            self._process = start("padforge.sense.virtual.ur5", json.dumps(self._settings | {"pose_log": str(path)}))
-            self.pose_log = PoseLog(path)
-            self._stack = stack.pop_all()
-        if problem := self._read_answer():
-            self.__exit__()
-            raise RigFault("refused", f"no emulated arm at {problem}", "is there another one?")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.communicate()
-        self._stack.close()
-
-    def true_poses(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 6) true poses in mm and rad at monotonic times; see `PoseLog.poses`."""
-        return self.pose_log.poses(times_s)
-
-    def _command(self, *command: Any) -> Any:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(command).encode() + b"\n")
-        self._process.stdin.flush()
-        return self._read_answer()
-
-    protective_stop = partialmethod(_command, "protective_stop")
-    """Stop the arm as after a collision: the program is paused."""
-    emergency_stop = partialmethod(_command, "emergency_stop")  # press the red button
-    clear = partialmethod(_command, "clear")
-    """Unlock the arm, power on and release the brakes, as a person does after a stop."""
-    play = partialmethod(_command, "play")  # press play at the pendant: a paused program goes on
-    stop_program = partialmethod(_command, "stop_program")  # press stop at the pendant: the program ends
-    drop = partialmethod(_command, "drop")  # close the connections to a port; new ones are accepted
-    freeze = partialmethod(_command, "set", "frozen")  # send no more states; all else goes on
-    unplug = partialmethod(_command, "set", "unplugged")
-    """Receive and send nothing, and close no connection: the cable is out."""
-    slow = partialmethod(_command, "slow")  # delay every answer and every command by some seconds
-    push = partialmethod(_command, "set", "sideways_n")  # push the tool sideways with a force in N
-    remote_control = partialmethod(_command, "set", "remote")  # switch between local and remote control
-    restart = partialmethod(_command, "restart")
-    """Restart the controller: all connections end, and it is back after some seconds."""
-    dashboard_log = partialmethod(_command, "dashboard_log")  # return every line that was sent to the dashboard
-
-    def refuse(self, refused: bool) -> None:
-        """Refuse new connections, or accept them again; open connections stay."""
-        self._command("refuse" if refused else "listen")
-
-    def _read_answer(self) -> Any:
-        assert self._process.stdout is not None
-        return json.loads(self._process.stdout.readline() or b'"the emulator has ended"')
+COMMAND_S = 5.0  # longest wait for a command to be executed
 
 
 class Connection:
@@ -135,13 +44,6 @@ class Connection:
         self.streaming = False
         self.splitter = rtde.FrameSplitter()
         self.text = b""
-        self.backlog = b""
-
-    def send(self, data: bytes) -> None:
-        """Send what the socket accepts and keep the remainder for the next call."""
-        self.backlog += data
-        with suppress(BlockingIOError):
-            self.backlog = self.backlog[self.link.send(self.backlog) :]
 
     def pack_state(self, state: dict[str, Any]) -> bytes:
         """Return the values of the output recipe."""
@@ -153,60 +55,139 @@ class Connection:
         return b"\x01" + layout.pack(*values)
 
 
-class ControllerServer:
-    """The sockets of one controller."""
+class EmulatedUR5:
+    """A context: the controller runs from entry to exit.
 
-    def __init__(self, controller: Controller, pose_log: PoseLogWriter, host: str) -> None:
-        self.controller, self.pose_log, self.host = controller, pose_log, host
-        self.connections: list[Connection] = []
-        self.listeners: dict[str, socket.socket] = {}
-        self.frozen = self.unplugged = False
-        self.delay_s = 0.0
-        self._delayed: list[tuple[float, int, Callable[[], None]]] = []
-        self._numbers = itertools.count()
+    For 127.0.0.1 ur-rtde never asks whether the arm is in remote control, for other names (127.1, say) it does.
+    """
+
+    def __init__(
+        self,
+        series: Series = "cb3",
+        pose: Pose = HOME,
+        surface_mm: float | None = None,
+        stiffness_n_mm: float = 2.0,
+        host: str = HOST,
+        tcp_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Describe a controller: "cb3" at 125 Hz or "e" at 500 Hz, over a springy plane at `surface_mm`."""
+        surface_m = -np.inf if surface_mm is None else surface_mm / 1e3
+        x, y, z = (value / 1e3 for value in tcp_mm)
+        pose_m = np.array(pose) / TO_MM
+        self._controller = Controller(series, pose_m, surface_m, stiffness_n_mm * 1e3, time.monotonic(), (x, y, z))
+        self.pose_log = PoseLog()  # true poses of the tip
+        self._host = host
+        self._connections: list[Connection] = []
+        self._listeners: dict[str, socket.socket] = {}
+        self._frozen = self._unplugged = False
+        self._delay_s = 0.0
+        self._delayed: deque[tuple[float, Callable[[], None]]] = deque()
         self._restart_s: float | None = None
+        self._commands: queue.SimpleQueue[tuple[str, tuple[Any, ...], Future[None]]] = queue.SimpleQueue()
+        self._ending = False
+        self._thread = threading.Thread(target=self._serve, name=f"emulated arm at {host}", daemon=True)
 
-    def listen(self) -> None:
-        """Open the ports; OSError if one is in use."""
+    def __enter__(self) -> Self:
+        try:
+            self._listen()
+        except OSError as error:
+            self._close_all()
+            message = f"no emulated arm at {self._host}: {error.strerror}"
+            raise RigFault("refused", message, "is there another one?") from error
+        self._run_cycle(time.monotonic())  # so that there is a pose from the start on
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending = True
+        self._thread.join()
+        self._close_all()
+
+    def true_poses(self, times_s: ArrayLike) -> Array:
+        """Return the (n, 6) true poses in mm and rad at monotonic times; see `PoseLog.poses`."""
+        return self.pose_log.poses(times_s)
+
+    def dashboard_log(self) -> list[str]:
+        """Return every line that was sent to the dashboard."""
+        return list(self._controller.dashboard_log)
+
+    def _command(self, name: str, *arguments: Any) -> None:
+        """Call a method between two cycles, and wait for its end."""
+        done: Future[None] = Future()
+        self._commands.put((name, arguments, done))
+        done.result(COMMAND_S)
+
+    protective_stop = partialmethod(_command, "protective_stop")
+    """Stop the arm as after a collision: the program is paused."""
+    emergency_stop = partialmethod(_command, "emergency_stop")  # press the red button
+    clear = partialmethod(_command, "clear")
+    """Unlock the arm, power on and release the brakes, as a person does after a stop."""
+    play = partialmethod(_command, "play")  # press play at the pendant: a paused program goes on
+    stop_program = partialmethod(_command, "stop_program")  # press stop at the pendant: the program ends
+    refuse = partialmethod(_command, "_refuse")  # refuse new connections, or accept them again; open ones stay
+    drop = partialmethod(_command, "_drop")  # close the connections to a port; new ones are accepted
+    slow = partialmethod(_command, "_slow")  # delay every answer and every command by some seconds
+    restart = partialmethod(_command, "_restart")
+    """Restart the controller: all connections end, and it is back after some seconds."""
+
+    def freeze(self, frozen: bool) -> None:
+        """Send no more states, or go on; all else goes on."""
+        self._frozen = frozen
+
+    def unplug(self, unplugged: bool) -> None:
+        """Receive and send nothing, and close no connection: the cable is out."""
+        self._unplugged = unplugged
+
+    def push(self, sideways_n: float) -> None:
+        """Push the tool along x with a force from now on."""
+        self._controller.sideways_n = sideways_n
+
+    def remote_control(self, remote: bool) -> None:
+        """Switch to remote control, or to local control."""
+        self._controller.remote = remote
+
+    def _listen(self) -> None:
         for name, port in PORTS.items():
-            self.listeners[name] = socket.create_server((self.host, port))
+            self._listeners[name] = socket.create_server((self._host, port))
 
-    def refuse(self) -> None:
-        """Close the ports; open connections stay."""
-        for listener in self.listeners.values():
+    def _refuse(self, refused: bool) -> None:
+        for listener in self._listeners.values():
             listener.close()
-        self.listeners.clear()
+        self._listeners.clear()
+        if not refused:
+            self._listen()
 
-    def drop(self, port: str) -> None:
-        """Close the connections to one of the ports."""
-        for connection in [connection for connection in self.connections if connection.port == port]:
+    def _drop(self, port: str) -> None:
+        for connection in [connection for connection in self._connections if connection.port == port]:
             self._close(connection)
 
-    def slow(self, seconds: float) -> None:
+    def _close_all(self) -> None:
+        self._refuse(True)
+        for port in PORTS:
+            self._drop(port)
+
+    def _slow(self, seconds: float) -> None:
         """Delay answers and commands from now on; what waits is done now, so that nothing overtakes it."""
         while self._delayed:
-            heapq.heappop(self._delayed)[2]()
-        self.delay_s = seconds
+            self._delayed.popleft()[1]()
+        self._delay_s = seconds
 
-    def restart(self, seconds: float) -> None:
-        """Close all connections and ports; they come back after some seconds with a restarted controller."""
-        self.refuse()
-        for port in PORTS:
-            self.drop(port)
+    def _restart(self, seconds: float) -> None:
+        self._close_all()
         self._delayed.clear()
-        self.controller.stop_program()
+        self._controller.stop_program()
         self._restart_s = time.monotonic() + seconds
 
-    def serve(self) -> None:
-        """Run until stdin ends."""
-        period = 1 / RATES_HZ[self.controller.series]
+    def _serve(self) -> None:
+        period = 1 / RATES_HZ[self._controller.series]
         cycle = time.monotonic()
-        while True:
-            timeout = max(0.0, cycle - time.monotonic())
-            if not self._poll(timeout):
-                return
+        while not self._ending:
+            self._poll(max(0.0, cycle - time.monotonic()))
+            while not self._commands.empty():
+                name, arguments, done = self._commands.get()
+                done.set_result(getattr(self if name.startswith("_") else self._controller, name)(*arguments))
             while self._delayed and self._delayed[0][0] <= time.monotonic():
-                heapq.heappop(self._delayed)[2]()
+                self._delayed.popleft()[1]()
             while cycle <= time.monotonic():
                 self._run_cycle(cycle)
                 cycle += period
@@ -214,34 +195,33 @@ class ControllerServer:
     def _run_cycle(self, now: float) -> None:
         if self._restart_s is not None and now >= self._restart_s:
             self._restart_s = None
-            self.controller.restart(now)
-            self.listen()
-        self.controller.tick(now)
-        pose, surface = self.controller.motion.pose, self.controller.surface
-        self.pose_log.append(now, pose * TO_MM, surface.force(pose) if surface else 0.0)
-        if self.frozen or self.unplugged:
+            self._controller.restart(now)
+            self._listen()
+        self._controller.tick(now)
+        self.pose_log.append(now, self._controller.motion.pose * TO_MM, self._controller.surface_force())
+        if self._frozen or self._unplugged:
             return
-        state = self.controller.state()
-        for connection in [connection for connection in self.connections if connection.streaming]:
-            if len(connection.backlog) < MAX_BACKLOG:
-                self._send(connection, rtde.pack_frame(rtde.DATA, connection.pack_state(state)))
+        state = self._controller.state()
+        for connection in [connection for connection in self._connections if connection.streaming]:
+            self._send(connection, rtde.pack_frame(rtde.DATA, connection.pack_state(state)))
 
-    def _poll(self, timeout: float) -> bool:
-        """Wait for sockets and the parent; return False once the parent has gone."""
-        listeners = {} if self.unplugged else {listener: name for name, listener in self.listeners.items()}
-        links = {} if self.unplugged else {connection.link: connection for connection in self.connections}
-        ready, _, _ = select.select([sys.stdin, *listeners, *links], [], [], timeout)
-        for source in ready:
+    def _poll(self, timeout: float) -> None:
+        """Wait for the sockets."""
+        if self._unplugged:
+            time.sleep(timeout)
+            return
+        listeners = {listener: name for name, listener in self._listeners.items()}
+        links = {connection.link: connection for connection in self._connections}
+        for source in select.select([*listeners, *links], [], [], timeout)[0]:
             if source in listeners:
                 with suppress(OSError):
                     self._accept(source.accept()[0], listeners[source])
-            elif source in links and links[source] in self.connections:
+            elif links[source] in self._connections:
                 self._receive(links[source])
-        return sys.stdin not in ready or self._execute_command()
 
     def _accept(self, link: socket.socket, port: str) -> None:
         connection = Connection(link, port)
-        self.connections.append(connection)
+        self._connections.append(connection)
         if port == "dashboard":
             self._answer(connection, b"Connected: Universal Robots Dashboard Server\n")
 
@@ -259,21 +239,21 @@ class ControllerServer:
             connection.text += data
             if re.search(rb"(?m)^end\s*\Z", connection.text):
                 connection.text = b""
-                self._do(self.controller.upload)
+                self._do(self._controller.upload)
         else:
             *lines, connection.text = (connection.text + data).split(b"\n")
             for line in lines:
-                self._answer(connection, self.controller.answer_dashboard(line.decode().strip()).encode() + b"\n")
+                self._answer(connection, self._controller.answer_dashboard(line.decode().strip()).encode() + b"\n")
 
     def _process_frame(self, connection: Connection, kind: int, payload: bytes) -> None:
         if kind == rtde.DATA:
             names, layout = connection.inputs[payload[0] - 1]
             values = dict(zip(names, layout.unpack(payload[1:]), strict=True))
-            self._do(lambda: self.controller.write(values, time.monotonic()))
+            self._do(lambda: self._controller.write(values, time.monotonic()))
             return
         answer = b"\x01"
         if kind == rtde.CONTROLLER:
-            answer = struct.pack(">4I", *VERSIONS[self.controller.series])
+            answer = struct.pack(">4I", *VERSIONS[self._controller.series])
         elif kind in (rtde.OUTPUTS, rtde.INPUTS):
             # A rate of eight bytes precedes the names of outputs, and ur-rtde leaves a comma after the last name.
             names = payload[8 * (kind == rtde.OUTPUTS) :].decode().strip(",").split(",")
@@ -290,8 +270,8 @@ class ControllerServer:
 
     def _do(self, action: Callable[[], None]) -> None:
         """Run an action now, or later if answers are slow."""
-        if self.delay_s:
-            heapq.heappush(self._delayed, (time.monotonic() + self.delay_s, next(self._numbers), action))
+        if self._delay_s:
+            self._delayed.append((time.monotonic() + self._delay_s, action))
         else:
             action()
 
@@ -299,60 +279,13 @@ class ControllerServer:
         self._do(lambda: self._send(connection, data))
 
     def _send(self, connection: Connection, data: bytes) -> None:
-        if connection in self.connections:
+        """Send bytes, or close the connection to a client that has left too many unread."""
+        if connection in self._connections:
             try:
-                connection.send(data)
+                connection.link.sendall(data)
             except OSError:
                 self._close(connection)
 
     def _close(self, connection: Connection) -> None:
-        self.connections.remove(connection)
+        self._connections.remove(connection)
         connection.link.close()
-
-    def _execute_command(self) -> bool:
-        """Execute a command of the parent; return False if there is no parent."""
-        line = sys.stdin.readline()
-        if not line:
-            return False
-        command, *arguments = json.loads(line)
-        if command == "set":
-            name, value = arguments
-            setattr(self.controller if hasattr(self.controller, name) else self, name, value)
-            _print(None)
-        elif command == "dashboard_log":
-            _print(self.controller.dashboard_log)
-        else:
-            server_commands = ("listen", "refuse", "drop", "restart", "slow")
-            _print(getattr(self if command in server_commands else self.controller, command)(*arguments))
-        return True
-
-
-def _print(value: Any) -> None:
-    print(json.dumps(value), flush=True)
-
-
-def main(
-    series: Series,
-    pose_mm: list[float],
-    surface_mm: float | None,
-    stiffness_n_mm: float,
-    host: str,
-    tcp_mm: tuple[float, float, float],
-    pose_log: str,
-) -> None:
-    """Open the ports and serve; the first line on stdout is null, or why that fails."""
-    surface = None if surface_mm is None else SpringySurface(surface_mm / 1e3, stiffness_n_mm * 1e3)
-    x, y, z = (value / 1e3 for value in tcp_mm)
-    controller = Controller(series, np.array(pose_mm) / TO_MM, surface, time.monotonic(), (x, y, z))
-    server = ControllerServer(controller, PoseLogWriter(Path(pose_log)), host)
-    try:
-        server.listen()
-    except OSError as error:
-        _print(f"{host}: {error.strerror}")
-        return
-    _print(None)
-    server.serve()
-
-
-if __name__ == "__main__":
-    main(**json.loads(sys.argv[1]))

@@ -1,19 +1,17 @@
 """The emulated UR controller without its sockets: motions, registers, ur-rtde's control program, watchdog and safety.
 
-Lengths are m and angles rad, poses and velocities have six numbers. The true poses are logged, in mm, in a file that
-several processes map: one writer, any readers.
+Lengths are m and angles rad, poses and velocities have six numbers. The true poses are logged in mm.
 """
 
+import threading
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.motion import TrapezoidalProfile
 from padforge.sense.rig.arms.rtde import PAUSED, PLAYING, RUNNING, STOPPED
 
@@ -25,10 +23,9 @@ START_S = 0.02  # from the last byte of a program to its first step
 NORMAL, PROTECTIVE, EMERGENCY = 1 << 0, 1 << 2, 1 << 7
 POWER_OFF = 3
 
-MOVE_L, SPEED_L, STOP_L, SET_TCP, STOP, WATCHDOG, IS_SAFE, GET_TCP, IS_STEADY, END = (
-    3, 10, 15, 29, 33, 35, 36, 40, 47, 255,
-)  # fmt: skip
-"""Commands of ur-rtde's control program that are emulated."""
+MOVE_L, STOP, WATCHDOG, GET_TCP, END = 3, 33, 35, 40, 255
+"""Commands of ur-rtde's control program that are emulated: those of our driver."""
+ROWS = 1 << 16  # length of the log of poses: 131 s at 500 Hz, 524 s at 125 Hz
 
 
 class StraightTrajectory:
@@ -53,20 +50,17 @@ class StraightTrajectory:
         return self._start + distance * self._direction, speed * self._direction
 
 
-class VelocityRamp:
-    """From one velocity to another, which is then kept: speedL, and braking if it is zero."""
+class Braking:
+    """From a velocity to rest."""
 
-    def __init__(self, start: Array, before: Array, after: Array, acceleration: float) -> None:
-        self._start, self._before, self._after = start, before, after
-        self._ramp_s = float(np.linalg.norm(after - before)) / acceleration
-        self.duration = np.inf if after.any() else self._ramp_s
+    def __init__(self, start: Array, velocity: Array, deceleration: float) -> None:
+        self._start, self._velocity = start, velocity
+        self.duration = float(np.linalg.norm(velocity)) / deceleration
 
     def evaluate(self, t: float) -> tuple[Array, Array]:
-        change = self._after - self._before
-        share = min(t / self._ramp_s, 1.0) if self._ramp_s else 1.0
-        cruise_s = max(t - self._ramp_s, 0.0)
-        ramped = self._before * (t - cruise_s) + change * share * (t - cruise_s) / 2
-        return self._start + ramped + self._after * cruise_s, self._before + change * share
+        """Return pose and velocity `t` seconds after the start."""
+        share = t / self.duration if self.duration else 1.0
+        return self._start + self._velocity * (1 - share / 2) * t, self._velocity * (1 - share)
 
 
 class Motion:
@@ -74,7 +68,7 @@ class Motion:
 
     def __init__(self, pose: Array) -> None:
         self.pose, self.velocity = pose, np.zeros(6)
-        self._trajectory: StraightTrajectory | VelocityRamp | None = None
+        self._trajectory: StraightTrajectory | Braking | None = None
         self._start_s = 0.0
         self._interrupted: StraightTrajectory | None = None
 
@@ -84,17 +78,13 @@ class Motion:
 
     def move_to(self, end: Array, speed: float, acceleration: float, now: float) -> None:
         """Start a straight move; the tool has to be at rest."""
-        self._start(StraightTrajectory(self.pose, end, speed, acceleration), now)
-
-    def set_velocity(self, velocity: Array, acceleration: float, now: float) -> None:
-        """Accelerate to a velocity and keep it."""
-        self._start(VelocityRamp(self.pose, self.velocity, velocity, acceleration), now)
+        self._trajectory, self._start_s = StraightTrajectory(self.pose, end, speed, acceleration), now
 
     def brake(self, deceleration: float, now: float) -> None:
         """Come to rest; braking again changes nothing."""
         self._interrupted = None
-        if self.moving and not (isinstance(self._trajectory, VelocityRamp) and np.isfinite(self._trajectory.duration)):
-            self._start(VelocityRamp(self.pose, self.velocity, np.zeros(6), deceleration), now)
+        if isinstance(self._trajectory, StraightTrajectory):
+            self._trajectory, self._start_s = Braking(self.pose, self.velocity, deceleration), now
 
     def interrupt(self, deceleration: float, now: float) -> None:
         """Come to rest, and remember the move under way."""
@@ -117,21 +107,6 @@ class Motion:
         if t >= self._trajectory.duration:
             self._trajectory, self.velocity = None, np.zeros(6)
 
-    def _start(self, trajectory: StraightTrajectory | VelocityRamp, now: float) -> None:
-        self._trajectory, self._start_s = trajectory, now
-
-
-@dataclass(frozen=True)
-class SpringySurface:
-    """A plane that yields like a spring: its height in m, its stiffness in N/m."""
-
-    height: float
-    stiffness: float
-
-    def force(self, pose: Array) -> float:
-        """Return the force on the tool, N, upwards."""
-        return self.stiffness * max(0.0, self.height - float(pose[2]))
-
 
 class Controller:
     """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock."""
@@ -140,15 +115,16 @@ class Controller:
         self,
         series: Series,
         pose: Array,
-        surface: SpringySurface | None = None,
+        surface: float = -np.inf,
+        stiffness: float = 2000.0,
         now: float = 0.0,
         tcp: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Switch it on at the time `now`, its tool at `pose`."""
+        """Switch it on at the time `now`, its tool at `pose`, above a springy plane; its height in m and N/m."""
         self.series: Series = series
-        self._installed_tcp = tcp
+        self._tcp = tcp
         self.motion = Motion(pose)
-        self.surface = surface
+        self._surface, self._stiffness = surface, stiffness
         self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
         self.dashboard_log: list[str] = []
         self.restart(now)
@@ -158,7 +134,6 @@ class Controller:
         self.motion = Motion(self.motion.pose)
         self.inputs: defaultdict[str, float] = defaultdict(float)  # registers that clients write
         self.outputs: dict[str, float] = {}  # registers that clients read
-        self.tcp: Array = np.array([*self._installed_tcp, 0.0, 0.0, 0.0])
         self._boot = self._now = now
         self._safety, self._runtime, self._mode = NORMAL, STOPPED, RUNNING
         self._threads: list[Iterator[None]] = []
@@ -237,10 +212,13 @@ class Controller:
             answers |= {"get serial number": "20185500000", "is in remote control": str(self.remote).lower()}
         return answers.get(line, f"could not understand: '{line}'")
 
+    def surface_force(self) -> float:
+        """Return the force of the plane on the tool, N, upwards."""
+        return self._stiffness * max(0.0, self._surface - float(self.motion.pose[2]))
+
     def state(self) -> dict[str, Any]:
         """Return the variables that are not zero, by name."""
-        force = np.zeros(6)
-        force[0], force[2] = self.sideways_n, self.surface.force(self.motion.pose) if self.surface else 0.0
+        force = np.array([self.sideways_n, 0.0, self.surface_force(), 0.0, 0.0, 0.0])
         return self.outputs | {
             "timestamp": self._now - self._boot,
             "actual_TCP_pose": self.motion.pose,
@@ -260,10 +238,7 @@ class Controller:
         executed = False
         while True:
             command = int(self.inputs["input_int_register_0"])
-            if command == SPEED_L:
-                self.motion.set_velocity(self._read_doubles(0, 6), self._read_double(6), self._now)
-                self._signal(1)
-            elif command == END:
+            if command == END:
                 self.stop_program()
                 return
             elif command and not executed:
@@ -280,23 +255,20 @@ class Controller:
 
     def _execute(self, command: int) -> Iterator[None]:
         if command == MOVE_L:
-            pose, speed, acceleration = self._read_doubles(0, 6), self._read_double(6), self._read_double(7)
+            *pose, speed, acceleration = map(self._read_double, range(8))
             yield from self._halt(HALT_M_S2)
-            thread = self._move(pose, speed, acceleration)
+            thread = self._move(np.array(pose), speed, acceleration)
             if self.inputs["input_int_register_1"]:  # asynchronous
                 self._threads.append(thread)
             else:
                 yield from thread
-        elif command in (STOP, STOP_L):
+        elif command == STOP:
             yield from self._halt(self._read_double(0))
-        elif command == SET_TCP:
-            self.tcp = self._read_doubles(0, 6)
         elif command == GET_TCP:
-            self.outputs |= {f"output_double_register_{i}": float(value) for i, value in enumerate(self.tcp)}
+            tcp = (*self._tcp, 0.0, 0.0, 0.0)
+            self.outputs |= {f"output_double_register_{i}": value for i, value in enumerate(tcp)}
         elif command == WATCHDOG:
             self._watchdog_s = 1 / self._read_double(0)
-        elif command in (IS_SAFE, IS_STEADY):
-            self.outputs["output_int_register_1"] = int(command == IS_SAFE or not self.motion.moving)
         else:
             self.stop_program()
 
@@ -325,63 +297,36 @@ class Controller:
     def _read_double(self, index: int) -> float:
         return self.inputs[f"input_double_register_{index}"]
 
-    def _read_doubles(self, first: int, count: int) -> Array:
-        return np.array([self._read_double(index) for index in range(first, first + count)])
-
-
-COLUMNS = 8  # time on the host's monotonic clock in s, pose in mm and rad, force on the tool in N
-ROWS = 1 << 16  # length of the ring: 131 s at 500 Hz, 524 s at 125 Hz
-WINDOWS = (256, 8192, ROWS)
-"""Numbers of newest rows that are searched in turn: who asks in real time, as a board does, asks for the newest."""
-_MARGIN = 16  # rows that the writer may overwrite while a reader copies
-
-
-class PoseLogWriter:
-    """Appends rows to the ring."""
-
-    def __init__(self, path: Path) -> None:
-        self._count, self._rows = _map_ring(path, "r+")
-
-    def append(self, time_s: float, pose: ArrayLike, force_n: float) -> None:
-        """Add a row; the pose in mm and rad."""
-        count = int(self._count[0])
-        row = self._rows[count % ROWS]
-        row[0], row[1:7], row[7] = time_s, pose, force_n
-        self._count[0] = count + 1
-
 
 class PoseLog:
-    """The true poses of the emulated arm: reads the ring, from any process."""
+    """The newest true poses of the tip, at least `ROWS` of them; threads may read while one writes."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._count, self._rows = _map_ring(path, "r")
+    def __init__(self) -> None:
+        self._rows = np.empty((2 * ROWS, 8))
+        self._end = 0
+        self._lock = threading.Lock()
 
-    def rows(self, max_rows: int = ROWS) -> Array:
-        """Return the newest (n, 8) rows, oldest first: time, pose in mm and rad, force."""
-        count = int(self._count[0])
-        first = max(0, count - min(max_rows, ROWS - _MARGIN))
-        copy = self._rows[np.arange(first, count) % ROWS]
-        overwritten = int(self._count[0]) - ROWS + _MARGIN
-        return copy[max(0, overwritten - first) :]
+    def append(self, time_s: float, pose: ArrayLike, force_n: float) -> None:
+        """Add a row: time on the host's monotonic clock, pose in mm and rad, force on the tool."""
+        with self._lock:
+            if self._end == len(self._rows):
+                self._end //= 2
+                self._rows[: self._end] = self._rows[self._end :]
+            row = self._rows[self._end]
+            row[0], row[1:7], row[7] = time_s, pose, force_n
+            self._end += 1
+
+    def rows(self, since_s: float = -np.inf) -> Array:
+        """Return the (n, 8) rows from the last one before a time on, oldest first."""
+        with self._lock:
+            first = int(np.searchsorted(self._rows[: self._end, 0], since_s, side="right")) - 1
+            return self._rows[max(first, 0) : self._end].copy()
 
     def poses(self, times_s: ArrayLike) -> Array:
         """Return the (n, 6) poses in mm and rad at monotonic times; ValueError for a time before the oldest row."""
         times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
         first_s = np.min(times, initial=np.inf)
-        for max_rows in WINDOWS:
-            rows = self.rows(max_rows)
-            if len(rows) and rows[0, 0] <= first_s:
-                return np.column_stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:7]])
-        raise ValueError("a time before the oldest pose of the log")
-
-
-def create_pose_log(path: Path) -> None:
-    """Make an empty ring."""
-    with path.open("wb") as file:
-        file.truncate(8 + 8 * COLUMNS * ROWS)
-
-
-def _map_ring(path: Path, mode: str) -> tuple[Indices, Array]:
-    data = np.memmap(path, np.uint8, mode)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return data[:8].view(np.int64), data[8:].view(np.float64).reshape(ROWS, COLUMNS)
+        rows = self.rows(first_s)
+        if not len(rows) or rows[0, 0] > first_s:
+            raise ValueError("a time before the oldest pose of the log")
+        return np.column_stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:7]])

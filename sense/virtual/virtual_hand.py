@@ -53,15 +53,13 @@ class Finger:
         contact: Contact,
         rig: RigSettings,
         rate_hz: float,
-        *,
-        scatter_mm: float = SCATTER_MM,
         mishaps: float = 0.05,
     ) -> None:
         """Hold the finger over a pad; `mishaps` is the share of presses that become one of `MISHAPS`."""
         rng = np.random.default_rng(rig.seed)
         self._model = LivePad(pad, contact, rig, rate_hz, rng)
         self._rng, self._depth_mm = rng.spawn(1)[0], rig.depth_mm
-        self._scatter_mm, self._mishaps = scatter_mm, mishaps
+        self._mishaps = mishaps
         self._view: Mapping[str, Any] = {"phase": "settle"}
         self._now_s = -math.inf
         self.strokes: list[FingerStroke] = []  # all that it has made
@@ -102,7 +100,7 @@ class Finger:
         if self._view["phase"] != "press":
             return None
         kind = str(self._rng.choice(MISHAPS)) if self._rng.random() < self._mishaps else "press"
-        position_mm = np.array(self._view["target"]) + self._scatter_mm * self._rng.standard_normal(2)
+        position_mm = np.array(self._view["target"]) + SCATTER_MM * self._rng.standard_normal(2)
         depth_mm = self._depth_mm * self._rng.uniform(*DEPTHS)
         stroke = FingerStroke(kind, position_mm, depth_mm, time_s + self._rng.uniform(*REACTION_S))
         if kind in ("short", "light"):

@@ -1,6 +1,5 @@
 """A whole rig without hardware: the real drivers talk to an emulated arm and board, which share one simulated pad."""
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
@@ -11,14 +10,14 @@ from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.boards.board_reader import BoardDriver
 from padforge.sense.rig.boards.due import DueBoard
-from padforge.sense.rig.boards.line_board import LineBoard
-from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import Arm, Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, LivePad
-from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, SampleSource
+from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, SampleSource, SerialBoard
 from padforge.sense.virtual.printer import EmulatedPrinter
 from padforge.sense.virtual.ur5 import HOST, EmulatedUR5
 
@@ -26,31 +25,26 @@ STIFFNESS_N_MM = 2.0  # of the pad under the emulated UR5, which has a force sen
 MIN_LINE_INPUTS = 16  # inputs of the emulated line board, which has more if higher ones are named
 BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any pad
 
-_START_S = 2.0
-
-BoardDriver = DueBoard | LineBoard
-EmulatedBoard = EmulatedDue | EmulatedLineBoard
-
 
 @contextmanager
 def emulate_ur5(
     pad: Morphology, contact: Contact, rig: RigSettings
-) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, EmulatedBoard]]:
+) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, SerialBoard]]:
     """Open drivers of arm and board, not yet connected, and the emulators behind them; `rig` is of `ur5_settings`."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
-    with EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot:
-        deadline = time.monotonic() + _START_S  # a board that samples from its start on asks for the arm's pose
-        while not len(robot.pose_log.rows()) and time.monotonic() < deadline:
-            time.sleep(1e-3)
-        with _emulate_board(pad, contact, rig, robot.true_poses) as (driver, board), closing(UR5(HOST)) as arm:
-            yield arm, driver, robot, board
+    with (
+        EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot,
+        _emulate_board(pad, contact, rig, robot.true_poses) as (driver, board),
+        closing(UR5(HOST)) as arm,
+    ):
+        yield arm, driver, robot, board
 
 
 @contextmanager
 def emulate_printer(
     pad: Morphology, contact: Contact, rig: RigSettings
-) -> Iterator[tuple[Printer, BoardDriver, EmulatedPrinter, EmulatedBoard]]:
+) -> Iterator[tuple[Printer, BoardDriver, EmulatedPrinter, SerialBoard]]:
     """Open drivers and emulators as `emulate_ur5` does, with a printer as the arm and `rig` of `printer_settings`."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp = np.array(rig.tcp_mm)
@@ -68,7 +62,7 @@ def emulate_printer(
 @contextmanager
 def _emulate_board(
     pad: Morphology, contact: Contact, rig: RigSettings, tip_positions: SampleSource
-) -> Iterator[tuple[BoardDriver, EmulatedBoard]]:
+) -> Iterator[tuple[BoardDriver, SerialBoard]]:
     """Open the driver of a board, and the board, which samples the pad below the tip."""
     frame, inputs = RobotFrame.from_settings(rig), rig.inputs(len(pad.knots))
     n_inputs = max(MIN_LINE_INPUTS, 1 + max(inputs))
@@ -94,15 +88,10 @@ def _emulate_board(
             yield driver, board
 
 
-def _reach_mm(rig: RigSettings, pad: Morphology) -> float:
-    """Return how far from the middle of a pad a tip may go, however the pad is rotated."""
-    return max(pad.layout.size_mm) + rig.clearance_mm
-
-
 def ur5_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
     """Return `rig` with a workspace around the emulated pad; pad and tip are where `rig` says, if it does."""
     x, y = rig.pad_mm or (0.0, -400.0)
-    reach = _reach_mm(rig, pad)
+    reach = max(pad.layout.size_mm) + rig.clearance_mm  # however the pad is rotated
     return rig.model_copy(
         update={
             "pad_mm": (x, y),
@@ -116,7 +105,7 @@ def ur5_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
 def printer_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
     """Return `rig` with the pad in the middle of the emulated printer's bed, and the probe beside its nozzle."""
     middle, height = BED_MM / 2, 8.0
-    reach = _reach_mm(rig, pad)
+    reach = max(pad.layout.size_mm) + rig.clearance_mm
     sides = (middle - reach, middle + reach)
     return rig.model_copy(
         update={

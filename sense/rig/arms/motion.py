@@ -52,14 +52,13 @@ class StraightMove:
         return math.dist(self.start, self.end)
 
     @property
-    def profile(self) -> TrapezoidalProfile:
-        """Distance from the start over time."""
-        return TrapezoidalProfile(self.length_mm, self.speed, self.acceleration)
-
-    @property
     def duration_s(self) -> float:
         """Time from rest to rest, s."""
-        return self.profile.duration_s
+        return self._profile.duration_s
+
+    @property
+    def _profile(self) -> TrapezoidalProfile:
+        return TrapezoidalProfile(self.length_mm, self.speed, self.acceleration)
 
     def limit_axes(self, max_speeds: Sequence[float], max_accelerations: Sequence[float]) -> "StraightMove":
         """Return the same move, slowed down until no axis exceeds its own speed and acceleration."""
@@ -76,7 +75,7 @@ class StraightMove:
         """Return the position `t_s` seconds after the start; `start` before the move, `end` after it."""
         if t_s >= self.duration_s:
             return self.end
-        share = self.profile.evaluate(t_s)[0] / self.length_mm
+        share = self._profile.evaluate(t_s)[0] / self.length_mm
         x, y, z = (a + share * (b - a) for a, b in zip(self.start, self.end, strict=True))
         return x, y, z
 

@@ -29,12 +29,12 @@ from padforge.sense.rig.arms.printer_link import (
     FIRMWARE,
     HOMING_ADVICE,
     MarlinLink,
-    PrinterInfo,
     format_move,
     parse_axis_limits,
+    parse_identity,
     parse_position,
 )
-from padforge.sense.rig.devices import ArmState, Array, Pose, RigFault
+from padforge.sense.rig.devices import ArmState, Array, RigFault
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
@@ -260,7 +260,7 @@ class Printer:
         self._link = link = MarlinLink(rig.printer_port, rig.printer_baud)
         try:
             link.handshake(CONNECT_S)
-            info = _identify(link)
+            identity = _identify(link)
             max_mm_s, max_mm_s2 = _read_axis_limits(link)
             self._check_press_time(max_mm_s, max_mm_s2)
             for command in SETTINGS:
@@ -274,11 +274,9 @@ class Printer:
         return {
             "port": rig.printer_port,
             "baud": rig.printer_baud,
-            "firmware": info.firmware,
-            "machine": info.machine,
+            **identity,
             "max_mm_s": list(max_mm_s),
             "max_mm_s2": list(max_mm_s2),
-            "halts_at_once": "EMERGENCY_PARSER" in info.capabilities,
         }
 
     def state(self) -> ArmState:
@@ -287,7 +285,7 @@ class Printer:
         if (age_s := time.monotonic() - state.time_s) > STALE_S:
             message = f"the printer's last answer is {age_s:.2f} s old; allowed {STALE_S} s"
             raise RigFault("stale", message, "it may be busy: look at its display")
-        return ArmState(state.time_s, self._pose(state.position), state.speed_mm_s, None, False, False, state.moving)
+        return self._to_arm_state(state)
 
     def drain(self) -> Array:
         """Return the (n, 10) states since the last call; those before a fault come before it."""
@@ -295,7 +293,7 @@ class Printer:
         if not states:
             self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
-        return np.array([[one.time_s, *self._pose(one.position), one.speed_mm_s, np.nan, 1.0] for one in states])
+        return np.array([self._to_arm_state(state).to_row() for state in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move from rest, as fast as the axes can; RigFault("refused") also for a turn of the tool."""
@@ -327,9 +325,10 @@ class Printer:
             raise self._thread.fault
         return self._thread
 
-    def _pose(self, nozzle: Position) -> Pose:
-        x, y, z = (a + b for a, b in zip(nozzle, self._tcp, strict=True))
-        return (x, y, z, *self._rig.tool_rad)
+    def _to_arm_state(self, state: NozzleState) -> ArmState:
+        x, y, z = (a + b for a, b in zip(state.position, self._tcp, strict=True))
+        pose = (x, y, z, *self._rig.tool_rad)
+        return ArmState(state.time_s, pose, state.speed_mm_s, None, False, False, state.moving)
 
     def _check_press_time(self, max_mm_s: Position, max_mm_s2: Position) -> None:
         """Refuse presses that would be over before the tip is down."""
@@ -346,14 +345,17 @@ class Printer:
             )
 
 
-def _identify(link: MarlinLink) -> PrinterInfo:
-    info = PrinterInfo.parse(link.execute("M115"))
-    if FIRMWARE not in info.firmware:
-        raise RigFault("refused", f"the firmware is {info.firmware or 'of no name'!r}, allowed is Marlin")
-    if re.match(r"Marlin (bugfix-)?1\.", info.firmware):  # answers M114 only once all moves are over
-        message = f"the firmware is {info.firmware!r}, which reports its position only once it stands"
+def _identify(link: MarlinLink) -> dict[str, Any]:
+    """Return what the printer is; RigFault("refused") unless its firmware is Marlin 2."""
+    lines = link.execute("M115")
+    firmware = parse_identity(lines, "FIRMWARE_NAME")
+    if FIRMWARE not in firmware:
+        raise RigFault("refused", f"the firmware is {firmware or 'of no name'!r}, allowed is Marlin")
+    if re.match(r"Marlin (bugfix-)?1\.", firmware):  # answers M114 only once all moves are over
+        message = f"the firmware is {firmware!r}, which reports its position only once it stands"
         raise RigFault("refused", message, "allowed is Marlin 2")
-    return info
+    machine, halts_at_once = parse_identity(lines, "MACHINE_TYPE"), "Cap:EMERGENCY_PARSER:1" in lines
+    return {"firmware": firmware, "machine": machine, "halts_at_once": halts_at_once}
 
 
 def _read_axis_limits(link: MarlinLink) -> tuple[Position, Position]:

@@ -5,7 +5,6 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import reduce
 from operator import xor
 from typing import Any
@@ -65,6 +64,12 @@ def parse_axis_limits(lines: list[str], code: str) -> Position | None:
     return values if values and min(values) > 0 else None
 
 
+def parse_identity(lines: list[str], name: str) -> str:
+    """Return a field of the answer to M115, such as FIRMWARE_NAME; "" without."""
+    match = re.search(rf"{name}:(.*?)(?: [A-Z_]+:|$)", "\n".join(lines), re.MULTILINE)
+    return match[1].strip() if match else ""
+
+
 def is_halt(line: str) -> bool:
     """Return whether the line says that the firmware has stopped for good."""
     return line.startswith("Error:") and any(words in line for words in HALTED)
@@ -72,26 +77,6 @@ def is_halt(line: str) -> bool:
 
 def _is_confirmation(line: str) -> bool:
     return line == "ok" or line.startswith("ok ")
-
-
-@dataclass(frozen=True)
-class PrinterInfo:
-    """Identity of a printer, from its answer to M115."""
-
-    firmware: str = ""  # its name with the version
-    machine: str = ""  # name of the printer
-    capabilities: frozenset[str] = field(default_factory=frozenset)  # those that it has, such as EMERGENCY_PARSER
-
-    @classmethod
-    def parse(cls, lines: list[str]) -> "PrinterInfo":
-        """Read the lines of the answer."""
-        text = "\n".join(lines)
-        firmware = re.search(r"FIRMWARE_NAME:(.*?)(?: [A-Z_]+:|$)", text, re.MULTILINE)
-        machine = re.search(r"MACHINE_TYPE:(.*?)(?: [A-Z_]+:|$)", text, re.MULTILINE)
-        capabilities = re.findall(r"^Cap:([A-Z0-9_]+):1$", text, re.MULTILINE)
-        return cls(
-            firmware[1].strip() if firmware else "", machine[1].strip() if machine else "", frozenset(capabilities)
-        )
 
 
 class MarlinLink:

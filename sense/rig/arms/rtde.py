@@ -1,18 +1,17 @@
 """RTDE, the data link of Universal Robots controllers: frames, recipes, the dashboard, and a reader of the states.
 
-Frames are big-endian, both ways. At the end, the messages from the process that holds ur-rtde to its parent.
+Frames are big-endian, both ways.
 """
 
-import json
 import math
 import re
 import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 VERSION, CONTROLLER, OUTPUTS, INPUTS, START, PAUSE, DATA = b"VvOISPU"
@@ -112,7 +111,6 @@ class RtdeState:
     """A state as the controller sends it."""
 
     time_s: float  # when it was measured, on the host's monotonic clock
-    skipped: int  # number of states missing before it
     pose: tuple[float, ...]  # m and rad
     speed: float  # of the tool, m/s
     force_n: float | None  # on the tool along z; None without a sensor
@@ -149,7 +147,6 @@ class RtdeReader:
         self._splitter = FrameSplitter()
         self._queue: deque[tuple[float, bytes]] = deque()
         self._clock = HostClock()
-        self._last_stamp: float | None = None
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
         self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of the controller
@@ -197,13 +194,8 @@ class RtdeReader:
         has_sensor = self.version[0] >= FORCE_SERIES
         if not all(map(math.isfinite, values)):
             raise ValueError("the controller sent a state that holds NaN or infinity")
-        skipped = 0
-        if self._last_stamp is not None:
-            skipped = max(0, round((stamp - self._last_stamp) * self.rate_hz) - 1)
-        self._last_stamp = stamp
         return RtdeState(
             time_s=self._clock.host_time(stamp, arrival_s),
-            skipped=skipped,
             pose=pose,
             speed=math.hypot(*speed),
             force_n=force[2] if has_sensor else None,
@@ -216,50 +208,3 @@ def _unpack(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
     if len(payload) != layout.size:
         raise ValueError(f"the controller sent {len(payload)} bytes, expected {layout.size}")
     return layout.unpack(payload)
-
-
-class StateRow(NamedTuple):
-    """A state as the worker process sends it: mm, rad, s and N; flags are 0 or 1, force is NaN without a sensor."""
-
-    time_s: float
-    x_mm: float
-    y_mm: float
-    z_mm: float
-    rx: float
-    ry: float
-    rz: float
-    speed_mm_s: float
-    force_n: float
-    protective_stop: float
-    emergency_stop: float
-    moving: float
-    skipped: float
-    sideways_n: float
-
-
-_STATE = struct.Struct("<c14d")
-_REPLY = struct.Struct("<cI")
-
-
-def pack_state(row: StateRow) -> bytes:
-    """Return the bytes of a state."""
-    return _STATE.pack(b"S", *row)
-
-
-def pack_reply(reply: Any) -> bytes:
-    """Return the bytes of a reply, which is any JSON."""
-    text = json.dumps(reply).encode()
-    return _REPLY.pack(b"A", len(text)) + text
-
-
-def read_messages(source: Callable[[int], bytes]) -> Iterator[StateRow | dict[str, Any]]:
-    """Yield states and replies from a blocking `source` of bytes, until it ends or is damaged."""
-    while kind := source(1):
-        head = kind + source((_STATE if kind == b"S" else _REPLY).size - 1)
-        try:
-            if kind == b"S":
-                yield StateRow._make(_STATE.unpack(head)[1:])
-            else:
-                yield json.loads(source(_REPLY.unpack(head)[1]))
-        except (struct.error, ValueError, RecursionError):
-            return

@@ -1,7 +1,7 @@
 """The worker process that holds ur-rtde, which can hang or crash: commands on stdin, states and replies on stdout.
 
-Run as `python -m padforge.sense.rig.arms.rtde_worker HOST`. Commands are JSON lines, an empty line is a heartbeat. The
-arm's watchdog is kicked from here alone, so the arm stops by itself if this process ends or hangs. It also stops if the
+Run as `python -m padforge.sense.rig.arms.rtde_worker HOST`. All are JSON lines; an empty one is a heartbeat. The arm's
+watchdog is kicked from here alone, so the arm stops by itself if this process ends or hangs. It also stops if the
 parent ends, or gives no sign of life during a move. Nothing here unlocks, powers or starts an arm.
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from padforge.sense.rig.arms import rtde
-from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState, StateRow
+from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState
 
 WATCHDOG_HZ = 4.0
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
@@ -127,14 +127,14 @@ class WorkerProcess:
             try:
                 result = getattr(self, f"_do_{command['command']}")(*command["arguments"])
                 if command["id"]:
-                    self._reply({"id": command["id"], "result": result})
+                    self._send({"id": command["id"], "result": result})
             except CommandRejected as fault:
-                self._reply({"id": command["id"], "fault": fault.args})
+                self._send({"id": command["id"], "fault": fault.args})
             except Exception as error:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
                 if self._control is not None:
                     self._exit("lost", f"ur-rtde lost the arm: {reason}", "connect again")
-                self._reply({"id": command["id"], "fault": ("refused", f"the arm refused: {reason}", "")})
+                self._send({"id": command["id"], "fault": ("refused", f"the arm refused: {reason}", "")})
 
     def _do_kick(self) -> None:
         if self._is_playing() and not self._halting and not self._stopped_by_arm:
@@ -216,7 +216,7 @@ class WorkerProcess:
             self._latest = state
             self._update(state)
             self._new_state.set()
-            self._write(rtde.pack_state(self._to_row(state)))
+            self._send({"state": self._to_arm_state(state)})
             try:
                 state = reader.read(STREAM_TIMEOUT_S)
             except TimeoutError:
@@ -242,19 +242,19 @@ class WorkerProcess:
         if arrived or stopped:
             self._previous_operation = None
 
-    def _to_row(self, state: RtdeState) -> StateRow:
+    def _to_arm_state(self, state: RtdeState) -> dict[str, Any]:
+        """Return the fields of an `ArmState`."""
         emergency = bool(state.safety & rtde.EMERGENCY_BITS)
-        x, y, z, *rotation = state.pose
-        return StateRow(
-            *(state.time_s, 1e3 * x, 1e3 * y, 1e3 * z, *rotation),
-            speed_mm_s=1e3 * state.speed,
-            force_n=float("nan") if state.force_n is None else state.force_n,
-            protective_stop=bool(state.safety & rtde.PROTECTIVE_BITS) and not emergency,
-            emergency_stop=emergency,
-            moving=self._previous_operation is not None,
-            skipped=state.skipped,
-            sideways_n=state.sideways_n,
-        )
+        return {
+            "time_s": state.time_s,
+            "pose": [*(1e3 * value for value in state.pose[:3]), *state.pose[3:]],
+            "speed_mm_s": 1e3 * state.speed,
+            "force_n": state.force_n,
+            "protective_stop": bool(state.safety & rtde.PROTECTIVE_BITS) and not emergency,
+            "emergency_stop": emergency,
+            "moving": self._previous_operation is not None,
+            "sideways_n": state.sideways_n,
+        }
 
     def _halt(self, cause: str, message: str) -> None:
         """Stop the arm and end; if ur-rtde does not stop it, the watchdog does."""
@@ -263,17 +263,15 @@ class WorkerProcess:
         self._halted.wait(HALT_S)
         self._exit(cause, message, "connect again")
 
-    def _reply(self, reply: dict[str, Any]) -> None:
-        self._write(rtde.pack_reply(reply))
-
-    def _write(self, data: bytes) -> None:
+    def _send(self, message: dict[str, Any]) -> None:
+        data = json.dumps(message).encode() + b"\n"
         with self._write_lock:
             while data:
                 data = data[os.write(self._out, data) :]
 
     def _exit(self, cause: str, message: str, advice: str) -> NoReturn:
         """Report the reason, if the parent listens; end without ur-rtde's own clean-up, which waits and can crash."""
-        report = threading.Thread(target=self._reply, args=({"exit": (cause, message, advice)},), daemon=True)
+        report = threading.Thread(target=self._send, args=({"exit": (cause, message, advice)},), daemon=True)
         report.start()
         report.join(HALT_S)
         os._exit(0)

@@ -10,13 +10,14 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
-from padforge.sense.rig.arms.rtde import StateRow, read_messages, stop_program
-from padforge.sense.rig.devices import ArmState, Array, Cause, RigFault, start
+from padforge.sense.rig.arms.rtde import stop_program
+from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, start
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
@@ -36,26 +37,20 @@ class RtdeWorker:
     def __init__(self, host: str) -> None:
         self._host = host
         self.fault: RigFault | None = None  # why the worker has ended; None while it runs
-        self.latest: StateRow | None = None  # last state of the arm
-        self.skipped = 0  # number of states that the controller left out
+        self.latest: ArmState | None = None  # last state of the arm
         self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
         self._replies: dict[int, dict[str, Any]] = {}
         self._ids = itertools.count(1)
-        self._rows: deque[StateRow] = deque(maxlen=MAX_STATES)
+        self._states: deque[ArmState] = deque(maxlen=MAX_STATES)
         self._received = threading.Condition()
         self._supervised_s = time.monotonic()
         self._killed = threading.Event()
-        self._process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
-        assert self._process.stdin is not None
-        os.set_blocking(self._process.stdin.fileno(), False)
+        self.process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
+        assert self.process.stdin is not None
+        os.set_blocking(self.process.stdin.fileno(), False)
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._receive, self._send_heartbeats)]
         for thread in self._threads:
             thread.start()
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
 
     def request(self, command: str, *arguments: Any, timeout_s: float) -> Any:
         """Send a command and return its result; RigFault if it fails, the worker ends, or it is late."""
@@ -74,28 +69,28 @@ class RtdeWorker:
         """Note that the program looks at the arm, so that a move may go on."""
         self._supervised_s = time.monotonic()
 
-    def drain(self) -> list[StateRow]:
+    def drain(self) -> list[ArmState]:
         """Return the states since the last call."""
         with self._received:
-            rows = list(self._rows)
-            self._rows.clear()
-        return rows
+            states = list(self._states)
+            self._states.clear()
+        return states
 
     def kill(self) -> None:
         """Kill the worker and wait for its end; never raises."""
         self._killed.set()
-        self._process.kill()
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
         for thread in self._threads:
             thread.join()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 pipe.close()
 
     def _write(self, line: bytes) -> None:
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         try:
-            os.write(self._process.stdin.fileno(), line + b"\n")
+            os.write(self.process.stdin.fileno(), line + b"\n")
         except (OSError, ValueError):
             raise self.fault or RigFault("lost", f"the link to the arm {self._host} is down", "connect again") from None
 
@@ -106,14 +101,18 @@ class RtdeWorker:
                     self._write(b"")
 
     def _receive(self) -> None:
-        assert self._process.stdout is not None
+        assert self.process.stdout is not None
         reason: tuple[Cause, str, str] = ("lost", "the process that holds ur-rtde has ended", "connect again")
-        for message in read_messages(self._process.stdout.read):
+        for line in self.process.stdout:
+            try:
+                message = json.loads(line)
+            except ValueError:  # it ended in the middle of a line
+                break
             with self._received:
-                if isinstance(message, StateRow):
-                    self.latest = message
-                    self.skipped += int(message.skipped)
-                    self._rows.append(message)
+                if "state" in message:
+                    pose: Pose = tuple(message["state"].pop("pose"))
+                    self.latest = ArmState(pose=pose, **message["state"])
+                    self._states.append(self.latest)
                 elif "exit" in message:
                     reason = message["exit"]
                 else:
@@ -163,42 +162,27 @@ class UR5:
     @property
     def worker_pid(self) -> int | None:
         """Process id of the worker, None before `connect`."""
-        return self._worker.pid if self._worker else None
-
-    @property
-    def skipped(self) -> int:
-        """Number of states that the controller left out since `connect`."""
-        return self._worker.skipped if self._worker else 0
+        return self._worker.process.pid if self._worker else None
 
     def state(self) -> ArmState:
         """Return the latest state; also RigFault("deadline") if nobody asked for one for 2 s during a move."""
         worker = self._connected()
         worker.supervise()
-        row = worker.latest
-        age_s = np.inf if row is None else time.monotonic() - row.time_s
-        if row is None or age_s > STALE_S:
+        state = worker.latest
+        age_s = np.inf if state is None else time.monotonic() - state.time_s
+        if state is None or age_s > STALE_S:
             raise RigFault("stale", f"the last state of the arm is {age_s:.2f} s old; allowed {STALE_S} s")
-        return ArmState(
-            time_s=row.time_s,
-            pose=(row.x_mm, row.y_mm, row.z_mm, row.rx, row.ry, row.rz),
-            speed_mm_s=row.speed_mm_s,
-            force_n=None if np.isnan(row.force_n) else row.force_n,
-            protective_stop=bool(row.protective_stop),
-            emergency_stop=bool(row.emergency_stop),
-            moving=bool(row.moving) or row.time_s < self._move_s,
-            sideways_n=row.sideways_n,
-        )
+        return replace(state, moving=state.moving or state.time_s < self._move_s)
 
     def drain(self) -> Array:
         """Return the (n, 10) states since the last call; those before the link was lost come before the fault."""
-        rows = self._worker.drain() if self._worker else []
-        if not rows:
+        states = self._worker.drain() if self._worker else []
+        if not states:
             self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
         if self._worker:
             self._worker.supervise()
-        values = np.array(rows, dtype=np.float64)
-        return np.column_stack([values[:, :9], (~values[:, 9:11].any(axis=1)).astype(np.float64)])
+        return np.array([state.to_row() for state in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move from rest; RigFault("refused") if it is none or the arm does not accept it."""

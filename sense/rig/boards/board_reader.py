@@ -1,15 +1,17 @@
-"""What all boards need: a thread that drains the port into a buffer, and the host times of the samples."""
+"""What all boards need: a driver without its protocol, a thread that drains the port, and host times of the samples."""
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
 
 POLL_S = 0.1  # longest wait for bytes
 SETTLE_S = 0.5
@@ -24,31 +26,79 @@ _MAX_BUCKETS = 60
 _MIN_STEP, _MAX_STEP = 0.5, 1.5  # between two returned times, in periods, while a changed line is caught up with
 
 
-class SampleBlock(Protocol):
-    """Samples that came together, (n, C) of them."""
-
-    @property
-    def counts(self) -> Any: ...
+Arrivals = list[tuple[float, Any]]
+"""Blocks of samples with their host times; the length of a block is the number of its samples."""
 
 
-B = TypeVar("B", bound=SampleBlock)
+class BoardDriver(ABC):
+    """The driver of a board at a serial port; implements `Board`."""
+
+    STOP_MESSAGE = b""  # ends the sampling
+
+    def __init__(self, port: str, baud: int) -> None:
+        """Take the port; nothing is opened before `connect`."""
+        self._port, self._baud = port, baud
+        self._stream: SerialStream | None = None
+        self._reader: BlockReader | None = None
+        self._assemble: Callable[[Arrivals], BoardSamples] | None = None
+
+    @abstractmethod
+    def _start(self, stream: SerialStream) -> dict[str, Any]:
+        """Identify the board, start it by `_read_blocks`, and return the board's identity."""
+
+    def connect(self) -> dict[str, Any]:
+        """Open the port and start the board; see `Board`."""
+        self.close()
+        self._stream = SerialStream(self._port, self._baud, POLL_S)
+        try:
+            return self._start(self._stream)
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self) -> BoardSamples:
+        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
+        if self._reader is None or self._assemble is None:
+            raise RigFault("refused", f"{self._port}: not connected")
+        return self._assemble(self._reader.drain())
+
+    def close(self) -> None:
+        """Stop sampling and close the port; never raises."""
+        if self._reader is not None:
+            self._reader.stop()
+        if self._stream is not None:
+            with suppress(RigFault):
+                self._stream.send(self.STOP_MESSAGE)
+            self._stream.close()
+        self._stream = self._reader = None
+
+    def _read_blocks(
+        self,
+        receive: Callable[[], tuple[float, list[Any]]],
+        rate_hz: float,
+        assemble: Callable[[Arrivals], BoardSamples],
+        request_start: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Read from now on, return once times are settled; `assemble` makes samples of the blocks."""
+        self._reader, self._assemble = BlockReader(self._port, receive, rate_hz), assemble
+        self._reader.start_settled(request_start)
 
 
-class BlockReader(threading.Thread, Generic[B]):
+class BlockReader(threading.Thread):
     """A thread that drains a port into a buffer, until it is stopped or something fails."""
 
-    def __init__(self, port: str, receive: Callable[[], tuple[float, list[B]]], rate_hz: float) -> None:
+    def __init__(self, port: str, receive: Callable[[], tuple[float, list[Any]]], rate_hz: float) -> None:
         """Prepare the thread; `receive` waits shortly for blocks and returns host time and blocks, or ends it."""
         super().__init__(name=f"reader of {port}", daemon=True)
         self._port, self._receive = port, receive
         self._capacity = round(BUFFER_S * rate_hz)
-        self._arrivals: deque[tuple[float, B]] = deque()
+        self._arrivals: deque[tuple[float, Any]] = deque()
         self._n_buffered = 0
         self._lock = threading.Lock()
         self._stopped = threading.Event()
         self._fault: RigFault | None = None
 
-    def start_settled(self, request_start: Callable[[], object] = lambda: None) -> None:
+    def start_settled(self, request_start: Callable[[], object]) -> None:
         """Start, call `request_start` until blocks come, return after `SETTLE_S`; RigFault("stale") without."""
         self.start()
         deadline = time.monotonic() + _START_S
@@ -69,7 +119,7 @@ class BlockReader(threading.Thread, Generic[B]):
         except Exception as error:  # a reader that dies silently would look like a pad at rest
             self._fault = RigFault("lost", f"{self._port}: the reader has failed ({error!r})")
 
-    def drain(self) -> list[tuple[float, B]]:
+    def drain(self) -> Arrivals:
         """Return the buffered blocks with their arrival times; raise the thread's fault once there are none."""
         with self._lock:
             arrivals = list(self._arrivals)
@@ -103,7 +153,7 @@ class BlockReader(threading.Thread, Generic[B]):
                 silent_s = 0.0
                 with self._lock:
                     self._arrivals.append((now_s, block))
-                    self._n_buffered += len(block.counts)
+                    self._n_buffered += len(block)
                 if self._n_buffered > self._capacity:
                     raise RigFault("data", f"{self._port}: nobody has read the samples for {BUFFER_S:g} s")
             if silent_s > _STALL_S:
@@ -140,11 +190,6 @@ class SampleClock:
         self._offset = 0.0
         self._slope = 0.0
         self._last: tuple[int, float] | None = None
-
-    @property
-    def skew_ppm(self) -> float:
-        """How much longer than its nominal period a sample takes by the host's clock, in millionths."""
-        return self._slope * 1e6
 
     def observe(self, index: int, arrival_s: float) -> None:
         """Add the arrival of a block whose last sample, or clock, has this unwrapped index."""

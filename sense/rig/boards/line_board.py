@@ -1,19 +1,32 @@
-"""A board that sends lines of text: any board that speaks the protocol of `line_framing`."""
+"""A board that sends lines of text, so plain that any board can be programmed to: docs/devices.md describes them."""
 
 import time
+from binascii import crc32
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
-from padforge.sense.rig.boards.line_framing import HEADER_REQUEST, LineDecoder, LineHeader, LineSample
+from padforge.sense.arrays import MAX_FIBRES
+from padforge.sense.rig.boards.board_reader import BoardDriver, SampleClock, select_inputs
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
+HEADER_REQUEST = b"?"
+MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 RESONATOR_SKEW = 5e-3  # relative error of a ceramic resonator, which small boards have instead of a quartz
 
+_MAGIC, _VERSION = "# padforge-line", "1"
+_LIMITS = {
+    "rate_hz": (MIN_RATE_HZ, MAX_RATE_HZ),
+    "bits": (1, 24),
+    "reference_v": (0.1, 100),
+    "channels": (1, MAX_FIBRES),
+}
+_MAX_LINE = 8192
+_MAX_TIME = 2**63  # of a clock that does not wrap around
 _ANSWER_S = 3.0  # opening their port resets many boards, and some wait for a new program before they start
 _RESEND_S = 0.5
 _RATE_TOLERANCE = 1e-3
@@ -21,6 +34,137 @@ _BAD_S, _MIN_BAD_LINES = 0.5, 5  # so much of nothing but damaged lines is no no
 _MAX_GAP_US = 2_000_000  # a board that is silent for a second is stale, so no valid time jumps so far
 _SLOT_GAIN = 0.1  # share by which the slots to come follow a line that is a little early or late
 _MAX_MISPLACED, _FORGIVEN = 8, 0.1  # misplaced lines that are a fault; a line in its slot makes up for a tenth of one
+
+
+@dataclass(frozen=True)
+class LineHeader:
+    """The header of a board."""
+
+    rate_hz: float  # samples a second
+    bits: int  # of a count
+    reference_v: float  # voltage of the highest count
+    channels: int  # number of inputs
+    checked: bool = True  # whether its lines have a check
+    extra: tuple[tuple[str, str], ...] = ()  # the board's own words and their values
+
+    @property
+    def full_scale(self) -> int:
+        """The highest count."""
+        return 2**self.bits - 1
+
+
+@dataclass(frozen=True)
+class LineSample:
+    """A sample: the board's time in us, wrapped or not, and (C,) counts."""
+
+    time_us: int
+    counts: tuple[int, ...]
+
+
+def format_header(header: LineHeader) -> bytes:
+    """Return a header as it is sent."""
+    numbers = ((name, f"{getattr(header, name):g}") for name in _LIMITS)
+    words = [*header.extra, *numbers, *([("check", "crc32")] if header.checked else [])]
+    return _format_line(f"{_MAGIC} {_VERSION} " + " ".join(map("=".join, words)), header.checked)
+
+
+def format_sample(time_us: int, counts: Sequence[int], checked: bool) -> bytes:
+    """Return a sample as it is sent."""
+    return _format_line(",".join(map(str, (time_us, *counts))), checked)
+
+
+def _format_line(text: str, checked: bool) -> bytes:
+    body = text.encode("ascii")
+    return body + (b"*%08x\n" % crc32(body) if checked else b"\n")
+
+
+class LineDecoder:
+    """Decodes headers and samples from a stream of bytes that comes in any portions."""
+
+    def __init__(self) -> None:
+        self.header: LineHeader | None = None  # the latest; before the first there are no samples
+        self._errors: Counter[str] = Counter()
+        self._tail = b""
+
+    @property
+    def n_errors(self) -> int:
+        """Number of damaged lines since the last sample or header."""
+        return self._errors.total()
+
+    @property
+    def error(self) -> str:
+        """What was wrong with most of them."""
+        return max(self._errors, key=lambda text: self._errors[text], default="")
+
+    def decode(self, data: bytes) -> list[LineHeader | LineSample]:
+        """Return the headers and samples that `data` completes, in order."""
+        *lines, tail = (self._tail + data).split(b"\n")
+        self._tail = tail[: _MAX_LINE + 1]  # one byte too long is damaged whatever follows
+        return [item for line in lines if (item := self._decode_line(line.removesuffix(b"\r"))) is not None]
+
+    def _decode_line(self, line: bytes) -> LineHeader | LineSample | None:
+        try:
+            if line.startswith(_MAGIC.encode()):
+                item = self.header = _parse_header(_verify(line).decode("ascii"))
+            elif self.header is None or not line or line.startswith(b"#"):
+                return None
+            else:
+                item = _parse_sample(line, self.header)
+        except ValueError as error:
+            self._errors[str(error)] += 1
+            return None
+        self._errors.clear()
+        return item
+
+
+def _verify(line: bytes) -> bytes:
+    """Return the line without its check, if it has one; ValueError if that does not fit."""
+    body, star, check = line.rpartition(b"*")
+    if not star:
+        return line
+    if check.lower() != b"%08x" % crc32(body):
+        raise ValueError("the check does not fit")
+    return body
+
+
+def _parse_header(text: str) -> LineHeader:
+    version, *words = text.removeprefix(_MAGIC).split()
+    if version != _VERSION:
+        raise ValueError(f"it speaks version {version} of the line protocol, expected {_VERSION}")
+    values = dict(word.split("=", 1) for word in words if "=" in word)
+    if (check := values.pop("check", "none")) not in ("crc32", "none"):
+        raise ValueError(f"check is {check[:20]!r}, allowed are crc32 and none")
+    rate_hz, bits, reference_v, channels = (_parse_number(name, values.pop(name, "missing")) for name in _LIMITS)
+    return LineHeader(rate_hz, int(bits), reference_v, int(channels), check == "crc32", tuple(values.items()))
+
+
+def _parse_number(name: str, text: str) -> float:
+    low, high = _LIMITS[name]
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not low <= value <= high or (isinstance(low, int) and value != int(value)):
+        raise ValueError(f"{name} of its header is {text[:20]!r}, allowed is {low:g} to {high:g}")
+    return value
+
+
+def _parse_sample(line: bytes, header: LineHeader) -> LineSample:
+    if len(line) > _MAX_LINE:
+        raise ValueError(f"a line of more than {_MAX_LINE} bytes")
+    if header.checked and b"*" not in line:
+        raise ValueError("a line has no check")
+    numbers = _verify(line).split(b",")
+    if len(numbers) != 1 + header.channels:
+        raise ValueError(f"a line has {len(numbers)} numbers, expected {1 + header.channels}: the time and the inputs")
+    if not all(map(bytes.isdigit, numbers)):
+        raise ValueError(f"a line begins {line[:20].decode('ascii', 'replace')!r}, expected whole numbers only")
+    time_us, *counts = map(int, numbers)
+    if time_us >= _MAX_TIME:
+        raise ValueError("the time of a line is beyond all clocks")
+    if max(counts) > header.full_scale:
+        raise ValueError(f"a count is {max(counts)}, its header allows {header.full_scale}")
+    return LineSample(time_us, tuple(counts))
 
 
 def find_line_port(rig: RigSettings) -> str:
@@ -34,15 +178,7 @@ def find_line_port(rig: RigSettings) -> str:
     return ports[0]
 
 
-@dataclass(frozen=True)
-class LineBlock:
-    """Samples that came together: n board times, and (n, C) counts."""
-
-    times_us: list[int]
-    counts: list[tuple[int, ...]]
-
-
-class LineBoard:
+class LineBoard(BoardDriver):
     """A board at a serial port that sends samples as lines; implements `Board`.
 
     The host time of a sample is when it was measured by the board's clock, but for the least delay of the port.
@@ -50,29 +186,24 @@ class LineBoard:
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
         """Take the settings; nothing is opened before `connect`, where the board's header must state `rate_hz`."""
-        self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
-        self._stream: SerialStream | None = None
+        super().__init__(port, baud)
+        self._rate_hz, self._inputs = rate_hz, inputs
         self._decoder = LineDecoder()
-        self._reader: BlockReader[LineBlock] | None = None
-        self._assembler: LineAssembler | None = None
+        self._settled, self._last_sample_s = False, 0.0
 
     @classmethod
     def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
         """Return the board that `[rig]` names; see `__init__` and `find_line_port`."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
 
-    def connect(self) -> dict[str, Any]:
-        """Open the port, ask the board for its header and start to read; see `Board`."""
-        self.close()
-        self._stream, self._decoder = SerialStream(self._port, self._baud, POLL_S), LineDecoder()
-        try:
-            header = self._identify(self._stream)
-            inputs = select_inputs(self._inputs, header.channels, "the board")
-            self._assembler = LineAssembler(header, inputs)
-            self._start(self._stream, header)
-        except BaseException:
-            self.close()
-            raise
+    def _start(self, stream: SerialStream) -> dict[str, Any]:
+        self._decoder, self._settled = LineDecoder(), False
+        header = self._identify(stream)
+        inputs = select_inputs(self._inputs, header.channels, "the board")
+        assembler = LineAssembler(header, inputs)
+        self._last_sample_s = time.monotonic()
+        self._read_blocks(lambda: self._receive_blocks(stream, header), header.rate_hz, assembler.assemble)
+        self._settled = True
         return {
             **dict(header.extra),
             "channels": len(inputs),
@@ -83,30 +214,6 @@ class LineBoard:
             "port": self._port,
             **({} if header.checked else {"warning": "its lines have no check: a damaged one may pass for a sample"}),
         }
-
-    def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or reset."""
-        if self._reader is None or self._assembler is None:
-            raise RigFault("refused", f"{self._port}: not connected")
-        return self._assembler.assemble(self._reader.drain())
-
-    def statistics(self) -> dict[str, float]:
-        """Return counts since `connect`, of what has been read: samples, damaged lines, missing samples, skew_ppm."""
-        assembler = self._assembler
-        return {
-            "samples": assembler.samples if assembler else 0,
-            "damaged": self._decoder.damaged,
-            "missing": assembler.missing if assembler else 0,
-            "skew_ppm": assembler.clock.skew_ppm if assembler else 0.0,
-        }
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        if self._reader is not None:
-            self._reader.stop()
-        if self._stream is not None:
-            self._stream.close()
-        self._reader = None
 
     def _identify(self, stream: SerialStream) -> LineHeader:
         deadline, resend_s = time.monotonic() + _ANSWER_S, 0.0
@@ -124,27 +231,19 @@ class LineBoard:
             raise RigFault("refused", message, f"set board_rate_hz = {header.rate_hz:g}")
         return header
 
-    def _start(self, stream: SerialStream, header: LineHeader) -> None:
-        settled, last_sample_s = False, time.monotonic()
-
-        def receive() -> tuple[float, list[LineBlock]]:
-            nonlocal last_sample_s
-            now_s, data = stream.receive()
-            items = self._decoder.decode(data)
-            headers = [item for item in items if isinstance(item, LineHeader)]
-            if headers and (settled or headers[-1] != header):  # before, it answers a request that was repeated
-                raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
-            if self._decoder.n_errors >= _MIN_BAD_LINES and now_s - last_sample_s > _BAD_S:
-                raise RigFault("data", f"{self._port}: {self._decoder.error}", "line after line; look at the board")
-            samples = [item for item in items if isinstance(item, LineSample)]
-            if not samples:
-                return now_s, []
-            last_sample_s = now_s
-            return now_s, [LineBlock([sample.time_us for sample in samples], [sample.counts for sample in samples])]
-
-        self._reader = BlockReader(self._port, receive, header.rate_hz)
-        self._reader.start_settled()
-        settled = True
+    def _receive_blocks(self, stream: SerialStream, header: LineHeader) -> tuple[float, list[list[LineSample]]]:
+        now_s, data = stream.receive()
+        items = self._decoder.decode(data)
+        headers = [item for item in items if isinstance(item, LineHeader)]
+        if headers and (self._settled or headers[-1] != header):  # before, it answers a request that was repeated
+            raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
+        if self._decoder.n_errors >= _MIN_BAD_LINES and now_s - self._last_sample_s > _BAD_S:
+            raise RigFault("data", f"{self._port}: {self._decoder.error}", "line after line; look at the board")
+        samples = [item for item in items if isinstance(item, LineSample)]
+        if not samples:
+            return now_s, []
+        self._last_sample_s = now_s
+        return now_s, [samples]
 
 
 class LineAssembler:
@@ -155,8 +254,7 @@ class LineAssembler:
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
-        self.clock = SampleClock(1e-6, RESONATOR_SKEW)
-        self.samples = self.missing = 0
+        self._clock = SampleClock(1e-6, RESONATOR_SKEW)
         self._columns = list(inputs)
         self._volts = header.reference_v / header.full_scale
         self._period_us = 1e6 / header.rate_hz
@@ -164,21 +262,19 @@ class LineAssembler:
         self._slot_us = 0.0
         self._n_misplaced = 0.0
 
-    def assemble(self, arrivals: Iterable[tuple[float, LineBlock]]) -> BoardSamples:
+    def assemble(self, arrivals: Iterable[tuple[float, list[LineSample]]]) -> BoardSamples:
         """Return the samples of lines with their arrival times; RigFault("data") if their times are impossible."""
         times_us, rows, gaps = [], [], []
         for arrival_s, block in arrivals:
-            for time_us, counts in zip(block.times_us, block.counts, strict=True):
-                if (missing := self._place(time_us)) is not None:
+            for sample in block:
+                if (missing := self._place(sample.time_us)) is not None:
                     times_us.append(self._last_us)
-                    rows.append([counts[column] for column in self._columns])
+                    rows.append([sample.counts[column] for column in self._columns])
                     gaps.append(missing)
             if times_us:
-                self.clock.observe(times_us[-1], arrival_s)
-        self.samples += len(rows)
-        self.missing += sum(gaps)
+                self._clock.observe(times_us[-1], arrival_s)
         return BoardSamples(
-            self.clock.times(np.array(times_us)) if times_us else np.empty(0),
+            self._clock.times(np.array(times_us)) if times_us else np.empty(0),
             np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._volts,
             np.array(gaps, np.int64),
         )

@@ -1,12 +1,7 @@
 """The emulated arm: the record of what it really did, its dashboard and program, and what it leaves behind."""
 
 import re
-import subprocess
-import sys
-import tempfile
-import time
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,23 +13,22 @@ from padforge.sense.virtual.ur5 import EmulatedUR5
 from padforge.sense.virtual.ur5_controller import Controller
 
 
-def test_pose_log_keeps_newest_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_log_keeps_newest_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5_controller, "ROWS", 64)
-    ur5_controller.create_pose_log(tmp_path / "truth")
-    writer, log = ur5_controller.PoseLogWriter(tmp_path / "truth"), ur5_controller.PoseLog(tmp_path / "truth")
+    log = ur5_controller.PoseLog()
     with pytest.raises(ValueError, match="before the oldest"):
         log.poses(0.0)
-    for i in range(100):
-        writer.append(i, np.full(6, 10.0 * i), 0.0)
-    np.testing.assert_allclose(log.poses([70.5, 99, 200])[:, 0], [705, 990, 990])
+    for i in range(150):
+        log.append(i, np.full(6, 10.0 * i), 0.0)
+    np.testing.assert_allclose(log.poses([90.5, 149, 200])[:, 0], [905, 1490, 1490])
     with pytest.raises(ValueError, match="before the oldest"):
-        log.poses(36.0)
+        log.poses(60.0)
 
 
 def test_emulator_has_its_ports_alone_and_frees_them(address: str) -> None:
     in_use = re.escape(f"{address}: Address already in use")
-    with EmulatedUR5(host=address), pytest.raises(RigFault, match=in_use) as caught:
-        EmulatedUR5(host=address).__enter__()
+    with EmulatedUR5(host=address), pytest.raises(RigFault, match=in_use) as caught, EmulatedUR5(host=address):
+        pass
     assert "\n" not in str(caught.value)
     with EmulatedUR5("e", host=address) as robot:
         robot.remote_control(False)
@@ -77,34 +71,3 @@ def test_play_resumes_paused_program_but_not_stopped_one(stopped: bool) -> None:
     height = controller.motion.pose[2]
     assert height > 0.14 if stopped else height == pytest.approx(0.0)
     assert (controller.state()["runtime_state"] == rtde.PLAYING) is not stopped
-
-
-LEFT = """
-import os, sys
-from padforge.sense.virtual.ur5 import EmulatedUR5
-with EmulatedUR5(host=sys.argv[1]):
-    os._exit(9)
-"""
-
-
-@pytest.mark.slow
-def test_emulator_removes_temporary_files_of_killed_one(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And nothing else goes, nor the file of one that is at work."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    others = ("ur-mine", "ur-0123456789abcde", "ur-127.0.0.1.lock", "arm-127.0.0.1.lock")
-    near = {f"padforge-{name}" for name in others}
-    for name in near:
-        (tmp_path / name).touch()
-    assert subprocess.run([sys.executable, "-c", LEFT, address], check=False).returncode == 9
-    assert len(list(tmp_path.iterdir())) == len(near) + 1
-    time.sleep(0.5)  # its arm finds that its program has ended
-    with EmulatedUR5(host=address):
-        at_work = {path.name for path in tmp_path.iterdir()} - near
-        assert len(at_work) == 1
-        with pytest.raises(RigFault, match="is there another one"), EmulatedUR5(host=address):
-            pass
-        assert {path.name for path in tmp_path.iterdir()} == near | at_work
-    assert {path.name for path in tmp_path.iterdir()} == near

@@ -55,9 +55,7 @@ def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
 @pytest.mark.parametrize(
     ("change", "error"),
     [
-        ({"kind": "rig"}, "of no simulated pad"),
         ({"twin": {"presses": 1500}}, "of a pad simulated by its twin"),
-        ({"rig": {"rate_hz": -1}}, "rig rate_hz: got -1"),
         ({"morphology": {}}, "no pad that can be simulated"),
     ],
 )

@@ -11,8 +11,8 @@ import pytest
 
 from padforge.sense.rig.arms import printer_link
 from padforge.sense.rig.arms.printer import Printer
-from padforge.sense.rig.arms.printer_link import MarlinLink, PrinterInfo
-from padforge.sense.rig.boards.line_framing import LineHeader
+from padforge.sense.rig.arms.printer_link import MarlinLink
+from padforge.sense.rig.boards.line_board import LineHeader
 from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.virtual import printer as firmware
@@ -54,6 +54,7 @@ def test_connect_reports_identity_and_axis_limits():
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         identity = arm.connect()
         assert identity["firmware"].startswith("Marlin")
+        assert identity["halts_at_once"]
         assert identity["max_mm_s"] == [500.0, 500.0, 15.0]
         state = arm.state()
         assert state.pose == pytest.approx(pose(110, 110, 40))
@@ -140,11 +141,9 @@ def test_unconfirmed_stop_halts_printer_and_clipped_move_raises():
 @pytest.mark.parametrize(
     ("options", "settings", "match"),
     [
-        ({}, {"printer_port": None}, "printer_port is unknown"),
         ({}, {"tcp_mm": None}, "tcp_mm is unknown"),
         ({"position": (0.0, 0.0, 0.0)}, {}, "has not been homed"),
         ({"max_mm_s": (500.0, 500.0, 3.0)}, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
-        ({}, {"depths_mm": (1.0, 9.0), "press_mm_s": 2.0}, "way down of 11 mm"),
     ],
 )
 def test_connect_refuses_unusable_printer(options, settings, match):
@@ -221,19 +220,8 @@ def test_handshake_refuses_endless_talker():
         assert fault_of(lambda: link.handshake(0.5), "refused", "no printer answers") < 5
 
 
-M115 = [
-    "FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin"
-    " PROTOCOL_VERSION:1.0 MACHINE_TYPE:Ender-3 Pro EXTRUDER_COUNT:1 UUID:cede2a2f-41a2-4748-9b12-c55c62f367ff",
-    *("Cap:SERIAL_XON_XOFF:0", "Cap:EEPROM:1", "Cap:EMERGENCY_PARSER:1", "Cap:AUTOREPORT_POS:0"),
-]
-M503 = [
-    "echo:; Maximum feedrates (units/s):",
-    "echo:  M203 X500.00 Y400.00 Z5.00 E25.00",
-    "echo:; Maximum Acceleration (units/s2):",
-    "echo:  M201 X500.00 Y500.00 Z100.00 E5000.00",
-    "echo:; Acceleration (units/s2) (P<print-accel> R<retract-accel> T<travel-accel>):",
-    "echo:  M204 P500.00 R1000.00 T500.00",
-]
+M115 = ["FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com MACHINE_TYPE:Ender-3 Pro UUID:0"]
+M503 = ["echo:  M203 X500.00 Y400.00 Z5.00 E25.00", "echo:  M201 X500.00 Y500.00 Z100.00 E5000.00"]
 
 
 def test_lines_follow_marlin_and_answers_are_parsed():
@@ -241,34 +229,50 @@ def test_lines_follow_marlin_and_answers_are_parsed():
     assert printer_link.number_line(0, "M110 N0") == b"N0 M110 N0*125\n"
     assert printer_link.number_line(3, "T0") == b"N3 T0*57\n"  # the example of the RepRap wiki
     assert printer_link.format_move((1.0, 2.5, -0.125), 10.0) == "G1 X1.000 Y2.500 Z-0.125 F600.0"
-    info = PrinterInfo.parse(M115)
-    assert info.firmware == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
-    assert info.machine == "Ender-3 Pro"
-    assert info.capabilities == {"EEPROM", "EMERGENCY_PARSER"}
-    assert PrinterInfo.parse(["echo: hello"]) == PrinterInfo()
+    assert printer_link.parse_identity(M115, "FIRMWARE_NAME") == "Marlin 2.1.2 (Nov 22 2023 12:00:00)"
+    assert printer_link.parse_identity(M115, "MACHINE_TYPE") == "Ender-3 Pro"
+    assert printer_link.parse_identity(["echo: hello"], "FIRMWARE_NAME") == ""
     assert printer_link.parse_axis_limits(M503, "M203") == (500.0, 400.0, 5.0)
     assert printer_link.parse_axis_limits(M503, "M201") == (500.0, 500.0, 100.0)
-    assert printer_link.parse_axis_limits(M503[2:], "M203") is None
+    assert [printer_link.parse_resend(line) for line in ("Resend: 42", "rs N12", "Resend: 4x")] == [42, 12, None]
+    assert printer_link.parse_position("X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280") == (10.0, -0.5, 3.2)
+    assert printer_link.parse_position("X:1.00 Y:2.00 Z:3.0o E:0.00") is None
+    assert printer_link.is_halt("Error:Thermal Runaway, system stopped! Heater_ID: bed")
+    assert not printer_link.is_halt("Error:checksum mismatch, Last Line: 41")
+    assert printer_link.parse_axis_limits(M503[1:], "M203") is None
     assert printer_link.parse_axis_limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
 
 
-@pytest.mark.parametrize(
-    ("read", "line", "expected"),
-    [
-        *(
-            (printer_link.parse_resend, line, number)
-            for line, number in (("Resend: 42", 42), ("Resend:7", 7), ("rs N12", 12))
-        ),
-        (printer_link.parse_resend, "Resend: 4x", None),
-        (printer_link.parse_position, "X:10.00 Y:-0.50 Z:3.20 E:0.00 Count X:800 Y:-40 Z:1280", (10.0, -0.5, 3.2)),
-        *((printer_link.parse_position, line, None) for line in ("X:1.00 Y:2.00 Z:3.0o E:0.00", "X:1.00 Y:2.00")),
-        (printer_link.is_halt, "Error:Printer halted. kill() called!", True),
-        (printer_link.is_halt, "Error:Thermal Runaway, system stopped! Heater_ID: bed", True),
-        *(
-            (printer_link.is_halt, line, False)
-            for line in ("Error:checksum mismatch, Last Line: 41", "echo:Printer halted")
-        ),
-    ],
-)
-def test_parse_line(read, line, expected):
-    assert read(line) == expected
+AT_HOME = (50.0, 50.0, 50.0)
+
+
+def answer(marlin: firmware.Firmware, data: bytes, now: float = 0.0) -> list[str]:
+    marlin.receive(data, now)
+    return marlin.run(now).decode().splitlines()
+
+
+def test_firmware_executes_lines_once_in_order_and_reports_busy():
+    marlin = firmware.Firmware(AT_HOME)
+    assert answer(marlin, printer_link.number_line(0, "M110 N0")) == ["ok"]
+    assert answer(marlin, printer_link.number_line(1, "G90")) == ["ok"]
+    again = ["Error:Line Number is not Last Line Number+1, Last Line: 1", "Resend: 2", "ok"]
+    assert answer(marlin, printer_link.number_line(1, "G90")) == again
+    assert answer(marlin, printer_link.number_line(3, "G90")) == again
+    assert answer(marlin, printer_link.number_line(2, "G90").replace(b"9", b"8")) == [
+        "Error:checksum mismatch, Last Line: 1",
+        *again[1:],
+    ]
+    assert answer(marlin, b"N2 G90\n")[0].startswith("Error:No Checksum")
+    assert answer(marlin, b"2 G90*35\n") == ['echo:Unknown command: "2 G90*35"', "ok"]
+    assert answer(marlin, printer_link.number_line(2, "G90")) == ["ok"]
+    marlin.restart(1.0)
+    assert answer(marlin, b"", 1.0)[0] == "start"
+    assert printer_link.parse_position(answer(marlin, b"M114\n", 1.0)[0]) == (0, 0, 0)  # until it is homed
+    assert answer(marlin, printer_link.number_line(3, "G90"), 1.0)[1] == "Resend: 1"
+    marlin = firmware.Firmware(AT_HOME)
+    marlin.busy(5.0)
+    assert answer(marlin, b"M114\n", 0.0) == []
+    assert answer(marlin, b"", 1.9) == []
+    assert answer(marlin, b"", 2.1) == ["echo:busy: processing"]
+    assert answer(marlin, b"", 4.2) == ["echo:busy: processing"]
+    assert answer(marlin, b"", 5.1)[-1] == "ok"

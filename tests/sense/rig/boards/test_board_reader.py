@@ -72,10 +72,9 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     seed=st.integers(0, 1000),
 )
 def test_times_are_accurate_from_first_block(rate: tuple[float, int], skew: float, jitter_s: float, seed: int) -> None:
-    errors, clock = run(Link(*rate, 30.0, skew, seed, jitter_s))
+    errors, _ = run(Link(*rate, 30.0, skew, seed, jitter_s))
     assert np.abs(errors).max() < 5e-3
     assert np.abs(errors[len(errors) // 2 :]).max() < 5e-4
-    assert clock.skew_ppm == pytest.approx(skew * 1e6, abs=60)
 
 
 def test_times_stay_accurate_in_bounded_memory() -> None:
@@ -114,7 +113,6 @@ def test_times_of_microsecond_clock() -> None:
         times = clock.times(measured_us[block])
     assert times == pytest.approx(measured_s[-10:], abs=1e-3)
     assert np.diff(times) == pytest.approx(np.diff(measured_s[-10:]), rel=1e-2)
-    assert clock.skew_ppm == pytest.approx(3000, abs=60)
 
 
 @settings(max_examples=40)
@@ -127,9 +125,10 @@ def test_times_follow_highest_line_below_arrivals(seed: int, count: int, size: f
     for second, delay_s in zip(x.tolist(), y.tolist(), strict=True):
         clock.observe(second, second + delay_s)
     clock.observe(101, 102.0)  # so late that it does not matter
-    slope, at_0 = clock.skew_ppm * 1e-6, float(clock.times(np.array([101]))[0]) - 101
-    line = at_0 + slope * (x - 101)
+    at_101, at_201 = (float(clock.times(np.array([index]))[0]) for index in (101, 201))
+    slope = (at_201 - at_101) / 100 - 1
+    line = at_101 - 101 + slope * (x - 101)
     best = linprog([-1, -x.mean()], np.column_stack([np.ones(count), x]), y, bounds=[(None, None), (-5e-4, 5e-4)])
-    assert abs(slope) <= 5e-4
+    assert abs(slope) <= 5e-4 + 1e-12
     assert (line <= y + 1e-9).all()
     assert line.mean() == pytest.approx(-best.fun, abs=1e-9)

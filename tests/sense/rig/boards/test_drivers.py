@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
 from padforge.sense.rig.boards import board_reader, due, line_board
 from padforge.sense.rig.boards.due import DueBoard
-from padforge.sense.rig.boards.line_board import LineBoard
-from padforge.sense.rig.boards.line_framing import LineHeader
-from padforge.sense.rig.devices import BoardSamples, RigFault
+from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
+from padforge.sense.rig.devices import BoardSamples
 from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
@@ -94,9 +92,8 @@ def check(
     assert np.abs(samples.times_s - board.true_times(index)).max() < atol_s
 
 
-BOTH = pytest.mark.parametrize("kind", ["due", "line"])
 SLOW_LINE = pytest.param("line", marks=pytest.mark.slow)
-SKEWED = {"due": {"skew_ppm": 150}, "line": {"skew_ppm": 2000, "boot_us": 2**32 - 700_000}}
+SKEWED = {"due": {"skew_ppm": 150}, "line": {"skew_ppm": 2000}}
 SAYS: dict[str, dict[str, Any]] = {
     "due": {"name": "padforge-due", "firmware": "1.0.0", "channels": 12, "bits": 12, "supply_v": 3.3},
     "line": {"name": "emulated", "serial": "7", "channels": 16, "bits": 12, "supply_v": 3.3},
@@ -113,24 +110,18 @@ def test_read_returns_exact_samples_on_time(kind: str, monkeypatch: pytest.Monke
         assert identity["rate_hz"] == pytest.approx(1000)
         assert identity["inputs"] == list(range(SAYS[kind]["channels"]))
         assert "warning" not in identity
-        start = time.process_time(), time.monotonic()
         samples = read_for(driver, 0.6)
-        share = (time.process_time() - start[0]) / (time.monotonic() - start[1])
         assert len(samples.times_s) > 900
         assert not samples.missing.any()
         check(samples, board, atol_s=5e-3)
-        assert share < 0.5  # of a core, the emulated board included: nobody waits in a loop
-        counted = {"due": ("blocks", 16), "line": ("samples", 1)}[kind]
-        assert driver.statistics()[counted[0]] == len(samples.times_s) / counted[1]
 
 
 @pytest.mark.parametrize(
     ("kind", "header", "options"),
     [
-        *(("due", replace(HEADER, rate_hz=rate_hz), {}) for rate_hz in (10.0, 4000.0)),
+        ("due", replace(HEADER, rate_hz=10.0), {}),
         ("due", HEADER, {"inputs": range(8), "averaging": 16}),
         ("due", replace(HEADER, rate_hz=500.0), {"inputs": (11, 3, 0)}),
-        ("line", replace(HEADER, rate_hz=10.0), {}),
         ("line", LineHeader(333.0, 16, 5.0, 16), {"inputs": (15, 0, 7)}),
     ],
 )
@@ -155,7 +146,7 @@ def test_line_board_connects_through_noise_and_warns_without_checks() -> None:
         check(read_for(driver, 0.1), board)
 
 
-@BOTH
+@pytest.mark.parametrize("kind", ["due", "line"])
 def test_read_counts_garbled_samples_and_returns_no_wrong_one(kind: str) -> None:
     board = emulated(kind, seed=3)
     with connected(board) as driver:
@@ -164,10 +155,7 @@ def test_read_counts_garbled_samples_and_returns_no_wrong_one(kind: str) -> None
         board.garble(0)
         samples = concatenate(samples, read_for(driver, 0.1))
         check(samples, board)
-        statistics = driver.statistics()
-        assert statistics["damaged"] > 5
-        assert statistics["missing"] == samples.missing.sum() > 50
-        assert statistics.get("overruns", 0) == 0
+        assert samples.missing.sum() > 50
 
 
 def test_due_counts_overruns_and_raises_for_lost_conversions() -> None:
@@ -177,14 +165,12 @@ def test_due_counts_overruns_and_raises_for_lost_conversions() -> None:
         samples = read_for(driver, 0.25)
         check(samples, board)
         assert samples.missing.max() == samples.missing.sum() == 160
-        assert driver.statistics()["overruns"] == 160
         board.halt()
         fault_of(driver.read, "data", "lost conversions")
 
 
-@BOTH
-def test_read_raises_when_unplugged_after_last_samples(kind: str) -> None:
-    board = emulated(kind)
+def test_read_raises_when_unplugged_after_last_samples() -> None:
+    board = EmulatedLineBoard(waves, HEADER)
     with connected(board) as driver:
         board.unplug()
         assert len(driver.read().times_s) >= 96
@@ -206,10 +192,9 @@ def test_read_raises_when_board_stalls_and_connect_recovers(kind: str) -> None:
         check(read_for(driver, 0.1), board)
 
 
-@pytest.mark.parametrize("kind", ["due", SLOW_LINE])
-def test_read_raises_after_buffer_overflow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_raises_after_buffer_overflow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board_reader, "BUFFER_S", 0.3)
-    board = emulated(kind)
+    board = EmulatedDue(waves)
     with connected(board) as driver:
         time.sleep(0.35)
         check(driver.read(), board)
@@ -231,19 +216,13 @@ def test_read_raises_when_line_board_resets(garbled: float) -> None:
         check(read_for(driver, 0.1), board)
 
 
-def test_read_raises_for_lines_of_other_columns() -> None:
-    board = EmulatedLineBoard(waves, HEADER)
-    with connected(board) as driver:
-        board.send_columns(15)
-        assert fault_of(driver.read, "data", "a line has 16 numbers, expected 17: .* line after line") < 2
-
-
 @pytest.mark.parametrize(
     ("kind", "board_options", "rate_hz", "options", "match"),
     [
         ("due", {"silent": True}, 1000, {}, "no padforge board answers.*native USB port"),
         ("due", {"firmware": (9, 1, 0)}, 1000, {}, r"firmware 9\.1\.0"),
         ("due", {}, 10_000, {"averaging": 16}, "12 channels at 10000 Hz"),
+        ("due", {}, 1000, {"inputs": (3, 12)}, "fibre 2 is on input 12, an Arduino Due has 0 to 11"),
         ("line", {"silent": True}, 1000, {}, "no board that speaks.*baud"),
         ("line", {}, 500, {}, "takes 1000 samples a second, .rig. says 500; set board_rate_hz = 1000"),
         ("line", {}, 1000, {"inputs": (3, 16)}, "channels: fibre 2 is on input 16, the board has 0 to 15"),
@@ -255,24 +234,11 @@ def test_connect_refuses_unsuitable_board(
     for module in (due, line_board):
         monkeypatch.setattr(module, "_ANSWER_S", 0.3)
     with emulated(kind, **board_options) as board:
-        assert fault_of(make_driver(board, rate_hz, **options).connect, "refused", match) < 5
+        assert fault_of(lambda: make_driver(board, rate_hz, **options).connect(), "refused", match) < 5
 
 
-@pytest.mark.parametrize(
-    ("values", "error", "match"),
-    [
-        ({"rate_hz": 10_001}, InputError, "rate_hz is 10001, expected 10 to"),
-        ({"inputs": (3, 12)}, RigFault, "channels: fibre 2 is on input 12, an Arduino Due has 0 to 11"),
-    ],
-)
-def test_due_refuses_impossible_settings(values: dict, error: type, match: str) -> None:
-    with pytest.raises(error, match=match):
-        DueBoard("port", **{"rate_hz": 1000, **values})
-
-
-@BOTH
-def test_connect_refuses_port_in_use_until_closed(kind: str) -> None:
-    with emulated(kind) as board:
+def test_connect_refuses_port_in_use_until_closed() -> None:
+    with EmulatedDue(waves) as board:
         first, second = make_driver(board), make_driver(board)
         first.connect()
         fault_of(second.connect, "refused", "another program uses it")

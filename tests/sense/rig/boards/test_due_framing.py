@@ -4,7 +4,6 @@ And the samples that are put together of its blocks.
 """
 
 import pickle
-import sys
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -13,9 +12,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.boards import due_framing as framing
-from padforge.sense.rig.boards.due import DueAssembler
-from padforge.sense.rig.boards.due_framing import Ack, BoardSettings, DueBlock, DueDecoder, Identity, Kind, Request
+from padforge.sense.rig.boards import due as framing
+from padforge.sense.rig.boards.due import (
+    Ack,
+    BoardSettings,
+    DueAssembler,
+    DueBlock,
+    DueDecoder,
+    Identity,
+    Kind,
+    Request,
+)
 from padforge.sense.rig.devices import RigFault
 
 U8, U16, U32 = st.integers(0, 2**8 - 1), st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
@@ -99,7 +106,6 @@ def test_decode_returns_messages_in_any_portions(frames: list[framing.DueMessage
     decoder = DueDecoder()
     decoded = [frame for a, b in pairwise(edges) for frame in decoder.decode(sent[a:b])]
     assert payloads(decoded) == payloads(frames)
-    assert decoder.damaged == 0
 
 
 def damage_in_one_place(sent: bytes) -> Iterator[bytes]:
@@ -113,10 +119,8 @@ def test_decode_loses_at_most_one_block_per_damaged_byte() -> None:
     frames = stream(3)
     expected = payloads(DueDecoder().decode(b"".join(frames)))
     for damaged in damage_in_one_place(frames[1]):
-        decoder = DueDecoder()
-        decoded = payloads(decoder.decode(frames[0] + damaged + frames[2]))
+        decoded = payloads(DueDecoder().decode(frames[0] + damaged + frames[2]))
         assert decoded in (expected, [expected[0], expected[2]])
-        assert decoder.damaged > 0 or decoded == expected
 
 
 @settings(max_examples=20)
@@ -141,34 +145,27 @@ def test_decode_bounds_memory_of_endless_noise() -> None:
     assert len(pickle.dumps(decoder)) < 1000
     (frame,) = stream(1)
     assert len(decoder.decode(frame)) == 1
-    assert decoder.damaged == 1
 
 
-def of_counts(counts: object, averaging: int = 1, mask: int = 0xFF) -> bytes:
-    return DueBlock(np.array(counts, np.uint16), averaging, mask, 0, 0, 0, 0).pack()
+def of_counts(counts: object, averaging: int = 1) -> bytes:
+    return DueBlock(np.array(counts, np.uint16), averaging, 0xFF, 0, 0, 0, 0).pack()
 
 
 @pytest.mark.parametrize(
     "payload",
     [
         *(b"", b"\x01\x00", b"\x77", b"\x02\x00", b"\x90\x01"),
-        b"\x81\x01\x02\x03\x0c\x08" + b"\xff" * 32,
         of_counts([[0] * 7 + [4096]]),
         of_counts([[0] * 8], 17),
-        of_counts(np.zeros((0, 8))),
-        of_counts([[0]], mask=0x1000),
-        of_counts(np.zeros((17, 8))),
         of_counts(np.zeros((2, 8)))[:-1],
     ],
 )
-def test_decode_counts_impossible_payload_as_damaged(payload: bytes) -> None:
+def test_decode_skips_impossible_payload(payload: bytes) -> None:
     class Forged(Request):
         def pack(self) -> bytes:
             return payload
 
-    decoder = DueDecoder()
-    assert decoder.decode(framing.encode(Forged(Kind.STOP))) == []
-    assert decoder.damaged == 1
+    assert DueDecoder().decode(framing.encode(Forged(Kind.STOP))) == []
 
 
 def check_bytes(coded: bytes) -> bytes:
@@ -207,24 +204,22 @@ def block(first: int, time_us: int | None = None, samples: int = 16) -> DueBlock
 
 
 def assembler(inputs: tuple[int, ...] = (0, 1, 2, 3, 4, 5, 6, 7), averaging: int = 1) -> DueAssembler:
-    return DueAssembler(BoardSettings(1_000_000, sum(1 << i for i in inputs), averaging), inputs, 3.3)
+    return DueAssembler(BoardSettings(1_000_000, sum(1 << i for i in inputs), averaging), inputs)
 
 
 def test_assemble_unwraps_indices_in_bounded_memory() -> None:
     count = 70_000
     start = 2**32 - count // 32 * 16
-    decoder, due, allocated, before = DueDecoder(), assembler(), [], -np.inf
+    decoder, due, before = DueDecoder(), assembler(), -np.inf
     for first in range(start, start + count, 400):
         sent = [framing.encode(block(index)) for index in range(first, first + 400, 16)]
         frames = [frame for frame in decoder.decode(b"".join(sent)) if isinstance(frame, DueBlock)]
         samples = due.assemble(((first + 16 * i) * 1e-3, frame) for i, frame in enumerate(frames))
         assert samples.times_s[0] > before
         before = samples.times_s[-1]
+        assert samples.missing.sum() == (start if first == start else 0)  # none but those before the first block
         assert samples.volts[0, 0] == pytest.approx(first % 4096 * STEP_V)
-        allocated.append(sys.getallocatedblocks())
-    assert due.missing == start  # none but those before the first block
-    assert due.blocks == count // 16
-    assert max(allocated[-40:]) < max(allocated[60:110]) + 1000
+    assert len(pickle.dumps(due)) < 10_000
 
 
 @pytest.mark.parametrize(

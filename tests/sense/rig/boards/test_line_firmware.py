@@ -5,13 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.sense.rig.boards import line_framing as framing
-from padforge.sense.rig.boards.line_board import LineAssembler, LineBlock
-from padforge.sense.rig.boards.line_framing import LineDecoder, LineHeader, LineSample, format_header, format_sample
+from padforge.sense.rig.boards import line_board
+from padforge.sense.rig.boards.line_board import (
+    LineAssembler,
+    LineDecoder,
+    LineHeader,
+    LineSample,
+    format_header,
+    format_sample,
+)
 from padforge.sense.rig.devices import BoardSamples
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
-FIRMWARE = Path(framing.__file__).parent / "firmware" / "padforge_line"
+FIRMWARE = Path(line_board.__file__).parent / "firmware" / "padforge_line"
 PAGE = Path(__file__).parents[4] / "docs" / "devices.md"
 NAME = (("name", "padforge-line"),)
 HEADERS = {
@@ -29,7 +35,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def read(program: Path, *script: str) -> tuple[list[LineHeader | LineSample], bytes]:
     stream, decoder = run_sketch(program, list(script)), LineDecoder()
     items = decoder.decode(stream)
-    assert decoder.damaged == 0
+    assert decoder.n_errors == 0
     return items, stream
 
 
@@ -38,8 +44,7 @@ def select_samples(items: list[LineHeader | LineSample]) -> list[LineSample]:
 
 
 def assemble(header: LineHeader, samples: list[LineSample]) -> BoardSamples:
-    lines = LineBlock([item.time_us for item in samples], [item.counts for item in samples])
-    return LineAssembler(header, range(header.channels)).assemble([(1.0, lines)])
+    return LineAssembler(header, range(header.channels)).assemble([(1.0, samples)])
 
 
 @pytest.mark.parametrize("board", ["ESP32", pytest.param("TEENSY", marks=pytest.mark.slow)])

@@ -1,4 +1,4 @@
-// The wire format of the Due board in plain C++ without Arduino; sense/rig/boards/due_framing.py describes it.
+// The wire format of the Due board in plain C++ without Arduino; README.md describes it.
 //
 // A frame on the wire is `00 coded check 00`: `coded` is the payload with its zeros taken out by COBS, `check` the
 // CRC-16/CCITT-FALSE of `coded` in three bytes without a zero. Numbers are little-endian.

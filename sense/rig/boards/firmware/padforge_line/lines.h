@@ -1,4 +1,4 @@
-// The line protocol in plain C++ without Arduino; sense/rig/boards/line_framing.py describes it.
+// The line protocol in plain C++ without Arduino; docs/devices.md describes it.
 #pragma once
 
 #include <stddef.h>
