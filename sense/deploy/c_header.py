@@ -125,9 +125,7 @@ def distill(
     """Train a student as large as the budget allows, on presses of known position.
 
     Every press is used with the features of its command and, where the detector finds it, with those of its detection.
-
-    Raises:
-        InputError: the budget is too small, there are too few presses, or the training diverged.
+    Raises InputError if the budget is too small, there are too few presses, or the training diverged.
     """
     from padforge.sense.localizer.training import train_members
 
@@ -190,10 +188,8 @@ def evaluate_student(
 ) -> dict[str, Any]:
     """Evaluate a student, and localizers to compare it with, on presses of known position.
 
-    Returns:
-        "errors": by "header" and the features of the localizers, a row for each number of failed fibres;
-        "n_detected": how many presses the detector finds; "n_false": its false detections after them, each up to the
-        next press; "detected_mean_mm": mean error of those detected, None if there are none.
+    "errors" are by "header" and the features of the localizers, a row a number of failed fibres; "n_false" counts
+    false detections after those presses, each up to the next; "detected_mean_mm" is None if none is detected.
     """
     positions_mm, model = recording.presses_mm[test], student.model
     compared = {"header": (model, model.scaler.transform(streaming.commanded_features(recording)[test]))}

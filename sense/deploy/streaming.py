@@ -93,19 +93,21 @@ def _run_stream(readings: Any, pressed: Any, fibre_mask: Any, inverse_noise: Any
 @kernel
 def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: Any) -> None:
     """Store a reading; what is missing or beyond MAX_VOLTS repeats the reading before."""
-    is_missing = ~(np.abs(row) <= np.float32(MAX_VOLTS))
-    missing += is_missing
-    ring[n % RING] = np.where(is_missing, ring[(n - 1) % RING], row)
-    if n == 0:
-        baseline[:] = ring[0]
-        averages[:] = np.expand_dims(ring[0], 1)
-    elif n >= LAG:
-        _follow_level(ring[(n - LAG) % RING], averages)
+    for c in range(len(row)):
+        is_missing = not abs(row[c]) <= np.float32(MAX_VOLTS)
+        missing[c] += is_missing
+        ring[n % RING, c] = ring[(n - 1) % RING, c] if is_missing else row[c]
+        if n == 0:
+            baseline[c] = ring[0, c]
+            averages[c] = ring[0, c]
+        elif n >= LAG:
+            _follow_level(ring[(n - LAG) % RING, c], averages[c])
 
 
 @kernel
-def _follow_level(row: Any, averages: Any) -> None:
-    averages += RATES * (np.expand_dims(row, 1) - averages)
+def _follow_level(x: Any, averages: Any) -> None:
+    for j in range(len(averages)):
+        averages[j] += RATES[j] * (x - averages[j])
 
 
 @kernel
@@ -158,7 +160,8 @@ def _store_history(n: int, ring: Any, averages: Any, pad: Any) -> None:
     """Bring the averages up to the begin of the press, and store them."""
     averages[1] = averages[0]
     for i in range(max(n - LAG + 1, 0), pad[DOWN_COMMAND]):
-        _follow_level(ring[i % RING], averages[1])
+        for c in range(averages.shape[1]):
+            _follow_level(ring[i % RING, c], averages[1, c])
 
 
 @kernel
