@@ -8,10 +8,11 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import LocalizerSettings, Recording, calibrate
+from padforge.sense.deploy.c_header import StudentNetwork, distill, evaluate_student, quantize
 from padforge.sense.deploy.streaming import MemoryBudget
-from padforge.sense.deploy.student import StudentNetwork, distill, evaluate_student, quantize, split_student_presses
 from padforge.sense.formats.import_export import open_recording
 from padforge.sense.localizer import training as trainings
+from padforge.sense.localizer.calibration import split_unseen
 from padforge.sense.localizer.model import LocalizerModel
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
@@ -22,7 +23,7 @@ MAX_RATIO = 1.25
 def test_student_is_nearly_as_accurate_as_its_teacher(
     student: StudentNetwork, recording: Recording, localizer: LocalizerModel
 ) -> None:
-    _, test = split_student_presses(recording, localizer, QUICK)
+    _, test = split_unseen(recording, localizer, QUICK)
     assert set(test.tolist()) == set(localizer.test)
     evaluation = evaluate_student(student, [localizer], recording, test)
     header, teacher = evaluation["errors"]["header"], evaluation["errors"]["press_and_release"]
@@ -39,7 +40,7 @@ def test_student_is_nearly_as_accurate_as_a_causal_localizer_on_the_published_re
     recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 1200)
     options = LocalizerSettings(members=1, hidden=96, layers=3, epochs=40, batch=128, features="causal", max_failures=1)
     localizer, _ = calibrate(recording, options)
-    training, test = split_student_presses(recording, localizer, options)
+    training, test = split_unseen(recording, localizer, options)
     student = distill(recording, localizer, training, MemoryBudget(150_000, 65_536), options)
     evaluation = evaluate_student(student, [localizer], recording, test)
     errors = evaluation["errors"]
@@ -49,7 +50,7 @@ def test_student_is_nearly_as_accurate_as_a_causal_localizer_on_the_published_re
 
 
 def test_distill_ignores_test_presses(brief: Recording, localizer: LocalizerModel) -> None:
-    training, test = split_student_presses(brief, localizer, QUICK)
+    training, test = split_unseen(brief, localizer, QUICK)
     assert (len(training), len(test)) == (34, 6)
     assert not set(training.tolist()) & set(test.tolist())
     wrong = np.array(brief.presses_mm)
@@ -66,13 +67,10 @@ def test_distill_ignores_test_presses(brief: Recording, localizer: LocalizerMode
 def test_split_leaves_out_presses_that_cannot_test(brief: Recording, localizer: LocalizerModel) -> None:
     unknown = np.array(brief.presses_mm)
     unknown[:10] = np.nan
-    training, test = split_student_presses(replace(brief, presses_mm=unknown), localizer, QUICK)
+    training, test = split_unseen(replace(brief, presses_mm=unknown), localizer, QUICK)
     assert min(*training, *test) == 10
-    recalibrated = replace(localizer, recalibrated_by=(brief.digest,))
     with pytest.raises(InputError, match="the localizer was recalibrated by"):
-        split_student_presses(brief, recalibrated, QUICK)
-    with pytest.raises(InputError, match="within 25%"):
-        split_student_presses(replace(brief, times_s=brief.times_s * 2), localizer, QUICK)
+        split_unseen(brief, replace(localizer, recalibrated_by=(brief.digest,)), QUICK)
 
 
 def test_distill_reports_a_training_that_diverged(brief, localizer, monkeypatch) -> None:

@@ -136,16 +136,9 @@ def test_locate_on_bed_refuses_a_pad_without_a_holder(folder, tmp_path):
         locate_on_bed(PRINTER.model_copy(update={"tcp_mm": None}), folder)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("centre_mm", [1.0], "centre_mm.* field required"),
-        ("walls_mm", 1e9, "walls_mm: got 1000000000.0"),
-    ],
-)
-def test_locate_on_bed_names_a_damaged_entry(with_frame, key, value, message):
-    with pytest.raises(InputError, match=message):
-        locate_on_bed(PRINTER, with_frame(**{key: value}))
+def test_locate_on_bed_names_a_damaged_entry(with_frame):
+    with pytest.raises(InputError, match=r"walls_mm: got 1000000000\.0"):
+        locate_on_bed(PRINTER, with_frame(walls_mm=1e9))
 
 
 RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))
@@ -220,9 +213,7 @@ def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
     [
         ("arm", "controller", "5.13.0", True),
         ("arm", "serial", "2019", False),
-        ("arm", "model", "UR3", False),
         ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0], False),
-        ("board", "name", "another", False),
         ("board", "serial", "cd34", False),
         ("board", "firmware", "1.1.0", False),
     ],
@@ -237,9 +228,8 @@ def test_resume_refuses_another_arm_tool_or_board(run, tmp_path, device, key, va
         pass
 
 
-@pytest.mark.parametrize("source", ["[]", '{"plan": 5}'])
-def test_resume_refuses_a_recording_without_a_plan(tmp_path, source):
-    text = f'{{"format": "padforge-recording/2", "fibres": 4, "source": {source}}}'
+def test_resume_refuses_a_recording_without_a_plan(tmp_path):
+    text = '{"format": "padforge-recording/2", "fibres": 4, "source": {"plan": 5}}'
     (tmp_path / "start.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="has no plan"):
         resumed_plan(tmp_path)

@@ -80,9 +80,7 @@ def test_run_leaves_a_gap_for_lost_samples(tmp_path):
     arm, board, options = rig()
     arm.hook = lambda arm: setattr(board, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
     run(tmp_path / "run", arm, board, options)
-    recording = Recording.open(tmp_path / "run")
-    assert len(recording.presses_mm) == len(PLAN)
-    assert 0.02 < np.diff(recording.times_s).max() < 0.06
+    assert 0.02 < np.diff(Recording.open(tmp_path / "run").times_s).max() < 0.06
     assert "lost" in (tmp_path / "run" / "journal.ndjson").read_text()
 
 
