@@ -166,23 +166,6 @@ def distill(
     return StudentNetwork(replace(model, interval_factors=factors), detector, budget.quantized)
 
 
-def _causal_reference(
-    teacher: LocalizerModel,
-    recording: Recording,
-    training: Indices,
-    options: LocalizerSettings,
-    on_progress: OnProgress,
-) -> LocalizerModel:
-    """Return the teacher or a localizer of its size that, as the student, uses no readings after the end of a press."""
-    if teacher.features == "causal":
-        return teacher
-    max_failures = len(teacher.interval_factors) - 1
-    update = {"features": "causal", "method": "ensemble", "max_failures": max_failures}
-    with one_torch_thread():
-        rng = np.random.default_rng(options.seed)
-        return fit_recording(recording, training, options.model_copy(update=update), rng, on_progress)
-
-
 def evaluate_student(
     student: StudentNetwork, references: Sequence[LocalizerModel], recording: Recording, test: Indices
 ) -> dict[str, Any]:
@@ -261,8 +244,14 @@ def export_header(
     check_same_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
     training, test = split_unseen(recording, teacher, options)
     student = distill(recording, teacher, training, budget, options, on_progress)
-    causal = _causal_reference(teacher, recording, training, options, on_progress)
-    evaluation = evaluate_student(student, [causal] if causal is teacher else [causal, teacher], recording, test)
+    references = [teacher]
+    if teacher.features != "causal":  # a localizer of its size that, as the student, needs no readings after a press
+        max_failures = len(teacher.interval_factors) - 1
+        update = {"features": "causal", "method": "ensemble", "max_failures": max_failures}
+        causal, rng = options.model_copy(update=update), np.random.default_rng(options.seed)
+        with one_torch_thread():
+            references = [fit_recording(recording, training, causal, rng, on_progress), teacher]
+    evaluation = evaluate_student(student, references, recording, test)
     about = [
         f"by padforge {version('padforge')}, of localizer.json with SHA-256",
         digest,

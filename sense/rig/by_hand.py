@@ -370,7 +370,10 @@ class HandSession:
     def _release(self, released: int) -> None:
         up_command = max(self._ring.command_index(released, RELEASE_DELAY_S), self._touched + 1, self._down_command + 1)
         target, rejection = self._sequence.target, self._sequence.release(self._time_s(released))
-        responses = self._responses(up_command)
+        # Of a press whose begin is no longer in the ring, by its end alone.
+        first = max(self._down_command + REST[0], self._released, self._ring.end - HISTORY - SLACK)
+        readings = self._ring.rows(first, self._ring.end)[:, 1:]
+        responses = press_responses(readings, max(self._down_command - first, 1), up_command - first)
         rejection = rejection or self._validator.rejection(responses)
         press = self._number, self._first + self._down_command, self._first + up_command
         if rejection:
@@ -428,12 +431,6 @@ class HandSession:
 
     def _time_s(self, reading: int) -> float:
         return float(self._ring.rows(reading, reading + 1)[0, 0])
-
-    def _responses(self, up_command: int) -> Array:
-        """See `press_responses`; of a press whose begin is no longer in the ring, by its end alone."""
-        first = max(self._down_command + REST[0], self._released, self._ring.end - HISTORY - SLACK)
-        readings = self._ring.rows(first, self._ring.end)[:, 1:]
-        return press_responses(readings, max(self._down_command - first, 1), up_command - first)
 
     def view(self) -> dict[str, Any]:
         """Return what there is to show now, as JSON: lines, numbers of presses, and positions [x, y] in mm or None.
