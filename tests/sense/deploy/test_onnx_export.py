@@ -21,7 +21,6 @@ from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import ROOT, tutorial_code
-from tests.sense.live.conftest import first_presses
 
 DIGEST = "a" * 64
 
@@ -58,13 +57,6 @@ def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, record
         check_positions(positions_mm, expected)
         for name, values in zip(names[1:], others, strict=True):
             np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
-
-
-def test_graph_takes_any_number_of_presses_and_readings(graph, localizer, brief) -> None:
-    presses = localizer.scaled_features(brief)
-    for count in (1, 2, 7):
-        inputs = inputs_of(first_presses(brief, count), np.ones((count, 4), bool))
-        check_positions(graph.run(["positions_mm"], inputs)[0], localizer.predict_features(presses[np.arange(count)]))
 
 
 @pytest.mark.parametrize("features", ["causal", "onset", "published"])

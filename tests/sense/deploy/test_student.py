@@ -11,7 +11,6 @@ from padforge.sense import LocalizerSettings, Recording, calibrate
 from padforge.sense.deploy.c_header import StudentNetwork, distill, evaluate_student, quantize
 from padforge.sense.deploy.streaming import MemoryBudget
 from padforge.sense.formats.import_export import open_recording
-from padforge.sense.localizer import training as trainings
 from padforge.sense.localizer.calibration import split_unseen
 from padforge.sense.localizer.model import LocalizerModel
 from tests.sense.conftest import QUICK
@@ -71,13 +70,6 @@ def test_split_leaves_out_presses_that_cannot_test(brief: Recording, localizer: 
     assert min(*training, *test) == 10
     with pytest.raises(InputError, match="the localizer was recalibrated by"):
         split_unseen(brief, replace(localizer, recalibrated_by=(brief.digest,)), QUICK)
-
-
-def test_distill_reports_a_training_that_diverged(brief, localizer, monkeypatch) -> None:
-    wild = {name: np.full((1, 1, 1), np.nan, np.float32) for name in ("first.w", "hidden.w")}
-    monkeypatch.setattr(trainings, "train_members", lambda *_: trainings.TrainedNetworks(wild, None, {}))
-    with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate"):
-        distill(brief, localizer, np.arange(30), MemoryBudget(20_000, 4_000), QUICK)
 
 
 def test_quantize_is_within_half_a_step(student: StudentNetwork) -> None:

@@ -403,14 +403,9 @@ def test_sequence_rejects_by_time(sequence: PressSequence, down_s: float, up_s: 
     assert sequence.phase(up_s + 0.9) == "wait"
 
 
-def test_sequence_undoes_and_skips(sequence: PressSequence) -> None:
-    assert not sequence.undo(100.0)  # there is nothing
-    press(sequence, 100.0, 101.0)
-    sequence.accept(101.1)
-    assert sequence.undo(101.2)
-    assert (sequence.target, sequence.accepted_mm) == ((1.0, 2.0), [])
+def test_sequence_takes_back_or_skips_the_press_under_way(sequence: PressSequence) -> None:
     sequence.touch(110.0)
-    assert not sequence.undo(110.5)  # the press under way
+    assert not sequence.undo(110.5)
     assert sequence.phase(110.6) == "lift"
     assert sequence.release(111.0) == "it was taken back"
     sequence.touch(120.0)
@@ -442,12 +437,9 @@ def test_press_responses_are_differences_from_the_baseline() -> None:
 
 
 def test_validator_rejects_weak_and_moved_presses(validator: PressValidator) -> None:
-    weak = np.array([0.1 * PRESS, 0.1 * PRESS])
     assert validator.rejection(press_responses(readings(PRESS, 1.3 * PRESS), 10, 30)) == ""
-    assert validator.rejection(3 * weak) == ""
-    assert "weaker" in validator.rejection(weak)
+    assert "weaker" in validator.rejection(np.array([0.1 * PRESS, 0.1 * PRESS]))
     assert "changed" in validator.rejection(press_responses(readings(PRESS, PRESS[::-1]), 10, 30))
-    assert PressValidator().rejection(weak) == ""  # the usual response is not known yet
 
 
 def test_validator_detects_that_nothing_touches(validator: PressValidator) -> None:

@@ -38,15 +38,6 @@ from tests.sense.rig import fakes
 PAD = Morphology.straight(2)
 
 
-@pytest.mark.parametrize(("mirrored", "y_mm"), [(False, -397), (True, -403)])
-def test_robot_frame_of_a_turned_pad(mirrored, y_mm):
-    """Turned to the left, its x axis is the arm's y axis; with its tracks up, x runs the other way."""
-    pad = {"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2), "mirrored": mirrored}
-    frame = RobotFrame.from_settings(fakes.RIG.model_copy(update=pad))
-    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, y_mm, 46, 0.1, 3.1, 0.2))
-    assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
-
-
 MM = st.floats(-500, 500)
 PRESSES = st.lists(st.tuples(MM, MM, st.floats(-20, 20)), min_size=1, max_size=5)
 
@@ -113,8 +104,6 @@ def test_locate_on_bed_prefers_what_rig_sets(folder, with_frame):
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg, rig.mirrored) == ((50.0, 60.0), 9.0, 90.0, False)
     assert rig.box_mm is not None
     assert rig.box_mm[0] == 50 - HALF_MM
-    complete = rig.model_copy(update={"tcp_mm": None})
-    assert locate_on_bed(complete, folder / "nowhere") is complete
     assert locate_on_bed(PRINTER, with_frame(mirrored=False)).mirrored is False
 
 

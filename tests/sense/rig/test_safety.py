@@ -115,13 +115,11 @@ def test_limits_that_limit_nothing_are_refused(change: dict[str, object]) -> Non
 def test_limits_from_settings() -> None:
     rig = RigSettings(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20)
     update = {"max_depth_mm": 4.5, "acceleration_mm_s2": 700, "max_force_n": 33}
-    limits = Limits.from_settings(rig.model_copy(update=update))
-    assert (limits.box_mm, limits.contact_mm, limits.max_speed_mm_s) == (((-1, 1), (-2, 2), (0, 90)), 30, 80)
-    assert (limits.max_depth_mm, limits.max_acceleration_mm_s2, limits.max_force_n) == (4.5, 700, 33)
+    expected = Limits(((-1, 1), (-2, 2), (0, 90)), 30, 4.5, 80, 700, max_force_n=33)
+    assert Limits.from_settings(rig.model_copy(update=update)) == expected
     for change in ({"box_mm": None}, {"box_mm": (1, -1, -2, 2, 0, 90)}, {"tool_rad": (0, 0, 0)}):
-        with pytest.raises(RigFault, match=r"\[rig\]") as caught:
+        with pytest.raises(RigFault, match=r"\[rig\]"):
             Limits.from_settings(rig.model_copy(update=change))
-        assert caught.value.cause == "refused"
 
 
 @given(st.floats(-math.pi, math.pi), st.tuples(*[st.floats(-7, 7)] * 3), st.tuples(*[st.floats(-7, 7)] * 3))
