@@ -3,11 +3,7 @@
 All memory is fixed: a ring holds the latest readings, and exponential moving averages of each fibre, of several time
 constants, stand for the history before. They lag LAG readings behind, as a touch is detected only after it began.
 
-The touch detector is simpler than `signals.press_detection` on purpose: that one tracks levels by Kalman filters in
-float64 and looks back at whole runs of readings; this one has a baseline, a threshold and a few integers of fixed size,
-and can be read in C. While the pad is free, the baseline follows each fibre; the pad is touched when the sum of squared
-deviations, in units of the fibres' noise, exceeds a threshold in two readings in a row, and released when the deviation
-has gone back by half. The baseline then starts anew.
+The detector of touches is simpler than `signals.press_detection` on purpose: fixed in size, and to be read in C.
 """
 
 from dataclasses import dataclass
@@ -183,7 +179,12 @@ def _compute_features(end: int, ring: Any, history: Any, pad: Any, out: Any) -> 
 
 @dataclass(frozen=True)
 class ThresholdDetector:
-    """The simple detector of touches."""
+    """A baseline, a threshold and a few integers, where `signals.press_detection` has Kalman filters in float64.
+
+    While the pad is free, the baseline follows each fibre; the pad is touched when the sum of squared deviations, in
+    units of the fibres' noise, exceeds a threshold in two readings in a row, and released when the deviation has gone
+    back by half. The baseline then starts anew.
+    """
 
     noise_v: Array  # (C,), infinite for a fibre that does not respond
     threshold: float  # of the sum of squared deviations in units of the noise
