@@ -241,7 +241,8 @@ def stream_presses(
         detector.delay,
     )
     windows, history = np.split(features.astype(np.float64), [N_WINDOWS], axis=2)
-    return StreamedPresses(*edges.T.copy(), PressFeatures(windows, history, valid.copy()))
+    down_command, estimated, ended = edges.T.copy()
+    return StreamedPresses(down_command, estimated, ended, PressFeatures(windows, history, valid.copy()))
 
 
 def commanded_presses(recording: Recording) -> Mask:
@@ -306,13 +307,13 @@ def state_bytes(n_fibres: int, n_measures: int, hidden: int) -> int:
 
 def max_hidden(n_fibres: int, n_measures: int, n_levels: int, budget: MemoryBudget) -> int:
     """Return the neurons of a layer that a budget allows; InputError if not even the smallest student fits."""
-    hidden = np.arange(HIDDEN_STEP, MAX_HIDDEN + 1, HIDDEN_STEP)
-    flash = CODE_BYTES + table_bytes(n_fibres, n_measures, n_levels, hidden, budget.quantized)
-    ram = state_bytes(n_fibres, n_measures, hidden)
-    for name, allowed, (least, *_) in (("flash", budget.flash, flash), ("ram", budget.ram, ram)):
+    sizes = range(HIDDEN_STEP, MAX_HIDDEN + 1, HIDDEN_STEP)
+    flash = [CODE_BYTES + table_bytes(n_fibres, n_measures, n_levels, size, budget.quantized) for size in sizes]
+    ram = [state_bytes(n_fibres, n_measures, size) for size in sizes]
+    for name, allowed, least in (("flash", budget.flash, flash[0]), ("ram", budget.ram, ram[0])):
         if least > allowed:
             raise InputError(
                 f"--{name} is {allowed} bytes: the smallest localizer of {n_fibres} fibres takes {least}, "
                 "allowed is that or more"
             )
-    return int(hidden[(flash <= budget.flash) & (ram <= budget.ram)].max())
+    return max(size for size, f, r in zip(sizes, flash, ram, strict=True) if f <= budget.flash and r <= budget.ram)
