@@ -24,7 +24,7 @@ from padforge.sense.rig import operation
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import BoardSamples, RigFault
-from padforge.sense.rig.press_loop import Averager, PressLoop, check_plan
+from padforge.sense.rig.press_loop import Averager, DiskThread, PressLoop, check_plan
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
@@ -320,6 +320,21 @@ def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
     np.testing.assert_allclose(volts, np.column_stack([expected, -expected]).reshape(-1, 2))
     np.testing.assert_allclose(1000 * times, expected)
     assert averager.n_missing == sum(i <= last for i in lost)
+
+
+def test_disk_thread_stops_after_a_failure() -> None:
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    done: list[int] = []
+    with DiskThread() as disk:
+        disk.submit(done.append, 1)
+        disk.submit(full)
+        disk.submit(done.append, 2)
+        for _ in range(2):
+            with pytest.raises(OSError, match="No space"):
+                disk.is_idle(5)
+    assert done == [1]
 
 
 def run_until(arm: FakeArm, path: Path, error: type[BaseException]) -> None:
