@@ -254,17 +254,11 @@ class OnnxReport:
 
 
 def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recording | None = None) -> OnnxReport:
-    """Write a localizer as an ONNX graph, and test it.
+    """Write a localizer, whose `localizer.json` has the SHA-256 `digest`, as an ONNX graph.
 
-    Args:
-        model: localizer to export.
-        digest: SHA-256 of its `localizer.json`, which has that of its weights.
-        path: of the graph.
-        recording: whose presses it is tested on; None for made-up ones.
-
-    Raises:
-        InputError: localizer of the published method, recording of another pad or rate, or `path` cannot be written.
-        Fault: positions differ by more than MAX_DIFFERENCE_MM.
+    It is tested on the presses of a recording, or on made-up ones. Raises InputError for a localizer of the published
+    method, a recording of another pad or rate, or a path that cannot be written; Fault if positions differ by more than
+    MAX_DIFFERENCE_MM.
     """
     if model.method != "ensemble":
         raise InputError(f"the localizer is of method {model.method}, expected ensemble: calibrate again")

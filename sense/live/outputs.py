@@ -49,12 +49,7 @@ class Message:
 
 
 class MessageBuilder:
-    """Build the messages of a pipeline.
-
-    Args:
-        pipeline: that is fed.
-        mirrored: whether the pad lies with its tracks up, so that z points into it, as in an exported bag.
-    """
+    """Build the messages of a pipeline; of a pad `mirrored`, with its tracks up, z points into it as in a bag."""
 
     def __init__(self, pipeline: Live, mirrored: bool = False) -> None:
         self._pipeline, self._pressed, self._is_first = pipeline, False, True
@@ -80,11 +75,11 @@ class MessageBuilder:
 
     def _health(self, time_s: float, fault: FibreFault | None) -> Message:
         states = [fibre["state"] for fibre in self._pipeline.view()["fibres"]]
-        status = []
-        for number, state in enumerate(states, 1):
-            level = _OK if state in ("sound", "unmonitored") else _ERROR
-            entry = {"level": level, "name": f"pad: fibre {number}", "message": state, "hardware_id": "pad"}
-            status.append(entry | {"values": []})
+        status = [
+            {"level": _OK if state in ("sound", "unmonitored") else _ERROR, "name": f"pad: fibre {number}"}
+            | {"message": state, "hardware_id": "pad", "values": []}
+            for number, state in enumerate(states, 1)
+        ]
         pad: dict[str, Any] = {"event": "health", "time_s": time_s, "states": states}
         if fault is not None:
             pad["fault"] = {**asdict(fault), "text": fault.text}
@@ -119,7 +114,7 @@ class OutputStream(Protocol):
     """Anything that sends messages to other programs."""
 
     def send(self, message: Message) -> None:
-        """Send one message; never wait for who receives it."""
+        """Send one message, if it is of a kind that this sends; never wait for who receives it."""
 
 
 def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> None:
@@ -130,17 +125,10 @@ def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> N
 
 
 class JsonLines(ConnectionServer):
-    """Lines of JSON over TCP, within `with`: each subscriber gets all messages from when it came.
+    """Lines of JSON over TCP, within `with`: the latest state of the fibres, then all messages from then on.
 
-    The first that it gets is the latest state of the fibres.
-
-    Args:
-        host: address to listen on.
-        port: of it; 0 for any that is free.
-        token: the first line that a subscriber must send; "" for none.
-
-    Raises:
-        InputError: the port cannot be used, or other machines could listen without a token.
+    Port 0 is any that is free; the token is the first line that a subscriber must send, "" for none. Raises InputError
+    if the port cannot be used, or other machines could listen without a token.
     """
 
     def __init__(self, host: str, port: int, token: str = "") -> None:
@@ -213,15 +201,7 @@ class _Subscriber(socketserver.StreamRequestHandler):
 
 
 class OscOutput(contextlib.AbstractContextManager["OscOutput"]):
-    """Open Sound Control over UDP: /pad/touches, /pad/readings, /pad/pressed and /pad/health.
-
-    Args:
-        address: HOST:PORT to send to.
-
-    Raises:
-        InputError: no such address, or one that nothing can be sent to.
-        ModuleNotFoundError: python-osc is not installed.
-    """
+    """Open Sound Control over UDP, to HOST:PORT: /pad/touches, /pad/readings, /pad/pressed and /pad/health."""
 
     def __init__(self, address: str) -> None:
         from pythonosc.udp_client import SimpleUDPClient
@@ -260,17 +240,7 @@ def _values(message: Message) -> list[Any]:
 
 
 class LslOutput:
-    """Streams of the Lab Streaming Layer: "NAME readings" in V at their rate, and "NAME touches" as they come.
-
-    Args:
-        name: of the streams, which all the network can see.
-        fibres: number of channels of the readings.
-        rate_hz: readings per second.
-
-    Raises:
-        ModuleNotFoundError: pylsl is not installed.
-        InputError: `name` is no text.
-    """
+    """Streams of the Lab Streaming Layer, for all the network: "NAME readings" in V at their rate, "NAME touches"."""
 
     def __init__(self, name: str, fibres: int, rate_hz: float) -> None:
         if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes of a command line that are no text
@@ -280,7 +250,6 @@ class LslOutput:
         self._touches = _open_outlet(f"{name} touches", TOUCH_UNITS, 0.0)
 
     def send(self, message: Message) -> None:
-        """Send one message, if it is of readings or of a touch."""
         if message.topic == READINGS:
             self._readings.push_sample(_values(message))
         elif message.topic == TOUCHES:
@@ -299,17 +268,9 @@ def _open_outlet(name: str, units: Mapping[str, str], rate_hz: float) -> Any:
 
 
 class LivePage(LocalPage):
-    """A page of a pad that is pressed, served in the `with` block; it may send commands.
+    """A page of a pad that is pressed, a file in `pages`, served as `LocalPage` in the `with` block.
 
-    Args:
-        port: to listen on; 0 for any that is free.
-        page: file in `pages`.
-        commands: that the page may send, see `read_commands`.
-        host: address to listen on.
-        token: required from clients, see `LocalPage`.
-
-    Raises:
-        InputError: raised by `LocalPage`.
+    It may send `commands`.
     """
 
     def __init__(

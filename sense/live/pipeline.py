@@ -16,7 +16,7 @@ from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, M
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
-from padforge.sense.localizer.features import DOWN, FEATURES, REST, UP, compute_features, interpolate_gaps
+from padforge.sense.localizer.features import DOWN, FEATURES, REST, UP, compute_features
 from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.scaler import ScaledFeatures
@@ -101,9 +101,9 @@ class BufferedPress:
             self._opening = buffer.rows(self.down_command - HISTORY, self.down_command + OPENING)[:, 1:].copy()
 
     def excerpt(self, buffer: RingBuffer, end: int) -> tuple[Array, int, int, int]:
-        """Return its readings before index `end`, the indices of its commands and that of the end of the press before.
+        """Return its readings before index `end`, without those in its middle that no features look at.
 
-        Of a long press, the readings are without those that no features look at.
+        And the indices in them of its commands, and of the end of the press before.
         """
         up_command = end if self.up_command is None else min(self.up_command, end)
         if self._opening is None or up_command <= self.down_command + OPENING:
@@ -204,7 +204,10 @@ class Live:
             without a reading) and "state"; "presses": `Estimate.to_dict` with "measures_text" and "text"; "faults":
             a line each.
         """
-        swings = self._swings()
+        swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
+        if end:
+            rest = self._buffer.rest(end) if self._press is None else self._press.rest
+            swings = (self._buffer.rows(end - 1, end)[0, 1:] - rest) / self._response_v
         return {
             "pressed": self.pressed,
             "fibres": [
@@ -217,13 +220,6 @@ class Live:
             "faults": [fault.text for fault in self.faults],
         }
 
-    def _swings(self) -> Array:
-        end = self._buffer.end
-        if end == 0:
-            return np.full(len(self._response_v), np.nan)
-        rest = self._rest(end) if self._press is None else self._press.rest
-        return (self._buffer.rows(end - 1, end)[0, 1:] - rest) / self._response_v
-
     def _states(self, missing: Mask) -> list[str]:
         kinds = {fibre: fault.kind for fault in self.faults for fibre in fault.fibres}
         healthy = "unmonitored" if self._monitor is None else "sound"
@@ -232,17 +228,13 @@ class Live:
             for fibre, is_missing in enumerate(missing)
         ]
 
-    def _rest(self, index: int) -> Array:
-        """(C,) V, mean of the readings just before `index`."""
-        return interpolate_gaps(self._buffer.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
-
     def _begin(self, touched: int) -> list[Event]:
         """Begin a press, after the press before has given all that is still to come of it."""
         down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
         events = self._advance(down_command)
         down_command = max(down_command, self._previous_end + 1)
         time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])
-        rest = self._rest(down_command)
+        rest = self._buffer.rest(down_command)
         self._press = BufferedPress(self._n_presses, time_s, touched, down_command, self._previous_end, rest)
         self._n_presses += 1
         return events

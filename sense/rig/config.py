@@ -110,7 +110,13 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     if rig.tcp_mm is None:
         message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
         raise RigFault("refused", message, "measure them with the probe in place")
-    frame = _read_holder_frame(folder)
+    path = folder / FABRICATION_FILE
+    stored = read_json(path, FABRICATION_FORMAT).get("frame") if path.is_file() else None
+    if not isinstance(stored, Mapping):
+        reason = f"{path} is of a pad without a holder" if path.is_file() else f"there is no {path}"
+        message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {reason}"
+        raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
+    frame = validate(HolderFrame, stored, f"{path}: frame")
     x, y = rig.pad_mm or frame.centre_mm
     contact = frame.surface_mm if rig.contact_mm is None else rig.contact_mm
     side = frame.pad_mm
@@ -133,16 +139,6 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
             "pad_angle_deg": rig.pad_angle_deg + frame.angle_deg,
         }
     )
-
-
-def _read_holder_frame(folder: Path) -> HolderFrame:
-    path = folder / FABRICATION_FILE
-    frame = read_json(path, FABRICATION_FORMAT).get("frame") if path.is_file() else None
-    if isinstance(frame, Mapping):
-        return validate(HolderFrame, frame, f"{path}: frame")
-    reason = f"{path} is of a pad without a holder" if path.is_file() else f"there is no {path}"
-    message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {reason}"
-    raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")
 
 
 @dataclass(frozen=True)
@@ -171,8 +167,7 @@ def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> Pres
 def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
     """Return the source of the recording to resume; raises InputError if it was begun otherwise or has no plan."""
     source = read_json(config.out / START, FORMAT).get("source")
-    source = source if isinstance(source, dict) else {}
-    if not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
+    if not isinstance(source, dict) or not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
         raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
     if source.get("kind") != kind:
         raise InputError(f"{config.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
@@ -180,8 +175,7 @@ def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any
     if source.get("morphology") != now["morphology"]:
         raise InputError(f"{config.out}: was begun with another pad than the one given")
     for key in sorted(now["rig"].keys() - _CHANGEABLE):
-        before, value = _get(source.get("rig"), key), now["rig"][key]
-        if before != value:
+        if (before := _get(source.get("rig"), key)) != (value := now["rig"][key]):
             raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {before}")
     return source
 
@@ -204,17 +198,9 @@ def open_recorder(
     identities: Mapping[str, Mapping[str, Any]],
     kind: str = KIND,
 ) -> Recorder:
-    """Return the recorder of a new recording in `folder`, or of the one there that is resumed.
+    """Return the recorder of a new recording in `folder`, or of the one there, if any, that is resumed.
 
-    Args:
-        config: What is recorded.
-        rig: `[rig]`, as it is on this rig.
-        presses: The plan, x and y or x, y and depth of each, mm.
-        folder: The run directory.
-        resume: Whether to resume what is in `folder`, if anything is.
-        identities: What "arm" and "board" returned on connecting.
-        kind: Of the source.
-
+    The plan is x and y, or x, y and depth, of each press; identities are what "arm" and "board" returned on connecting.
     Raises InputError if the recording cannot be resumed, or was begun with another arm, tool or board.
     """
     devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))

@@ -89,16 +89,9 @@ def record_simulated(
     like: Twin | None = None,
     replacing: bool = False,
 ) -> Recording:
-    """Record presses on a simulated pad, at once.
+    """Record presses on a simulated pad at once, see `simulate`; `overrides` of `[rig]` take precedence.
 
-    Args:
-        spec: Settings.
-        pad: See `simulate`.
-        out: Run directory.
-        overrides: Settings of `[rig]` that take precedence.
-        inputs: Files it is made from, for the provenance.
-        like: See `simulate`.
-        replacing: Whether a simulated recording in `out` is replaced.
+    `inputs` are files it is made from; `replacing` tells whether a simulated recording in `out` is replaced.
     """
     if not replacing:
         check_new_folder(out)
@@ -145,18 +138,11 @@ def record(
     on_progress: OnProgress = lambda done, total: None,
     on_message: Callable[[str], None] = lambda line: None,
 ) -> Recording | None:
-    """Record with a rig; what is done is on the disk whatever happens.
+    """Record with a rig, of `opened_rig` or `opened_virtual_rig`; what is done is on the disk whatever happens.
 
-    Args:
-        config: What is recorded.
-        opened: The rig, of `opened_rig` or `virtual.virtual_rig.opened_virtual_rig`.
-        model: Folder of the localizer of an adaptive plan.
-        dry: Go through the plan without touching the pad; nothing is kept.
-        resume: Resume what is in `config.out`.
-        on_progress: Receives the number of presses done, and of all.
-        on_message: Receives what a person should know before the arm moves.
-
-    Returns the recording; None of a dry run. Raises RigFault if the rig failed, or the plan is not safe.
+    An adaptive plan needs the folder of a localizer, `model`. If `dry`, the pad is not touched, nothing is kept, and
+    None is returned. `on_message` receives what a person should know before the arm moves. Raises RigFault if the rig
+    failed, or the plan is not safe.
     """
     with opened as (arm, board, rig):
         with Interrupts() as interrupts:

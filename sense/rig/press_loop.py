@@ -44,15 +44,15 @@ _SETTLE_S = 0.1  # until the state of an arm that refused a move tells why
 _RECENT = 4096  # readings whose times are remembered, to find the first one after a command
 
 
-class DiskThread:
-    """A thread that makes calls in their order; after one that failed it makes no more. A context, which ends it."""
+class DiskThread(ThreadPoolExecutor):
+    """A thread that makes calls in their order; after one that failed it makes no more."""
 
     def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1, "disk")
+        super().__init__(1, "disk")
         self._last: Future[None] = Future()
         self._last.set_result(None)
 
-    def submit(self, call: Callable[..., Any], *arguments: Any, **more: Any) -> None:
+    def submit(self, call: Callable[..., Any], /, *arguments: Any, **more: Any) -> Future[Any]:
         """Queue a call."""
         before = self._last
 
@@ -60,23 +60,14 @@ class DiskThread:
             before.result()
             call(*arguments, **more)
 
-        self._last = self._pool.submit(work)
+        self._last = super().submit(work)
+        return self._last
 
     def is_idle(self, timeout_s: float = 0.0) -> bool:
         """Wait for at most `timeout_s`; return whether all calls are done. Raises what a failed call raised."""
         if done := bool(wait([self._last], timeout_s).done):
             self._last.result()
         return done
-
-    def end(self) -> None:
-        """Wait until all calls are made that can be; raises nothing."""
-        self._pool.shutdown()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.end()
 
 
 class Interrupts:
@@ -157,8 +148,8 @@ class PressLoop:
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
-        The planner is called with the plan and the next press, from which on it may move the presses. Raises RigFault
-        if the plan is not safe, or the rig failed; the arm stands still then, and what is done is on the disk.
+        The planner may move the presses from the next one on. Raises RigFault if the plan is not safe, or the rig
+        failed; the arm stands still then, and what is done is on the disk.
         """
         check_plan(plan, self._rig)
         check_start_state(self._arm.state(), self._limits)
@@ -284,7 +275,7 @@ class PressLoop:
         except BaseException as error:
             with self._interrupts.blocked():
                 obstacle = self._stop_and_retreat()
-            self._disk.end()
+            self._disk.shutdown()
             with contextlib.suppress(Exception):
                 self._recorder.abort(str(error) or type(error).__name__)
                 self._recorder.sync()

@@ -14,10 +14,15 @@ from typing import Any, NoReturn
 from padforge.sense.rig.devices import Arm, ArmState, Pose, RigFault
 from padforge.sense.settings import RigSettings
 
+Range = tuple[float, float]
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 DOWN: Vector = (0.0, math.pi, 0.0)  # rotation vector of a tool that points straight down
 MAX_LEAN_DEG = 10.0  # of the expected tool axis from straight down: depths are measured along the base's z axis
+MAX_TILT_DEG = 2.0  # between the expected tool axis and a target's
+MAX_TURN_DEG = 45.0  # about that axis, from how the arm holds the tool before the first move
 TCP_TOLERANCE_MM = 0.1
+MAX_STATE_AGE_S = 0.5
 STILL_MM_S = 1.0
 DEPTH_TOLERANCE_MM = 0.3  # how much deeper than allowed a moving tip may read: noise and overshoot, no wrong target
 POLL_S = 0.004
@@ -31,23 +36,15 @@ EDGE_MM = 1.0  # how far outside the box a tool may stand that was sent to its e
 
 @dataclass(frozen=True)
 class Limits:
-    """What the arm may do; lengths in the base frame.
+    """What the arm may do; lengths in the base frame. Raises ValueError for a limit that limits nothing."""
 
-    Raises ValueError for a limit that limits nothing.
-    """
-
-    box_mm: tuple[
-        tuple[float, float], tuple[float, float], tuple[float, float]
-    ]  # lowest and highest x, y, z of the tip
+    box_mm: tuple[Range, Range, Range]  # lowest and highest x, y, z of the tip
     contact_mm: float | None  # z of the pad's surface; while it is None no target is safe
     max_depth_mm: float  # of the tip below the surface
     max_speed_mm_s: float = 250.0
     max_acceleration_mm_s2: float = 1200.0
     tool: Vector = DOWN  # rotation vector of the tool as it should be held
-    max_tilt_deg: float = 2.0  # between its axis and a target's
-    max_turn_deg: float = 45.0  # about its axis, from how the arm holds it before the first move
     max_force_n: float | None = 50.0  # on the tool, in any direction; None if no force is watched
-    max_state_age_s: float = 0.5
     deadline_s: float = 30.0  # of a move
 
     @classmethod
@@ -72,16 +69,12 @@ class Limits:
 
     def __post_init__(self) -> None:
         for axis, (low, high) in zip("xyz", self.box_mm, strict=True):
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            if not -math.inf < low < high < math.inf:
                 raise ValueError(f"box_mm: {axis} from {low} to {high}; expected two finite numbers, ascending")
-        speeds = ("max_speed_mm_s", "max_acceleration_mm_s2")
-        force = () if self.max_force_n is None else ("max_force_n",)
-        for name in ("max_depth_mm", *speeds, *force, "max_state_age_s", "deadline_s"):
-            if not (math.isfinite(value := getattr(self, name)) and value > 0):
+        for name in ("max_depth_mm", "max_speed_mm_s", "max_acceleration_mm_s2", "max_force_n", "deadline_s"):
+            value = getattr(self, name)
+            if not (0 < value < math.inf if value is not None else name == "max_force_n"):
                 raise ValueError(f"{name} is {value}; expected a finite number above 0")
-        for name, maximum in (("max_tilt_deg", 90), ("max_turn_deg", 180)):
-            if not 0 <= (value := getattr(self, name)) <= maximum:
-                raise ValueError(f"{name} is {value}; allowed 0 to {maximum}")
         if self.contact_mm is not None and not math.isfinite(self.contact_mm):
             raise ValueError(f"contact_mm is {self.contact_mm}; expected a finite number or None")
         if not tilt_deg(self.tool, DOWN) <= MAX_LEAN_DEG:
@@ -90,16 +83,33 @@ class Limits:
 
 def tilt_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
     """Return the angle in degrees between the axes of two tools given by their rotation vectors."""
-    a, b = _axis(tool), _axis(expected)
-    cross = math.hypot(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-    return math.degrees(math.atan2(cross, sum(p * q for p, q in zip(a, b, strict=True))))
+    w, x, y, z = _rotation(tool, expected)
+    return math.degrees(2 * math.atan2(math.hypot(x, y), math.hypot(w, z)))
 
 
 def turn_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
     """Return the angle in degrees, 0 to 180, by which two tools, rotation vectors, differ about their axis (twist)."""
-    (w, x, y, z), (p, q, r, s) = _quaternion(tool), _quaternion(expected)
-    about, along = w * s - z * p - x * r + y * q, w * p + x * q + y * r + z * s
-    return math.degrees(2 * math.atan2(abs(about), abs(along)))
+    w, _, _, z = _rotation(tool, expected)
+    return math.degrees(2 * math.atan2(abs(z), abs(w)))
+
+
+def _rotation(start: Sequence[float], end: Sequence[float]) -> Quaternion:
+    """Return the rotation from one tool to another, in the frame of the first."""
+    (w, x, y, z), (p, q, r, s) = _quaternion(start), _quaternion(end)
+    return (
+        w * p + x * q + y * r + z * s,
+        w * q - x * p - y * s + z * r,
+        w * r + x * s - y * p - z * q,
+        w * s - x * r + y * q - z * p,
+    )
+
+
+def _quaternion(rotation: Sequence[float]) -> Quaternion:
+    """Convert a rotation vector to a unit quaternion, its scalar first."""
+    angle = math.hypot(*rotation)
+    share = math.sin(angle / 2) / angle if angle else 0.0
+    x, y, z = (share * value for value in rotation)
+    return math.cos(angle / 2), x, y, z
 
 
 def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
@@ -109,7 +119,7 @@ def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_
     if not all(math.isfinite(value) for value in pose):
         _refuse(f"the pose {list(pose)}", "finite numbers")
     for name, value in (("speed", speed_mm_s), ("acceleration", acceleration_mm_s2)):
-        if not (math.isfinite(value) and value > 0):
+        if not 0 < value < math.inf:
             _refuse(f"the {name} {value}", "more than 0")
 
 
@@ -127,14 +137,14 @@ def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
         _refuse(f"speed {speed_mm_s:g} mm/s", f"at most {limits.max_speed_mm_s:g} mm/s")
     if acceleration_mm_s2 > limits.max_acceleration_mm_s2:
         _refuse(f"acceleration {acceleration_mm_s2:g} mm/s²", f"at most {limits.max_acceleration_mm_s2:g} mm/s²")
-    if not (tilt := tilt_deg(pose[3:], limits.tool)) <= limits.max_tilt_deg:
-        _refuse(f"the tool tilted by {tilt:.1f} degrees", f"at most {limits.max_tilt_deg:g}")
+    if not (tilt := tilt_deg(pose[3:], limits.tool)) <= MAX_TILT_DEG:
+        _refuse(f"the tool tilted by {tilt:.1f} degrees", f"at most {MAX_TILT_DEG:g}")
 
 
 def check_start_state(state: ArmState, limits: Limits) -> None:
     """Raise RigFault("refused") if the first move would turn tool and cable too far, or the force cannot be watched."""
-    if not (turn := turn_deg(state.pose[3:], limits.tool)) <= limits.max_turn_deg:
-        _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {limits.max_turn_deg:g}")
+    if not (turn := turn_deg(state.pose[3:], limits.tool)) <= MAX_TURN_DEG:
+        _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {MAX_TURN_DEG:g}")
     if state.force_n is None and limits.max_force_n is not None:
         _refuse(f"[rig] max_force_n is {limits.max_force_n:g}, but this arm measures no force", '"unwatched"')
 
@@ -158,8 +168,8 @@ def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = 
         raise RigFault("emergency_stop", "the arm is in an emergency stop", advice)
     if state.protective_stop:
         raise RigFault("protective_stop", "the arm is in a protective stop", advice)
-    if not (age := now_s - state.time_s) <= limits.max_state_age_s:
-        raise RigFault("stale", f"the arm's last state is {age:.2f} s old; allowed {limits.max_state_age_s:g} s")
+    if not (age := now_s - state.time_s) <= MAX_STATE_AGE_S:
+        raise RigFault("stale", f"the arm's last state is {age:.2f} s old; allowed {MAX_STATE_AGE_S:g} s")
     force_n, max_n = state.total_force_n, limits.max_force_n
     if force_n is not None and max_n is not None and not force_n <= max_n:
         raise RigFault("force", f"the force is {force_n:.1f} N; allowed {max_n:g} N")
@@ -244,24 +254,6 @@ def _falling_force_check(arm: Arm, first_n: float, max_n: float, clock: Callable
             raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
 
     return check
-
-
-def _axis(rotation: Sequence[float]) -> Vector:
-    """Rotate the z axis by a rotation vector (Rodrigues)."""
-    angle = math.hypot(*rotation)
-    if angle == 0:
-        return 0.0, 0.0, 1.0
-    x, y, z = (value / angle for value in rotation)
-    sine, versine = math.sin(angle), 1 - math.cos(angle)
-    return y * sine + x * z * versine, -x * sine + y * z * versine, math.cos(angle) + z * z * versine
-
-
-def _quaternion(rotation: Sequence[float]) -> tuple[float, float, float, float]:
-    """Convert a rotation vector to a unit quaternion, its scalar first."""
-    angle = math.hypot(*rotation)
-    share = math.sin(angle / 2) / angle if angle else 0.0
-    x, y, z = (share * value for value in rotation)
-    return math.cos(angle / 2), x, y, z
 
 
 def _refuse(what: str, allowed: str) -> NoReturn:

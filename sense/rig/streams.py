@@ -11,7 +11,7 @@ import numpy as np
 from padforge.design.common.files import read_json
 from padforge.design.common.validation import check_float
 from padforge.sense.arrays import Array
-from padforge.sense.localizer.features import SLOW
+from padforge.sense.localizer.features import REST, SLOW, interpolate_gaps
 from padforge.sense.recording.recording import Recording, is_mirrored
 from padforge.sense.recording.run_directory import FORMAT, START
 from padforge.sense.rig.devices import Board, BoardSamples
@@ -48,13 +48,12 @@ class RingBuffer:
         dropped = self.end - self._filled
         return self._rows[max(first - dropped, 0) : max(min(end - dropped, self._filled), 0)]
 
-    def command_index(self, reading: int, delay_s: float) -> int:
-        """Return the index of the reading at which the probe was sent, if that shows `delay_s` later.
+    def rest(self, index: int) -> Array:
+        """Return the mean (columns - 1,) of the readings just before an index; column 0 of the rows are times."""
+        return interpolate_gaps(self.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
 
-        Args:
-            reading: index of the first reading that shows it; column 0 of the rows are times in s.
-            delay_s: from the command to its effect, s.
-        """
+    def command_index(self, reading: int, delay_s: float) -> int:
+        """Return the index of the reading at which the probe was sent, if `reading`, `delay_s` later, shows it."""
         times_s = self.rows(0, reading + 1)[:, 0]
         return reading + 1 - len(times_s) + int(np.searchsorted(times_s, times_s[-1] - delay_s))
 
@@ -99,11 +98,7 @@ class ReadingStream:
 
 
 def stream_board(board: Board, rate_hz: float) -> ReadingStream:
-    """Connect a board, and stream its samples averaged to about `rate_hz`, without end.
-
-    Raises:
-        RigFault: raised by the board, now or while its samples are read.
-    """
+    """Connect a board, and stream its samples averaged to about `rate_hz`, without end or until it raises RigFault."""
     identity = board.connect()
     ratio = max(1, round(identity["rate_hz"] / rate_hz))
     averager = Averager(ratio, identity["channels"])

@@ -13,9 +13,9 @@ import pytest
 
 from padforge.sense import Recording
 from padforge.sense.arrays import Array, Mask
-from padforge.sense.deploy.c_header import render_header
+from padforge.sense.deploy.c_header import StudentNetwork, distill, quantize, render_header
 from padforge.sense.deploy.streaming import MemoryBudget
-from padforge.sense.deploy.student import StudentNetwork, distill, quantize, split_student_presses
+from padforge.sense.localizer.calibration import split_unseen
 from padforge.sense.localizer.model import LocalizerModel
 from tests.sense.conftest import QUICK
 
@@ -38,9 +38,6 @@ class Output(NamedTuple):
         return self.events[(self.events[:, 1].astype(int) & 2) > 0]
 
 
-Program = Callable[..., Output]
-
-
 def tutorial_code(name: str, language: str) -> str:
     """The code in the tutorial that follows the comment of a name."""
     text = (ROOT / "docs" / "tutorial-sense.md").read_text(encoding="utf-8")
@@ -60,7 +57,7 @@ def compile_c(source: Path, folder: Path, *flags: str) -> Path:
 
 @pytest.fixture(scope="session")
 def student(recording: Recording, localizer: LocalizerModel) -> StudentNetwork:
-    return distill(recording, localizer, split_student_presses(recording, localizer, SHORT)[0], BUDGET, SHORT)
+    return distill(recording, localizer, split_unseen(recording, localizer, SHORT)[0], BUDGET, SHORT)
 
 
 @pytest.fixture(scope="session")
@@ -72,13 +69,13 @@ def quantized(student: StudentNetwork) -> StudentNetwork:
 @pytest.fixture(scope="session")
 def deep_student(deep_recording: Recording, deep_localizer: LocalizerModel) -> StudentNetwork:
     """A student that predicts depth and force."""
-    training, _ = split_student_presses(deep_recording, deep_localizer, SHORT)
+    training, _ = split_unseen(deep_recording, deep_localizer, SHORT)
     return distill(deep_recording, deep_localizer, training, BUDGET, SHORT)
 
 
 def build_program(
     student: StudentNetwork, folder: Path, *flags: str, budget: MemoryBudget = BUDGET, text: str = ""
-) -> Program:
+) -> Callable[..., Output]:
     """Build a program that takes readings, whether the pad is pressed, and failed fibres."""
     (folder / "localizer.h").write_text(text or render_header(student, budget, ["of a test"]))
     path = compile_c(HERE / "driver.c", folder, *flags)
@@ -96,5 +93,5 @@ def build_program(
 
 
 @pytest.fixture(scope="session")
-def program(student: StudentNetwork, tmp_path_factory: pytest.TempPathFactory) -> Program:
+def program(student: StudentNetwork, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Output]:
     return build_program(student, tmp_path_factory.mktemp("program"))

@@ -1,19 +1,36 @@
-"""`localizer.h`, compiled and fed readings, gives what its Python twin gives."""
+"""`localizer.h`, compiled, gives what its Python twin gives; the student in it is nearly as accurate as its teacher."""
 
 import re
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.deploy.c_header import WRAP_AT, WRAP_BY, render_header
-from padforge.sense.deploy.streaming import CODE_BYTES, MemoryBudget, commanded_presses, state_bytes, table_bytes
+from padforge.design.common.validation import InputError
+from padforge.sense import LocalizerSettings, Recording, calibrate
+from padforge.sense.deploy.c_header import (
+    WRAP_AT,
+    WRAP_BY,
+    StudentNetwork,
+    distill,
+    evaluate_student,
+    quantize,
+    render_header,
+)
+from padforge.sense.deploy.streaming import CODE_BYTES, MemoryBudget, commanded_presses
+from padforge.sense.formats.import_export import open_recording
+from padforge.sense.localizer.calibration import split_unseen
+from padforge.sense.localizer.model import LocalizerModel
+from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import BUDGET, Output, build_program, compile_c, tutorial_code
+from tests.sense.live.conftest import first_presses
 
 TOLERANCE_MM = 1e-3
+MAX_RATIO = 1.25  # of the mean errors of a student and its teacher
 
 
 def check_twin(output: Output, twin: tuple, failed: tuple[int, ...] = ()) -> None:
@@ -36,11 +53,8 @@ def test_header_gives_positions_of_the_twin_within_its_budget(weights: str, reco
         output = run(recording.readings, pressed, failed)
         assert len(output.positions) == 300
         check_twin(output, student.predict(recording.readings, pressed, failed), failed)
-    n_measures, n_levels = len(student.model.scaler.measures), len(student.model.interval_factors)
-    output = run(np.zeros((1, 4)))
-    assert output.tables == table_bytes(4, n_measures, n_levels, student.hidden, student.quantized)
-    assert output.tables + CODE_BYTES <= 40_000
-    assert output.state <= state_bytes(4, n_measures, student.hidden) <= 8_000
+        assert output.tables == student.table_bytes <= 40_000 - CODE_BYTES
+        assert output.state <= student.state_bytes <= 8_000
 
 
 def test_header_detects_presses_of_the_twin(student, program, recording) -> None:
@@ -63,10 +77,10 @@ def test_header_gives_depth_and_force(deep_student, deep_recording, tmp_path) ->
     np.testing.assert_allclose(output.positions[:, 7:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(("rate", "literal"), [(13.0, "13.0f"), (13.333, "13.33f"), (20_000.0, "2e+04f")])
-def test_header_writes_whole_rates_as_floats(student, rate: float, literal: str) -> None:
-    other = replace(student, model=replace(student.model, rate_hz=rate))
-    assert f"#define LOCALIZER_RATE_HZ {literal}\n" in render_header(other, BUDGET, [])
+def test_header_writes_whole_rates_as_floats(student) -> None:
+    for rate, literal in ((13.0, "13.0f"), (13.333, "13.33f"), (20_000.0, "2e+04f")):
+        other = replace(student, model=replace(student.model, rate_hz=rate))
+        assert f"#define LOCALIZER_RATE_HZ {literal}\n" in render_header(other, BUDGET, [])
 
 
 @pytest.mark.parametrize("budget", [MemoryBudget(40_000, 500), MemoryBudget(9_000, 8_000)])
@@ -115,3 +129,64 @@ def test_header_agrees_with_its_twin_on_any_readings(student, program) -> None:
         check_twin(program(readings, pressed), student.predict(readings, pressed))
 
     check()
+
+
+def test_student_is_nearly_as_accurate_as_its_teacher(
+    student: StudentNetwork, recording: Recording, localizer: LocalizerModel
+) -> None:
+    _, test = split_unseen(recording, localizer, QUICK)
+    assert set(test.tolist()) == set(localizer.test)
+    evaluation = evaluate_student(student, [localizer], recording, test)
+    header, teacher = evaluation["errors"]["header"], evaluation["errors"]["press_and_release"]
+    assert header[0]["mean_mm"] < MAX_RATIO * teacher[0]["mean_mm"]
+    assert [row["n_failed"] for row in header] == [0, 1, 2, 3]
+    assert all(0.75 < row["within_r90"] < 1 for row in header)
+    assert (evaluation["n_detected"], evaluation["n_false"]) == (len(test), 0)
+    assert evaluation["detected_mean_mm"] < MAX_RATIO * teacher[0]["mean_mm"]
+
+
+@pytest.mark.slow
+def test_student_is_nearly_as_accurate_as_a_causal_localizer_on_the_published_recording(published: Path) -> None:
+    """With 64 KiB of RAM, after a training of the same length."""
+    recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 1200)
+    options = LocalizerSettings(members=1, hidden=96, layers=3, epochs=40, batch=128, features="causal", max_failures=1)
+    localizer, _ = calibrate(recording, options)
+    training, test = split_unseen(recording, localizer, options)
+    student = distill(recording, localizer, training, MemoryBudget(150_000, 65_536), options)
+    evaluation = evaluate_student(student, [localizer], recording, test)
+    errors = evaluation["errors"]
+    assert errors["header"][0]["mean_mm"] <= MAX_RATIO * errors["causal"][0]["mean_mm"]
+    assert evaluation["n_detected"] >= 0.95 * len(test)
+    assert evaluation["n_false"] <= 0.03 * len(test)
+
+
+def test_distill_ignores_test_presses(brief: Recording, localizer: LocalizerModel) -> None:
+    training, test = split_unseen(brief, localizer, QUICK)
+    assert (len(training), len(test)) == (34, 6)
+    assert not set(training.tolist()) & set(test.tolist())
+    wrong = np.array(brief.presses_mm)
+    wrong[test] = 0.0
+    options, budget = QUICK.model_copy(update={"epochs": 2}), MemoryBudget(20_000, 4_000)
+    recordings = brief, replace(brief, presses_mm=wrong)
+    one, other = (distill(each, localizer, training, budget, options) for each in recordings)
+    for name, weight in one.model.weights.items():
+        assert np.array_equal(weight, other.model.weights[name])
+    assert np.array_equal(one.model.interval_factors, other.model.interval_factors)
+    assert one.detector.threshold == other.detector.threshold
+
+
+def test_split_leaves_out_presses_that_cannot_test(brief: Recording, localizer: LocalizerModel) -> None:
+    unknown = np.array(brief.presses_mm)
+    unknown[:10] = np.nan
+    training, test = split_unseen(replace(brief, presses_mm=unknown), localizer, QUICK)
+    assert min(*training, *test) == 10
+    with pytest.raises(InputError, match="the localizer was recalibrated by"):
+        split_unseen(brief, replace(localizer, recalibrated_by=(brief.digest,)), QUICK)
+
+
+def test_quantize_is_within_half_a_step(student: StudentNetwork) -> None:
+    quantized = quantize(student.model.weights)
+    for name, weight in student.model.weights.items():
+        step = np.abs(weight).max(axis=-2, keepdims=True) / 127 if name.endswith(".w") else 0  # biases stay
+        assert (np.abs(quantized[name] - weight) <= 0.501 * step).all()
+        assert not name.endswith(".w") or (np.abs(np.rint(quantized[name] / step)) <= 127).all()

@@ -25,14 +25,11 @@ from padforge.sense.deploy.streaming import (
 )
 from padforge.sense.localizer.features import compute_features
 
-
-@pytest.fixture
-def unused() -> ThresholdDetector:
-    return ThresholdDetector(np.full(4, np.inf), np.inf, 0)
+UNUSED = ThresholdDetector(np.full(4, np.inf), np.inf, 0)
 
 
-def test_stream_presses_as_commanded_gives_the_windows_of_causal_features(recording, unused) -> None:
-    presses = stream_presses(recording.readings, unused, commanded_presses(recording))
+def test_stream_presses_as_commanded_gives_the_windows_of_causal_features(recording) -> None:
+    presses = stream_presses(recording.readings, UNUSED, commanded_presses(recording))
     assert np.array_equal(presses.down_command, recording.down_command)
     assert np.array_equal(presses.ended, recording.up_command)
     assert np.array_equal(presses.estimated, recording.down_command + PRESS - 1)
@@ -41,8 +38,8 @@ def test_stream_presses_as_commanded_gives_the_windows_of_causal_features(record
     np.testing.assert_allclose(commanded_features(recording).windows, expected.windows, atol=2e-6)
 
 
-def test_history_is_the_averages_at_the_begin_of_the_press(recording: Recording, unused: ThresholdDetector) -> None:
-    presses = stream_presses(recording.readings, unused, commanded_presses(recording))
+def test_history_is_the_averages_at_the_begin_of_the_press(recording: Recording) -> None:
+    presses = stream_presses(recording.readings, UNUSED, commanded_presses(recording))
     levels = np.repeat(recording.readings[:1, :, None], len(TIME_CONSTANTS), axis=2)[0]
     press = 0
     for n, row in enumerate(recording.readings[: recording.down_command[20]]):
@@ -54,17 +51,17 @@ def test_history_is_the_averages_at_the_begin_of_the_press(recording: Recording,
     assert press == 20
 
 
-def test_stream_presses_handles_short_presses_without_pauses(recording: Recording, unused: ThresholdDetector) -> None:
+def test_stream_presses_handles_short_presses_without_pauses(recording: Recording) -> None:
     pressed = np.zeros(200, bool)
     for first, end in ((0, 3), (5, 6), (7, 8), (40, 90), (91, 92)):
         pressed[first:end] = True
-    presses = stream_presses(recording.readings[:200], unused, pressed)
+    presses = stream_presses(recording.readings[:200], UNUSED, pressed)
     assert presses.down_command.tolist() == [1, 5, 7, 40, 91]
     assert presses.ended.tolist() == [3, 6, 8, 90, 92]
     assert presses.estimated.tolist() == [3, 6, 8, 59, 92]
     assert np.isfinite(presses.features.windows).all()
     pressed[150:] = True
-    assert stream_presses(recording.readings[:200], unused, pressed).ended[-1] == 200
+    assert stream_presses(recording.readings[:200], UNUSED, pressed).ended[-1] == 200
 
 
 def test_threshold_detector_detects_presses_not_fitted_to(recording: Recording) -> None:

@@ -38,15 +38,6 @@ from tests.sense.rig import fakes
 PAD = Morphology.straight(2)
 
 
-@pytest.mark.parametrize(("mirrored", "y_mm"), [(False, -397), (True, -403)])
-def test_robot_frame_of_a_turned_pad(mirrored, y_mm):
-    """Turned to the left, its x axis is the arm's y axis; with its tracks up, x runs the other way."""
-    pad = {"pad_mm": (10.0, -400.0), "pad_angle_deg": 90.0, "tool_rad": (0.1, 3.1, 0.2), "mirrored": mirrored}
-    frame = RobotFrame.from_settings(fakes.RIG.model_copy(update=pad))
-    assert frame.pose(np.array([3.0, 0.0]), 4.0) == pytest.approx((10, y_mm, 46, 0.1, 3.1, 0.2))
-    assert frame.pose(np.array([0.0, 3.0]), -8.0) == pytest.approx((7, -400, 58, 0.1, 3.1, 0.2))
-
-
 MM = st.floats(-500, 500)
 PRESSES = st.lists(st.tuples(MM, MM, st.floats(-20, 20)), min_size=1, max_size=5)
 
@@ -113,8 +104,6 @@ def test_locate_on_bed_prefers_what_rig_sets(folder, with_frame):
     assert (rig.pad_mm, rig.contact_mm, rig.pad_angle_deg, rig.mirrored) == ((50.0, 60.0), 9.0, 90.0, False)
     assert rig.box_mm is not None
     assert rig.box_mm[0] == 50 - HALF_MM
-    complete = rig.model_copy(update={"tcp_mm": None})
-    assert locate_on_bed(complete, folder / "nowhere") is complete
     assert locate_on_bed(PRINTER, with_frame(mirrored=False)).mirrored is False
 
 
@@ -136,16 +125,9 @@ def test_locate_on_bed_refuses_a_pad_without_a_holder(folder, tmp_path):
         locate_on_bed(PRINTER.model_copy(update={"tcp_mm": None}), folder)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("centre_mm", [1.0], "centre_mm.* field required"),
-        ("walls_mm", 1e9, "walls_mm: got 1000000000.0"),
-    ],
-)
-def test_locate_on_bed_names_a_damaged_entry(with_frame, key, value, message):
-    with pytest.raises(InputError, match=message):
-        locate_on_bed(PRINTER, with_frame(**{key: value}))
+def test_locate_on_bed_names_a_damaged_entry(with_frame):
+    with pytest.raises(InputError, match=r"walls_mm: got 1000000000\.0"):
+        locate_on_bed(PRINTER, with_frame(walls_mm=1e9))
 
 
 RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))
@@ -220,9 +202,7 @@ def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
     [
         ("arm", "controller", "5.13.0", True),
         ("arm", "serial", "2019", False),
-        ("arm", "model", "UR3", False),
         ("arm", "tcp", [0.0, 0.0, 149.0, 0.0, 0.0, 0.0], False),
-        ("board", "name", "another", False),
         ("board", "serial", "cd34", False),
         ("board", "firmware", "1.1.0", False),
     ],
@@ -237,9 +217,8 @@ def test_resume_refuses_another_arm_tool_or_board(run, tmp_path, device, key, va
         pass
 
 
-@pytest.mark.parametrize("source", ["[]", '{"plan": 5}'])
-def test_resume_refuses_a_recording_without_a_plan(tmp_path, source):
-    text = f'{{"format": "padforge-recording/2", "fibres": 4, "source": {source}}}'
+def test_resume_refuses_a_recording_without_a_plan(tmp_path):
+    text = '{"format": "padforge-recording/2", "fibres": 4, "source": {"plan": 5}}'
     (tmp_path / "start.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="has no plan"):
         resumed_plan(tmp_path)

@@ -80,9 +80,7 @@ def test_run_leaves_a_gap_for_lost_samples(tmp_path):
     arm, board, options = rig()
     arm.hook = lambda arm: setattr(board, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
     run(tmp_path / "run", arm, board, options)
-    recording = Recording.open(tmp_path / "run")
-    assert len(recording.presses_mm) == len(PLAN)
-    assert 0.02 < np.diff(recording.times_s).max() < 0.06
+    assert 0.02 < np.diff(Recording.open(tmp_path / "run").times_s).max() < 0.06
     assert "lost" in (tmp_path / "run" / "journal.ndjson").read_text()
 
 
@@ -300,7 +298,6 @@ def test_run_records_depth_and_force(tmp_path):
     arm, board, options = rig(max_force_n=None)
     arm.force_n = None  # no sensor
     run(tmp_path / "without", arm, board, options, plan)
-    assert len(arm.moves) == 3 * len(plan)
     assert np.isnan(Recording.open(tmp_path / "without").forces_n).all()
 
 
@@ -319,10 +316,9 @@ def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
     times, volts = (np.concatenate(column) for column in zip(*pieces, strict=True))
     last = int(index[-1]) if len(index) else -1
     blocks = [index[index // ratio == number] for number in range((last + 1) // ratio)]
-    expected = [block.mean() for block in blocks if len(block)]
-    assert np.allclose(volts[:, 0], expected)
-    assert np.allclose(volts[:, 1], -np.array(expected))
-    assert np.allclose(1000 * times, expected)
+    expected = np.array([block.mean() for block in blocks if len(block)])
+    np.testing.assert_allclose(volts, np.column_stack([expected, -expected]).reshape(-1, 2))
+    np.testing.assert_allclose(1000 * times, expected)
     assert averager.n_missing == sum(i <= last for i in lost)
 
 
