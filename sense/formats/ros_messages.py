@@ -18,7 +18,6 @@ import numpy as np
 from padforge.design.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_S, Array, Indices, Mask
 from padforge.sense.formats.annotations import ModelAnnotations
-from padforge.sense.formats.ros_bag import RawMessages
 from padforge.sense.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -86,6 +85,14 @@ TOPICS = {
         (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")),
     ),
 }
+
+
+class RawMessages(NamedTuple):
+    """Messages of a topic in the order of the file: their type, and the log time (ns) and CDR of each."""
+
+    msgtype: str
+    stamps: list[int]
+    messages: list[bytes]
 
 
 class TopicSeries(NamedTuple):

@@ -15,7 +15,7 @@ import zstandard
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, import_bag
-from padforge.sense.formats import ros_bag
+from padforge.sense.formats import ros_recording
 
 from .foreign import STORE, array, channel, chunk, make, mcap_file, message, record, write_bag
 
@@ -126,7 +126,7 @@ def test_import_bag_refuses_stamps_and_counts_beyond_the_limits(
         ("MAX_TOPICS", 0, "more than 0 topics"),
     ):
         with monkeypatch.context() as patch:
-            patch.setattr(ros_bag, name, limit)
+            patch.setattr(ros_recording, name, limit)
             assert reason in refusal_of(many)
 
 
