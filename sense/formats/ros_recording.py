@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from padforge.design.common.files import UNFINISHED, atomic_files, check_file, read_bytes, reraise_write_error
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array, Indices, check_numbers
+from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.columns import (
     MILLIMETRES,
@@ -51,17 +52,6 @@ from padforge.sense.formats.ros_messages import (
     TOUCHES,
     RawMessages,
     TopicSeries,
-    arm_poses,
-    choose_epoch,
-    decode,
-    decode_text,
-    encode,
-    encode_health,
-    encode_recording,
-    from_text,
-    stamps_at,
-    to_topics,
-    touches,
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
@@ -308,9 +298,11 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {TOPICS[name].msgtype}")
-        topics = {name: decode(store, raw[name], TOPICS[name].paths) for name in number_topics if name in raw}
+        topics = {
+            name: ros_messages.decode(store, raw[name], TOPICS[name].paths) for name in number_topics if name in raw
+        }
         if RECORDING in raw:
-            if (recording := _restore(decode_text(store, raw[RECORDING]), topics)) is not None:
+            if (recording := _restore(ros_messages.decode_text(store, raw[RECORDING]), topics)) is not None:
                 return recording
             source[NOTE] = f"was changed since it was exported; {RECORDING} is left out"
         arrays = _to_arrays(topics)
@@ -319,11 +311,11 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
 
 def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
     """Return the exact recording of the text in a bag; None if its messages say something else."""
-    restored = from_text(text, topics[READINGS].values)
+    restored = ros_messages.from_text(text, topics[READINGS].values)
     if restored is None:
         return None
     recording, epoch_s, digest = restored
-    expected = to_topics(recording, epoch_s)
+    expected = ros_messages.to_topics(recording, epoch_s)
     if expected.keys() != topics.keys() or not all(topics[name].equals(expected[name]) for name in expected):
         return None
     if recording.digest == digest:
@@ -372,7 +364,7 @@ def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, In
     was_down = np.append(False, is_down[:-1])
     down, up = pressed.stamps[is_down & ~was_down], pressed.stamps[~is_down & was_down]
     if len(up) < len(down):
-        up = np.append(up, stamps_at(readings, np.array([len(readings)])))
+        up = np.append(up, ros_messages.stamps_at(readings, np.array([len(readings)])))
     valid = (down > readings[0]) & (down <= readings[-1])
     if not valid.any():
         raise InputError("press is nowhere true after the first reading")
@@ -413,7 +405,7 @@ def _decode_entry(store: "Typestore", entry: ColumnEntry, name: str, raw: Mappin
     if raw[name].msgtype not in types:
         raise InputError(f"{what} of {short_repr(raw[name].msgtype)}, expected {', '.join(types)}")
     with naming_file(what):
-        return decode(store, raw[name], types[raw[name].msgtype])
+        return ros_messages.decode(store, raw[name], types[raw[name].msgtype])
 
 
 def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:
@@ -443,18 +435,20 @@ def export_bag(
         if states.shape[1:] != (len(STATE_COLUMNS),):
             raise InputError(f"states have shape {states.shape}, expected (n, {len(STATE_COLUMNS)})")
     store = load_typestore(f"{path}: MCAP")
-    epoch_s = choose_epoch(recording.times_s)
-    topics = to_topics(recording, epoch_s)
+    epoch_s = ros_messages.choose_epoch(recording.times_s)
+    topics = ros_messages.to_topics(recording, epoch_s)
     if annotations is not None:
-        topics[TOUCHES] = touches(recording, annotations, epoch_s)
+        topics[TOUCHES] = ros_messages.touches(recording, annotations, epoch_s)
     if states is not None:
-        topics[ARM] = arm_poses(states, epoch_s)
+        topics[ARM] = ros_messages.arm_poses(states, epoch_s)
     stamps = {topic: series.stamps for topic, series in topics.items()}
-    messages = {topic: encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)}
+    messages = {
+        topic: ros_messages.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)
+    }
     if annotations is not None and annotations.faults is not None:
-        stamps[HEALTH], messages[HEALTH] = encode_health(store, recording, annotations, stamps[READINGS])
+        stamps[HEALTH], messages[HEALTH] = ros_messages.encode_health(store, recording, annotations, stamps[READINGS])
     stamps[RECORDING] = stamps[READINGS][:1]
-    messages = {RECORDING: [encode_recording(store, recording, epoch_s, messages)], **messages}
+    messages = {RECORDING: [ros_messages.encode_recording(store, recording, epoch_s, messages)], **messages}
     _check_readable(messages)
     types = {topic: (TOPICS[topic].msgtype, TOPICS[topic].description) for topic in messages}
     in_order = merge(

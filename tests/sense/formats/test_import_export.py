@@ -40,10 +40,9 @@ def test_export_file_round_trip_with_missing_values(eight: Recording, tmp_path: 
 
 def unrelated(folder: Path) -> dict[str, bytes]:
     """Return the content of files of other kinds, by name."""
-    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8))
-    for kind in ("png", "jpeg", "bmp", "tiff"):
-        image.save(folder / f"image.{kind}")
-    return {path.suffix: path.read_bytes() for path in folder.iterdir()} | {
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8)).save(folder / "image.png")
+    return {
+        "image": (folder / "image.png").read_bytes(),
         "empty": b"",
         "zeros": bytes(2000),
         "text": b"dear all,\nplease find attached\n",
@@ -57,7 +56,7 @@ def unrelated(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("end", ["mat", "csv", "h5", "mcap", "db3"])
 def test_import_refuses_files_of_another_kind(tmp_path: Path, end: str) -> None:
     for name, content in unrelated(tmp_path).items():
-        file = tmp_path / f"{name.strip('.')}.{end}"
+        file = tmp_path / f"{name}.{end}"
         file.write_bytes(content)
         result = CliRunner().invoke(sense, ["import", str(file), "--out", str(tmp_path / "out")])
         assert isinstance(result.exception, InputError), (name, result.exception)
