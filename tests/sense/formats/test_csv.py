@@ -62,7 +62,7 @@ def test_import_csv_refuses_other_tables(tmp_path: Path, text: str, message: str
 LAB = """# bench 2
 t_ms;ch1;ch2;note;px;py;contact;f
 0;1000,5;2000;begin;1,5;2;0;0
-100;1001;2000;;1,5;2;1;250
+100;1001;2000;;1,5;2;1;200
 200;;2000;loud;1,5;2;1;250
 300;1000;2000;;-0,5;2;0;0
 400;1000;2000;;-0,5;2;1;500

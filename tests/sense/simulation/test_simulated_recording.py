@@ -87,6 +87,9 @@ def test_model_twin_follows_the_plan_transform() -> None:
     plain, mirrored = (model_twin(twin_of(PlanTransform(mirrored=mirrored))) for mirrored in (False, True))
     assert mirrored.responses(positions * [-1, 1]) == pytest.approx(plain.responses(positions))
     assert np.abs(mirrored.responses(positions) - plain.responses(positions)).max() > 0.01
+    keep_out = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))  # of the plan, so on the other side if mirrored
+    free = model_twin(twin_of(PlanTransform(mirrored=True)), PadSettings(keep_out_mm=(keep_out,))).free
+    assert free(np.array([[5.0, 0.0], [-5.0, 0.0]])).tolist() == [True, False]
     twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
     for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
         recording = simulate(replace(twin, frame=PlanTransform(turn_deg=turn_deg)), RigSettings(presses=400))
