@@ -121,6 +121,7 @@ def test_export_lerobot_puts_every_frame_in_an_episode(eight: Recording, tmp_pat
     assert set(map(tuple, columns["observation.touch"][over])) == {(3.0, 3.0, 2.5, 1.0)}
     assert not columns["observation.touch"][~over].any()
     assert not (over & (columns["action"][:, -1] == 1)).any()
+    assert over[positioned.up_command[:-1]].all()
     assert columns["observation.force"].max() == 7
 
 
