@@ -54,14 +54,6 @@ def check_magnitude(name: str, values: Array, limit: float, unit: str, missing: 
         )
 
 
-def check_ascending(times_s: Array) -> None:
-    """Raise InputError unless each time (n,) is later than the one before."""
-    is_later = np.diff(times_s) > 0
-    if not is_later.all():
-        row = int(np.argmin(is_later)) + 1
-        raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
-
-
 def check_stream(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = None) -> tuple[Array, Array]:
     """Check readings (n, C), V, NaN where missing, and their times (n,), s, and convert them to float64.
 
@@ -79,5 +71,8 @@ def check_stream(times_s: ArrayLike, readings: ArrayLike, fibres: int | None = N
         raise InputError(f"readings are of {rows.shape[1]} fibres, allowed is 1 to {MAX_FIBRES}")
     check_magnitude("readings", rows, MAX_VOLTS, "V", missing=True)
     check_magnitude("times", times[:, None], MAX_S, "s")
-    check_ascending(times)
+    is_later = np.diff(times) > 0
+    if not is_later.all():
+        row = int(np.argmin(is_later)) + 1
+        raise InputError(f"times do not ascend at reading {row}, expected every reading later than the one before")
     return times, rows

@@ -25,6 +25,7 @@ def _check_plan(value: str) -> str:
 
 Unknown, Unwatched = null_as("unknown"), null_as("unwatched")
 Millimetres = Annotated[float, Field(ge=-1e4, le=1e4)]
+Box = tuple[Millimetres, Millimetres, Millimetres, Millimetres, Millimetres, Millimetres]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Depth = Annotated[float, Field(gt=0, le=50)]
 Force = Annotated[float, Field(gt=0, le=250)]
@@ -78,11 +79,9 @@ class RigSettings(Settings):
     channels: Annotated[tuple[Input, ...], BeforeValidator(as_tuple)] = Field(
         default=(), max_length=512, description="input of the board that each fibre is on, from 0; [] in order"
     )
-    box_mm: Annotated[
-        tuple[Millimetres, Millimetres, Millimetres, Millimetres, Millimetres, Millimetres] | None,
-        BeforeValidator(as_tuple),
-        *Unknown,
-    ] = Field(default=None, description='workspace [x0, x1, y0, y1, z0, z1] in the base frame, or "unknown"')
+    box_mm: Annotated[Box | None, BeforeValidator(as_tuple), *Unknown] = Field(
+        default=None, description='workspace [x0, x1, y0, y1, z0, z1] in the base frame, or "unknown"'
+    )
     contact_mm: Annotated[Millimetres | None, *Unknown] = Field(
         default=None, description='height of the pad\'s surface in the base frame, or "unknown"'
     )
@@ -97,11 +96,9 @@ class RigSettings(Settings):
     tool_rad: Annotated[tuple[Angle, Angle, Angle], BeforeValidator(as_tuple)] = Field(
         default=(0.0, 3.141592653589793, 0.0), description="rotation vector of the tool, pointing down, radians"
     )
-    tcp_mm: Annotated[
-        tuple[Millimetres, Millimetres, Millimetres] | None,
-        BeforeValidator(as_tuple),
-        *Unknown,
-    ] = Field(default=None, description='the tip [x, y, z] from the flange, as set on the controller, or "unknown"')
+    tcp_mm: Annotated[tuple[Millimetres, Millimetres, Millimetres] | None, BeforeValidator(as_tuple), *Unknown] = Field(
+        default=None, description='the tip [x, y, z] from the flange, as set on the controller, or "unknown"'
+    )
     max_depth_mm: float = Field(default=6.0, gt=0, le=50, description="no press is deeper, mm")
     clearance_mm: float = Field(default=10.0, ge=1, le=500, description="height above the surface between presses, mm")
     travel_mm_s: float = Field(default=100.0, gt=0, le=500, description="speed between presses, mm/s")

@@ -1,11 +1,9 @@
 """Recordings from and to CSV.
 
-Padforge's own columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm`
-and `y_mm`. The last two hold the position of the press while the probe is sent down, `?` where it is unknown, and are
-empty on all other lines: a press begins on the first line of a run of equal positions, and ends on the first one after
-it. Where any press has them, `depth_mm` (commanded), `reached_mm` and `force_n` follow. Where no line has a position,
-all lines have one, or the two columns are missing, presses are detected in the readings. Other columns are named by a
-mapping (`columns`).
+Columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm` and `y_mm`: the
+position of the press while the probe is sent down, `?` where it is unknown, and empty on all other lines. A press is a
+run of equal positions; where no line or every line has one, presses are detected in the readings. `depth_mm`
+(commanded), `reached_mm` and `force_n` follow where any press has them. A mapping (`columns`) names other columns.
 """
 
 import csv

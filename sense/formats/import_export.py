@@ -10,8 +10,7 @@ from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.csv_recording import export_csv, import_csv
 from padforge.sense.formats.hdf5_mat import export_hdf5, import_hdf5, import_mat
 from padforge.sense.formats.lerobot import export_lerobot
-from padforge.sense.formats.ros_bag import METADATA, SUFFIXES
-from padforge.sense.formats.ros_recording import export_bag, import_bag
+from padforge.sense.formats.ros_recording import METADATA, SUFFIXES, export_bag, import_bag
 from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import START, STATE_COLUMNS, STATES

@@ -4,8 +4,8 @@ Numbers are in the units of REP 103: m, N and V. Positions are in the frame `pad
 x and y run as on the plan, and z points away from the surface; for a pad that lay mirrored z points into it, so that
 the frame is right-handed there, too. The messages of a press come with the reading that follows its begin or its end.
 
-Messages round a recording, to whole ns and from mm to m. The topic RECORDING holds its exact numbers as JSON; they are
-taken where the other messages still say the same.
+Messages round a recording, to whole ns and from mm to m. RECORDING holds its exact numbers as JSON, which are taken
+where the other messages still say the same.
 """
 
 import json
@@ -18,7 +18,6 @@ import numpy as np
 from padforge.design.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_S, Array, Indices, Mask
 from padforge.sense.formats.annotations import ModelAnnotations
-from padforge.sense.formats.ros_bag import RawMessages
 from padforge.sense.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -86,6 +85,14 @@ TOPICS = {
         (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")),
     ),
 }
+
+
+class RawMessages(NamedTuple):
+    """Messages of a topic in the order of the file: their type, and the log time (ns) and CDR of each."""
+
+    msgtype: str
+    stamps: list[int]
+    messages: list[bytes]
 
 
 class TopicSeries(NamedTuple):
@@ -293,13 +300,13 @@ def encode_health(
 ) -> tuple[Indices, list[memoryview]]:
     """Return HEALTH, (n,) stamps and messages: all fibres at the first reading, and whenever a fault was named."""
     faults = dict.fromkeys(annotations.dead, ("dead", "was dead in the recording that health was learnt from"))
-    health_stamps, messages = [int(stamps[0])], [_health_message(store, recording.fibres, faults, int(stamps[0]))]
-    ends = stamps_at(stamps, recording.up_command)
+    states = [(int(stamps[0]), faults)]
+    ends = stamps_at(stamps, recording.up_command).tolist()
     for fault in annotations.faults or ():
-        faults |= dict.fromkeys(fault.fibres, (fault.kind, fault.text))
-        health_stamps.append(int(ends[min(fault.press, len(ends) - 1)]))
-        messages.append(_health_message(store, recording.fibres, faults, health_stamps[-1]))
-    return np.array(health_stamps, np.int64), messages
+        faults = faults | dict.fromkeys(fault.fibres, (fault.kind, fault.text))
+        states.append((ends[min(fault.press, len(ends) - 1)], faults))
+    messages = [_health_message(store, recording.fibres, faults, stamp) for stamp, faults in states]
+    return np.array([stamp for stamp, _ in states], np.int64), messages
 
 
 def _health_message(store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int) -> memoryview:

@@ -1,19 +1,30 @@
-"""Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics."""
+"""Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics.
 
-from collections.abc import Mapping, Sequence
+MCAP is read by the library rosbags, SQLite by the standard library, and neither is trusted: a file may claim anything.
+Messages are read in sequence, whatever an index says; chunks are unpacked to no more than they claim and than
+MAX_CHUNK_BYTES; of a folder only the storage files directly in it are opened; SQLite files are opened read-only, and
+must consist of plain tables that hold no more than the file does.
+"""
+
+import re
+import sqlite3
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from heapq import merge
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import UNFINISHED, atomic_files, reraise_write_error
+from padforge.design.common.files import UNFINISHED, atomic_files, check_file, read_bytes, reraise_write_error
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array, Indices, check_numbers
+from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.columns import (
     MILLIMETRES,
@@ -28,7 +39,6 @@ from padforge.sense.formats.columns import (
     parse_columns,
 )
 from padforge.sense.formats.hdf5_mat import NOTE
-from padforge.sense.formats.ros_bag import MAX_BYTES, MAX_MESSAGES, RawMessages, load_typestore, read_bag, write_mcap
 from padforge.sense.formats.ros_messages import (
     ARM,
     FORCE,
@@ -40,24 +50,26 @@ from padforge.sense.formats.ros_messages import (
     RECORDING,
     TOPICS,
     TOUCHES,
+    RawMessages,
     TopicSeries,
-    arm_poses,
-    choose_epoch,
-    decode,
-    decode_text,
-    encode,
-    encode_health,
-    encode_recording,
-    from_text,
-    stamps_at,
-    to_topics,
-    touches,
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+MAX_FILE_BYTES, MAX_METADATA_BYTES = 2**33, 2**24
+MAX_CHUNK_BYTES = 2**26
+"""Unpacked size of a chunk; recorders make them of 1 to 4 MiB."""
+FREE_CHUNK_BYTES, MAX_COMPRESSION = 2**22, 64
+"""Unpacked size that is always allowed, and compression ratio that a larger chunk may have."""
+MAX_MESSAGES, MAX_BYTES = 2**22, 2**28
+"""Messages, and their bytes, of all topics that are asked for."""
+MAX_TOPICS = 10_000
+SUFFIXES = (".mcap", ".db3")
+METADATA = "metadata.yaml"
+"""The file that makes a folder a rosbag2 bag."""
 
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
@@ -90,6 +102,173 @@ _TYPES: dict[str, Mapping[str, tuple[str, ...]]] = {
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
+def load_typestore(purpose: str) -> "Typestore":
+    """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[ros]'") from error
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> tuple[dict[str, RawMessages], dict[str, str]]:
+    """Read messages of a bag: an .mcap or .db3 file, or a folder of such with METADATA.
+
+    Returns:
+        The topics asked for (by `is_wanted` of their names) that have messages, and the types of all, by name.
+    """
+    topics, types, n_messages, n_bytes = dict[str, RawMessages](), dict[str, str](), 0, 0
+    for file in _storage_files(path):
+        file = check_file(file, MAX_FILE_BYTES)
+        with _one_line_errors(file), closing(_read_storage(file, types, is_wanted)) as messages:
+            for name, stamp, message in messages:
+                topic = topics.setdefault(name, RawMessages(types[name], [], []))
+                topic.stamps.append(stamp)
+                topic.messages.append(message)
+                n_messages, n_bytes = n_messages + 1, n_bytes + len(message)
+                if n_bytes > MAX_BYTES or n_messages > MAX_MESSAGES:
+                    raise InputError(f"the topics read have more than {MAX_MESSAGES} messages or {MAX_BYTES} bytes")
+    return topics, types
+
+
+def _storage_files(path: Path) -> list[Path]:
+    """Return the files of a bag in the order in which they were recorded."""
+    if not path.is_dir():
+        return [path]
+    metadata = read_bytes(path / METADATA, MAX_METADATA_BYTES).decode(errors="replace")
+    mode = re.search(r"^[ \t]*compression_mode:[ \t]*[\"']?(file|message)\b", metadata, re.IGNORECASE | re.MULTILINE)
+    if mode:
+        raise InputError(f"{path}: is compressed by {mode[1]}, expected none or by chunk (ros2 bag convert)")
+
+    def number(file: Path) -> tuple[int, str]:
+        suffix = re.search(r"_(\d{1,9})$", file.stem)
+        return (int(suffix[1]) if suffix else -1, file.name)
+
+    files = sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=number)
+    if not files:
+        raise InputError(f"{path}: has {METADATA}, but no file that ends in {' or '.join(SUFFIXES)}")
+    return files
+
+
+@contextmanager
+def _one_line_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # rosbags raises many kinds on torn files
+        reason = " ".join(f"{error or type(error).__name__}".replace(str(path), path.name).split())[:200]
+        raise InputError(f"{path}: no bag, or cut off or damaged ({reason})") from error
+
+
+def _read_storage(
+    path: Path, types: dict[str, str], is_wanted: Callable[[str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
+    """Yield topic, stamp and content of the messages asked for, and add the types of all topics."""
+
+    def is_selected(name: str, msgtype: str, encoding: str) -> bool:
+        msgtype = msgtype if msgtype.count("/") == 2 else msgtype.replace("/", "/msg/")  # the short form of ROS 1
+        if types.setdefault(name, msgtype) != msgtype:
+            raise InputError(f"topic {short_repr(name)} is of {short_repr(types[name])} and of {short_repr(msgtype)}")
+        if len(types) > MAX_TOPICS:
+            raise InputError(f"it has more than {MAX_TOPICS} topics")
+        if is_wanted(name) and encoding != "cdr":
+            raise InputError(f"topic {short_repr(name)} is written as {short_repr(encoding)}, expected 'cdr'")
+        return is_wanted(name)
+
+    return (_read_mcap if path.suffix.lower() == ".mcap" else _read_sqlite)(path, is_selected)
+
+
+def _read_mcap(
+    path: Path, is_selected: Callable[[str, str, str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
+    from rosbags.rosbag2 import storage_mcap
+
+    storage = storage_mcap.McapReader(path)
+    with _guarded(storage_mcap):
+        storage.open()
+        with closing(storage):
+            selected = [
+                connection
+                for connection in storage.connections
+                if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
+            ]
+            n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
+            for connection, stamp, message in storage.messages_scan(selected):
+                n_messages += 1
+                yield connection.topic, stamp, message
+    if n_messages < n_expected:  # rosbags ends without an error at a record that is longer than its chunk
+        raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
+
+
+@contextmanager
+def _guarded(storage_mcap: Any) -> Iterator[None]:
+    """Have rosbags unpack no more than is allowed, and leave out the YAML of QoS, which may be long."""
+    decompressors, get_qos = storage_mcap.DECOMPRESSORS, storage_mcap.get_qos
+    storage_mcap.DECOMPRESSORS = {name: _bounded(name) for name in decompressors}
+    storage_mcap.get_qos = lambda metadata: []
+    try:
+        yield
+    finally:
+        storage_mcap.DECOMPRESSORS, storage_mcap.get_qos = decompressors, get_qos
+
+
+def _bounded(compression: str) -> Callable[[bytes, int], bytes]:
+    """Return a decompressor for rosbags that stops at the size that a chunk claims, and refuses large claims."""
+
+    def decompress(packed: bytes, size: int) -> bytes:
+        limit = min(MAX_CHUNK_BYTES, max(FREE_CHUNK_BYTES, MAX_COMPRESSION * len(packed)))
+        if size > limit:
+            raise InputError(f"a chunk claims {size} bytes in {len(packed)} of the file, allowed are {limit}")
+        if compression == "lz4":
+            from lz4.frame import LZ4FrameDecompressor as Decompressor
+        elif compression == "zstd":
+            try:
+                from compression.zstd import ZstdDecompressor as Decompressor  # pyright: ignore  from Python 3.14 on
+            except ImportError:
+                from backports.zstd import ZstdDecompressor as Decompressor
+        else:
+            return packed
+        return Decompressor().decompress(packed, size + 1)
+
+    return decompress
+
+
+def _read_sqlite(
+    path: Path, is_selected: Callable[[str, str, str], bool]
+) -> Generator[tuple[str, int, bytes], None, None]:
+    with closing(sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)) as database:
+        _check_tables(database, path.stat().st_size)
+        topics = {
+            number: str(name)
+            for number, name, *types in database.execute("SELECT id, name, type, serialization_format FROM topics")
+            if is_selected(str(name), *map(str, types))
+        }
+        # Row by row as they are stored: to sort them, SQLite would keep all.
+        for number, stamp, message in database.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED"):
+            if number in topics:
+                if not isinstance(stamp, int) or not isinstance(message, bytes):
+                    raise InputError(f"a message has a {type(message).__name__} where rosbag2 has bytes")
+                yield topics[number], stamp, message
+
+
+def _check_tables(database: sqlite3.Connection, file_bytes: int) -> None:
+    """Check that a database has plain tables only: views and computed columns may take any time and memory."""
+    database.execute("PRAGMA trusted_schema = OFF")
+    for kind, name, sql in database.execute(
+        "SELECT type, name, sql FROM sqlite_master WHERE type != 'index'"
+    ).fetchall():
+        is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE")
+        columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall() if is_plain else []
+        if not is_plain or any(hidden for (hidden,) in columns):
+            raise InputError(f"has {short_repr(name)}, which is computed, expected the plain tables of rosbag2")
+    (size,) = database.execute("SELECT total(length(data)) FROM messages NOT INDEXED").fetchone()
+    if size > file_bytes:  # rows that lack a column have its default, which may be long
+        raise InputError(f"its messages claim {size:.0f} bytes in {file_bytes} of the file")
+
+
 def import_bag(path: str | Path, columns: str = "") -> Recording:
     """Read a recording from a bag of ROS 2.
 
@@ -119,9 +298,11 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {TOPICS[name].msgtype}")
-        topics = {name: decode(store, raw[name], TOPICS[name].paths) for name in number_topics if name in raw}
+        topics = {
+            name: ros_messages.decode(store, raw[name], TOPICS[name].paths) for name in number_topics if name in raw
+        }
         if RECORDING in raw:
-            if (recording := _restore(decode_text(store, raw[RECORDING]), topics)) is not None:
+            if (recording := _restore(ros_messages.decode_text(store, raw[RECORDING]), topics)) is not None:
                 return recording
             source[NOTE] = f"was changed since it was exported; {RECORDING} is left out"
         arrays = _to_arrays(topics)
@@ -130,11 +311,11 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
 
 def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
     """Return the exact recording of the text in a bag; None if its messages say something else."""
-    restored = from_text(text, topics[READINGS].values)
+    restored = ros_messages.from_text(text, topics[READINGS].values)
     if restored is None:
         return None
     recording, epoch_s, digest = restored
-    expected = to_topics(recording, epoch_s)
+    expected = ros_messages.to_topics(recording, epoch_s)
     if expected.keys() != topics.keys() or not all(topics[name].equals(expected[name]) for name in expected):
         return None
     if recording.digest == digest:
@@ -183,7 +364,7 @@ def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, In
     was_down = np.append(False, is_down[:-1])
     down, up = pressed.stamps[is_down & ~was_down], pressed.stamps[~is_down & was_down]
     if len(up) < len(down):
-        up = np.append(up, stamps_at(readings, np.array([len(readings)])))
+        up = np.append(up, ros_messages.stamps_at(readings, np.array([len(readings)])))
     valid = (down > readings[0]) & (down <= readings[-1])
     if not valid.any():
         raise InputError("press is nowhere true after the first reading")
@@ -224,7 +405,7 @@ def _decode_entry(store: "Typestore", entry: ColumnEntry, name: str, raw: Mappin
     if raw[name].msgtype not in types:
         raise InputError(f"{what} of {short_repr(raw[name].msgtype)}, expected {', '.join(types)}")
     with naming_file(what):
-        return decode(store, raw[name], types[raw[name].msgtype])
+        return ros_messages.decode(store, raw[name], types[raw[name].msgtype])
 
 
 def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:
@@ -254,18 +435,20 @@ def export_bag(
         if states.shape[1:] != (len(STATE_COLUMNS),):
             raise InputError(f"states have shape {states.shape}, expected (n, {len(STATE_COLUMNS)})")
     store = load_typestore(f"{path}: MCAP")
-    epoch_s = choose_epoch(recording.times_s)
-    topics = to_topics(recording, epoch_s)
+    epoch_s = ros_messages.choose_epoch(recording.times_s)
+    topics = ros_messages.to_topics(recording, epoch_s)
     if annotations is not None:
-        topics[TOUCHES] = touches(recording, annotations, epoch_s)
+        topics[TOUCHES] = ros_messages.touches(recording, annotations, epoch_s)
     if states is not None:
-        topics[ARM] = arm_poses(states, epoch_s)
+        topics[ARM] = ros_messages.arm_poses(states, epoch_s)
     stamps = {topic: series.stamps for topic, series in topics.items()}
-    messages = {topic: encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)}
+    messages = {
+        topic: ros_messages.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)
+    }
     if annotations is not None and annotations.faults is not None:
-        stamps[HEALTH], messages[HEALTH] = encode_health(store, recording, annotations, stamps[READINGS])
+        stamps[HEALTH], messages[HEALTH] = ros_messages.encode_health(store, recording, annotations, stamps[READINGS])
     stamps[RECORDING] = stamps[READINGS][:1]
-    messages = {RECORDING: [encode_recording(store, recording, epoch_s, messages)], **messages}
+    messages = {RECORDING: [ros_messages.encode_recording(store, recording, epoch_s, messages)], **messages}
     _check_readable(messages)
     types = {topic: (TOPICS[topic].msgtype, TOPICS[topic].description) for topic in messages}
     in_order = merge(
@@ -285,3 +468,45 @@ def _check_readable(messages: Mapping[str, Sequence[memoryview]]) -> None:
             f"recording would be {len(read)} messages of {size} bytes, "
             f"allowed in a bag are {MAX_MESSAGES} of {MAX_BYTES}"
         )
+
+
+def write_mcap(
+    folder: Path,
+    store: "Typestore",
+    topics: Mapping[str, tuple[str, str]],
+    messages: Iterable[tuple[str, int, memoryview]],
+    latched: str,
+) -> Path:
+    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return the .mcap file that holds them.
+
+    Topics have a type and a description. The last message of the `latched` one is for those that come later.
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for topic, (msgtype, description) in topics.items():
+            writer.set_custom_data(topic, description)
+            connections[topic] = writer.add_connection(
+                topic, msgtype, typestore=store, offered_qos_profiles=[_qos(topic == latched)]
+            )
+        for topic, stamp, message in messages:
+            writer.write(connections[topic], stamp, message)
+    return folder / f"{folder.name}.mcap"
+
+
+def _qos(is_latched: bool) -> Any:
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(2147483647, 4294967295)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if is_latched else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE,
+        deadline=never,
+        lifespan=never,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=never,
+        avoid_ros_namespace_conventions=False,
+    )

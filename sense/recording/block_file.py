@@ -8,6 +8,7 @@ torn last block, which is cut off by readers; damage before an intact block has 
 import os
 import re
 import zlib
+from itertools import takewhile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -142,15 +143,9 @@ def _intact_blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]
 
 def _begins_with_block(content: bytes) -> bool:
     """Whether the content begins with an intact block of any number of fibres."""
-    if not content.startswith(_MAGIC):
-        return False
-    for dtype in map(block_dtype, range(1, MAX_FIBRES + 1)):
-        if len(content) < dtype.itemsize:
-            return False
-        block = np.frombuffer(content, dtype, count=1)
-        if block["crc"][0] == _checksums(block)[0]:
-            return True
-    return False
+    dtypes = map(block_dtype, range(1, MAX_FIBRES + 1))
+    fitting = takewhile(lambda dtype: dtype.itemsize <= len(content), dtypes)
+    return content.startswith(_MAGIC) and any(_has_valid_crc(content, dtype, 0) for dtype in fitting)
 
 
 def _has_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
@@ -158,12 +153,15 @@ def _has_block(content: bytes, dtype: np.dtype[np.void]) -> bool:
     for match in re.finditer(re.escape(_MAGIC), content[: max(len(content) - dtype.itemsize + len(_MAGIC), 0)]):
         start = match.start()
         count = int.from_bytes(content[start + _COUNT_OFFSET : start + _CRC_OFFSET], "little")
-        if count > dtype["rows"].shape[0]:  # quick, in a file full of magic words
-            continue
-        block = np.frombuffer(content, dtype, count=1, offset=start)
-        if block["crc"][0] == _checksums(block)[0]:
+        # The count is checked first: that is quick, in a file full of magic words.
+        if count <= dtype["rows"].shape[0] and _has_valid_crc(content, dtype, start):
             return True
     return False
+
+
+def _has_valid_crc(content: bytes, dtype: np.dtype[np.void], start: int) -> bool:
+    block = np.frombuffer(content, dtype, count=1, offset=start)
+    return bool(block["crc"][0] == _checksums(block)[0])
 
 
 def _checksums(blocks: NDArray[np.void]) -> NDArray[np.uint32]:

@@ -19,15 +19,13 @@ from padforge.sense.arrays import (
     MAX_MM,
     MAX_N,
     MAX_RATE_HZ,
-    MAX_S,
-    MAX_VOLTS,
     MIN_RATE_HZ,
     Array,
     Indices,
     Mask,
-    check_ascending,
     check_magnitude,
     check_numbers,
+    check_stream,
 )
 from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.run_directory import (
@@ -251,13 +249,9 @@ def _check_readings(recording: Recording) -> None:
     readings, times_s = recording.readings, recording.times_s
     if readings.ndim != 2 or not 1 <= readings.shape[1] <= MAX_FIBRES or len(readings) < 2:
         raise InputError(f"readings have shape {readings.shape}, expected (R, C), R >= 2, C = 1 to {MAX_FIBRES}")
-    if times_s.shape != (len(readings),):
-        raise InputError(f"times have shape {times_s.shape}, expected ({len(readings)},)")
-    check_magnitude("readings", readings, MAX_VOLTS, "V", missing=True)
-    check_magnitude("times", times_s[:, None], MAX_S, "s")
+    check_stream(times_s, readings)
     if np.isnan(readings).all():
         raise InputError(f"readings are all missing (NaN), all {readings.size} of them, expected some numbers")
-    check_ascending(times_s)
     if not MIN_RATE_HZ <= recording.rate_hz <= MAX_RATE_HZ:
         raise InputError(
             f"times give {recording.rate_hz:g} readings a second, allowed is {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"

@@ -65,11 +65,7 @@ PAD = np.dtype(
 """State of the pad."""
 
 BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
-FADE_S, SLOPE_S, NOISE_S = (
-    2.5,
-    1.0,
-    10.0,
-)  # in which a slope fades (as an overshoot does), is learnt, and noise is
+FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0  # in which a slope fades (as an overshoot does), is learnt, and noise is
 GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer starts anew; a longer run without agreement is grown noise
 WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # before the first change; after n blocks noise is widened by ROUGH_BLOCKS / n
 LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # shares of a step by which level, and slope per s, may be wrong: silicone settles

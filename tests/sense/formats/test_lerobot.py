@@ -34,72 +34,55 @@ def check_dataset(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], 
     assert {name: info["features"][name]["dtype"] for name in COUNTED} == COUNTED
     episodes = pq.read_table(sorted((folder / "meta" / "episodes").glob("*/*.parquet"))).to_pylist()
     assert info["splits"] == {"train": f"0:{len(episodes)}"}
-    assert info["total_episodes"] == len(episodes)
     tasks = pq.read_table(folder / "meta" / "tasks.parquet")
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]  # pandas has the text as index
-    assert tasks["task_index"].to_pylist() == list(range(info["total_tasks"]))
+    assert tasks["task_index"].to_pylist() == [0]
     columns = read_columns(folder, info, episodes)
-    check_counts(info, columns, episodes, tasks["task"].to_pylist())
-    check_statistics(folder, info, columns, episodes)
-    return info, columns, episodes
-
-
-def read_columns(folder: Path, info: dict[str, Any], episodes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return all frames, from the files that the episodes name, one row group an episode."""
-    parts: list[dict[str, np.ndarray]] = []
-    path = folder
-    files = sorted({(each["data/chunk_index"], each["data/file_index"]) for each in episodes})
-    assert len(files) == len(list((folder / "data").glob("*/*.parquet")))
-    for chunk, file in files:
-        path = folder / info["data_path"].format(chunk_index=chunk, file_index=file)
-        table = pq.read_table(path)
-        assert set(table.column_names) == set(info["features"])
-        held = [each for each in episodes if (each["data/chunk_index"], each["data/file_index"]) == (chunk, file)]
-        assert [each["episode_index"] for each in held] == sorted(set(table["episode_index"].to_pylist()))
-        assert pq.ParquetFile(path).num_row_groups == len(held)
-        parts.append({name: np.array(table[name].to_pylist()) for name in table.column_names})
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    schema = pq.read_schema(path)
-    for name, about in info["features"].items():
-        kind = schema.field(name).type
-        wanted = tuple(about["shape"])
-        assert "/" not in name
-        number = {"float32": "float", "int64": "int64"}[about["dtype"]]
-        assert str(kind) == (number if wanted == (1,) else f"fixed_size_list<element: {number}>[{wanted[0]}]")
-        assert columns[name].shape[1:] == (() if wanted == (1,) else wanted)
-        assert about["names"] is None or len(about["names"]) == wanted[0]
-    return columns
-
-
-def check_counts(info: dict, columns: dict[str, np.ndarray], episodes: list[dict], tasks: list[str]) -> None:
     assert columns["index"].tolist() == list(range(info["total_frames"]))
     end = 0
     for number, episode in enumerate(episodes):
-        assert episode["episode_index"] == number
+        assert (episode["episode_index"], episode["tasks"]) == (number, tasks["task"].to_pylist())
         assert (episode["dataset_from_index"], episode["dataset_to_index"]) == (end, end + episode["length"])
         rows = slice(end, end := end + episode["length"])
         assert set(columns["episode_index"][rows]) == {number}
         assert columns["frame_index"][rows].tolist() == list(range(episode["length"]))
         np.testing.assert_allclose(columns["timestamp"][rows] * info["fps"], np.arange(episode["length"]), atol=1e-4)
-        assert {tasks[at] for at in columns["task_index"][rows]} == set(episode["tasks"])
         assert episode["meta/episodes/chunk_index"] == episode["meta/episodes/file_index"] == 0
-    assert end == info["total_frames"]
-
-
-def check_statistics(folder: Path, info: dict, columns: dict[str, np.ndarray], episodes: list[dict]) -> None:
+    assert (end, len(episodes)) == (info["total_frames"], info["total_episodes"])
     overall = json.loads((folder / "meta" / "stats.json").read_text())
-    assert set(overall) == set(info["features"])
     for name, values in columns.items():
-        assert set(overall[name]) == STATISTICS
-        rows = values.reshape(len(values), -1).astype(float)
-        spans = [(each["dataset_from_index"], each["dataset_to_index"]) for each in episodes]
-        of_episodes = [{key: each[f"stats/{name}/{key}"] for key in STATISTICS} for each in episodes]
-        for (start, end), about in zip([(0, len(rows)), *spans], [overall[name], *of_episodes], strict=True):
-            part = rows[start:end]
-            assert about["count"] == [len(part)]
-            for key, expected in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
-                np.testing.assert_allclose(about[key], expected(part, axis=0), rtol=1e-5, atol=1e-6)
-            np.testing.assert_allclose(about["q90"], np.nanquantile(part, 0.9, axis=0), rtol=1e-5)
+        check_statistics(overall[name], values)
+        for each in episodes:
+            part = values[each["dataset_from_index"] : each["dataset_to_index"]]
+            check_statistics({key: each[f"stats/{name}/{key}"] for key in STATISTICS}, part)
+    return info, columns, episodes
+
+
+def read_columns(folder: Path, info: dict[str, Any], episodes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Return all frames, from the files that the episodes name, one row group an episode."""
+    tables = []
+    for chunk, file in sorted({(each["data/chunk_index"], each["data/file_index"]) for each in episodes}):
+        path = folder / info["data_path"].format(chunk_index=chunk, file_index=file)
+        tables.append(pq.read_table(path))
+        held = [each for each in episodes if (each["data/chunk_index"], each["data/file_index"]) == (chunk, file)]
+        assert [each["episode_index"] for each in held] == sorted(set(tables[-1]["episode_index"].to_pylist()))
+        assert pq.ParquetFile(path).num_row_groups == len(held)
+    assert len(tables) == len(list((folder / "data").glob("*/*.parquet")))
+    assert set(tables[0].column_names) == set(info["features"])
+    for name, about in info["features"].items():
+        (width,), number = about["shape"], {"float32": "float", "int64": "int64"}[about["dtype"]]
+        expected = number if width == 1 else f"fixed_size_list<element: {number}>[{width}]"
+        assert {str(table.schema.field(name).type) for table in tables} == {expected}
+        assert about["names"] is None or len(about["names"]) == width
+    return {name: np.concatenate([np.array(table[name].to_pylist()) for table in tables]) for name in info["features"]}
+
+
+def check_statistics(statistics: dict[str, Any], values: np.ndarray) -> None:
+    rows = values.reshape(len(values), -1).astype(float)
+    assert (set(statistics), statistics["count"]) == (STATISTICS, [len(rows)])
+    for key, expected in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
+        np.testing.assert_allclose(statistics[key], expected(rows, axis=0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(statistics["q90"], np.nanquantile(rows, 0.9, axis=0), rtol=1e-5)
 
 
 def test_export_lerobot_writes_the_format(eight: Recording, tmp_path: Path) -> None:
@@ -138,6 +121,7 @@ def test_export_lerobot_puts_every_frame_in_an_episode(eight: Recording, tmp_pat
     assert set(map(tuple, columns["observation.touch"][over])) == {(3.0, 3.0, 2.5, 1.0)}
     assert not columns["observation.touch"][~over].any()
     assert not (over & (columns["action"][:, -1] == 1)).any()
+    assert over[positioned.up_command[:-1]].all()
     assert columns["observation.force"].max() == 7
 
 

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from padforge.benchmarks.filter import admm, fibre, linear_program
 from padforge.design.common.validation import InputError
 from padforge.sense import (
     RunningMedian,
@@ -95,19 +94,6 @@ def test_robust_total_variation_is_the_least_of_an_exhaustive_search(y, lam):
     assert objective(y, x, lam) <= least_by_search(y, lam) * (1 + 1e-9) + 1e-300
     assert y.min() <= x.min() + 5e-324  # between subnormal values there is nothing
     assert x.max() <= y.max()
-
-
-def test_total_variation_agrees_with_the_solvers_of_the_bench():
-    clean, y = fibre(1000, np.random.default_rng(3))
-    for lam in (1.0, 4.0, 17.3):
-        least = objective(y, total_variation(y, lam), lam)
-        assert objective(y, linear_program(y, lam), lam) == pytest.approx(least, rel=1e-9)
-    least = objective(y, total_variation(y, 4), 4)
-    assert least <= objective(y, admm(y, 4, 1000), 4) <= 1.01 * least
-    error = (y - clean) / STEP_V
-    assert np.median(np.abs(error)) < 2
-    assert 0.003 < (np.abs(error) > 8).mean() < 0.03
-    assert np.abs(total_variation(y, 4) - clean).mean() < 0.3 * np.abs(y - clean).mean()
 
 
 @settings(max_examples=50)
@@ -221,12 +207,9 @@ def test_filters_take_any_shape_layout_and_type(fidelity):
         np.testing.assert_array_equal(total_variation(other, 2, fidelity), total_variation(plain, 2, fidelity))
     assert total_variation(single, 2, fidelity).dtype == np.float64
     np.testing.assert_array_equal(single, y.astype(np.float32))  # readings are not changed
-    np.testing.assert_array_equal(total_variation([3, 1, 2], 50), [2, 2, 2])
     for shape in ((0,), (0, 3), (3, 0)):
         assert total_variation(np.empty(shape), 2, fidelity).shape == shape
         assert running_median(np.empty(shape), 5).shape == shape
-    assert total_variation([7.0], 2, fidelity) == [7]
-    np.testing.assert_allclose(total_variation([0.0, 1.0], 100, fidelity), 0.5)
 
 
 @settings(max_examples=50)
@@ -310,16 +293,10 @@ def test_a_flushed_stream_starts_anew(make):
     ("call", "message"),
     [
         (lambda: total_variation([1, np.inf], 4), r"readings hold inf \(first at \[1\]\), allowed is"),
-        (lambda: total_variation(np.zeros((2, 2, 2)), 4), r"shape \(2, 2, 2\), expected \(R,\) or \(R, C\)"),
         (lambda: total_variation([1], 0), "lam is 0, allowed is a number above 0"),
-        (lambda: total_variation([1], 4, "huber"), "fidelity is 'huber', allowed is robust or squares"),  # type: ignore[arg-type]
         (lambda: total_variation([1, 2], 4, starts=[2]), "starts are .*, allowed are ascending indices of 2 readings"),
-        (lambda: running_median([1], 4), "width is 4, allowed is an odd whole number above 0"),
         (lambda: find_segment_starts([0, 2, 1], 1), "times_s are .*, expected finite numbers that ascend"),
-        (lambda: find_segment_starts([0], 0), "max_interval_s is 0, allowed is a number above 0"),
-        (lambda: TotalVariation(0, 4), "channels is 0, allowed is a whole number from 1 to 512"),
         (lambda: TotalVariation(2, 4).update([[1, 2, 3]]), r"shape \(1, 3\), expected \(n, 2\)"),
-        (lambda: RunningMedian(1, 3).update([[1, 2]]), r"expected \(n, 1\)"),
     ],
 )
 def test_filters_refuse_wrong_arguments_in_one_line(call, message):
