@@ -53,25 +53,6 @@ class CalibrationData:
     rate_hz: float
     sha256: str  # of what they came from
 
-    @classmethod
-    def from_recording(cls, recording: Recording, training: Indices, options: LocalizerSettings) -> "CalibrationData":
-        """Compute the features of all presses of a recording; `training` are those that are trained on."""
-        from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
-
-        commands, detected = (recording.down_command, recording.up_command), None
-        if options.method == "ensemble":
-            again = align_to_detected(recording.readings, recording.times_s, *commands)
-            detected = compute_features(recording.readings, *again, options.features)
-        return cls(
-            compute_features(recording.readings, *commands, options.features),
-            detected,
-            recording.presses_mm,
-            known_measures(recording, training) if options.method == "ensemble" else {},
-            options.features,
-            recording.rate_hz,
-            recording.digest,
-        )
-
 
 def calibrate(
     recording: Recording,
@@ -111,8 +92,7 @@ def calibrate(
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"), one_torch_thread():
-        data = CalibrationData.from_recording(recording, training, options)
-        model = fit_model(data, training, options, rng, on_progress, time_budget)
+        model = fit_recording(recording, training, options, rng, on_progress, time_budget)
     model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     with stage("evaluate"):
         document = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
@@ -126,9 +106,21 @@ def fit_recording(
     options: LocalizerSettings,
     rng: np.random.Generator,
     on_progress: OnProgress = lambda done, total: None,
+    time_budget: float | None = None,
 ) -> LocalizerModel:
     """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
-    return fit_model(CalibrationData.from_recording(recording, training, options), training, options, rng, on_progress)
+    from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
+
+    readings, commands = recording.readings, (recording.down_command, recording.up_command)
+    detected, measures = None, {}
+    if options.method == "ensemble":
+        again = align_to_detected(readings, recording.times_s, *commands)
+        detected = compute_features(readings, *again, options.features)
+        measures = known_measures(recording, training)
+    features = compute_features(readings, *commands, options.features)
+    origin = options.features, recording.rate_hz, recording.digest
+    data = CalibrationData(features, detected, recording.presses_mm, measures, *origin)
+    return fit_model(data, training, options, rng, on_progress, time_budget)
 
 
 def fit_model(
@@ -225,14 +217,9 @@ def calibrate_intervals(
     levels: int,
     measures: Mapping[str, Array] | None = None,
 ) -> Array:
-    """Return the (levels, 3 + T) `interval_factors` that hold on presses never trained on.
+    """Return the (levels, 3 + T) `interval_factors`, by failed fibres, that hold on presses never trained on.
 
-    Args:
-        model: whose `interval_factors` are not used.
-        presses: of the calibration.
-        positions_mm: (Q, 2).
-        levels: numbers of failed fibres, from 0.
-        measures: (Q,) of each that is predicted, NaN where unknown.
+    Other arguments are as in `evaluation.conformal`.
     """
     plain = replace(model, interval_factors=np.ones((1, model.interval_factors.shape[1])))
     factors = []
@@ -303,16 +290,9 @@ def unlearnt_lines(recording: Recording, model: LocalizerModel) -> list[str]:
 def split_unseen(
     recording: Recording, model: LocalizerModel | None, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
-    """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen.
-
-    Raises:
-        InputError: the model was recalibrated by the recording, or there are too few presses.
-    """
-    known, digest = np.flatnonzero(recording.has_position), recording.digest
-    if model is not None and digest in model.recalibrated_by:
-        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    if model is not None and digest == model.training_recording_sha256:
-        test = held_back_presses(model, recording)
+    """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen."""
+    known = np.flatnonzero(recording.has_position)
+    if model is not None and (test := held_back_presses(model, recording)) is not None:
         return np.setdiff1d(known, test), test
     rng = np.random.default_rng(options.seed)
     training, test = split_presses(len(known), options.split, options.test_share, rng)
@@ -322,17 +302,9 @@ def split_unseen(
 def split_presses(
     presses: int, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
 ) -> tuple[Indices, Indices]:
-    """Return ascending indices of the presses to train on and of those held back: drawn at random, or the last.
+    """Return ascending indices of the presses to train on and of a share held back: drawn at random, or the last.
 
-    Args:
-        presses: how many there are.
-        split: "random" or "chronological".
-        share: of the presses to hold back.
-        rng: of the draw.
-        min_training: presses that must be left to train on.
-
-    Raises:
-        InputError: one of the two would have too few.
+    `split` is "random" or "chronological". InputError is raised if fewer than `min_training` would be left.
     """
     n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
     if not 1 <= n_held_back <= presses - min_training:

@@ -1,9 +1,8 @@
 """Features of presses: means of each fibre's readings over windows about a press, and its history before it.
 
-Windows are counted in readings from the one at which the probe was sent down, or up; where a window would reach into a
-neighbouring press, the nearest reading that does not is repeated. A feature is made of one fibre's readings alone, so
-that a failed fibre can be masked and affects no other. Readings may be missing (NaN): short gaps are interpolated, and
-a fibre that lacks too much of a press is masked in it.
+Windows are counted in readings from the command; where one would reach into a neighbouring press, the nearest reading
+that does not is repeated. A feature is made of one fibre's readings alone, so that a failed fibre can be masked and
+affects no other. Short gaps (NaN) are interpolated, and a fibre that lacks too much of a press is masked in it.
 """
 
 from dataclasses import dataclass
@@ -91,13 +90,9 @@ class PressFeatures:
 
 
 def compute_features(readings: Array, down_command: Indices, up_command: Indices, features: str) -> PressFeatures:
-    """Compute the features of every press.
+    """Compute the features, a name in `FEATURES`, of every press from (R, C) readings, V, NaN where missing.
 
-    Args:
-        readings: (R, C) V, NaN where missing.
-        down_command: (Q,) first reading after the probe was sent down.
-        up_command: (Q,) first reading after it was sent up.
-        features: a name in `FEATURES`.
+    Commands are the (Q,) first readings after the probe was sent down, and after it was sent up.
     """
     filled, kind = interpolate_gaps(readings), FEATURES[features]
     # A press counts up to its end, or to the end of its release if that is looked at.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,20 +70,24 @@ def files_of(folder: str | Path, name: str) -> ModelFiles:
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 
-class TrainedModel(Protocol):
-    """A model of `fibres` fibres, trained at `rate_hz` readings per second."""
+def check_arrays(
+    arrays: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[tuple[int, ...], type]], limit: float
+) -> None:
+    """Raise InputError unless arrays have the expected shapes and types, and entries up to a limit."""
+    actual = {name: (array.shape, array.dtype.type) for name, array in arrays.items()}
+    if actual != expected:
+        wrong = min(name for name in actual.keys() | expected if actual.get(name) != expected.get(name))
+        raise InputError(f"{wrong} is {actual.get(wrong)}, expected {expected.get(wrong)}")
+    for name, array in arrays.items():
+        largest = np.abs(array).max(initial=0)
+        if not largest <= limit:
+            raise InputError(f"{name} is up to {largest:g}, allowed is up to {limit:g}")
 
-    @property
-    def fibres(self) -> int: ...
 
-    @property
-    def rate_hz(self) -> float: ...
-
-
-def check_same_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
+def check_same_pad(model: Any, what: str, fibres: int, rate_hz: float) -> None:
     """Raise InputError if readings have another number of fibres, or another rate, than the training of a model.
 
-    `what` is the name of the model in messages; fibres and rate are those of the readings.
+    `what` is the name of the model in messages; it has `fibres` and `rate_hz`, as the readings.
     """
     if fibres != model.fibres:
         raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")

@@ -48,13 +48,8 @@ class ResponseModel:
     ) -> "ResponseModel":
         """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
 
-        Args:
-            positions: (Q, 2) within [-1, 1].
-            windows: (Q, C, F), V.
-            history: (Q, C, J), V.
-            fibre_mask: (Q, C).
-            relative_depth: (Q,) depth of each press over that of the table; None if all are equal.
-            phases: windows whose sensitivity is modulated together.
+        Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V. `relative_depth` (Q,) is that
+        of each press over that of the table; windows of a phase have their sensitivity modulated together.
         """
         fibres, pasts = history.shape[1:]
         size, n_rbf = windows.shape[2], RBF_SIDE**2

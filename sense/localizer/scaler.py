@@ -102,16 +102,8 @@ class FeatureScaler:
         """Fit the response model of the pad and the scaling of its features.
 
         A window is divided by the geometric mean of its own standard deviation and its fibre's, so that the fine
-        windows of a touch keep some of their smallness, and so of their noise.
-
-        Args:
-            features: of the presses of training.
-            positions_mm: (Q, 2).
-            measures: (Q,) of each of depth and force to be predicted.
-            phases: windows whose sensitivity is modulated together.
-
-        Returns:
-            The scaler, and the (S, S, C, F + G) scaled response by position, at the scaled depth 0 if depths vary.
+        windows of a touch keep some of their smallness, and so of their noise. `phases` are as in `ResponseModel.fit`.
+        Also returned is the (S, S, C, F + G) scaled response by position, at the scaled depth 0 if depths vary.
         """
         targets = tuple(TargetScaler.fit(name, values) for name, values in (measures or {}).items())
         low, high = positions_mm.min(axis=0), positions_mm.max(axis=0)

@@ -56,9 +56,8 @@ def spline_weights(f: float, out: Any) -> None:
 def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
     """Evaluate cubic B-splines of coefficients (n, J) from end to end of F elements.
 
-    Returns:
-        Values at each element, and their change over it; shape (2, n, F). First coefficient that each element depends
-        on; shape (F,). Derivatives of value and change by that one and the next three; shape (2, F, 4).
+    Returned are values at each element and their change over it (2, n, F); the first coefficient that each element
+    depends on (F,); and the derivatives of value and change by that one and the next three (2, F, 4).
     """
     curves, count = coefficients.shape
     pieces = count - 3
@@ -80,19 +79,12 @@ def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
 def channel_response(
     fibre: Any, lateral_offset: Any, log_sensitivity: Any, positions: Any, profile: Any, step: float
 ) -> Any:
-    """Compute the responses of one fibre, and their derivatives; grid units.
+    """Compute the responses (Q,) of one fibre to presses at positions (Q, 2), and their derivatives; grid units.
 
-    Args:
-        fibre: middles (F, 2), unit tangents (F, 2) and lengths (F,) of its planned elements, evenly spaced.
-        lateral_offset: spline coefficients of the offset in x and in y, which also stretches the fibre; shape (2, J).
-        log_sensitivity: spline coefficients; shape (1, J').
-        positions: presses; shape (Q, 2).
-        profile: coefficients of w and of v; shape (2, K).
-        step: distance of the splines of the profile.
-
-    Returns:
-        Responses (Q,), and their derivatives by profile (Q, 2, K), lateral offset (Q, 2, J), log-sensitivity (Q, J')
-        and position (Q, 2).
+    The fibre is middles (F, 2), unit tangents (F, 2) and lengths (F,) of its planned elements, evenly spaced. Splines
+    have the coefficients `lateral_offset` (2, J), in x and y, which also stretches it, `log_sensitivity` (1, J') and
+    `profile` (2, K), of w and v, whose splines are `step` apart. Derivatives are by profile (Q, 2, K), lateral offset
+    (Q, 2, J), log-sensitivity (Q, J') and position (Q, 2).
     """
     path, tangent, length = fibre
     elements, splines, presses = len(path), profile.shape[1], len(positions)

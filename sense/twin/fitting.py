@@ -87,14 +87,10 @@ class AsBuiltFit:
 def fit_as_built(
     start: AsBuiltPad, responses: Responses, priors: Priors, noise_inflation: Array | float = 1.0
 ) -> AsBuiltFit:
-    """Fit a pad to responses, maximum a posteriori.
+    """Fit a pad to the responses of its channels, maximum a posteriori, from a first guess whose wiring stays.
 
-    Args:
-        start: first guess; its wiring stays.
-        responses: of the channels that the pad has.
-        priors: standard deviations to begin with, and what stays as planned.
-        noise_inflation: factor on the noise of each channel (C,), since residuals of neighbouring presses are
-            correlated where the model is wrong.
+    `noise_inflation` is a factor (C,) on the noise of each channel, since residuals of neighbouring presses are
+    correlated where the model is wrong.
     """
     free, damping = np.flatnonzero(priors.free_mask(len(start.fibres))), 1e-3
     current = _Objective(start, responses, priors, noise_inflation, np.sqrt(responses.variance) / 2)
@@ -235,12 +231,7 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     Half the squared difference of the residuals of two neighbouring presses is their variance, whatever smooth
     function of position is left in them: floor^2 + share^2 x^2 for responses x, a straight line over x^2. Where
     channels share a part of it, products of their differences are common share^2 x_c x_c'. Too few presses give
-    constant noise.
-
-    Args:
-        pad: as fitted to the presses.
-        responses: of its channels.
-        noise_v: standard deviation of each channel's total scatter; shape (C,).
+    constant noise. `noise_v` (C,) is the standard deviation of each channel's total scatter.
     """
     valid = np.flatnonzero(responses.valid.all(axis=1))
     if len(valid) < 2 * MIN_PAIRS:

@@ -196,8 +196,7 @@ class Identification:
     def lateral_offsets_mm(self) -> list[tuple[Array, Array, Mask]]:
         """Compute how far each live channel's fibre lies to the left of its plan.
 
-        Returns:
-            For each: offset (F,) of its elements, mm; standard deviation (F,), mm; mask (F,) of those pressed.
+        Returned are, for each, offset and standard deviation (F,) of its elements, mm, and a mask of those pressed.
         """
         built, unit_mm = self.fit.pad, self.pad.unit_mm
         pressed = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))

@@ -46,7 +46,7 @@ def test_combine_members_weighs_by_variance_and_adds_disagreement() -> None:
 def test_fit_network_returns_the_average_of_the_last_weights() -> None:
     """Of a quadratic with noisy gradients, the average is nearer to the minimum than single weights are."""
     torch.manual_seed(0)
-    reports: list[int] = []
+    reports: list[float] = []
 
     def fit(averaged: bool) -> float:
         w = torch.zeros(200, requires_grad=True)
@@ -63,7 +63,7 @@ def test_fit_network_returns_the_average_of_the_last_weights() -> None:
 
     assert fit(averaged=True) < 0.05
     assert reports == sorted(reports)
-    assert (len(reports), reports[-1]) == (training.REPORTS, 1000)
+    assert (len(reports), reports[-1]) == (training.REPORTS, 1.0)
     assert fit(averaged=False) < 0.05
     assert [training.one_cycle(share) for share in (0.0, 0.1, 0.2, 0.6, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
