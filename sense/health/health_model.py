@@ -198,9 +198,6 @@ def fit_health_model(
     Presses that miss a reading of a living fibre are left out. A single living fibre suffices for faults that its own
     readings show (stuck, noisy, offset); responses need two or more. A model of fewer than MIN_GAIN_PRESSES never
     reports a reduced gain.
-
-    Raises:
-        InputError: fewer than MIN_PRESSES complete presses, or no living fibre.
     """
     dead = find_dead_fibres(readings)
     living = np.setdiff1d(np.arange(readings.shape[1]), dead)

@@ -17,27 +17,20 @@ from padforge.sense.arrays import Array, Mask
 from padforge.sense.localizer.model_files import check_arrays
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
-COMPONENTS = 6
-"""Discriminant directions of a fibre: those in which positions differ most for their scatter."""
-COARSENING = 2
-"""Cells of the response table along a side of a cell of the posterior's grid."""
+COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
+COARSENING = 2  # cells of the response table along a side of a cell of the posterior's grid
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
 """Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
-MIN_VARIANCE = 1e-4
-"""Of scaled features, which are about 1."""
+MIN_VARIANCE = 1e-4  # of scaled features, which are about 1
 PRIOR_WEIGHT = 0.05
 """Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold."""
-GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2
-"""Steps, and the longest, in units of the scaled position."""
-MIN_STD = 1e-2
-"""Smallest standard deviation on the grid, a seventh of a cell."""
+GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2  # steps, and the longest, in units of the scaled position
+MIN_STD = 1e-2  # smallest standard deviation on the grid, a seventh of a cell
 N_SUMMARY = 9
 """Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
-MIN_EXPONENT = -60.0
-"""Smaller exponents count for nothing, and their exponential takes ten times as long."""
+MIN_EXPONENT = -60.0  # smaller exponents count for nothing, and their exponential takes ten times as long
 MAX_COEFFICIENT = 1e12
-PREFIX = "bayes."
-"""Of the names of the arrays in files."""
+PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
 

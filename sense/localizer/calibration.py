@@ -26,18 +26,15 @@ from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-MIN_TRAINING = 3
-"""Presses that a split must leave to learn from: fewer have no scale."""
+MIN_TRAINING = 3  # presses that a split must leave to learn from: fewer have no scale
 CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that calibrate the uncertainty. Of the published method, 15 % of all, half of which
 end the training."""
 MAX_TIME_BUDGET_S = 1e9
-MIN_DEPTH_RANGE_MM = 0.2
-"""Depths of which nine tenths lie within this are one depth."""
+MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
-INTERVAL_SUBSETS = 32
-"""Sets of failed fibres of a size that intervals are calibrated on, at most."""
+INTERVAL_SUBSETS = 32  # sets of failed fibres of a size that intervals are calibrated on, at most
 OnProgress = Callable[[int, int], None]
 
 
@@ -147,7 +144,7 @@ def fit_model(
     if data.detected is not None:
         features, rows = features + data.detected[train], np.concatenate([train, train])
     phases = FEATURES[data.feature_set].phases if data.feature_set in FEATURES else ()
-    positions_mm, measures = data.positions_mm[rows], _rows(data.measures, rows)
+    positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures)
     bayes, residual_network = None, {}
@@ -173,7 +170,8 @@ def fit_model(
     scaled, positions_mm = scaler.transform(data.features[calibration]), data.positions_mm[calibration]
     if bayes is not None:
         model = calibrate_scales(model, scaled, positions_mm, levels)
-    factors = calibrate_intervals(model, scaled, positions_mm, levels, _rows(data.measures, calibration))
+    measures = {name: values[calibration] for name, values in data.measures.items()}
+    factors = calibrate_intervals(model, scaled, positions_mm, levels, measures)
     return replace(model, interval_factors=factors)
 
 
@@ -255,10 +253,6 @@ def _split_training(
         return train, held_back, held_back
     early_stop, calibration = (held_back[part] for part in split_presses(len(held_back), options.split, 0.5, rng, 1))
     return train, early_stop, calibration
-
-
-def _rows(measures: Mapping[str, Array], rows: Indices) -> dict[str, Array]:
-    return {name: values[rows] for name, values in measures.items()}
 
 
 def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:

@@ -14,10 +14,8 @@ from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/2"
-CELLS = 5
-"""Cells along a side of the map of errors by position."""
-ACTIVE = 0.02
-"""Share of its range that a fibre must change by to be active in a press (paper, table III)."""
+CELLS = 5  # cells along a side of the map of errors by position
+ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 
 

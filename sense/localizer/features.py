@@ -13,12 +13,10 @@ from padforge.sense.arrays import Array, Indices, Mask
 
 Window = tuple[int, int]
 
-REST: Window = (-10, 0)
-"""Readings before the probe is sent down; the other windows are measured from their mean."""
+REST: Window = (-10, 0)  # readings before the probe is sent down; the other windows are measured from their mean
 DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
-ONSET = 6
-"""Windows of `DOWN` that end within six readings of the touch, which comes two after the command."""
+ONSET = 6  # windows of `DOWN` that end within six readings of the touch, which comes two after the command
 UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 PAST: tuple[Window, ...] = (
@@ -26,16 +24,11 @@ PAST: tuple[Window, ...] = (
     *((-50, -40), (-60, -50), (-80, -60), (-100, -80), (-120, -100), (-160, -120)),
 )
 """Windows of the history: silicone creeps for seconds to minutes after a press."""
-SLOW = (800, 4000)
-"""Lengths, in readings before the press, of slow medians: a minute and five at 13 Hz."""
-SLOW_SAMPLES = 200
-"""Readings that a slow median is taken of."""
-MEDIAN = 15
-"""Width of the published running median, readings."""
-MEDIAN_OFFSET = 10
-"""Readings from a command to the middle of the published median."""
-MIN_PRESENT = 0.75
-"""Share of a press's readings that a fibre must have given to be valid in it."""
+SLOW = (800, 4000)  # lengths, in readings before the press, of slow medians: a minute and five at 13 Hz
+SLOW_SAMPLES = 200  # readings that a slow median is taken of
+MEDIAN = 15  # width of the published running median, readings
+MEDIAN_OFFSET = 10  # readings from a command to the middle of the published median
+MIN_PRESENT = 0.75  # share of a press's readings that a fibre must have given to be valid in it
 
 
 @dataclass(frozen=True)

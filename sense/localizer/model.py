@@ -29,8 +29,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Features, Method, Split
 
 FORMAT = "padforge-localizer/3"
-NAME = "localizer"
-"""Of its files, `localizer.json` and `localizer.safetensors`."""
+NAME = "localizer"  # of its files, `localizer.json` and `localizer.safetensors`
 TABLE, RESIDUAL = "table", "residual."
 """Names among the arrays: the response table, and the prefix of the residual network."""
 UNIFORM = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)

@@ -16,8 +16,7 @@ from safetensors.numpy import load, save
 from padforge.design.common.files import atomic_files, read_bytes
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 
-RATE_TOLERANCE = 0.25
-"""Windows are counted in readings, so the rate must be about that of the training."""
+RATE_TOLERANCE = 0.25  # windows are counted in readings, so the rate must be about that of the training
 
 
 class ModelFiles(NamedTuple):
@@ -27,11 +26,7 @@ class ModelFiles(NamedTuple):
     weights: Path
 
     def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`.
-
-        Raises:
-            InputError: the document is not finite or no JSON, or the folder cannot be written.
-        """
+        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`."""
         content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
         try:
@@ -44,11 +39,7 @@ class ModelFiles(NamedTuple):
 
     @contextmanager
     def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the arrays of a document of this digest, to be checked in the body of `with`; messages say `what`.
-
-        Raises:
-            InputError: they cannot be read, belong to another document, or the body raises one.
-        """
+        """Yield the arrays of a document of this digest, to be checked in the body of `with`; messages say `what`."""
         content, name = read_bytes(self.weights), self.document.name
         if hashlib.sha256(content).hexdigest() != digest:
             raise InputError(f"{self.weights}: not the weights that {name} was written with; calibrate again")
@@ -59,11 +50,7 @@ class ModelFiles(NamedTuple):
 
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
-    """Return the files of a model in a folder.
-
-    Raises:
-        InputError: `folder` is no path, or `name` no plain name.
-    """
+    """Return the files of a model in a folder."""
     folder = check_path("folder", folder)
     if not re.fullmatch(r"\w{1,100}", check_type("name", name, str)):
         raise InputError(f"name is {short_repr(name)}, expected letters, digits and underscores")

@@ -22,12 +22,10 @@ network, E = 1, no `hidden`, and 2 in place of 2 N."""
 
 N_OUTPUTS = 4
 """x, y and their log errors, in scaled units; with T measures, 2 T more: values follow y, and their logs the logs."""
-EPSILON = 1e-5
-"""Added to the variance in layer normalization."""
+EPSILON = 1e-5  # added to the variance in layer normalization
 MIN_LOG_ERROR, MAX_LOG_ERROR = -9.0, 2.0
 """Range of log errors: from a ten-thousandth of the pad to the whole pad and more."""
-MAX_WEIGHT = 1e4
-"""Largest weight of a network, far above any that training ends with; no sum overflows below it."""
+MAX_WEIGHT = 1e4  # largest weight of a network, far above any that training ends with; no sum overflows below it
 
 
 def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:

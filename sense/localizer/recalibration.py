@@ -28,20 +28,16 @@ FORMAT = "padforge-recalibration/2"
 GAIN_STD, ROTATION_STD, SHIFT_STD = 0.2, 0.05, 0.1
 """Prior standard deviations: of the logarithm of a gain, of the angle (radians) and the logarithm of the scale, and of
 the shift (scaled position)."""
-R90_STD = 1.645
-"""Standard deviations in the half-width that holds 90 % of a normal distribution."""
+R90_STD = 1.645  # standard deviations in the half-width that holds 90 % of a normal distribution
 DIFFERENCE = 0.02
 """Step of numerical derivatives, in prior standard deviations: shorter ones drown in the rounding of the network."""
-MIN_PRESSES = 10
-"""New presses needed: fewer can neither change much nor show that it was for the better."""
+MIN_PRESSES = 10  # new presses needed: fewer can neither change much nor show that it was for the better
 FOLDS = 5
 CORRECT_FROM, FINE_TUNE_FROM = 2.0, -1.0
 """Gains, in standard errors, from which a correction, which is coarse, and fine tuning, which is gentle, are kept. Fine
 tuning gains almost always, but less than a hundred presses can show, so it is kept unless they speak against it."""
-SUBSETS = 16
-"""Sets of failed fibres of a size that are looked at, at most."""
-Predictions = Sequence[Sequence[Localization]]
-"""By number and by set of failed fibres."""
+SUBSETS = 16  # sets of failed fibres of a size that are looked at, at most
+Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed fibres
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
 
 

@@ -14,15 +14,12 @@ import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 
-RBF_SIDE = 21
-"""Basis functions along a side of the pad."""
-RBF_STD = 2.0
-"""Their standard deviation, in distances between neighbours: wide enough that sums of them are smooth."""
+RBF_SIDE = 21  # basis functions along a side of the pad
+RBF_STD = 2.0  # their standard deviation, in distances between neighbours: wide enough that sums of them are smooth
 RIDGE_POSITION, RIDGE_HISTORY = 1.0, 300.0
 """Penalties on squared weights, of basis functions and of standardized history. Features of the history are collinear:
 with a small penalty weights cancel each other, and a few hundred presses err by a tenth more."""
-GRID_CELLS = 60
-"""Cells along a side of the grid on which the response is tabulated."""
+GRID_CELLS = 60  # cells along a side of the grid on which the response is tabulated
 _CHUNK = 16_384
 
 

@@ -16,10 +16,8 @@ from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats,
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 
-MAX_INPUT = 1e4
-"""Largest scaled feature, in standard deviations; beyond lies no press, and features are clipped."""
-MAX_LEVERAGE = 0.9
-"""Of a press far from all others; its residual grows tenfold at most."""
+MAX_INPUT = 1e4  # largest scaled feature, in standard deviations; beyond lies no press, and features are clipped
+MAX_LEVERAGE = 0.9  # of a press far from all others; its residual grows tenfold at most
 DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
@@ -155,8 +153,7 @@ class FeatureScaler:
         self, features: PressFeatures, positions_mm: Array, measures: Mapping[str, Array] | None = None
     ) -> "TrainingPresses":
         """Scale features and targets of presses."""
-        scaled = self.transform(features)
-        targets = self.scale_targets(positions_mm, measures)
+        scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
         return TrainingPresses(scaled.inputs, scaled.fibre_mask, targets, self.depth_gain)
 
 
@@ -167,11 +164,9 @@ def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
 
 
 @dataclass(frozen=True)
-class TrainingPresses:
+class TrainingPresses(ScaledFeatures):
     """Scaled presses of known targets, to train or to check on."""
 
-    inputs: Floats  # (Q, C, F + G)
-    fibre_mask: Mask  # (Q, C)
     targets: Floats  # (Q, 2 + T)
     depth_gain: float = 0.0  # see `FeatureScaler.depth_gain`
 

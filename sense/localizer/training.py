@@ -28,12 +28,9 @@ from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_resid
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs, sample_fibre_dropout
 from padforge.sense.settings import LocalizerSettings
 
-WARM_UP = 0.2
-"""Share of the steps in which the learning rate rises."""
-AVERAGE_DECAY = 0.998
-"""Decay of the exponential moving average of the weights."""
-REPORTS = 40
-"""Calls of `on_progress` in a training."""
+WARM_UP = 0.2  # share of the steps in which the learning rate rises
+AVERAGE_DECAY = 0.998  # decay of the exponential moving average of the weights
+REPORTS = 40  # calls of `on_progress` in a training
 
 
 def one_cycle(share: float) -> float:
@@ -110,12 +107,9 @@ class JointProgress:
         self._stopped.set()
 
 
-MEASURE_WEIGHT = 0.5
-"""Weight of the error of a scaled depth or force, beside the distance."""
-LOG_ERROR_WEIGHT = 0.1
-"""Weight of the likelihood of the expected error, beside the distance."""
-INPUT_NOISE = 0.02
-"""Standard deviation of noise on scaled features, which are about 1."""
+MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, beside the distance
+LOG_ERROR_WEIGHT = 0.1  # weight of the likelihood of the expected error, beside the distance
+INPUT_NOISE = 0.02  # standard deviation of noise on scaled features, which are about 1
 AUGMENTATION = 2.2
 """Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm among 3000 presses on a
 pad of 45 mm, 7 mm among 240, which leave more to interpolate."""
@@ -126,8 +120,7 @@ MIN_BATCHES, MAX_STEPS, HARDER = 10, 11_000, 2
 release is not looked at, which is harder to learn."""
 RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
 """Largest size of the network that corrects the Bayesian localizer: larger ones gain nothing."""
-PUBLISHED_HIDDEN = 50
-"""Neurons of the published network, of one tanh layer."""
+PUBLISHED_HIDDEN = 50  # neurons of the published network, of one tanh layer
 PACE_STEPS, MIN_LENGTHS, MAX_MEMBERS = 12, 5, 64
 """With a time budget: steps that measure the pace, usual lengths of a training before there is another for each core,
 and the most networks."""
@@ -328,12 +321,10 @@ class _Training:
 
 FINE_TUNING_STEPS, FINE_TUNING_BATCH, FINE_TUNING_RATE = 200, 128, 1e-4
 """Enough to follow drift and too little to forget: errors hardly change for half and twice as much."""
-PRIOR_PRESSES = 100
-"""New presses that weigh as much as what was learnt before."""
+PRIOR_PRESSES = 100  # new presses that weigh as much as what was learnt before
 NEAR_STD, FAR_NOISE = 0.09, 0.1
 """Standard deviations of augmented scaled positions, 2 mm on a pad of 45 mm, and of noise on presses moved anywhere."""
-KEEP_LOG_ERROR_WEIGHT = 0.02
-"""Weight of keeping log errors, beside the positions."""
+KEEP_LOG_ERROR_WEIGHT = 0.02  # weight of keeping log errors, beside the positions
 
 
 def fine_tune(

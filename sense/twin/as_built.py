@@ -22,24 +22,17 @@ from padforge.design.twin import PlanTransform
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.twin.responses import Responses
 
-EPSILON = 1e-6
-"""Squared distance below which the direction to the press is undefined, squared grid units."""
-N_ELEMENTS = 160
-"""Elements of a fibre."""
-FLAT_TOLERANCE = 1e-3
-"""Tolerance of the polyline that elements lie on, grid units."""
-N_SPLINES = 9
-"""Splines of a profile."""
-SPLINE_STEP = 0.36
-"""Their distance, as a share of the standard deviation of the Gaussian profile that fits best."""
-N_OFFSET, N_SENSITIVITY = 12, 8
-"""Splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity."""
+EPSILON = 1e-6  # squared distance below which the direction to the press is undefined, squared grid units
+N_ELEMENTS = 160  # elements of a fibre
+FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
+N_SPLINES = 9  # splines of a profile
+SPLINE_STEP = 0.36  # their distance, as a share of the standard deviation of the Gaussian profile that fits best
+N_OFFSET, N_SENSITIVITY = 12, 8  # splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity
 N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
 """Parameters that all channels share (transform and two profiles), and those of each channel."""
 OFFSET, SENSITIVITY = slice(2, 2 + 2 * N_OFFSET), slice(2 + 2 * N_OFFSET, N_CHANNEL)
 """Among the parameters of a channel, those of its lateral offset, x before y, and of its log-sensitivity."""
-SLOPE_STEP_MM = 0.5
-"""Half of the step of the central differences by which slopes over the position are taken."""
+SLOPE_STEP_MM = 0.5  # half of the step of the central differences by which slopes over the position are taken
 
 
 @njit(cache=True, error_model="numpy")

@@ -29,24 +29,19 @@ from padforge.sense.twin.as_built import (
 )
 from padforge.sense.twin.responses import Responses
 
-CORRELATION_LENGTH = 0.3
-"""Correlation length of lateral offsets and log-sensitivities, as a share of the fibre."""
+CORRELATION_LENGTH = 0.3  # correlation length of lateral offsets and log-sensitivities, as a share of the fibre
 TRANSFORM_STD = np.array([0.1, 5.0, 5.0, 0.05])
 """Prior standard deviations of turn (rad, from a quarter turn), shift (mm, from 0) and scale (from 1)."""
-ANGULAR_STD = 0.3
-"""Prior standard deviation of the splines of v."""
+ANGULAR_STD = 0.3  # prior standard deviation of the splines of v
 PROFILE_BEND = 0.15
 """Prior standard deviation of the second differences of a profile's splines, as a share of its largest weight."""
 OFFSET_RANGE_MM, SENSITIVITY_RANGE = (0.1, 1.2), (0.02, 0.4)
 """Ranges of the standard deviations of lateral offset, mm, and log-sensitivity."""
-FIRST_PRIOR_STEP = 3
-"""Step from which these are estimated; before, a poor fit would pass for large offsets."""
-TOLERANCE = 1e-4
-"""Relative change of the objective at which a fit has converged."""
+FIRST_PRIOR_STEP = 3  # step from which these are estimated; before, a poor fit would pass for large offsets
+TOLERANCE = 1e-4  # relative change of the objective at which a fit has converged
 MAX_DAMPING = 1e8
 MAX_STEPS = 25
-MIN_PAIRS = 30
-"""Pairs of presses that the scatter is estimated from, at least."""
+MIN_PAIRS = 30  # pairs of presses that the scatter is estimated from, at least
 
 
 @dataclass(frozen=True)
@@ -96,9 +91,10 @@ def fit_as_built(
     current = _Objective(start, responses, priors, noise_inflation, np.sqrt(responses.variance) / 2)
     for step in range(MAX_STEPS):
         hessian, gradient = current.normal_equations()
-        proposal = None
+        block, change, proposal = hessian[np.ix_(free, free)], np.zeros(len(gradient)), None
         while proposal is None and damping < MAX_DAMPING:
-            proposal = current.moved(_damped_step(hessian, gradient, free, damping))
+            change[free] = cho_solve(cho_factor(block + damping * np.diag(np.diag(block))), gradient[free])
+            proposal = current.moved(change)
             if proposal.value >= current.value:
                 damping, proposal = 4 * damping, None
         if proposal is None:
@@ -109,13 +105,6 @@ def fit_as_built(
             break
     hessian = current.normal_equations()[0]
     return AsBuiltFit(current.pad, current.priors, _inverse(hessian, free), current.log_evidence(hessian, free))
-
-
-def _damped_step(hessian: Array, gradient: Array, free: Indices, damping: float) -> Array:
-    block = hessian[np.ix_(free, free)]
-    step = np.zeros(len(gradient))
-    step[free] = cho_solve(cho_factor(block + damping * np.diag(np.diag(block))), gradient[free])
-    return step
 
 
 def _inverse(matrix: Array, free: Indices) -> Array:

@@ -16,15 +16,12 @@ from padforge.sense.localizer.features import DOWN, PressFeatures, compute_featu
 from padforge.sense.localizer.response_model import GRID_CELLS, ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
-DEPTH_TOLERANCE = 0.15
-"""Share of its depth by which another press may differ that counts as equally deep."""
-FIRST_HELD = 3
-"""First window of the press that counts as held: the tip has come to rest in the silicone."""
+DEPTH_TOLERANCE = 0.15  # share of its depth by which another press may differ that counts as equally deep
+FIRST_HELD = 3  # first window of the press that counts as held: the tip has come to rest in the silicone
 HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(DOWN)], float)
 HOLD /= HOLD.sum()
 """Weights of the windows of a press in its response; shape (9,)."""
-GP_WIDTHS = (0.4, 0.8)
-"""Standard deviations of the Gaussian kernels that are tried, grid units."""
+GP_WIDTHS = (0.4, 0.8)  # standard deviations of the Gaussian kernels that are tried, grid units
 GP_PRESSES = 800
 """Presses that a Gaussian process is fitted to, at most: it takes the eigenvalues of a matrix of that size."""
 GP_RATIOS = np.append(0.0, np.geomspace(1e-2, 1e4, 61))
