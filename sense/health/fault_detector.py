@@ -374,11 +374,7 @@ HEALTH_FILES = frozenset(file.name for name in (COMMANDED, DETECTED) for file in
 
 
 def mask_faults(faults: Sequence[FibreFault], presses: int, fibres: int) -> Mask:
-    """Return the valid fibres (Q, C) of each of `presses`: faulty ones are masked from the first bad press on.
-
-    Raises:
-        InputError: a fault of a fibre that the pad does not have.
-    """
+    """Return the valid fibres (Q, C) of each of `presses`: faulty ones are masked from the first bad press on."""
     mask = np.ones((presses, fibres), dtype=bool)
     for fault in faults:
         if max(fault.fibres, default=0) >= fibres:

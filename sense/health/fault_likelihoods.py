@@ -1,10 +1,9 @@
 """Log-likelihood ratios of every fault of every fibre, their cumulative sums, and how high these rise by chance.
 
-A fault hypothesis says what a fibre's readings would look like; a press gives the log-likelihood ratio (llr) of the
-hypothesis against health. Their cumulative sums (CUSUM: E. S. Page, "Continuous inspection schemes", Biometrika 41,
-1954) rise steadily under the fault. How high they rise by chance is measured on presses that the prediction was not
-trained on: the peaks of healthy sums have an exponential tail (D. Siegmund, "Sequential Analysis", 1985, chapter X),
-which converts a rate of false alarms into a threshold.
+A press gives the log-likelihood ratio (llr) of a fault hypothesis against health. Their cumulative sums (CUSUM: E. S.
+Page, "Continuous inspection schemes", Biometrika 41, 1954) rise steadily under the fault. How high they rise by chance
+is measured on presses that the prediction was not trained on: peaks of healthy sums have an exponential tail (D.
+Siegmund, "Sequential Analysis", 1985, chapter X), which converts a rate of false alarms into a threshold.
 """
 
 from collections.abc import Sequence

@@ -35,7 +35,7 @@ from padforge.sense.health.trace_model import (
     predict_fibres,
     train_networks,
 )
-from padforge.sense.localizer.model_files import files_of
+from padforge.sense.localizer.model_files import check_arrays, files_of
 from padforge.sense.recording.recording import median_rate_hz
 
 FORMAT = "padforge-health/3"
@@ -144,7 +144,7 @@ class HealthModel:
 
 
 def validate_arrays(arrays: Mapping[str, NDArray[Any]], fibres: int) -> None:
-    """Raise ValueError unless arrays are those of a model of so many living fibres, with entries in range."""
+    """Raise InputError unless arrays are those of a model of so many living fibres, with entries in range."""
     tail = min(MAX_FAILED, fibres - 1) + 1, len(HYPOTHESES)
     positive = {  # they are divided by, or their logarithm is taken
         "pca.input_scale_v": (fibres, INPUTS),
@@ -177,16 +177,10 @@ def validate_arrays(arrays: Mapping[str, NDArray[Any]], fibres: int) -> None:
     }
     expected = {key: (shape, np.float64) for key, shape in doubles.items()}
     expected |= {key: (shape, np.float32) for key, shape in floats.items()}
-    actual = {key: (array.shape, array.dtype.type) for key, array in arrays.items()}
-    if actual != expected:
-        wrong = min(key for key in actual.keys() | expected if actual.get(key) != expected.get(key))
-        raise ValueError(f"{wrong} is {actual.get(wrong)}, expected {expected.get(wrong)}")
-    for key, array in arrays.items():
-        if not np.abs(array).max(initial=0) <= MAX_ENTRY:
-            raise ValueError(f"{key} goes up to {np.abs(array).max():g}, allowed is {MAX_ENTRY:g}")
+    check_arrays(arrays, expected, MAX_ENTRY)
     for key in positive:
         if not (arrays[key] > 0).all():
-            raise ValueError(f"{key} is {arrays[key].min():g} at least, allowed is above 0")
+            raise InputError(f"{key} is {arrays[key].min():g} at least, allowed is above 0")
 
 
 def fit_health_model(
@@ -204,9 +198,6 @@ def fit_health_model(
     Presses that miss a reading of a living fibre are left out. A single living fibre suffices for faults that its own
     readings show (stuck, noisy, offset); responses need two or more. A model of fewer than MIN_GAIN_PRESSES never
     reports a reduced gain.
-
-    Raises:
-        InputError: fewer than MIN_PRESSES complete presses, or no living fibre.
     """
     dead = find_dead_fibres(readings)
     living = np.setdiff1d(np.arange(readings.shape[1]), dead)

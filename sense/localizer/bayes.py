@@ -14,29 +14,23 @@ import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Mask
+from padforge.sense.localizer.model_files import check_arrays
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
-COMPONENTS = 6
-"""Discriminant directions of a fibre: those in which positions differ most for their scatter."""
-COARSENING = 2
-"""Cells of the response table along a side of a cell of the posterior's grid."""
+COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
+COARSENING = 2  # cells of the response table along a side of a cell of the posterior's grid
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
 """Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
-MIN_VARIANCE = 1e-4
-"""Of scaled features, which are about 1."""
+MIN_VARIANCE = 1e-4  # of scaled features, which are about 1
 PRIOR_WEIGHT = 0.05
 """Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold."""
-GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2
-"""Steps, and the longest, in units of the scaled position."""
-MIN_STD = 1e-2
-"""Smallest standard deviation on the grid, a seventh of a cell."""
+GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2  # steps, and the longest, in units of the scaled position
+MIN_STD = 1e-2  # smallest standard deviation on the grid, a seventh of a cell
 N_SUMMARY = 9
 """Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
-MIN_EXPONENT = -60.0
-"""Smaller exponents count for nothing, and their exponential takes ten times as long."""
+MIN_EXPONENT = -60.0  # smaller exponents count for nothing, and their exponential takes ten times as long
 MAX_COEFFICIENT = 1e12
-PREFIX = "bayes."
-"""Of the names of the arrays in files."""
+PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
 
@@ -105,12 +99,9 @@ class BayesianLocalizer:
         return cls(*map(_rounded, (*arrays, np.eye(2), np.zeros(2))))
 
     def predict(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Return (Q, 2) MAP positions and (Q, N_SUMMARY) posterior summaries, from the fibres in the mask.
+        """Return (Q, 2) MAP positions and (Q, N_SUMMARY) posterior summaries, from the fibres in the (Q, C) mask.
 
-        Args:
-            inputs: (Q, C, F + G) scaled features.
-            fibre_mask: (Q, C).
-            xp: module of all arrays, numpy or torch.
+        Inputs are (Q, C, F + G) scaled features; `xp` is the module of all arrays, numpy or torch.
         """
         fibres, _, size = self.projection.shape
         mask = xp.asarray(fibre_mask, dtype=inputs.dtype)
@@ -164,19 +155,15 @@ class BayesianLocalizer:
     def from_arrays(cls, arrays: Mapping[str, Any], fibres: int, n_features: int) -> "BayesianLocalizer":
         """Read what `to_arrays` returned, and check shapes and values; KeyError if an array is missing."""
         bayes = cls(**{each.name: arrays[PREFIX + each.name].astype(np.float64) for each in fields(cls)})
-        shapes = [part.shape for part in vars(bayes).values()]
         n_grid, side = (len(part) if part.ndim else 0 for part in (bayes.grid, bayes.linearization))
-        n_coefficients = fibres * (COMPONENTS * (COMPONENTS + 3) // 2 + 1)
-        expected = [
-            *((fibres, n_features, COMPONENTS), (n_grid, 2), (n_coefficients, n_grid)),
-            *((side, side, fibres * 3 * (COMPONENTS + 1)), (2, 2), (2, 2), (2,)),
-        ]
-        if shapes != expected or not n_grid or side < 2:
-            raise InputError(f"Bayesian localizer has shapes {shapes}, expected {expected}")
-        for name, part in vars(bayes).items():
-            largest = np.abs(part).max(initial=0)
-            if not largest <= MAX_COEFFICIENT:
-                raise InputError(f"{name} is up to {largest:g}, allowed is up to {MAX_COEFFICIENT:g}")
+        shapes = {
+            "projection": (fibres, n_features, COMPONENTS),
+            "grid": (max(n_grid, 1), 2),
+            "log_likelihood_coefficients": (fibres * (COMPONENTS * (COMPONENTS + 3) // 2 + 1), n_grid),
+            "linearization": (max(side, 2), side, fibres * 3 * (COMPONENTS + 1)),
+            **{"bounds": (2, 2), "rotation": (2, 2), "shift": (2,)},
+        }
+        check_arrays(vars(bayes), {name: (shape, np.float64) for name, shape in shapes.items()}, MAX_COEFFICIENT)
         fisher = bayes.linearization[:, :, 3 * fibres * COMPONENTS :].reshape(side, side, fibres, 3)[..., :2]
         if fisher.min() < 0:
             raise InputError(f"linearization has a Fisher information of {fisher.min():g}, expected 0 or more")

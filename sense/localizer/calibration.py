@@ -26,18 +26,15 @@ from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-MIN_TRAINING = 3
-"""Presses that a split must leave to learn from: fewer have no scale."""
+MIN_TRAINING = 3  # presses that a split must leave to learn from: fewer have no scale
 CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that calibrate the uncertainty. Of the published method, 15 % of all, half of which
 end the training."""
 MAX_TIME_BUDGET_S = 1e9
-MIN_DEPTH_RANGE_MM = 0.2
-"""Depths of which nine tenths lie within this are one depth."""
+MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
-INTERVAL_SUBSETS = 32
-"""Sets of failed fibres of a size that intervals are calibrated on, at most."""
+INTERVAL_SUBSETS = 32  # sets of failed fibres of a size that intervals are calibrated on, at most
 OnProgress = Callable[[int, int], None]
 
 
@@ -52,25 +49,6 @@ class CalibrationData:
     feature_set: str  # a name in `FEATURES`, or "array"
     rate_hz: float
     sha256: str  # of what they came from
-
-    @classmethod
-    def from_recording(cls, recording: Recording, training: Indices, options: LocalizerSettings) -> "CalibrationData":
-        """Compute the features of all presses of a recording; `training` are those that are trained on."""
-        from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
-
-        commands, detected = (recording.down_command, recording.up_command), None
-        if options.method == "ensemble":
-            again = align_to_detected(recording.readings, recording.times_s, *commands)
-            detected = compute_features(recording.readings, *again, options.features)
-        return cls(
-            compute_features(recording.readings, *commands, options.features),
-            detected,
-            recording.presses_mm,
-            known_measures(recording, training) if options.method == "ensemble" else {},
-            options.features,
-            recording.rate_hz,
-            recording.digest,
-        )
 
 
 def calibrate(
@@ -111,8 +89,7 @@ def calibrate(
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"), one_torch_thread():
-        data = CalibrationData.from_recording(recording, training, options)
-        model = fit_model(data, training, options, rng, on_progress, time_budget)
+        model = fit_recording(recording, training, options, rng, on_progress, time_budget)
     model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     with stage("evaluate"):
         document = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
@@ -126,9 +103,21 @@ def fit_recording(
     options: LocalizerSettings,
     rng: np.random.Generator,
     on_progress: OnProgress = lambda done, total: None,
+    time_budget: float | None = None,
 ) -> LocalizerModel:
     """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
-    return fit_model(CalibrationData.from_recording(recording, training, options), training, options, rng, on_progress)
+    from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
+
+    readings, commands = recording.readings, (recording.down_command, recording.up_command)
+    detected, measures = None, {}
+    if options.method == "ensemble":
+        again = align_to_detected(readings, recording.times_s, *commands)
+        detected = compute_features(readings, *again, options.features)
+        measures = known_measures(recording, training)
+    features = compute_features(readings, *commands, options.features)
+    origin = options.features, recording.rate_hz, recording.digest
+    data = CalibrationData(features, detected, recording.presses_mm, measures, *origin)
+    return fit_model(data, training, options, rng, on_progress, time_budget)
 
 
 def fit_model(
@@ -155,7 +144,7 @@ def fit_model(
     if data.detected is not None:
         features, rows = features + data.detected[train], np.concatenate([train, train])
     phases = FEATURES[data.feature_set].phases if data.feature_set in FEATURES else ()
-    positions_mm, measures = data.positions_mm[rows], _rows(data.measures, rows)
+    positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures)
     bayes, residual_network = None, {}
@@ -181,7 +170,8 @@ def fit_model(
     scaled, positions_mm = scaler.transform(data.features[calibration]), data.positions_mm[calibration]
     if bayes is not None:
         model = calibrate_scales(model, scaled, positions_mm, levels)
-    factors = calibrate_intervals(model, scaled, positions_mm, levels, _rows(data.measures, calibration))
+    measures = {name: values[calibration] for name, values in data.measures.items()}
+    factors = calibrate_intervals(model, scaled, positions_mm, levels, measures)
     return replace(model, interval_factors=factors)
 
 
@@ -225,14 +215,9 @@ def calibrate_intervals(
     levels: int,
     measures: Mapping[str, Array] | None = None,
 ) -> Array:
-    """Return the (levels, 3 + T) `interval_factors` that hold on presses never trained on.
+    """Return the (levels, 3 + T) `interval_factors`, by failed fibres, that hold on presses never trained on.
 
-    Args:
-        model: whose `interval_factors` are not used.
-        presses: of the calibration.
-        positions_mm: (Q, 2).
-        levels: numbers of failed fibres, from 0.
-        measures: (Q,) of each that is predicted, NaN where unknown.
+    Other arguments are as in `evaluation.conformal`.
     """
     plain = replace(model, interval_factors=np.ones((1, model.interval_factors.shape[1])))
     factors = []
@@ -270,10 +255,6 @@ def _split_training(
     return train, early_stop, calibration
 
 
-def _rows(measures: Mapping[str, Array], rows: Indices) -> dict[str, Array]:
-    return {name: values[rows] for name, values in measures.items()}
-
-
 def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:
     """Depth, if it is known of all `presses` and varies; then force too, if it is known of all."""
     measures = recording.measures
@@ -303,16 +284,9 @@ def unlearnt_lines(recording: Recording, model: LocalizerModel) -> list[str]:
 def split_unseen(
     recording: Recording, model: LocalizerModel | None, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
-    """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen.
-
-    Raises:
-        InputError: the model was recalibrated by the recording, or there are too few presses.
-    """
-    known, digest = np.flatnonzero(recording.has_position), recording.digest
-    if model is not None and digest in model.recalibrated_by:
-        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    if model is not None and digest == model.training_recording_sha256:
-        test = held_back_presses(model, recording)
+    """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen."""
+    known = np.flatnonzero(recording.has_position)
+    if model is not None and (test := held_back_presses(model, recording)) is not None:
         return np.setdiff1d(known, test), test
     rng = np.random.default_rng(options.seed)
     training, test = split_presses(len(known), options.split, options.test_share, rng)
@@ -322,17 +296,9 @@ def split_unseen(
 def split_presses(
     presses: int, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
 ) -> tuple[Indices, Indices]:
-    """Return ascending indices of the presses to train on and of those held back: drawn at random, or the last.
+    """Return ascending indices of the presses to train on and of a share held back: drawn at random, or the last.
 
-    Args:
-        presses: how many there are.
-        split: "random" or "chronological".
-        share: of the presses to hold back.
-        rng: of the draw.
-        min_training: presses that must be left to train on.
-
-    Raises:
-        InputError: one of the two would have too few.
+    `split` is "random" or "chronological". InputError is raised if fewer than `min_training` would be left.
     """
     n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
     if not 1 <= n_held_back <= presses - min_training:

@@ -14,10 +14,8 @@ from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/2"
-CELLS = 5
-"""Cells along a side of the map of errors by position."""
-ACTIVE = 0.02
-"""Share of its range that a fibre must change by to be active in a press (paper, table III)."""
+CELLS = 5  # cells along a side of the map of errors by position
+ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 
 
@@ -45,11 +43,8 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
     levels = tuple(check_type("levels", levels, Iterable))
     if not levels:
         raise InputError(f"levels name no number of failed fibres, expected one or more of 0 to {model.fibres - 1}")
-    digest = check_type("recording", recording, Recording).digest
-    if digest in model.recalibrated_by:
-        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
-    is_training = digest == model.training_recording_sha256
-    test = held_back_presses(model, recording) if is_training else np.flatnonzero(recording.has_position)
+    held_back = held_back_presses(model, check_type("recording", recording, Recording))
+    test = np.flatnonzero(recording.has_position) if held_back is None else held_back
     if len(test) == 0:
         raise InputError(
             f"recording has no press of known position to test on among {len(recording.presses_mm)}, "
@@ -64,7 +59,7 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
     return {
         "format": FORMAT,
         "errors": rows,
-        "split": model.split if is_training else "none",
+        "split": "none" if held_back is None else model.split,
         "test_presses": len(test),
         "by_subset": by_subset,
         "by_position": errors_by_position(prediction.positions_mm, positions_mm),
@@ -87,8 +82,12 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
     }
 
 
-def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices:
-    """Return the indices of the test presses of a model in the recording of its training, checked."""
+def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices | None:
+    """Return the test presses of a model in the recording of its training, checked; None for one it has not seen."""
+    if recording.digest in model.recalibrated_by:
+        raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
+    if recording.digest != model.training_recording_sha256:
+        return None
     presses = len(recording.presses_mm)
     for press in model.test:
         if press >= presses or not recording.has_position[press]:
@@ -105,17 +104,9 @@ def errors_by_loss(
     positions_mm: Array,
     measures: Measures | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return "errors" and "by_subset" of `evaluate`.
+    """Return "errors" and "by_subset" of `evaluate`; `predict` predicts the presses without the fibres of its indices.
 
-    Args:
-        fibres: C.
-        levels: numbers of failed fibres.
-        predict: predicts the presses without the fibres of these indices.
-        positions_mm: (Q, 2) true positions.
-        measures: (Q,) true depths and forces, NaN where unknown.
-
-    Raises:
-        InputError: a level that leaves no fibre.
+    True positions are (Q, 2), and depths and forces (Q,), NaN where unknown.
     """
     rows, by_subset = [], []
     for level in levels:
@@ -240,20 +231,20 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
     rows = document["errors"]
 
     def table(title: str, header: str, errors: Sequence[str], shares: Sequence[str]) -> list[str]:
-        formats = [("n_failed", "4d"), ("subsets", "5d"), *((name, "6.2f") for name in errors)]
+        formats = [("n_failed", "6d"), ("subsets", "5d"), *((name, "6.2f") for name in errors)]
         formats += [(name, "7.1%") for name in shares]
         return [title, header, *(" ".join(f"{row[name]:{spec}}" for name, spec in formats) for row in rows)]
 
     pad = " of a simulated pad" if document["provenance"].get("recording_kind") == "simulated" else ""
     lines = table(
         f"error in mm on {document['test_presses']} presses{pad} (split: {document['split']})",
-        "lost  sets   mean    std    max median    p95  in r50  in r90",
+        "failed  sets   mean    std    max median    p95  in r50  in r90",
         ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm"),
         ("within_r50", "within_r90"),
     )
     for kind, unit in (("depth", "mm"), ("force", "N")):
         names = (f"{kind}_mean_{unit.lower()}", f"{kind}_p95_{unit.lower()}")
         if names[0] in rows[0]:
-            header = "lost  sets   mean    p95  in r90"
+            header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
     return lines

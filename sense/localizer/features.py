@@ -1,9 +1,8 @@
 """Features of presses: means of each fibre's readings over windows about a press, and its history before it.
 
-Windows are counted in readings from the one at which the probe was sent down, or up; where a window would reach into a
-neighbouring press, the nearest reading that does not is repeated. A feature is made of one fibre's readings alone, so
-that a failed fibre can be masked and affects no other. Readings may be missing (NaN): short gaps are interpolated, and
-a fibre that lacks too much of a press is masked in it.
+Windows are counted in readings from the command; where one would reach into a neighbouring press, the nearest reading
+that does not is repeated. A feature is made of one fibre's readings alone, so that a failed fibre can be masked and
+affects no other. Short gaps (NaN) are interpolated, and a fibre that lacks too much of a press is masked in it.
 """
 
 from dataclasses import dataclass
@@ -14,12 +13,10 @@ from padforge.sense.arrays import Array, Indices, Mask
 
 Window = tuple[int, int]
 
-REST: Window = (-10, 0)
-"""Readings before the probe is sent down; the other windows are measured from their mean."""
+REST: Window = (-10, 0)  # readings before the probe is sent down; the other windows are measured from their mean
 DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
-ONSET = 6
-"""Windows of `DOWN` that end within six readings of the touch, which comes two after the command."""
+ONSET = 6  # windows of `DOWN` that end within six readings of the touch, which comes two after the command
 UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 PAST: tuple[Window, ...] = (
@@ -27,16 +24,11 @@ PAST: tuple[Window, ...] = (
     *((-50, -40), (-60, -50), (-80, -60), (-100, -80), (-120, -100), (-160, -120)),
 )
 """Windows of the history: silicone creeps for seconds to minutes after a press."""
-SLOW = (800, 4000)
-"""Lengths, in readings before the press, of slow medians: a minute and five at 13 Hz."""
-SLOW_SAMPLES = 200
-"""Readings that a slow median is taken of."""
-MEDIAN = 15
-"""Width of the published running median, readings."""
-MEDIAN_OFFSET = 10
-"""Readings from a command to the middle of the published median."""
-MIN_PRESENT = 0.75
-"""Share of a press's readings that a fibre must have given to be valid in it."""
+SLOW = (800, 4000)  # lengths, in readings before the press, of slow medians: a minute and five at 13 Hz
+SLOW_SAMPLES = 200  # readings that a slow median is taken of
+MEDIAN = 15  # width of the published running median, readings
+MEDIAN_OFFSET = 10  # readings from a command to the middle of the published median
+MIN_PRESENT = 0.75  # share of a press's readings that a fibre must have given to be valid in it
 
 
 @dataclass(frozen=True)
@@ -91,13 +83,9 @@ class PressFeatures:
 
 
 def compute_features(readings: Array, down_command: Indices, up_command: Indices, features: str) -> PressFeatures:
-    """Compute the features of every press.
+    """Compute the features, a name in `FEATURES`, of every press from (R, C) readings, V, NaN where missing.
 
-    Args:
-        readings: (R, C) V, NaN where missing.
-        down_command: (Q,) first reading after the probe was sent down.
-        up_command: (Q,) first reading after it was sent up.
-        features: a name in `FEATURES`.
+    Commands are the (Q,) first readings after the probe was sent down, and after it was sent up.
     """
     filled, kind = interpolate_gaps(readings), FEATURES[features]
     # A press counts up to its end, or to the end of its release if that is looked at.

@@ -169,18 +169,9 @@ class Localizer:
         Raises:
             InputError: not fitted, or as `evaluation.evaluate`.
         """
-        return self.evaluation_report(recording, max_failures)["errors"]
-
-    def evaluation_report(self, recording: Recording, max_failures: int | None = None) -> dict[str, Any]:
-        """Evaluate, and return the whole document of `evaluation.evaluate`.
-
-        Args:
-            recording: as `evaluate`.
-            max_failures: as `evaluate`.
-        """
         model = self._fitted
         most = len(model.interval_factors) - 1 if max_failures is None else max_failures
-        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))
+        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))["errors"]
 
     def save(self, folder: str | Path) -> None:
         """Write `localizer.json` and `localizer.safetensors`.

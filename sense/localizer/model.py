@@ -21,7 +21,7 @@ from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
 from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features
-from padforge.sense.localizer.model_files import check_same_pad, files_of
+from padforge.sense.localizer.model_files import check_arrays, check_same_pad, files_of
 from padforge.sense.localizer.network import Weights, check_weights, combine_members, predict_members
 from padforge.sense.localizer.response_model import GRID_CELLS
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
@@ -29,8 +29,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Features, Method, Split
 
 FORMAT = "padforge-localizer/3"
-NAME = "localizer"
-"""Of its files, `localizer.json` and `localizer.safetensors`."""
+NAME = "localizer"  # of its files, `localizer.json` and `localizer.safetensors`
 TABLE, RESIDUAL = "table", "residual."
 """Names among the arrays: the response table, and the prefix of the residual network."""
 UNIFORM = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
@@ -265,11 +264,7 @@ class LocalizerModel(LocalizerDocument):
         n_inputs, n_measures = scaler.n_inputs(method), len(scaler.measures)
         with files.arrays(digest, "the localizer") as weights:
             table, shape = weights.pop(TABLE), (GRID_CELLS + 1, GRID_CELLS + 1, *scaler.mean_v.shape)
-            if table.shape != shape or table.dtype != np.float32 or not np.abs(table).max(initial=0) <= MAX_INPUT:
-                raise InputError(
-                    f"table of the response is {table.dtype} of shape {table.shape}, "
-                    f"expected float32 {shape} up to {MAX_INPUT:g}"
-                )
+            check_arrays({TABLE: table}, {TABLE: (shape, np.float32)}, MAX_INPUT)
             parts = {name: weights.pop(name) for name in list(weights) if name.startswith((BAYES, RESIDUAL))}
             check_weights(weights, n_inputs, method, n_measures)
             bayes, residual_network = None, {}

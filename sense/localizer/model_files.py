@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,7 @@ from safetensors.numpy import load, save
 from padforge.design.common.files import atomic_files, read_bytes
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 
-RATE_TOLERANCE = 0.25
-"""Windows are counted in readings, so the rate must be about that of the training."""
+RATE_TOLERANCE = 0.25  # windows are counted in readings, so the rate must be about that of the training
 
 
 class ModelFiles(NamedTuple):
@@ -27,11 +26,7 @@ class ModelFiles(NamedTuple):
     weights: Path
 
     def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`.
-
-        Raises:
-            InputError: the document is not finite or no JSON, or the folder cannot be written.
-        """
+        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`."""
         content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
         try:
@@ -44,11 +39,7 @@ class ModelFiles(NamedTuple):
 
     @contextmanager
     def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the arrays of a document of this digest, to be checked in the body of `with`; messages say `what`.
-
-        Raises:
-            InputError: they cannot be read, belong to another document, or the body raises one.
-        """
+        """Yield the arrays of a document of this digest, to be checked in the body of `with`; messages say `what`."""
         content, name = read_bytes(self.weights), self.document.name
         if hashlib.sha256(content).hexdigest() != digest:
             raise InputError(f"{self.weights}: not the weights that {name} was written with; calibrate again")
@@ -59,31 +50,31 @@ class ModelFiles(NamedTuple):
 
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
-    """Return the files of a model in a folder.
-
-    Raises:
-        InputError: `folder` is no path, or `name` no plain name.
-    """
+    """Return the files of a model in a folder."""
     folder = check_path("folder", folder)
     if not re.fullmatch(r"\w{1,100}", check_type("name", name, str)):
         raise InputError(f"name is {short_repr(name)}, expected letters, digits and underscores")
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 
-class TrainedModel(Protocol):
-    """A model of `fibres` fibres, trained at `rate_hz` readings per second."""
+def check_arrays(
+    arrays: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[tuple[int, ...], type]], limit: float
+) -> None:
+    """Raise InputError unless arrays have the expected shapes and types, and entries up to a limit."""
+    actual = {name: (array.shape, array.dtype.type) for name, array in arrays.items()}
+    if actual != expected:
+        wrong = min(name for name in actual.keys() | expected if actual.get(name) != expected.get(name))
+        raise InputError(f"{wrong} is {actual.get(wrong)}, expected {expected.get(wrong)}")
+    for name, array in arrays.items():
+        largest = np.abs(array).max(initial=0)
+        if not largest <= limit:
+            raise InputError(f"{name} is up to {largest:g}, allowed is up to {limit:g}")
 
-    @property
-    def fibres(self) -> int: ...
 
-    @property
-    def rate_hz(self) -> float: ...
-
-
-def check_same_pad(model: TrainedModel, what: str, fibres: int, rate_hz: float) -> None:
+def check_same_pad(model: Any, what: str, fibres: int, rate_hz: float) -> None:
     """Raise InputError if readings have another number of fibres, or another rate, than the training of a model.
 
-    `what` is the name of the model in messages; fibres and rate are those of the readings.
+    `what` is the name of the model in messages; it has `fibres` and `rate_hz`, as the readings.
     """
     if fibres != model.fibres:
         raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")

@@ -13,6 +13,7 @@ import numpy as np
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer
+from padforge.sense.localizer.model_files import check_arrays
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
@@ -21,12 +22,10 @@ network, E = 1, no `hidden`, and 2 in place of 2 N."""
 
 N_OUTPUTS = 4
 """x, y and their log errors, in scaled units; with T measures, 2 T more: values follow y, and their logs the logs."""
-EPSILON = 1e-5
-"""Added to the variance in layer normalization."""
+EPSILON = 1e-5  # added to the variance in layer normalization
 MIN_LOG_ERROR, MAX_LOG_ERROR = -9.0, 2.0
 """Range of log errors: from a ten-thousandth of the pad to the whole pad and more."""
-MAX_WEIGHT = 1e4
-"""Largest weight of a network, far above any that training ends with; no sum overflows below it."""
+MAX_WEIGHT = 1e4  # largest weight of a network, far above any that training ends with; no sum overflows below it
 
 
 def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:
@@ -45,14 +44,7 @@ def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int 
     }
     if method == "ensemble":
         expected |= {"hidden.w": (*layers, members, hidden, hidden), "hidden.b": (*layers, members, 1, hidden)}
-    if shapes != expected:
-        raise InputError(f"weights have shapes {shapes}, expected {expected}")
-    for name, weight in weights.items():
-        largest = np.abs(weight).max(initial=0)
-        if weight.dtype != np.float32 or not largest <= MAX_WEIGHT:
-            raise InputError(
-                f"weights {name} are {weight.dtype} up to {largest:g}, allowed is float32 up to {MAX_WEIGHT:g}"
-            )
+    check_arrays(weights, {name: (shape, np.float32) for name, shape in expected.items()}, MAX_WEIGHT)
 
 
 def network_inputs(features: Floats, fibre_mask: Mask) -> Floats:

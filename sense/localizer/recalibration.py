@@ -7,7 +7,7 @@ fine tuning suffices. Cross-validation over the new presses decides whether eith
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import count, groupby
+from itertools import count
 from types import MappingProxyType
 from typing import Any
 
@@ -28,20 +28,16 @@ FORMAT = "padforge-recalibration/2"
 GAIN_STD, ROTATION_STD, SHIFT_STD = 0.2, 0.05, 0.1
 """Prior standard deviations: of the logarithm of a gain, of the angle (radians) and the logarithm of the scale, and of
 the shift (scaled position)."""
-R90_STD = 1.645
-"""Standard deviations in the half-width that holds 90 % of a normal distribution."""
+R90_STD = 1.645  # standard deviations in the half-width that holds 90 % of a normal distribution
 DIFFERENCE = 0.02
 """Step of numerical derivatives, in prior standard deviations: shorter ones drown in the rounding of the network."""
-MIN_PRESSES = 10
-"""New presses needed: fewer can neither change much nor show that it was for the better."""
+MIN_PRESSES = 10  # new presses needed: fewer can neither change much nor show that it was for the better
 FOLDS = 5
 CORRECT_FROM, FINE_TUNE_FROM = 2.0, -1.0
 """Gains, in standard errors, from which a correction, which is coarse, and fine tuning, which is gentle, are kept. Fine
 tuning gains almost always, but less than a hundred presses can show, so it is kept unless they speak against it."""
-SUBSETS = 16
-"""Sets of failed fibres of a size that are looked at, at most."""
-Predictions = Mapping[tuple[int, ...], Localization]
-"""By set of failed fibres."""
+SUBSETS = 16  # sets of failed fibres of a size that are looked at, at most
+Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed fibres
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
 
 
@@ -80,8 +76,7 @@ def recalibrate(
     rows = np.random.default_rng(seed).permutation(known)
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
-    levels = range(len(model.interval_factors))
-    subsets = [subset for level in levels for subset in failure_subsets(model.fibres, level, SUBSETS)]
+    subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(len(model.interval_factors))]
     validation = CrossValidation(features, positions_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
     before = validation.predict([model] * FOLDS)
     changed, after, changes = _select_changes(model, validation, before, seed, on_progress)
@@ -220,19 +215,21 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 
 
 class CrossValidation:
-    """Cross-validation of changes on new presses: each fold is left out in turn, for each subset of failed fibres."""
+    """Cross-validation of changes on new presses: each fold is left out in turn, for each subset of failed fibres.
+
+    `subsets` are listed by the number of failed fibres, from 0.
+    """
 
     def __init__(
         self,
         features: PressFeatures,
         positions_mm: Array,
         folds: Sequence[Indices],
-        subsets: Sequence[tuple[int, ...]],
+        subsets: Sequence[Sequence[tuple[int, ...]]],
         measures: Measures = MappingProxyType({}),
     ) -> None:
         self.presses = features, positions_mm, measures
         self._folds, self._subsets = folds, subsets
-        self._levels = [list(level) for _, level in groupby(subsets, len)]  # subsets ascend in size
 
     def change(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
         """Change the models, one a fold, each by the presses that its fold leaves."""
@@ -248,35 +245,31 @@ class CrossValidation:
         """Predict each press by the model of the fold that leaves it out, without each set of failed fibres."""
         features = self.presses[0]
         parts = [(each, each.scaler.transform(features[fold])) for each, fold in zip(models, self._folds, strict=True)]
-        return {
-            failed: concatenate([each.predict_features(part, failed) for each, part in parts])
-            for failed in self._subsets
-        }
+        return [
+            [concatenate([each.predict_features(part, failed) for each, part in parts]) for failed in level]
+            for level in self._subsets
+        ]
 
     def gain(self, before: Predictions, after: Predictions) -> tuple[float, float]:
         """Return the mean decrease of errors, mm, numbers of failed fibres weighing alike, and its standard error."""
-        positions_mm = self.presses[1]
 
-        def errors(predictions: Predictions, failed: tuple[int, ...]) -> Array:
-            return distances(predictions[failed].positions_mm, positions_mm)
+        def errors(prediction: Localization) -> Array:
+            return distances(prediction.positions_mm, self.presses[1])
 
-        levels = [[errors(before, failed) - errors(after, failed) for failed in level] for level in self._levels]
+        levels = [
+            [errors(old) - errors(new) for old, new in zip(*level, strict=True)]
+            for level in zip(before, after, strict=True)
+        ]
         decrease = np.mean([np.mean(level, axis=0) for level in levels], axis=0)
         return float(decrease.mean()), float(decrease.std(ddof=1) / np.sqrt(len(decrease)))
 
     def error_rows(self, predictions: Predictions) -> list[dict[str, Any]]:
         """Return rows of `evaluation.error_row`."""
-        _, positions_mm, measures = self.presses
-        return [
-            error_row(len(level[0]), [predictions[failed] for failed in level], positions_mm, measures)
-            for level in self._levels
-        ]
+        return [error_row(n_failed, level, *self.presses[1:]) for n_failed, level in enumerate(predictions)]
 
     def widening(self, predictions: Predictions) -> Array:
         """Return (K, 3 + T) factors, 1 or more, with which intervals hold on these presses."""
-        _, positions_mm, measures = self.presses
-        by_level = ([predictions[failed] for failed in level] for level in self._levels)
-        return np.maximum([conformal(each, positions_mm, measures) for each in by_level], 1.0)
+        return np.maximum([conformal(level, *self.presses[1:]) for level in predictions], 1.0)
 
 
 def recalibration_lines(document: Mapping[str, Any]) -> list[str]:

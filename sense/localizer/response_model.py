@@ -14,15 +14,12 @@ import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 
-RBF_SIDE = 21
-"""Basis functions along a side of the pad."""
-RBF_STD = 2.0
-"""Their standard deviation, in distances between neighbours: wide enough that sums of them are smooth."""
+RBF_SIDE = 21  # basis functions along a side of the pad
+RBF_STD = 2.0  # their standard deviation, in distances between neighbours: wide enough that sums of them are smooth
 RIDGE_POSITION, RIDGE_HISTORY = 1.0, 300.0
 """Penalties on squared weights, of basis functions and of standardized history. Features of the history are collinear:
 with a small penalty weights cancel each other, and a few hundred presses err by a tenth more."""
-GRID_CELLS = 60
-"""Cells along a side of the grid on which the response is tabulated."""
+GRID_CELLS = 60  # cells along a side of the grid on which the response is tabulated
 _CHUNK = 16_384
 
 
@@ -48,13 +45,8 @@ class ResponseModel:
     ) -> "ResponseModel":
         """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
 
-        Args:
-            positions: (Q, 2) within [-1, 1].
-            windows: (Q, C, F), V.
-            history: (Q, C, J), V.
-            fibre_mask: (Q, C).
-            relative_depth: (Q,) depth of each press over that of the table; None if all are equal.
-            phases: windows whose sensitivity is modulated together.
+        Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V. `relative_depth` (Q,) is that
+        of each press over that of the table; windows of a phase have their sensitivity modulated together.
         """
         fibres, pasts = history.shape[1:]
         size, n_rbf = windows.shape[2], RBF_SIDE**2

@@ -16,10 +16,8 @@ from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats,
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 
-MAX_INPUT = 1e4
-"""Largest scaled feature, in standard deviations; beyond lies no press, and features are clipped."""
-MAX_LEVERAGE = 0.9
-"""Of a press far from all others; its residual grows tenfold at most."""
+MAX_INPUT = 1e4  # largest scaled feature, in standard deviations; beyond lies no press, and features are clipped
+MAX_LEVERAGE = 0.9  # of a press far from all others; its residual grows tenfold at most
 DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
@@ -102,16 +100,8 @@ class FeatureScaler:
         """Fit the response model of the pad and the scaling of its features.
 
         A window is divided by the geometric mean of its own standard deviation and its fibre's, so that the fine
-        windows of a touch keep some of their smallness, and so of their noise.
-
-        Args:
-            features: of the presses of training.
-            positions_mm: (Q, 2).
-            measures: (Q,) of each of depth and force to be predicted.
-            phases: windows whose sensitivity is modulated together.
-
-        Returns:
-            The scaler, and the (S, S, C, F + G) scaled response by position, at the scaled depth 0 if depths vary.
+        windows of a touch keep some of their smallness, and so of their noise. `phases` are as in `ResponseModel.fit`.
+        Also returned is the (S, S, C, F + G) scaled response by position, at the scaled depth 0 if depths vary.
         """
         targets = tuple(TargetScaler.fit(name, values) for name, values in (measures or {}).items())
         low, high = positions_mm.min(axis=0), positions_mm.max(axis=0)
@@ -163,8 +153,7 @@ class FeatureScaler:
         self, features: PressFeatures, positions_mm: Array, measures: Mapping[str, Array] | None = None
     ) -> "TrainingPresses":
         """Scale features and targets of presses."""
-        scaled = self.transform(features)
-        targets = self.scale_targets(positions_mm, measures)
+        scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
         return TrainingPresses(scaled.inputs, scaled.fibre_mask, targets, self.depth_gain)
 
 
@@ -175,11 +164,9 @@ def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
 
 
 @dataclass(frozen=True)
-class TrainingPresses:
+class TrainingPresses(ScaledFeatures):
     """Scaled presses of known targets, to train or to check on."""
 
-    inputs: Floats  # (Q, C, F + G)
-    fibre_mask: Mask  # (Q, C)
     targets: Floats  # (Q, 2 + T)
     depth_gain: float = 0.0  # see `FeatureScaler.depth_gain`
 

@@ -1,17 +1,15 @@
 """Training of the networks in torch: one loop for all, and what the localizer minimizes by it.
 
-The loss is the distance itself, not its square, and a likelihood of the expected error. Every step masks random fibres
-and augments the positions (and depths) of presses, their features following the response model. The members of the
-ensemble know nothing of the Bayesian localizer; a smaller network learns its residual. Their errors are of different
-kinds, so that together they err by a tenth less. Nothing is selected on presses held back: of so few, chance would
-select.
+The loss is the distance, not its square, and a likelihood of the expected error. Every step masks random fibres and
+augments the positions (and depths) of presses, their features following the response model. The members of the ensemble
+know nothing of the Bayesian localizer, whose residual a smaller network learns: errors of different kinds, so that
+together they err by a tenth less. Nothing is selected on presses held back: of so few, chance would select.
 """
 
 import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from threading import Event, Lock
 from typing import NamedTuple
@@ -30,12 +28,9 @@ from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_resid
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs, sample_fibre_dropout
 from padforge.sense.settings import LocalizerSettings
 
-WARM_UP = 0.2
-"""Share of the steps in which the learning rate rises."""
-AVERAGE_DECAY = 0.998
-"""Decay of the exponential moving average of the weights."""
-REPORTS = 40
-"""Calls of `on_progress` in a training."""
+WARM_UP = 0.2  # share of the steps in which the learning rate rises
+AVERAGE_DECAY = 0.998  # decay of the exponential moving average of the weights
+REPORTS = 40  # calls of `on_progress` in a training
 
 
 def one_cycle(share: float) -> float:
@@ -45,57 +40,30 @@ def one_cycle(share: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
 
 
-@dataclass
-class _TrainingLength:
-    """Length of a training, in steps; or in seconds, counted from when this is made."""
-
-    steps: int
-    seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        self._begin = time.monotonic()
-
-    @property
-    def total(self) -> int:
-        """Steps, or seconds, of the whole training."""
-        return self.steps if self.seconds is None else max(1, round(self.seconds))
-
-    def share(self, step: int) -> float:
-        """Return the share of the training, above 0 and up to 1, that is done with a step, counted from 1."""
-        if self.seconds is None:
-            return step / self.steps
-        elapsed = time.monotonic() - self._begin
-        return min(elapsed / self.seconds, 1.0) if self.seconds > 0 else 1.0
-
-
 def fit_network(
     parameters: Mapping[str, Tensor],
     loss_of_batch: Callable[[], Tensor],
-    length: _TrainingLength | int,
+    steps: int,
     learning_rate: float,
     *,
+    seconds: float | None = None,
     weight_decay: float = 1e-2,
     averaged: bool = True,
-    on_progress: Callable[[int], None] = lambda done: None,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> dict[str, Floats]:
-    """Minimize a loss by AdamW with a one-cycle learning rate and averaged weights, and return these.
+    """Minimize a loss by AdamW with a one-cycle learning rate; return the moving average of the weights, or the last.
 
-    Args:
-        parameters: weights by name, which require gradients; they are changed in place.
-        loss_of_batch: draws a batch and returns its loss, a scalar; called once a step.
-        length: number of steps; a time budget in a calibration.
-        learning_rate: maximum of the schedule.
-        weight_decay: of AdamW.
-        averaged: whether to return the moving average of the weights, or the last ones.
-        on_progress: called up to `REPORTS` times with the steps (or seconds, in a time budget) done.
+    Weights by name require gradients and are changed in place. `loss_of_batch` draws a batch and returns its loss,
+    `seconds` limit the training in place of `steps`, and `on_progress` is called up to `REPORTS` times with the share
+    that is done.
     """
-    length = _TrainingLength(length) if isinstance(length, int) else length
+    begin = time.monotonic()
     average = [weight.detach().clone() for weight in parameters.values()]
     optimizer = torch.optim.AdamW(parameters.values(), lr=learning_rate, weight_decay=weight_decay, fused=True)
     share, step, reports = 0.0, 0, 0
     while share < 1:
         step += 1
-        share = length.share(step)
+        share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
         optimizer.param_groups[0]["lr"] = learning_rate * one_cycle(share)
         optimizer.zero_grad()
         loss_of_batch().backward()
@@ -106,7 +74,7 @@ def fit_network(
             mean.lerp_(weight.detach(), 1 - decay)
         if share * REPORTS >= reports + 1:
             reports = int(share * REPORTS)
-            on_progress(round(share * length.total))
+            on_progress(share)
     return {name: mean.cpu().numpy() for name, mean in zip(parameters, average, strict=True)}
 
 
@@ -115,11 +83,9 @@ class StoppedError(Exception):
 
 
 class JointProgress:
-    """Progress of trainings in several threads; those still at work when the `with` block ends stop at their next step.
+    """Progress of trainings in threads, of `totals` steps: `on_progress` is called with (steps done, steps in all).
 
-    Args:
-        totals: steps of each.
-        on_progress: called with (steps done, steps in all), of all together.
+    Those still at work when the `with` block ends stop at their next report.
     """
 
     def __init__(self, totals: Sequence[int], on_progress: Callable[[int, int], None]) -> None:
@@ -141,12 +107,9 @@ class JointProgress:
         self._stopped.set()
 
 
-MEASURE_WEIGHT = 0.5
-"""Weight of the error of a scaled depth or force, beside the distance."""
-LOG_ERROR_WEIGHT = 0.1
-"""Weight of the likelihood of the expected error, beside the distance."""
-INPUT_NOISE = 0.02
-"""Standard deviation of noise on scaled features, which are about 1."""
+MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, beside the distance
+LOG_ERROR_WEIGHT = 0.1  # weight of the likelihood of the expected error, beside the distance
+INPUT_NOISE = 0.02  # standard deviation of noise on scaled features, which are about 1
 AUGMENTATION = 2.2
 """Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm among 3000 presses on a
 pad of 45 mm, 7 mm among 240, which leave more to interpolate."""
@@ -157,8 +120,7 @@ MIN_BATCHES, MAX_STEPS, HARDER = 10, 11_000, 2
 release is not looked at, which is harder to learn."""
 RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
 """Largest size of the network that corrects the Bayesian localizer: larger ones gain nothing."""
-PUBLISHED_HIDDEN = 50
-"""Neurons of the published network, of one tanh layer."""
+PUBLISHED_HIDDEN = 50  # neurons of the published network, of one tanh layer
 PACE_STEPS, MIN_LENGTHS, MAX_MEMBERS = 12, 5, 64
 """With a time budget: steps that measure the pace, usual lengths of a training before there is another for each core,
 and the most networks."""
@@ -182,15 +144,9 @@ def train_members(
 ) -> TrainedNetworks:
     """Train the members of the localizer; the last of several is a Bayesian localizer with its residual network.
 
-    Where depths vary there is no Bayesian localizer. Networks are trained in threads.
-
-    Args:
-        presses: training data.
-        table: (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
-        options: size of the networks and length of the training.
-        rng: source of the seeds of torch's generators.
-        on_progress: called with (steps done, steps in all), of all networks; with a time budget, with seconds.
-        time_budget: seconds to train for, with as many members as these are good for; None for those of `options`.
+    Where depths vary there is no Bayesian localizer. Networks are trained in threads. `table` is the (S, S, C, F + G)
+    scaled response by position, over [-1, 1] in x and y. `time_budget` is in seconds, for as many members as these are
+    good for, and `on_progress` is called with seconds then, else with (steps done, steps in all) of all networks.
     """
     begin = time.monotonic()
     presses = leave_one_out_residuals(presses, table)
@@ -207,7 +163,8 @@ def train_members(
     has_bayes = networks > 1 and not presses.depth_gain
     bayes = BayesianLocalizer.fit(table, presses.inputs, presses.fibre_mask, presses.targets) if has_bayes else None
     seeds = [int(seed) for seed in rng.integers(2**63, size=networks)]
-    joint = JointProgress([_TrainingLength(steps, seconds).total] * networks, on_progress)
+    total = steps if seconds is None else max(1, round(seconds))
+    joint = JointProgress([total] * networks, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
     members = networks - has_bayes
 
@@ -217,9 +174,10 @@ def train_members(
         return fit_network(
             dict(training.network.named_parameters()),
             training.loss,
-            _TrainingLength(steps, seconds),
+            steps,
             options.learning_rate,
-            on_progress=lambda done: joint.update(number, done),
+            seconds=seconds,
+            on_progress=lambda share: joint.update(number, round(share * total)),
         )
 
     with one_torch_thread(), joint:
@@ -363,12 +321,10 @@ class _Training:
 
 FINE_TUNING_STEPS, FINE_TUNING_BATCH, FINE_TUNING_RATE = 200, 128, 1e-4
 """Enough to follow drift and too little to forget: errors hardly change for half and twice as much."""
-PRIOR_PRESSES = 100
-"""New presses that weigh as much as what was learnt before."""
+PRIOR_PRESSES = 100  # new presses that weigh as much as what was learnt before
 NEAR_STD, FAR_NOISE = 0.09, 0.1
 """Standard deviations of augmented scaled positions, 2 mm on a pad of 45 mm, and of noise on presses moved anywhere."""
-KEEP_LOG_ERROR_WEIGHT = 0.02
-"""Weight of keeping log errors, beside the positions."""
+KEEP_LOG_ERROR_WEIGHT = 0.02  # weight of keeping log errors, beside the positions
 
 
 def fine_tune(
@@ -407,6 +363,6 @@ def fine_tune(
         kept = (_loss(change) + KEEP_LOG_ERROR_WEIGHT * log_change.abs().mean(dim=2)).mean(dim=1).sum()
         return share * new + (1 - share) * kept
 
-    parameters, length = dict(network.named_parameters()), FINE_TUNING_STEPS
+    parameters, steps = dict(network.named_parameters()), FINE_TUNING_STEPS
     with one_torch_thread():
-        return fit_network(parameters, loss_of_batch, length, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)
+        return fit_network(parameters, loss_of_batch, steps, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)

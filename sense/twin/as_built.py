@@ -22,24 +22,17 @@ from padforge.design.twin import PlanTransform
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.twin.responses import Responses
 
-EPSILON = 1e-6
-"""Squared distance below which the direction to the press is undefined, squared grid units."""
-N_ELEMENTS = 160
-"""Elements of a fibre."""
-FLAT_TOLERANCE = 1e-3
-"""Tolerance of the polyline that elements lie on, grid units."""
-N_SPLINES = 9
-"""Splines of a profile."""
-SPLINE_STEP = 0.36
-"""Their distance, as a share of the standard deviation of the Gaussian profile that fits best."""
-N_OFFSET, N_SENSITIVITY = 12, 8
-"""Splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity."""
+EPSILON = 1e-6  # squared distance below which the direction to the press is undefined, squared grid units
+N_ELEMENTS = 160  # elements of a fibre
+FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
+N_SPLINES = 9  # splines of a profile
+SPLINE_STEP = 0.36  # their distance, as a share of the standard deviation of the Gaussian profile that fits best
+N_OFFSET, N_SENSITIVITY = 12, 8  # splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity
 N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
 """Parameters that all channels share (transform and two profiles), and those of each channel."""
 OFFSET, SENSITIVITY = slice(2, 2 + 2 * N_OFFSET), slice(2 + 2 * N_OFFSET, N_CHANNEL)
 """Among the parameters of a channel, those of its lateral offset, x before y, and of its log-sensitivity."""
-SLOPE_STEP_MM = 0.5
-"""Half of the step of the central differences by which slopes over the position are taken."""
+SLOPE_STEP_MM = 0.5  # half of the step of the central differences by which slopes over the position are taken
 
 
 @njit(cache=True, error_model="numpy")
@@ -56,9 +49,8 @@ def spline_weights(f: float, out: Any) -> None:
 def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
     """Evaluate cubic B-splines of coefficients (n, J) from end to end of F elements.
 
-    Returns:
-        Values at each element, and their change over it; shape (2, n, F). First coefficient that each element depends
-        on; shape (F,). Derivatives of value and change by that one and the next three; shape (2, F, 4).
+    Returned are values at each element and their change over it (2, n, F); the first coefficient that each element
+    depends on (F,); and the derivatives of value and change by that one and the next three (2, F, 4).
     """
     curves, count = coefficients.shape
     pieces = count - 3
@@ -80,19 +72,12 @@ def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
 def channel_response(
     fibre: Any, lateral_offset: Any, log_sensitivity: Any, positions: Any, profile: Any, step: float
 ) -> Any:
-    """Compute the responses of one fibre, and their derivatives; grid units.
+    """Compute the responses (Q,) of one fibre to presses at positions (Q, 2), and their derivatives; grid units.
 
-    Args:
-        fibre: middles (F, 2), unit tangents (F, 2) and lengths (F,) of its planned elements, evenly spaced.
-        lateral_offset: spline coefficients of the offset in x and in y, which also stretches the fibre; shape (2, J).
-        log_sensitivity: spline coefficients; shape (1, J').
-        positions: presses; shape (Q, 2).
-        profile: coefficients of w and of v; shape (2, K).
-        step: distance of the splines of the profile.
-
-    Returns:
-        Responses (Q,), and their derivatives by profile (Q, 2, K), lateral offset (Q, 2, J), log-sensitivity (Q, J')
-        and position (Q, 2).
+    The fibre is middles (F, 2), unit tangents (F, 2) and lengths (F,) of its planned elements, evenly spaced. Splines
+    have the coefficients `lateral_offset` (2, J), in x and y, which also stretches it, `log_sensitivity` (1, J') and
+    `profile` (2, K), of w and v, whose splines are `step` apart. Derivatives are by profile (Q, 2, K), lateral offset
+    (Q, 2, J), log-sensitivity (Q, J') and position (Q, 2).
     """
     path, tangent, length = fibre
     elements, splines, presses = len(path), profile.shape[1], len(positions)

@@ -29,24 +29,19 @@ from padforge.sense.twin.as_built import (
 )
 from padforge.sense.twin.responses import Responses
 
-CORRELATION_LENGTH = 0.3
-"""Correlation length of lateral offsets and log-sensitivities, as a share of the fibre."""
+CORRELATION_LENGTH = 0.3  # correlation length of lateral offsets and log-sensitivities, as a share of the fibre
 TRANSFORM_STD = np.array([0.1, 5.0, 5.0, 0.05])
 """Prior standard deviations of turn (rad, from a quarter turn), shift (mm, from 0) and scale (from 1)."""
-ANGULAR_STD = 0.3
-"""Prior standard deviation of the splines of v."""
+ANGULAR_STD = 0.3  # prior standard deviation of the splines of v
 PROFILE_BEND = 0.15
 """Prior standard deviation of the second differences of a profile's splines, as a share of its largest weight."""
 OFFSET_RANGE_MM, SENSITIVITY_RANGE = (0.1, 1.2), (0.02, 0.4)
 """Ranges of the standard deviations of lateral offset, mm, and log-sensitivity."""
-FIRST_PRIOR_STEP = 3
-"""Step from which these are estimated; before, a poor fit would pass for large offsets."""
-TOLERANCE = 1e-4
-"""Relative change of the objective at which a fit has converged."""
+FIRST_PRIOR_STEP = 3  # step from which these are estimated; before, a poor fit would pass for large offsets
+TOLERANCE = 1e-4  # relative change of the objective at which a fit has converged
 MAX_DAMPING = 1e8
 MAX_STEPS = 25
-MIN_PAIRS = 30
-"""Pairs of presses that the scatter is estimated from, at least."""
+MIN_PAIRS = 30  # pairs of presses that the scatter is estimated from, at least
 
 
 @dataclass(frozen=True)
@@ -87,22 +82,19 @@ class AsBuiltFit:
 def fit_as_built(
     start: AsBuiltPad, responses: Responses, priors: Priors, noise_inflation: Array | float = 1.0
 ) -> AsBuiltFit:
-    """Fit a pad to responses, maximum a posteriori.
+    """Fit a pad to the responses of its channels, maximum a posteriori, from a first guess whose wiring stays.
 
-    Args:
-        start: first guess; its wiring stays.
-        responses: of the channels that the pad has.
-        priors: standard deviations to begin with, and what stays as planned.
-        noise_inflation: factor on the noise of each channel (C,), since residuals of neighbouring presses are
-            correlated where the model is wrong.
+    `noise_inflation` is a factor (C,) on the noise of each channel, since residuals of neighbouring presses are
+    correlated where the model is wrong.
     """
     free, damping = np.flatnonzero(priors.free_mask(len(start.fibres))), 1e-3
     current = _Objective(start, responses, priors, noise_inflation, np.sqrt(responses.variance) / 2)
     for step in range(MAX_STEPS):
         hessian, gradient = current.normal_equations()
-        proposal = None
+        block, change, proposal = hessian[np.ix_(free, free)], np.zeros(len(gradient)), None
         while proposal is None and damping < MAX_DAMPING:
-            proposal = current.moved(_damped_step(hessian, gradient, free, damping))
+            change[free] = cho_solve(cho_factor(block + damping * np.diag(np.diag(block))), gradient[free])
+            proposal = current.moved(change)
             if proposal.value >= current.value:
                 damping, proposal = 4 * damping, None
         if proposal is None:
@@ -113,13 +105,6 @@ def fit_as_built(
             break
     hessian = current.normal_equations()[0]
     return AsBuiltFit(current.pad, current.priors, _inverse(hessian, free), current.log_evidence(hessian, free))
-
-
-def _damped_step(hessian: Array, gradient: Array, free: Indices, damping: float) -> Array:
-    block = hessian[np.ix_(free, free)]
-    step = np.zeros(len(gradient))
-    step[free] = cho_solve(cho_factor(block + damping * np.diag(np.diag(block))), gradient[free])
-    return step
 
 
 def _inverse(matrix: Array, free: Indices) -> Array:
@@ -235,12 +220,7 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     Half the squared difference of the residuals of two neighbouring presses is their variance, whatever smooth
     function of position is left in them: floor^2 + share^2 x^2 for responses x, a straight line over x^2. Where
     channels share a part of it, products of their differences are common share^2 x_c x_c'. Too few presses give
-    constant noise.
-
-    Args:
-        pad: as fitted to the presses.
-        responses: of its channels.
-        noise_v: standard deviation of each channel's total scatter; shape (C,).
+    constant noise. `noise_v` (C,) is the standard deviation of each channel's total scatter.
     """
     valid = np.flatnonzero(responses.valid.all(axis=1))
     if len(valid) < 2 * MIN_PAIRS:

@@ -26,45 +26,32 @@ from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
 from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built
 from padforge.sense.twin.responses import Responses, compute_responses, fisher_information, fit_gp, select_one_depth
 
-PROFILE_POINTS, MIN_WEIGHT = 13, 0.01
-"""Points of the sensitivity profile of a twin, and the least weight that counts."""
+PROFILE_POINTS, MIN_WEIGHT = 13, 0.01  # points of the sensitivity profile of a twin, and the least weight that counts
 MIN_PRESSES = 60
 MIN_SIDE = 0.5
 """Least width and height of what was pressed, as a share of the rectangle half a pitch beyond the outermost fibres."""
-HELD_OUT = 0.15
-"""Share of the presses that are held out."""
-MAX_PRESSES = 2000
-"""Presses of the last fit."""
+HELD_OUT = 0.15  # share of the presses that are held out
+MAX_PRESSES = 2000  # presses of the last fit
 N_CANDIDATES, N_COMPARED = 8, 150
 """Wirings that are fitted, and presses by which they are compared: residuals are correlated over about half a grid
 unit, so that more presses would count the same evidence twice."""
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
-MIN_LOG_BAYES_FACTOR = 10.0
-"""From which on a channel is live, and another wiring is ruled out."""
-SAME_LOG_EVIDENCE = 1.0
-"""Difference of log evidence below which two fits are equally good."""
-MIN_ANGULAR_GAIN = 0.01
-"""Share of the variance of held-out responses that an angular term must explain."""
+MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live, and another wiring is ruled out
+SAME_LOG_EVIDENCE = 1.0  # difference of log evidence below which two fits are equally good
+MIN_ANGULAR_GAIN = 0.01  # share of the variance of held-out responses that an angular term must explain
 MIN_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else the recording is of another pad."""
 
-PROFILE_WIDTH = 0.55
-"""Standard deviation of the Gaussian profile that is tried first, grid units."""
-N_SCORED = 400
-"""Presses by which transforms are scored."""
-ELEMENT_STRIDE = 4
-"""Every such element of a fibre is used."""
-SHIFTS = (-0.8, -0.4, 0.0, 0.4, 0.8)
-"""Shifts that are tried along each axis, grid units."""
-N_REFINED = 24
-"""Transforms of the grid that are refined."""
+PROFILE_WIDTH = 0.55  # standard deviation of the Gaussian profile that is tried first, grid units
+N_SCORED = 400  # presses by which transforms are scored
+ELEMENT_STRIDE = 4  # every such element of a fibre is used
+SHIFTS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # shifts that are tried along each axis, grid units
+N_REFINED = 24  # transforms of the grid that are refined
 FIRST_STEPS = np.array([0.06, 0.25, 0.25, 0.03, 0.15])
 """First steps of the refinement: turn (rad), shift (grid units), scale, and logarithm of the profile's width."""
-STEP_COST = 0.002
-"""Cost of a change by one such step in all, in shares of the variance explained."""
+STEP_COST = 0.002  # cost of a change by one such step in all, in shares of the variance explained
 
-OnProgress = Callable[[str, int, int], None]
-"""Called with (what is being done, steps done, total)."""
+OnProgress = Callable[[str, int, int], None]  # called with (what is being done, steps done, total)
 
 
 @dataclass(frozen=True)
@@ -196,8 +183,7 @@ class Identification:
     def lateral_offsets_mm(self) -> list[tuple[Array, Array, Mask]]:
         """Compute how far each live channel's fibre lies to the left of its plan.
 
-        Returns:
-            For each: offset (F,) of its elements, mm; standard deviation (F,), mm; mask (F,) of those pressed.
+        Returned are, for each, offset and standard deviation (F,) of its elements, mm, and a mask of those pressed.
         """
         built, unit_mm = self.fit.pad, self.pad.unit_mm
         pressed = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))

@@ -1,9 +1,8 @@
 """Responses of the channels to presses at known positions, and what they say without a model of the pad.
 
-A response is one number for a press and a channel: the mean while the tip rests in the silicone, minus the rest before,
-with what the channel's history adds taken off. All other windows of a press carry information on its position too; how
-much is Fisher's information J' S^-1 J, with J the slope of the windows over the position by the response model and S
-the covariance of its residuals on presses that it was not fitted to.
+A response is one number for a press and a channel: the mean while the tip rests in the silicone, minus the rest before
+and what the channel's history adds. How much all windows of a press tell of its position is Fisher's information
+J' S^-1 J, with J their slope by the response model and S the covariance of its residuals on presses held out.
 """
 
 from dataclasses import dataclass, replace
@@ -17,15 +16,12 @@ from padforge.sense.localizer.features import DOWN, PressFeatures, compute_featu
 from padforge.sense.localizer.response_model import GRID_CELLS, ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
-DEPTH_TOLERANCE = 0.15
-"""Share of its depth by which another press may differ that counts as equally deep."""
-FIRST_HELD = 3
-"""First window of the press that counts as held: the tip has come to rest in the silicone."""
+DEPTH_TOLERANCE = 0.15  # share of its depth by which another press may differ that counts as equally deep
+FIRST_HELD = 3  # first window of the press that counts as held: the tip has come to rest in the silicone
 HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(DOWN)], float)
 HOLD /= HOLD.sum()
 """Weights of the windows of a press in its response; shape (9,)."""
-GP_WIDTHS = (0.4, 0.8)
-"""Standard deviations of the Gaussian kernels that are tried, grid units."""
+GP_WIDTHS = (0.4, 0.8)  # standard deviations of the Gaussian kernels that are tried, grid units
 GP_PRESSES = 800
 """Presses that a Gaussian process is fitted to, at most: it takes the eigenvalues of a matrix of that size."""
 GP_RATIOS = np.append(0.0, np.geomspace(1e-2, 1e4, 61))
@@ -92,8 +88,7 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
 def fisher_information(recording: Recording, channels: Indices) -> Array:
     """Compute the Fisher information on the position in all windows of a press, mean over the pressed area.
 
-    Returns:
-        Trace of the information of each of the channels (C',), 1/mm^2, from presses in which it gave enough readings.
+    Its trace (C',), 1/mm^2, is of each of the channels, from presses in which it gave enough readings.
     """
     positions_mm, positions, inputs = _positions_and_features(recording, "press_and_release")
     information = []
@@ -139,13 +134,8 @@ def _positions_and_features(recording: Recording, features: str) -> tuple[Array,
 def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
     """Fit a Gaussian process over the position to each channel, by maximum likelihood over kernel width and noise.
 
-    Args:
-        responses: of any kind, such as residuals.
-        unit_mm: grid unit, mm.
-
-    Returns:
-        Standard deviation of what no smooth function of position explains; shape (C,); NaN where too few presses are
-        valid. Log-likelihood of a smooth function minus that of noise alone, the log Bayes factor; shape (C,).
+    Returns the standard deviation (C,) of what no smooth function of position explains, NaN where too few presses are
+    valid; and the log Bayes factor (C,): log-likelihood of a smooth function minus that of noise alone.
     """
     positions = responses.positions_mm[:GP_PRESSES] / unit_mm
     squares = ((positions[:, None, :] - positions) ** 2).sum(axis=2)

@@ -1,9 +1,10 @@
 """Recalibration: a changed pad is followed, an unchanged one not spoilt, and radii never shrink."""
 
-import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -58,20 +59,17 @@ def off_by(*amounts: float, radius: float = 1.0) -> Localization:
     return Localization(np.column_stack([amounts, np.zeros(count)]), np.full((count, 2), radius), radii, radii)
 
 
-def trial_of(folds: list[list[int]], raw: np.ndarray | None = None) -> CrossValidation:
-    places = np.zeros((4, 2))
-    return CrossValidation(raw, places, [np.array(fold) for fold in folds], [(), (0,), (1,)])  # pyright: ignore
-
-
 def test_cross_validation_compares_presses_left_out() -> None:
     """With all fibres errors shrink by 1, 2, 3, 4 mm, with one lost by 0 and by 4 mm: by 1.5 to 3 in the mean."""
-    before = {(): off_by(2, 4, 6, 8), (0,): off_by(5, 5, 5, 5), (1,): off_by(5, 5, 5, 5)}
-    after = {(): off_by(1, 2, 3, 4), (0,): off_by(5, 5, 5, 5), (1,): off_by(1, 1, 1, 1)}
-    gain, error = trial_of([[0, 1], [2, 3]]).gain(before, after)
+    before = [[off_by(2, 4, 6, 8)], [off_by(5, 5, 5, 5), off_by(5, 5, 5, 5)]]
+    after = [[off_by(1, 2, 3, 4)], [off_by(5, 5, 5, 5), off_by(1, 1, 1, 1)]]
+    folds, subsets = [np.array([1, 3]), np.array([0, 2])], [[()], [(0,), (1,)]]
+    validation: Any = CrossValidation(cast("Any", np.arange(4)), np.zeros((4, 2)), folds, subsets)
+    gain, error = validation.gain(before, after)
     assert gain == pytest.approx(2.25)
     assert error == pytest.approx(np.std([1.5, 2.0, 2.5, 3.0], ddof=1) / 2)
-    found = {(): off_by(0.1, 0.1, 0.1, 0.1), (0,): off_by(3, 3, 3, 3), (1,): off_by(3, 3, 3, 3)}
-    widened = trial_of([[0, 1], [2, 3]]).widening(found)  # where radii hold, they are not narrowed
+    found = [[off_by(0.1, 0.1, 0.1, 0.1)], [off_by(3, 3, 3, 3), off_by(3, 3, 3, 3)]]
+    widened = validation.widening(found)  # where radii hold, they are not narrowed
     np.testing.assert_allclose(widened, [[1, 1, 1], [3 / np.sqrt(2), 3, 3]])
     seen: list[list[int]] = []
 
@@ -80,19 +78,12 @@ def test_cross_validation_compares_presses_left_out() -> None:
         seen.append(raw.tolist())
         return localizer + 1
 
-    assert trial_of([[1, 3], [0, 2]], np.arange(4)).change([10, 20], change) == [11, 21]  # pyright: ignore
+    assert validation.change([10, 20], change) == [11, 21]
     assert seen == [[0, 2], [1, 3]]  # a fold is changed by the other presses only
 
 
-@pytest.fixture(scope="module")
-def followed(localizer: LocalizerModel, recording: Recording) -> tuple[LocalizerModel, dict]:
-    return recalibrate(localizer, known_only(remade(recording), NEW))
-
-
-def test_recalibrate_follows_a_remade_pad(
-    localizer: LocalizerModel, recording: Recording, followed: tuple, tmp_path: Path
-) -> None:
-    now, document = followed
+def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: Recording) -> None:
+    now, document = recalibrate(localizer, known_only(remade(recording), NEW))
     pad = remade(recording)
     for lost in ((), (0,), (2,), (1, 3)):
         pairs = ((localizer, pad), (now, pad), (localizer, recording))
@@ -109,13 +100,8 @@ def test_recalibrate_follows_a_remade_pad(
     assert np.allclose(now.interval_factors, localizer.interval_factors * document["widened"])
     found = now.predict_features(now.scaled_features(pad)[LATER])
     assert (distances(found.positions_mm, pad.presses_mm[LATER]) <= found.r90_mm).mean() > 0.8
-    # it is a model like any other, that has seen its presses
-    now.save(tmp_path)
-    again = LocalizerModel.load(tmp_path)
-    assert np.array_equal(again.table, now.table)
-    assert again.recalibrated_by == (known_only(pad, NEW).digest,)
-    assert np.array_equal(again.predict(pad).positions_mm, now.predict(pad).positions_mm)
-    json.dumps(document, allow_nan=False)
+    # it has seen its presses, and they decide with the seed
+    assert now.recalibrated_by == (known_only(pad, NEW).digest,)
     same, repeated = recalibrate(replace(localizer, recalibrated_by=("of before",)), known_only(pad, NEW))
     assert same.recalibrated_by == ("of before", *now.recalibrated_by)
     assert repeated == document
@@ -130,8 +116,6 @@ def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording
     # adapting is kept unless new presses speak against it by a standard error
     assert document["gain_mm"] >= -document["standard_error_mm"]
     assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
-    if not document["changes"]:
-        assert document["before"] == document["after"]
     with pytest.raises(InputError, match="has 9 presses of known position, expected at least 10"):
         recalibrate(localizer, known_only(recording, slice(0, 9)))
 
@@ -180,19 +164,12 @@ def test_fine_tune_weighs_new_presses_and_ignores_masked_fibres(localizer, recor
     assert abs(shifts[1]) < 0.2 * shifts[0]
 
 
-def test_recalibrate_command_writes_a_model(localizer: LocalizerModel, recording: Recording, tmp_path: Path) -> None:
-    localizer.save(tmp_path / "old")
-    known_only(remade(recording), slice(0, 20)).save(tmp_path / "new", {})
-    command = ("sense", "recalibrate", "--model", "old", "new", "--out")
-    ended = called(*command, "now", "--json", cwd=tmp_path)
-    document = json.loads(ended.out)
-    assert (ended.code, document) == (0, json.loads((tmp_path / "now/recalibration.json").read_text()))
-    assert (document["format"], document["presses"]) == ("padforge-recalibration/2", 20)
-    assert LocalizerModel.load(tmp_path / "now").fibres == 4
+def test_recalibrate_command_writes_nothing_beside_a_broken_detector(model: Path, tmp_path: Path) -> None:
+    shutil.copytree(model, tmp_path / "old")
     (tmp_path / "old/health.json").write_text("{}")
-    ended = called(*command, "later", cwd=tmp_path)
+    ended = called("sense", "recalibrate", "--model", "old", "old/recording", "--out", "new", cwd=tmp_path)
     assert (ended.code, ended.err[:28]) == (2, "padforge: old/health.json: f")
-    assert not (tmp_path / "later").exists()
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from padforge.benchmarks import harness
+from padforge.benchmarks import twin as bench
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import InputError, Morphology
 from padforge.design.settings import PadSettings
@@ -121,11 +123,8 @@ def test_identify_requires_presses_over_half_of_a_rectangle_each_way() -> None:
 @pytest.mark.parametrize(
     ("mirrored", "rig_mirrored", "side"),
     [
-        (False, None, "as planned"),
-        (True, None, "turned over"),
-        (True, False, "turned over"),
-        (False, True, "turned over, as [rig] mirrored"),
-        (True, True, "as planned, which [rig] mirrored denies"),
+        *((False, None, "as planned"), (True, None, "turned over"), (True, False, "turned over")),
+        *((False, True, "turned over, as [rig] mirrored"), (True, True, "as planned, which [rig] mirrored denies")),
     ],
 )
 def test_identification_lines_state_the_side_with_regard_to_the_rig(mirrored, rig_mirrored, side) -> None:
@@ -148,3 +147,21 @@ def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:
     assert twin.frame.mirrored
     assert twin.frame.turn_deg == pytest.approx(93.0, abs=5)
     assert twin.frame.shift_mm == pytest.approx(turned.frame.shift_mm, abs=1.5)
+
+
+@pytest.mark.slow
+def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = {"PRESSES": (250,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
+    for name, value in small.items():
+        monkeypatch.setattr(bench, name, value)
+    monkeypatch.setattr(harness, "BUDGET_S", 0)
+    for cached in (bench.printed, bench.recorded):
+        cached.cache_clear()
+    measured = harness.BenchRounds()
+    harness.measure_round(bench.BENCH, measured, lambda step: None, lambda key: False)
+    results = {key[1]: row for key, row in measured.results.items()}
+    for cached in (bench.printed, bench.recorded):
+        cached.cache_clear()
+    assert list(results) == ["twin", "plan", "place"]
+    assert results["twin"]["right"] == 1.0
+    assert results["twin"]["error"] < min(results["place"]["error"], results["plan"]["error"])
