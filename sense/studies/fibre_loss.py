@@ -14,10 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.files import provenance
-from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
+from padforge.design.common.parallel import Checkpoints, State
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_type, short_repr
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
@@ -25,7 +25,7 @@ from padforge.sense.localizer.calibration import fit_recording, split_unseen
 from padforge.sense.localizer.evaluation import errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
-from padforge.sense.studies.study import draw_error_map, failed_label
+from padforge.sense.studies.study import Task, compute_states, draw_error_map, failed_label
 
 FORMAT = "padforge-fibre-loss/3"
 ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document calls them
@@ -125,49 +125,30 @@ def _retrain(
 ) -> dict[Failed, Localization]:
     """Predict the test presses by a network of each set of failed fibres; finished ones are not trained again."""
     about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
-    checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
-    states = checkpoints.begin(resume=True) if checkpoints else {}
-    predictions = {
-        failed: _restore(states[number], len(test)) for failed in subsets if (number := _bit_mask(failed)) in states
-    }
-    on_progress(len(predictions), len(subsets))
     options = options.model_copy(update={"method": "published", "features": "published"})
-    missing = [failed for failed in subsets if failed not in predictions]
-    tasks = ((failed, partial(train_without, failed, recording, training, test, options)) for failed in missing)
-    with one_torch_thread():
-        for failed, prediction in run_tasks(tasks):
-            predictions[failed] = prediction
-            if checkpoints:
-                arrays = {key: value for key, value in vars(prediction).items() if key != "measures"}
-                checkpoints.save(_bit_mask(failed), arrays)
-            on_progress(len(predictions), len(subsets))
-    return predictions
+    tasks = {
+        _bit_mask(failed): Task("", partial(train_without, failed, recording, training, test, options))
+        for failed in subsets
+    }
+    checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
+    states = compute_states(tasks, checkpoints, lambda done, total, _: on_progress(done, total))
+    return {failed: Localization(**states[_bit_mask(failed)]) for failed in subsets}
 
 
 def train_without(
     failed: Failed, recording: Recording, training: Indices, test: Indices, options: settings.LocalizerSettings
-) -> Localization:
+) -> State:
     """Train on the other fibres alone, and predict the test presses; independent of all other trainings."""
     remaining = np.setdiff1d(np.arange(recording.fibres), failed)
     partial_recording = replace(recording, readings=recording.readings[:, remaining])
     rng = np.random.default_rng([options.seed, _bit_mask(failed)])
     localizer = fit_recording(partial_recording, training, options, rng)
-    return localizer.predict_features(localizer.scaled_features(partial_recording)[test])
+    prediction = localizer.predict_features(localizer.scaled_features(partial_recording)[test])
+    return {key: value for key, value in vars(prediction).items() if key != "measures"}
 
 
 def _bit_mask(failed: Failed) -> int:
     return sum(1 << fibre for fibre in failed)
-
-
-def _restore(state: State, presses: int) -> Localization:
-    """Return the predictions of a finished network; raises InputError if its file holds something else."""
-    shapes = {"positions_mm": (presses, 2), "std_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
-    arrays = {name: (array.shape, array.dtype.kind) for name, array in state.items()}
-    if arrays != {name: (shape, "f") for name, shape in shapes.items()}:
-        raise InputError(f"unfinished networks hold {short_repr(arrays)}, expected {shapes}; remove them to start anew")
-    if not all(np.isfinite(array).all() for array in state.values()):
-        raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
-    return Localization(state["positions_mm"], state["std_mm"], state["r50_mm"], state["r90_mm"])
 
 
 def fibre_loss_lines(document: dict[str, Any]) -> list[str]:

@@ -1,5 +1,6 @@
 """Sensitivity to the object: other objects than the pad was designed for, trained with or not (paper, figure 6)."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
@@ -14,6 +15,7 @@ from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact
+from padforge.sense.arrays import Array
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
 
 MEMBERS = 6
@@ -95,14 +97,10 @@ def _conclude(
     return StudyResult(rows, _describe(settings, rows))
 
 
-def _is_trained(row: Mapping[str, Any]) -> bool:
-    return (row["trained_radius"], row["trained_sides"]) == (row["radius"], row["sides"])
-
-
-def _trained_error(rows: list[dict[str, Any]], pad: str, radius: float, sides: int) -> float:
-    """Return the mean error on an object that the networks were trained with."""
-    case = {"pad": pad, "radius": radius, "sides": sides}
-    return next(row["mean"] for row in rows if _is_trained(row) and case.items() <= row.items())
+def _error_matrix(rows: list[dict[str, Any]], label: str) -> Array:
+    """Return the mean errors of a pad by trained and tested object, each by shape, then size."""
+    means = [row["mean"] for row in rows if row["pad"] == label]
+    return np.reshape(means, (math.isqrt(len(means)), -1))
 
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
@@ -114,17 +112,16 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         "Errors are in grid units."
     ]
     for label in settings["pads"]:
-        small, large = (
-            np.mean([_trained_error(rows, label, radius, shape) for shape in sides]) for radius in (radii[0], radii[-1])
-        )
-        shapes = [np.mean([_trained_error(rows, label, radius, shape) for radius in radii]) for shape in sides]
-        trained = [row["mean"] for row in rows if row["pad"] == label and _is_trained(row)]
-        other = [row["mean"] for row in rows if row["pad"] == label and not _is_trained(row)]
+        matrix = _error_matrix(rows, label)
+        trained = np.diag(matrix).reshape(len(sides), len(radii))
+        small, *_, large = trained.mean(axis=0)
+        shapes = trained.mean(axis=1)
+        other = matrix[~np.eye(len(matrix), dtype=bool)]
         text.append(
             f"{label}: {small:.3f} with K {radii[0]:g}, {large:.3f} with K {radii[-1]:g}; "
-            f"shapes differ by {100 * (max(shapes) / min(shapes) - 1):.0f} %. The mean error for an object that the "
-            f"networks were not trained with is {np.mean(other):.3f}, at worst {max(other):.3f}, instead of "
-            f"{np.mean(trained):.3f}."
+            f"shapes differ by {100 * (shapes.max() / shapes.min() - 1):.0f} %. The mean error for an object that the "
+            f"networks were not trained with is {other.mean():.3f}, at worst {other.max():.3f}, instead of "
+            f"{trained.mean():.3f}."
         )
     return text
 
@@ -137,9 +134,8 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     grid = figure.add_gridspec(2, len(labels), height_ratios=[1.0, 1.0])
     axes = figure.add_subplot(grid[0, :])
     for number, label in enumerate(labels):
-        for shape, style in zip(sides, ("--", "-", ":", "-."), strict=False):
-            errors = [_trained_error(rows, label, radius, shape) for radius in radii]
-            colour = CURVES[number % len(CURVES)]
+        colour, trained = CURVES[number % len(CURVES)], np.diag(_error_matrix(rows, label)).reshape(len(sides), -1)
+        for shape, style, errors in zip(sides, ("--", "-", ":", "-."), trained, strict=False):
             axes.plot(radii, errors, style, color=colour, marker="o", markersize=4, label=f"{label}, D {shape}")
     label_axes(axes, grid="y", xticks=radii, ylim=(0, None), ylabel="mean error (grid units)")
     axes.set_xlabel("size K of the object, trained and tested with (grid units)")
@@ -148,7 +144,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     highest = max(row["mean"] for row in rows)
     for number, label in enumerate(labels):
         axes = figure.add_subplot(grid[1, number], aspect="equal")
-        matrix = np.array([row["mean"] for row in rows if row["pad"] == label]).reshape(len(names), len(names))
+        matrix = _error_matrix(rows, label)
         axes.imshow(matrix, cmap="magma_r", vmin=0, vmax=highest)
         for (trained, tested), value in np.ndenumerate(matrix):
             colour = "w" if value > 0.6 * highest else INK

@@ -14,7 +14,7 @@ from padforge.sense import Recording, open_recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
-from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, network_inputs, press_levels
+from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, level_indices, network_inputs
 from padforge.sense.studies.study import Study, run
 
 PAD = Morphology.random(2, knots=3, seed=5)
@@ -61,20 +61,19 @@ def errors(document: dict[str, Any], label: str, compensation: str, key: str = "
     return [row[key] for row in document["rows"] if (row["recording"], row["compensation"]) == (label, compensation)]
 
 
-def test_press_levels_are_the_readings_10_30_and_50_of_a_cycle() -> None:
-    levels = press_levels(np.column_stack([np.arange(40.0 * CYCLES), -np.arange(40.0 * CYCLES)]), DOWN, UP)
-    assert levels.shape == (CYCLES, 2, 3)
-    np.testing.assert_array_equal(levels[1], [[50, 70, 90], [-50, -70, -90]])
-    np.testing.assert_array_equal(levels[-1, 0], [170, 190, 199])  # there are no readings after the last press
+def test_levels_are_the_readings_10_30_and_50_of_a_cycle() -> None:
+    levels = level_indices(40 * CYCLES, DOWN, UP)
+    assert levels[1].tolist() == [50, 70, 90]
+    assert levels[-1].tolist() == [170, 190, 199]  # there are no readings after the last press
     # those of short cycles stay within their phase
-    levels = press_levels(np.arange(20.0)[:, None], np.array([3, 9, 15]), np.array([6, 12, 18]))
-    np.testing.assert_array_equal(levels[:, 0], [[0, 5, 8], [6, 11, 14], [12, 17, 19]])
+    levels = level_indices(20, np.array([3, 9, 15]), np.array([6, 12, 18]))
+    assert levels.tolist() == [[0, 5, 8], [6, 11, 14], [12, 17, 19]]
 
 
 def test_network_inputs_subtract_the_baseline_of_their_compensation() -> None:
     readings = np.random.default_rng(0).normal(2, 0.1, (40 * CYCLES, 3))
     training = np.arange(CYCLES)
-    before, pressed, after = np.moveaxis(press_levels(readings, DOWN, UP), 2, 0)
+    before, pressed, after = readings[level_indices(len(readings), DOWN, UP).T]
     inputs = {name: network_inputs(name, readings, DOWN, UP, training) for name in COMPENSATIONS}
     np.testing.assert_array_equal(inputs["none"], pressed)
     np.testing.assert_array_equal(inputs["baseline"], pressed - before)

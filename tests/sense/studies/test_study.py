@@ -19,12 +19,12 @@ from padforge.design import Contact, InputError, Morphology, PadSettings, Search
 from padforge.design.optimize.search import SearchResult
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.studies import drift, scaling, sensitivity
-from padforge.sense.studies.indentation import force_study, shape_study
+from padforge.sense.studies import drift, indentation, scaling, sensitivity
 from padforge.sense.studies.multicontact import multicontact_study
 from padforge.sense.studies.robustness import robustness_study
 from padforge.sense.studies.study import (
     ADC_COUNTS,
+    Sizes,
     Study,
     StudyResult,
     Task,
@@ -42,9 +42,9 @@ SMALLEST: dict[str, Callable[[], Study]] = {
         *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
         **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},
     ),
-    "force": lambda: force_study(PADS, noise_counts=(1.0,), presses=60, test=40, hidden=4, epochs=3),
-    "shape": lambda: shape_study(PADS, presses=100, test=60, hidden=4, epochs=3),
-    "multicontact": lambda: multicontact_study(PADS, presses=100, test=60, hidden=5, members=2, epochs=3),
+    "force": lambda: indentation.force_study(PADS, sizes=Sizes(60, 40, hidden=4, epochs=3)),
+    "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
+    "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
     "sensitivity": lambda: sensitivity.sensitivity_study(PADS, radii=(0.6, 1.0), sides=(4,)),
 }
