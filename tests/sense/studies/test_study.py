@@ -147,6 +147,7 @@ def test_run_rejects_a_lock_that_is_no_file(tmp_path: Path) -> None:
         (["robustness", "square", "square"], "another one is called square"),
         (["robustness", "square", "--presses", "1000"], "presses is 1000, allowed is a square number from 4"),
         (["scaling", "square", "--grids", "4,x"], "grids is '4,x', expected numbers from 2 to 256"),
+        *(([name, "no"], "no: no such file") for name in ("sensitivity", "force", "shape", "multicontact")),
     ],
 )
 def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -213,9 +214,10 @@ def test_load_pads_searches_with_the_given_knots_by_either_method(monkeypatch: p
         load_pads(("optimised-0",), seed=0)
 
 
-def test_quantize_gives_whole_counts_up_to_full_scale() -> None:
-    signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 2.0, 0.0]])
-    counts = quantize(signals, np.array([0.5, 1.0, 0.0]), 0.0, np.random.default_rng(0))
-    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, ADC_COUNTS, 0]])
-    noisy = quantize(np.full((4000, 1), 0.5), np.ones(1), 4.0, np.random.default_rng(0))
-    assert noisy.std() == pytest.approx(4, rel=0.1)
+def test_quantize_gives_whole_counts_up_to_full_scale_of_the_training() -> None:
+    signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 0.5, 0.0], [0.75, 2.0, 0.0]])
+    counts = quantize(signals, 3, 0.0, np.random.default_rng(0))
+    full = [ADC_COUNTS, ADC_COUNTS, 0]
+    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, 2048, 0], full])
+    noisy = quantize(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
+    assert noisy[:-1].std() == pytest.approx(4, rel=0.1)
