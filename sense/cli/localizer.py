@@ -275,7 +275,7 @@ def fibre_loss(
     worst set of each size, and without the fibres of --failed. Finished networks are kept after an interruption, and
     the same command continues with them.
     """
-    from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.design.common.files import check_writable
     from padforge.design.common.parallel import Checkpoints
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.localizer.model import LocalizerModel
@@ -294,12 +294,19 @@ def fibre_loss(
     options |= {"failed": fibre_indices(failed, opened.fibres), "checkpoints": unfinished}
     with progress_bar("networks") as show:
         document = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
-    with atomic_files(target) as folder:
-        write_json(folder / "fibre_loss.json", document)
-        draw_fibre_loss(document, folder / "fibre_loss.png")
+    _write_study(target / "fibre_loss", document, draw_fibre_loss)
     if retrain:
         Checkpoints(unfinished, {}).clear()
     common.show_result(document, fibre_loss_lines(document), as_json)
+
+
+def _write_study(path: Path, document: dict[str, Any], draw: Callable[[dict[str, Any], Path], None]) -> None:
+    """Write a document and its figure, as `path` with .json and .png."""
+    from padforge.design.common.files import atomic_files, write_json
+
+    with atomic_files(path.parent) as folder:
+        write_json(folder / f"{path.name}.json", document)
+        draw(document, folder / f"{path.name}.png")
 
 
 @click.command("learning-curve")
@@ -316,7 +323,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 
     Writes learning_curve.json and learning_curve.png.
     """
-    from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.design.common.files import check_writable
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies import learning_curve as study
@@ -326,9 +333,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with progress_bar("training") as show:
         document = study.learning_curve(opened, options, on_progress=show)
-    with atomic_files(target) as folder:
-        write_json(folder / "learning_curve.json", document)
-        study.draw_learning_curve(document, folder / "learning_curve.png")
+    _write_study(target / "learning_curve", document, study.draw_learning_curve)
     common.show_result(document, study.learning_curve_lines(document), as_json)
 
 

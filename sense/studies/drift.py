@@ -70,17 +70,7 @@ def drift_study(
 ) -> Study:
     """Evaluate every filter with every kind of drift compensation, and how often fibres are idle.
 
-    Args:
-        pads: by label, each recorded by the simulated rig.
-        recordings: by label.
-        rig: simulated noise, drift, creep and hysteresis, and the cycle of a press.
-        presses: of a simulated pad.
-        hidden: neurons of a network.
-        epochs: of training.
-        seed: of simulated recordings, splits and networks.
-
-    Raises:
-        InputError: a label twice, or too few presses of known position.
+    Each pad is recorded by the simulated `rig`, with `presses` presses.
     """
     if duplicates := sorted(pads.keys() & recordings.keys()):
         raise InputError(f"{duplicates[0]}: label of a morphology and of a recording, expected each label once")

@@ -50,18 +50,7 @@ def robustness_study(
 ) -> Study:
     """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
 
-    Args:
-        pads: by label.
-        contact: PUBLISHED_CONTACT if None.
-        rule: of RULES.
-        max_failures: most fibres that fail at once.
-        hidden: neurons of a network.
-        presses: training presses, a square number.
-        test: fresh presses to test on.
-        seed: of presses and networks.
-
-    Raises:
-        InputError: `presses` is no square of a number from 2.
+    Signals are by one of RULES, under PUBLISHED_CONTACT unless there is another; training presses are a square number.
     """
     side = math.isqrt(presses)
     if side**2 != presses or side < 2:

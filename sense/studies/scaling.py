@@ -45,17 +45,7 @@ CELLS = 16  # along a side of an error map
 def scaling_study(
     pads: Mapping[str, Morphology], *, grids: Sequence[int] = GRIDS, side: int = 64, seed: int = 0
 ) -> Study:
-    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile.
-
-    Args:
-        pads: tiles by label.
-        grids: sizes of the surfaces, multiples of every tile's.
-        side: of the square of presses, side^2 to train on.
-        seed: of presses and networks.
-
-    Raises:
-        InputError: a tile that is no square of one pitch, or a grid that is no multiple of a tile's.
-    """
+    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile, by side^2 training presses."""
     for label, pad in pads.items():
         if not pad.layout.is_square:
             raise InputError(f"{label} has {pad.layout}, expected tiles of M + M fibres of one pitch")

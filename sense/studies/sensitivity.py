@@ -30,17 +30,7 @@ def sensitivity_study(
     sides: Sequence[int] = (4, 30),
     seed: int = 0,
 ) -> Study:
-    """Compare errors for objects of several sizes and shapes, by networks trained with the same object or another.
-
-    Args:
-        pads: by label.
-        radii: sizes K of the object, grid units.
-        sides: its shapes D, polygons.
-        seed: of presses and networks.
-
-    Raises:
-        InputError: a radius or number of sides that a contact cannot have.
-    """
+    """Compare errors for objects of several radii, grid units, and numbers of sides, by the object of the training."""
     objects = [Contact(radius=radius, sides=shape) for shape, radius in product(sides, radii)]
     tasks = [
         Task(f"{label}, trained with K {each.radius:g}, D {each.sides}", partial(_evaluate, pad, each, objects, seed))
