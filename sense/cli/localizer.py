@@ -20,6 +20,7 @@ from padforge.sense.cli.options import (
     fibres_option,
     max_failures_option,
     model_option,
+    predict_despite_faults,
     progress_bar,
     read_recording,
     recording_argument,
@@ -102,17 +103,12 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
     deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
     of a model that estimates them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
-    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
-    from padforge.sense.localizer.model import LocalizerModel, write_localization
+    from padforge.sense.localizer.model import write_localization
 
     file = out or common.pad_folder(recording) / "places.csv"
-    localizer = LocalizerModel.load(model)
-    failed, opened = fibre_indices(exclude_fibres, localizer.fibres), read_recording(recording)
-    findings = FaultDetector.load(model).predict(opened) if has_health(model) else []
-    for finding in findings:
-        click.echo(f"{finding.text}; left out from there on", err=True)
-    fibre_mask = mask_faults(findings, len(opened.down_command), localizer.fibres)
-    localization = localizer.predict(opened, failed, fibre_mask)
+    localization, faults, _ = predict_despite_faults(model, read_recording(recording), exclude_fibres)
+    for fault in faults:
+        click.echo(f"{fault.text}; left out from there on", err=True)
     write_localization(localization, file)
     click.echo(f"{len(localization.r50_mm)} positions -> {file}")
 
@@ -360,11 +356,10 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
 
     folder, pad = out or common.pad_folder(recording), Morphology.load(morphology)
     inputs = [path for path in (recording, morphology) if not path.is_dir()]
-    with locked_folder(folder), common.progress() as bar:
-        task = bar.add_task("identify", total=None, note="")
+    with locked_folder(folder), progress_bar("identify") as bar:
 
         def show(what: str, done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total, note=what)
+            bar(done, total, what)
 
         opened = read_recording(recording)
         document = identify_into(opened, pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force)

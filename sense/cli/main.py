@@ -8,7 +8,14 @@ import click
 from padforge.design.common.command_line import out_option, pad_folder
 from padforge.sense.cli import localizer, rig
 from padforge.sense.cli.live import live
-from padforge.sense.cli.options import FOLDER, echo_note, read_recording, recording_argument, recording_line
+from padforge.sense.cli.options import (
+    FOLDER,
+    echo_note,
+    predict_despite_faults,
+    read_recording,
+    recording_argument,
+    recording_line,
+)
 
 if TYPE_CHECKING:
     from padforge.sense.formats.annotations import ModelAnnotations
@@ -116,14 +123,9 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
     import numpy as np
 
     from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
-    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
-    from padforge.sense.localizer.model import LocalizerModel
 
-    detector = FaultDetector.load(model) if has_health(model) else None
-    findings, localizer = detector.predict(recording) if detector else [], LocalizerModel.load(model)
+    prediction, findings, detector = predict_despite_faults(model, recording)
     faults = [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in findings]
-    fibre_mask = mask_faults(findings, len(recording.down_command), localizer.fibres)
-    prediction = localizer.predict(recording, fibre_mask=fibre_mask)
     depth = prediction.measures.get("depth_mm")
     unknown = np.full(len(prediction.r90_mm), np.nan)
     return ModelAnnotations(

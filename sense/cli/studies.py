@@ -11,7 +11,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import max_failures_option
+from padforge.sense.cli.options import max_failures_option, progress_bar
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -56,21 +56,16 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
             from padforge.sense.studies.study import run, study_lines
 
             check_writable(out)
-            with common.progress() as bar:
-                task = bar.add_task(name, total=None, note="pads")
-                study = make(names, seed=seed or 0, **options)
-
-                def show(done: int, total: int, last: str) -> None:
-                    bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
-
-                try:
+            try:
+                with progress_bar(name) as show:
+                    show(0, 0, "pads")
+                    study = make(names, seed=seed or 0, **options)
                     with cluster(scheduler) as executor:
                         document = run(study, out, jobs=jobs, executor=executor, resume=resume, on_progress=show)
-                except KeyboardInterrupt:
-                    bar.stop()
-                    click.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
-                    # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
-                    os._exit(common.INTERRUPTED)
+            except KeyboardInterrupt:
+                click.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
+                # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
+                os._exit(common.INTERRUPTED)
             common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (

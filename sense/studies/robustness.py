@@ -34,6 +34,7 @@ MIN_NETWORKS = 16
 single network depends on its first weights."""
 MAX_SETS = 1024  # of failed fibres of a size that are evaluated; of more, a sample is drawn
 Respond = Callable[[Morphology, Array], Array]
+HIDDEN, TEST = 50, 2000  # neurons of a network, and fresh presses to test on
 SIDE = 33  # cells along a side of an error map
 
 
@@ -43,9 +44,7 @@ def robustness_study(
     contact: Contact | None = None,
     rule: str = "published",
     max_failures: int = 3,
-    hidden: int = 50,
     presses: int = 1024,
-    test: int = 2000,
     seed: int = 0,
 ) -> Study:
     """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
@@ -62,7 +61,7 @@ def robustness_study(
         for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
         for part in split_batches(failure_subsets(pad.layout.fibres, level, MAX_SETS))
     ]
-    sizes = {"hidden": hidden, "test": test, "seed": seed}
+    sizes = {"hidden": HIDDEN, "test": TEST, "seed": seed}
     evaluate = partial(_evaluate, respond=partial(RULES[rule], contact=contact), side=side, **sizes)
     tasks = [Task(f"{label}, {len(part[0])} failed", partial(evaluate, pads[label], part)) for label, part in parts]
     settings = {

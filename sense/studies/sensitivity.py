@@ -1,7 +1,7 @@
 """Sensitivity to the object: other objects than the pad was designed for, trained with or not (paper, figure 6)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from itertools import product
 from typing import Any
@@ -21,17 +21,12 @@ from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads
 MEMBERS = 6
 """Networks whose errors are averaged, since that of a single one depends on its first weights."""
 SIDE, TEST, HIDDEN = 32, 2000, 50
+RADII, SIDES = (0.6, 0.8, 1.0), (4, 30)  # sizes K, grid units, and shapes D of the object, which is a polygon
 
 
-def sensitivity_study(
-    pads: Mapping[str, Morphology],
-    *,
-    radii: Sequence[float] = (0.6, 0.8, 1.0),
-    sides: Sequence[int] = (4, 30),
-    seed: int = 0,
-) -> Study:
-    """Compare errors for objects of several radii, grid units, and numbers of sides, by the object of the training."""
-    objects = [Contact(radius=radius, sides=shape) for shape, radius in product(sides, radii)]
+def sensitivity_study(pads: Mapping[str, Morphology], *, seed: int = 0) -> Study:
+    """Compare errors for objects of several sizes and shapes, by networks trained with the same object or another."""
+    objects = [Contact(radius=radius, sides=shape) for shape, radius in product(SIDES, RADII)]
     tasks = [
         Task(f"{label}, trained with K {each.radius:g}, D {each.sides}", partial(_evaluate, pad, each, objects, seed))
         for label, pad in pads.items()
@@ -39,8 +34,8 @@ def sensitivity_study(
     ]
     settings = {
         "pads": describe_pads(pads),
-        "radii": list(radii),
-        "sides": list(sides),
+        "radii": list(RADII),
+        "sides": list(SIDES),
         "members": MEMBERS,
         "hidden": HIDDEN,
         "presses": SIDE**2,

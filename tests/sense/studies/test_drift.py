@@ -15,7 +15,8 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
 from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, level_indices, network_inputs
-from padforge.sense.studies.study import Study, run
+from padforge.sense.studies.study import run
+from tests.sense.live.conftest import first_presses
 
 PAD = Morphology.random(2, knots=3, seed=5)
 STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0)
@@ -33,18 +34,6 @@ def recorded() -> Recording:
     return replace(recording, readings=readings, presses_mm=positions_mm, source={"kind": "test"})
 
 
-def first_presses(recording: Recording, presses: int) -> Recording:
-    end = int(recording.up_command[presses - 1])
-    names = ("presses_mm", "down_command", "up_command", "depths_mm")
-    arrays = {name: getattr(recording, name)[:presses] for name in names}
-    return replace(recording, readings=recording.readings[:end], times_s=recording.times_s[:end], **arrays)
-
-
-def small_study(recorded: Recording) -> Study:
-    pads = {"winding": PAD, "square": Morphology.straight(4)}
-    return drift_study(pads, {"real": recorded}, rig=STRONG, presses=180, hidden=8, epochs=15)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def two_members() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
@@ -54,7 +43,9 @@ def two_members() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def document(recorded: Recording, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    return run(small_study(recorded), tmp_path_factory.mktemp("drift"))
+    pads = {"winding": PAD, "square": Morphology.straight(4)}
+    study = drift_study(pads, {"real": recorded}, rig=STRONG, presses=180, hidden=8, epochs=15)
+    return run(study, tmp_path_factory.mktemp("drift"))
 
 
 def errors(document: dict[str, Any], label: str, compensation: str, key: str = "mean_mm") -> list[float]:
@@ -116,8 +107,9 @@ def test_study_computes_idle_shares(document: dict[str, Any]) -> None:
 def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording) -> None:
     with pytest.raises(InputError, match="a: label of a morphology and of a recording"):
         drift_study({"a": PAD}, {"a": recorded})
+    few = np.where(np.arange(len(recorded.presses_mm))[:, None] < 3, recorded.presses_mm, np.nan)
     with pytest.raises(InputError, match="few: recording has 3 presses of known"):
-        drift_study({}, {"few": first_presses(recorded, 3)})
+        drift_study({}, {"few": replace(recorded, presses_mm=few)})
 
 
 @pytest.mark.slow

@@ -144,18 +144,6 @@ def test_fibre_loss_command_writes_document_and_figure() -> None:
 
 
 @pytest.mark.usefixtures("here")
-def test_fibre_loss_command_fails_in_one_line() -> None:
-    for arguments, message in (
-        (("--out", "other"), "neither --model nor --retrain"),
-        (("--model", "model", "--failed", "5"), "padforge: fibre 5: no such fibre, allowed are 1 to 4\n"),
-    ):
-        ended = call_fibre_loss(*arguments)
-        assert (ended.code, ended.out, ended.err.count("\n")) == (2, "", 1)
-        assert message in ended.err
-    assert not Path("other").exists()
-
-
-@pytest.mark.usefixtures("here")
 def test_fibre_loss_command_keeps_networks_until_the_result_is_written(
     trained: list, monkeypatch: pytest.MonkeyPatch
 ) -> None:

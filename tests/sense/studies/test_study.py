@@ -19,9 +19,8 @@ from padforge.design import Contact, InputError, Morphology, PadSettings, Search
 from padforge.design.optimize.search import SearchResult
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.studies import drift, indentation, scaling, sensitivity
+from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
 from padforge.sense.studies.multicontact import multicontact_study
-from padforge.sense.studies.robustness import robustness_study
 from padforge.sense.studies.study import (
     ADC_COUNTS,
     Sizes,
@@ -37,7 +36,7 @@ from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 SMALLEST: dict[str, Callable[[], Study]] = {
-    "robustness": lambda: robustness_study(PADS, max_failures=1, hidden=4, presses=16, test=20),
+    "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
     "drift": lambda: drift.drift_study(
         *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
         **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},
@@ -46,7 +45,15 @@ SMALLEST: dict[str, Callable[[], Study]] = {
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
     "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
-    "sensitivity": lambda: sensitivity.sensitivity_study(PADS, radii=(0.6, 1.0), sides=(4,)),
+    "sensitivity": lambda: sensitivity.sensitivity_study(PADS),
+}
+
+SMALLER: dict[object, dict[str, object]] = {
+    robustness: {"HIDDEN": 4, "TEST": 20},
+    drift: {"MEMBERS": 2, "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)}},
+    indentation: {"FORCE_NOISES": (1.0,)},
+    scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
+    sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "RADII": (0.6, 1.0), "SIDES": (4,)},
 }
 
 
@@ -59,14 +66,9 @@ def stop(done: int, total: int, name: str) -> None:
 def test_run_resumes_every_study_with_the_same_result(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drift, "MEMBERS", 2)
-    monkeypatch.setattr(drift, "FILTERS", {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)})
-    for module in (scaling, sensitivity):
-        monkeypatch.setattr(module, "HIDDEN", 12)
-        monkeypatch.setattr(module, "TEST", 50)
-    monkeypatch.setattr(scaling, "EPOCHS", 8)
-    monkeypatch.setattr(sensitivity, "SIDE", 8)
-    monkeypatch.setattr(sensitivity, "MEMBERS", 2)
+    for module, sizes in SMALLER.items():
+        for size, value in sizes.items():
+            monkeypatch.setattr(module, size, value)
     complete = run(SMALLEST[name](), tmp_path / "complete", jobs=1)
     study = replace(SMALLEST[name](), draw=lambda document: Figure())
     with pytest.raises(KeyboardInterrupt):
