@@ -154,14 +154,14 @@ def _describe_force(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> 
         f"from the readings' logarithms; they were trained on {settings['presses']} presses and tested on "
         f"{settings['test']} others."
     )
-    results = [
-        f"{row['pad']}, noise of {_counts(row['noise_counts'])}: the error of the depth is {row['depth_mm']:.2f} mm "
-        f"(guessing the middle depth: {row['depth_guessed_mm']:.2f} mm), of the force {row['force_n']:.3f} N or "
-        f"{row['force_percent']:.1f} % of its range (guessing: {row['force_guessed_percent']:.1f} %). That of the "
-        f"position is {row['position_mm']:.2f} mm, {row['position_depth_known_mm']:.2f} mm where the depth is an "
-        f"input, and {row['position_one_depth_mm']:.2f} mm where all presses are {MIDDLE:g} grid units deep."
-        for row in rows
-    ]
+    result = (
+        "{pad}, noise of {noise}: the error of the depth is {depth_mm:.2f} mm (guessing the middle depth: "
+        "{depth_guessed_mm:.2f} mm), of the force {force_n:.3f} N or {force_percent:.1f} % of its range (guessing: "
+        "{force_guessed_percent:.1f} %). That of the position is {position_mm:.2f} mm, {position_depth_known_mm:.2f} "
+        "mm where the depth is an input, and {position_one_depth_mm:.2f} mm where all presses are {middle:g} grid "
+        "units deep."
+    )
+    results = [result.format(**row, noise=_counts(row["noise_counts"]), middle=MIDDLE) for row in rows]
     caution = (
         "Depth and force are related by the contact mechanics of an elastic half-space of reduced modulus "
         f"{REDUCED_MODULUS_KPA:.0f} kPa. A pad a few millimetres thick on a hard table is stiffer than that, and "
@@ -302,13 +302,12 @@ def _describe_shape(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> 
         f"drawn for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} "
         f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
     )
-    results = [
-        f"{row['pad']}, {row['shapes']}: {row['accuracy_percent']:.1f} % are classified correctly (always the most "
-        f"frequent: {row['majority_percent']:.1f} %), worst the {row['worst']} with {row['worst_percent']:.1f} %. "
-        f"The error of the position is {row['position_mm']:.2f} mm, and {row['position_shape_known_mm']:.2f} mm by "
-        "networks with the shape as an input."
-        for row in rows
-    ]
+    result = (
+        "{pad}, {shapes}: {accuracy_percent:.1f} % are classified correctly (always the most frequent: "
+        "{majority_percent:.1f} %), worst the {worst} with {worst_percent:.1f} %. The error of the position is "
+        "{position_mm:.2f} mm, and {position_shape_known_mm:.2f} mm by networks with the shape as an input."
+    )
+    results = [result.format(**row) for row in rows]
     ratios = [row["position_mm"] / row["position_shape_known_mm"] for row in rows]
     chance = ", where below 1 is chance in training" if min(ratios) < 1 else ""
     growth = f"{min(ratios):.2f} to {max(ratios):.2f} times as large{chance}"
