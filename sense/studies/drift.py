@@ -38,6 +38,8 @@ Rows = Sequence[Mapping[str, Any]]
 
 TEST_SHARE = 0.15  # of the presses, held out at random, and again at the end
 MEMBERS = 3  # networks whose errors are averaged: they differ by their first weights
+HIDDEN, EPOCHS = 50, 200
+RIG = RigSettings(presses=1000)  # that records pads
 SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
 SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
 SLOW_PRESSES = 15  # with the last one, over whose rest levels the median is the slow baseline
@@ -58,37 +60,27 @@ SIMULATED = "simulated"  # kind of a recording, in its source and in rows
 COMPENSATIONS = ("none", "baseline", "slow baseline", "published", "windows")  # see `network_inputs`
 
 
-def drift_study(
-    pads: Mapping[str, Morphology],
-    recordings: Mapping[str, Recording],
-    *,
-    rig: RigSettings | None = None,
-    presses: int = 1000,
-    hidden: int = 50,
-    epochs: int = 200,
-    seed: int = 0,
-) -> Study:
+def drift_study(pads: Mapping[str, Morphology], recordings: Mapping[str, Recording], *, seed: int = 0) -> Study:
     """Evaluate every filter with every kind of drift compensation, and how often fibres are idle.
 
-    Each pad is recorded by the simulated `rig`, with `presses` presses.
+    Raises:
+        InputError: a label twice, or a recording with too few presses of known position.
     """
     if duplicates := sorted(pads.keys() & recordings.keys()):
         raise InputError(f"{duplicates[0]}: label of a morphology and of a recording, expected each label once")
     rig_seed = int(np.random.default_rng([6, seed]).integers(2**32))
-    rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": rig_seed})
+    rig = RIG.model_copy(update={"seed": rig_seed})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
-    kinds, n_presses = dict.fromkeys(pads, SIMULATED), dict.fromkeys(pads, presses)
+    kinds = dict.fromkeys(pads, SIMULATED)
     for label, recording in recordings.items():
         sources[label] = lambda recording=recording: recording
         kinds[label] = SIMULATED if recording.source.get("kind") == SIMULATED else "recorded"
-        n_presses[label] = int(recording.has_position.sum())
-    for label, count in n_presses.items():
         try:
-            _split(np.arange(count), seed)
+            _split(np.flatnonzero(recording.has_position), seed)
         except InputError as error:
             raise InputError(f"{label}: {error}") from error
     tasks = [
-        Task(f"{label}, filter {name}", partial(_evaluate, source, name, hidden, epochs, seed))
+        Task(f"{label}, filter {name}", partial(_evaluate, source, name, seed))
         for label, source in sources.items()
         for name in FILTERS
     ]
@@ -100,8 +92,8 @@ def drift_study(
         "compensations": list(COMPENSATIONS),
         "test_share": TEST_SHARE,
         "members": MEMBERS,
-        "hidden": hidden,
-        "epochs": epochs,
+        "hidden": HIDDEN,
+        "epochs": EPOCHS,
         "seed": seed,
     }
     conclude = partial(_conclude, dict(pads), kinds, settings)
@@ -152,7 +144,7 @@ def network_inputs(
     return pressed
 
 
-def _evaluate(source: Callable[[], Recording], name: str, hidden: int, epochs: int, seed: int) -> State:
+def _evaluate(source: Callable[[], Recording], name: str, seed: int) -> State:
     """Train and test the networks of every compensation on the readings after a filter.
 
     Returns:
@@ -173,7 +165,7 @@ def _evaluate(source: Callable[[], Recording], name: str, hidden: int, epochs: i
         rngs = np.random.default_rng([8, seed]).spawn(MEMBERS)
         stop_by = np.broadcast_to(inputs[validation], (MEMBERS, len(validation), inputs.shape[1]))
         networks = fit_batch(
-            inputs[training], positions_mm[training], rngs, hidden, epochs, (stop_by, positions_mm[validation])
+            inputs[training], positions_mm[training], rngs, HIDDEN, EPOCHS, (stop_by, positions_mm[validation])
         )
         for part, rows in tests.items():
             errors = [distances(network(inputs[rows]), positions_mm[rows]) for network in networks]

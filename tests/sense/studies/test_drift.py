@@ -19,7 +19,7 @@ from padforge.sense.studies.study import run
 from tests.sense.live.conftest import first_presses
 
 PAD = Morphology.random(2, knots=3, seed=5)
-STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0)
+STRONG = RigSettings(presses=180, drift_mv=300, creep=0, hysteresis=0)
 CYCLES = 5
 DOWN, UP = 40 * np.arange(CYCLES) + 20, 40 * np.arange(1, CYCLES + 1)
 
@@ -35,17 +35,17 @@ def recorded() -> Recording:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def two_members() -> Iterator[None]:
+def small() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(drift, "MEMBERS", 2)
+        for name, value in (("MEMBERS", 2), ("HIDDEN", 8), ("EPOCHS", 15), ("RIG", STRONG)):
+            patched.setattr(drift, name, value)
         yield
 
 
 @pytest.fixture(scope="module")
 def document(recorded: Recording, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     pads = {"winding": PAD, "square": Morphology.straight(4)}
-    study = drift_study(pads, {"real": recorded}, rig=STRONG, presses=180, hidden=8, epochs=15)
-    return run(study, tmp_path_factory.mktemp("drift"))
+    return run(drift_study(pads, {"real": recorded}), tmp_path_factory.mktemp("drift"))
 
 
 def errors(document: dict[str, Any], label: str, compensation: str, key: str = "mean_mm") -> list[float]:
@@ -116,7 +116,7 @@ def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording)
 def test_study_of_the_published_pad_and_recording(published: Path, tmp_path: Path) -> None:
     pad = Morphology.load(published / "5para_dis.mat")
     recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 300)
-    document = run(drift_study({"N=5": pad}, {"built": recording}, presses=60, hidden=8, epochs=15), tmp_path)
+    document = run(drift_study({"N=5": pad}, {"built": recording}), tmp_path)
     assert document["idle"][0]["idle_percent"] == pytest.approx(58, abs=1)
     assert max(errors(document, "built", "baseline")) < min(errors(document, "built", "none"))
     assert max(errors(document, "built", "published")) < min(errors(document, "built", "none"))

@@ -38,8 +38,7 @@ PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 SMALLEST: dict[str, Callable[[], Study]] = {
     "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
     "drift": lambda: drift.drift_study(
-        *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
-        **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},
+        {"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}
     ),
     "force": lambda: indentation.force_study(PADS, sizes=Sizes(60, 40, hidden=4, epochs=3)),
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
@@ -50,7 +49,10 @@ SMALLEST: dict[str, Callable[[], Study]] = {
 
 SMALLER: dict[object, dict[str, object]] = {
     robustness: {"HIDDEN": 4, "TEST": 20},
-    drift: {"MEMBERS": 2, "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)}},
+    drift: {
+        **{"MEMBERS": 2, "HIDDEN": 4, "EPOCHS": 2, "RIG": RigSettings(drift_mv=300, presses=40)},
+        "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
+    },
     indentation: {"FORCE_NOISES": (1.0,)},
     scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
     sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "RADII": (0.6, 1.0), "SIDES": (4,)},
