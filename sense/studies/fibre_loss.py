@@ -132,7 +132,9 @@ def _retrain(
         for failed in subsets
     }
     checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
-    states = compute_states(tasks, checkpoints, lambda done, total, _: on_progress(done, total))
+    states: Mapping[int, Mapping[str, Any]] = compute_states(
+        tasks, checkpoints, lambda done, total, _: on_progress(done, total)
+    )
     return {failed: Localization(**states[_bit_mask(failed)]) for failed in subsets}
 
 
