@@ -20,6 +20,7 @@ from padforge.sense.cli.options import (
     fibres_option,
     max_failures_option,
     model_option,
+    predict_despite_faults,
     progress_bar,
     read_recording,
     recording_argument,
@@ -102,17 +103,12 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
     deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
     of a model that estimates them also depth_mm, depth_r90_mm, force_n, force_r90_n.
     """
-    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
-    from padforge.sense.localizer.model import LocalizerModel, write_localization
+    from padforge.sense.localizer.model import write_localization
 
     file = out or common.pad_folder(recording) / "places.csv"
-    localizer = LocalizerModel.load(model)
-    failed, opened = fibre_indices(exclude_fibres, localizer.fibres), read_recording(recording)
-    findings = FaultDetector.load(model).predict(opened) if has_health(model) else []
-    for finding in findings:
-        click.echo(f"{finding.text}; left out from there on", err=True)
-    fibre_mask = mask_faults(findings, len(opened.down_command), localizer.fibres)
-    localization = localizer.predict(opened, failed, fibre_mask)
+    localization, faults, _ = predict_despite_faults(model, read_recording(recording), exclude_fibres)
+    for fault in faults:
+        click.echo(f"{fault.text}; left out from there on", err=True)
     write_localization(localization, file)
     click.echo(f"{len(localization.r50_mm)} positions -> {file}")
 
@@ -275,7 +271,7 @@ def fibre_loss(
     worst set of each size, and without the fibres of --failed. Finished networks are kept after an interruption, and
     the same command continues with them.
     """
-    from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.design.common.files import check_writable
     from padforge.design.common.parallel import Checkpoints
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.localizer.model import LocalizerModel
@@ -294,12 +290,19 @@ def fibre_loss(
     options |= {"failed": fibre_indices(failed, opened.fibres), "checkpoints": unfinished}
     with progress_bar("networks") as show:
         document = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
-    with atomic_files(target) as folder:
-        write_json(folder / "fibre_loss.json", document)
-        draw_fibre_loss(document, folder / "fibre_loss.png")
+    _write_study(target / "fibre_loss", document, draw_fibre_loss)
     if retrain:
         Checkpoints(unfinished, {}).clear()
     common.show_result(document, fibre_loss_lines(document), as_json)
+
+
+def _write_study(path: Path, document: dict[str, Any], draw: Callable[[dict[str, Any], Path], None]) -> None:
+    """Write a document and its figure, as `path` with .json and .png."""
+    from padforge.design.common.files import atomic_files, write_json
+
+    with atomic_files(path.parent) as folder:
+        write_json(folder / f"{path.name}.json", document)
+        draw(document, folder / f"{path.name}.png")
 
 
 @click.command("learning-curve")
@@ -316,7 +319,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 
     Writes learning_curve.json and learning_curve.png.
     """
-    from padforge.design.common.files import atomic_files, check_writable, write_json
+    from padforge.design.common.files import check_writable
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies import learning_curve as study
@@ -326,9 +329,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with progress_bar("training") as show:
         document = study.learning_curve(opened, options, on_progress=show)
-    with atomic_files(target) as folder:
-        write_json(folder / "learning_curve.json", document)
-        study.draw_learning_curve(document, folder / "learning_curve.png")
+    _write_study(target / "learning_curve", document, study.draw_learning_curve)
     common.show_result(document, study.learning_curve_lines(document), as_json)
 
 
@@ -355,11 +356,10 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
 
     folder, pad = out or common.pad_folder(recording), Morphology.load(morphology)
     inputs = [path for path in (recording, morphology) if not path.is_dir()]
-    with locked_folder(folder), common.progress() as bar:
-        task = bar.add_task("identify", total=None, note="")
+    with locked_folder(folder), progress_bar("identify") as bar:
 
         def show(what: str, done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total, note=what)
+            bar(done, total, what)
 
         opened = read_recording(recording)
         document = identify_into(opened, pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force)

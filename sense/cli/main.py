@@ -1,15 +1,142 @@
-"""`padforge sense`: the command line from recordings to positions."""
+"""`padforge sense`: all its commands, and those that import and export recordings."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from padforge.sense.cli import localizer, recordings, rig
+from padforge.design.common.command_line import out_option, pad_folder
+from padforge.sense.cli import localizer, rig
 from padforge.sense.cli.live import live
-
-COMMANDS = (
-    *(recordings.import_, recordings.export, localizer.calibrate, localizer.evaluate, localizer.identify),
-    *(localizer.locate, localizer.health, rig.record, rig.doctor, live, localizer.recalibrate),
-    *(localizer.fibre_loss, localizer.learning_curve, localizer.deploy),
+from padforge.sense.cli.options import (
+    FOLDER,
+    echo_note,
+    predict_despite_faults,
+    read_recording,
+    recording_argument,
+    recording_line,
 )
+
+if TYPE_CHECKING:
+    from padforge.sense.formats.annotations import ModelAnnotations
+    from padforge.sense.recording.recording import Recording
+
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command("import")
+@click.argument("file", type=_PATH)
+@click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="What columns, datasets or topics hold.")
+@out_option(what="Folder of the recording; must be new or empty")
+def import_(file: Path, columns: str, out: Path | None) -> None:
+    """Make a recording of FILE, a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a bag of ROS 2: an .mcap, a .db3
+    or a folder with metadata.yaml. Of NAME.csv it makes out/NAME/recording.
+
+    \b
+    padforge sense import readings.csv
+    padforge sense import lab.csv --columns 'time=t_ms:ms,fibres=ch*:mV,x=px,y=py'
+    padforge sense import lab.csv --columns 'time=Time [s],fibres=ch*,press=contact,x=X:cm,y=Y:cm'
+    padforge sense import lab.h5 --columns 'time=/t,fibres=/volts,positions=/xy,down_command=/on:s,up_command=/off:s'
+    padforge sense import lab.mcap --columns 'fibres=/skin/readings,positions=/probe,force=/wrench'
+
+    \b
+    Without --columns a CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two
+    hold the position pressed while the probe is down and are empty on all other lines. An .h5 or a bag
+    is one that export wrote, a .mat one of the published study.
+
+    \b
+    With it, columns, datasets, variables or topics are named, with commas between them; * stands for
+    any characters, ? for one. A unit or a factor follows a colon; without it they are s, V, mm, N.
+      time, fibres    of each reading, needed
+      x, y, positions of each reading, or of each press; positions are both in one dataset
+      depth, reached, force
+                      of each reading, or of each press: depth commanded and measured, and force
+      press           1 or a number while the pad is pressed, 0 or empty while not
+      down_command, up_command
+                      of each press: the reading, from 0, or the time where a unit is given
+    Where nothing says when the pad is pressed, presses are detected in the readings.
+
+    \b
+    In a bag, time is when messages were logged, and lengths are m where no unit is given:
+      fibres          std_msgs Float64MultiArray or another one of numbers, or topics of one number
+      positions       geometry_msgs Point, Pose, PoseWithCovariance, with or without Stamped
+      force           geometry_msgs Wrench, with or without Stamped, or a number
+      press           std_msgs Bool
+      x, y, depth, reached
+                      std_msgs Float64 or another number
+    A value holds until the next message.
+    """
+    from padforge.design.common.files import provenance
+    from padforge.sense.formats.columns import PRESSES_DETECTED
+    from padforge.sense.formats.import_export import import_file
+    from padforge.sense.recording.run_directory import check_new_folder
+
+    folder = out or pad_folder(file) / "recording"
+    check_new_folder(folder)
+    recording = import_file(file, columns)
+    echo_note(recording, file)
+    if PRESSES_DETECTED.items() <= recording.source.items():
+        click.echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
+    recording.save(folder, provenance("padforge sense import", inputs=[file]))
+    click.echo(recording_line(recording, folder))
+
+
+@click.command()
+@recording_argument
+@click.argument("file", type=_PATH)
+@click.option("--format", "kind", type=click.Choice(["lerobot"]), help="Write a folder FILE: a LeRobot dataset v3.0.")
+@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: add the positions it predicts, and health.")
+def export(recording: Path, file: Path, kind: str | None, model: Path | None) -> None:
+    """Write RECORDING to FILE for other programs: CSV (.csv), HDF5 (.h5) or ROS 2 (.mcap), by the end of
+    its name, or a LeRobot dataset.
+
+    \b
+    padforge sense export out/pad/recording recording.h5
+    padforge sense export out/pad/recording recording.mcap --model out/pad
+    padforge sense export out/pad/recording dataset --format lerobot
+
+    \b
+    An .mcap has these topics, in V, m and N, with the stamps of the readings; the frame pad has its
+    origin in the middle of the pad, and z points away from it (into one that lay mirrored):
+      /pad/readings   Float64MultiArray, a value for each fibre
+      /pad/pressed    Bool, as a press begins and ends
+      /pad/place      PoseWithCovarianceStamped, where a press was commanded; z is minus its depth
+      /pad/reached, /pad/force
+                      PointStamped, the depth measured, and WrenchStamped, where they are known
+      /pad/recording  String, latched: JSON of what messages round off, for an exact import
+      /pad/touches, /pad/health
+                      of --model: PoseWithCovarianceStamped as a press ends, and DiagnosticArray
+      /arm/pose       PoseStamped, of a recording made by an arm
+    It needs rosbags (pip install 'padforge[ros]'), LeRobot needs pyarrow (padforge[lerobot]).
+    """
+    from padforge.sense.formats.import_export import arm_states, export_file
+
+    opened = read_recording(recording)
+    annotations = _annotate(model, opened) if model else None
+    export_file(opened, file, kind or "", annotations, arm_states(recording))
+    click.echo(f"{recording} -> {file}")
+
+
+def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
+    """Predict positions and faults by a model; a fibre at fault is masked from the press on at which it is named."""
+    import numpy as np
+
+    from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
+
+    prediction, findings, detector = predict_despite_faults(model, recording)
+    faults = [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in findings]
+    depth = prediction.measures.get("depth_mm")
+    unknown = np.full(len(prediction.r90_mm), np.nan)
+    return ModelAnnotations(
+        positions_mm=prediction.positions_mm,
+        std_mm=prediction.std_mm,
+        r90_mm=prediction.r90_mm,
+        depths_mm=unknown if depth is None else depth.values,
+        depths_r90_mm=unknown if depth is None else depth.r90,
+        faults=faults if detector else None,
+        dead=detector.model_.dead if detector else (),
+    )
 
 
 @click.group()
@@ -23,5 +150,9 @@ def sense() -> None:
     """
 
 
-for command in COMMANDS:
-    sense.add_command(command)
+for _command in (
+    *(import_, export, rig.record, rig.doctor, live),
+    *(localizer.calibrate, localizer.evaluate, localizer.identify, localizer.locate, localizer.health),
+    *(localizer.recalibrate, localizer.fibre_loss, localizer.learning_curve, localizer.deploy),
+):
+    sense.add_command(_command)

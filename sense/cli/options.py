@@ -13,6 +13,8 @@ from padforge.design.common.command_line import progress
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
+    from padforge.sense.health.fault_detector import FaultDetector, FibreFault
+    from padforge.sense.localizer.model import Localization
     from padforge.sense.recording.recording import Recording
 
 
@@ -84,15 +86,31 @@ def recording_line(recording: "Recording", out: Path) -> str:
 
 
 @contextmanager
-def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows (done, total) on stderr; (0, 0) shows work without an end in sight."""
+def progress_bar(name: str) -> Iterator[Callable[..., None]]:
+    """Yield a function that shows (done, total, note) on stderr; (0, 0) shows work without an end in sight."""
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
 
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total or None, note=f"{done} of {total}" if total else "")
+        def show(done: int, total: int, note: str = "") -> None:
+            count = f"{done} of {total}  " if total else ""
+            bar.update(task, completed=done, total=total or None, note=count + note)
 
         yield show
+
+
+def predict_despite_faults(
+    model: Path, recording: "Recording", failed: Sequence[int] = ()
+) -> "tuple[Localization, list[FibreFault], FaultDetector | None]":
+    """Localize all presses without some fibres by number, and without a faulty one from where it is detected."""
+    from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
+    from padforge.sense.localizer.model import LocalizerModel
+
+    localizer = LocalizerModel.load(model)
+    detector = FaultDetector.load(model) if has_health(model) else None
+    excluded = fibre_indices(failed, localizer.fibres)
+    faults = detector.predict(recording) if detector else []
+    fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
+    return localizer.predict(recording, excluded, fibre_mask), faults, detector
 
 
 @contextmanager

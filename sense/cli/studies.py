@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import max_failures_option
+from padforge.sense.cli.options import max_failures_option, progress_bar
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -55,21 +56,16 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
             from padforge.sense.studies.study import run, study_lines
 
             check_writable(out)
-            with common.progress() as bar:
-                task = bar.add_task(name, total=None, note="pads")
-                study = make(names, seed=seed or 0, **options)
-
-                def show(done: int, total: int, last: str) -> None:
-                    bar.update(task, completed=done, total=total, note=f"{done} of {total}  {last}")
-
-                try:
+            try:
+                with progress_bar(name) as show:
+                    show(0, 0, "pads")
+                    study = make(names, seed=seed or 0, **options)
                     with cluster(scheduler) as executor:
                         document = run(study, out, jobs=jobs, executor=executor, resume=resume, on_progress=show)
-                except KeyboardInterrupt:
-                    bar.stop()
-                    click.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
-                    # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
-                    os._exit(common.INTERRUPTED)
+            except KeyboardInterrupt:
+                click.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
+                # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
+                os._exit(common.INTERRUPTED)
             common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (
@@ -128,18 +124,6 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
     return robustness_study(_pads(names, seed), seed=seed, contact=contact, **options)
 
 
-@_command("sensitivity")
-def sensitivity(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Objects of other sizes and shapes, trained with or not (figure 6).
-
-    \b
-    padforge study sensitivity square
-    """
-    from padforge.sense.studies.sensitivity import sensitivity_study
-
-    return sensitivity_study(_pads(names, seed), seed=seed)
-
-
 @_command("scaling")
 @click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
 def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
@@ -159,30 +143,6 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
     return scaling_study(_pads(names, seed, ("square", "optimised")), grids=sizes, seed=seed)
 
 
-@_command("force")
-def force(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Depth and force of a press from the signals that localize it, by a model of indentation.
-
-    \b
-    padforge study force square random-5
-    """
-    from padforge.sense.studies.indentation import force_study
-
-    return force_study(_pads(names, seed), seed=seed)
-
-
-@_command("shape")
-def shape(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Which object was pressed, from the signals that localize it.
-
-    \b
-    padforge study shape random-5
-    """
-    from padforge.sense.studies.indentation import shape_study
-
-    return shape_study(_pads(names, seed), seed=seed)
-
-
 @_command("drift", "PAD_OR_RECORDING")
 def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     """Filters and drift compensation, on simulated pads and on recordings; idle shares (figure 12, table III).
@@ -200,13 +160,20 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     return drift_study(load_pads(pads, seed), load_recordings(recordings), seed=seed)
 
 
-@_command("multicontact")
-def multicontact(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9).
+def _add_study(name: str, module: str, text: str, example: str) -> None:
+    """Add the command of a study without further options; `example` are its pads in the help."""
 
-    \b
-    padforge study multicontact square
-    """
-    from padforge.sense.studies.multicontact import multicontact_study
+    def make(names: tuple[str, ...], *, seed: int) -> "Study":
+        make_study = getattr(import_module(f"padforge.sense.studies.{module}"), f"{name}_study")
+        return make_study(_pads(names, seed), seed=seed)
 
-    return multicontact_study(_pads(names, seed), seed=seed)
+    make.__doc__ = f"{text}\n\n\b\npadforge study {name} {example}"
+    _command(name)(make)
+
+
+_add_study("sensitivity", "sensitivity", "Objects of other sizes and shapes, trained with or not (figure 6).", "square")
+_force = "Depth and force of a press from the signals that localize it, by a model of indentation."
+_add_study("force", "indentation", _force, "square random-5")
+_add_study("shape", "indentation", "Which object was pressed, from the signals that localize it.", "random-5")
+_multicontact = "Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9)."
+_add_study("multicontact", "multicontact", _multicontact, "square")

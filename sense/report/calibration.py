@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 
 from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
-from padforge.design.common.plotting import ALARM, INK, add_caption, new_figure, save_figure
+from padforge.design.common.plotting import INK, add_caption, new_figure, save_figure
 from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
@@ -16,7 +16,7 @@ from padforge.sense.localizer.calibration import unlearnt_lines
 from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
-from padforge.sense.studies.fibre_loss import label_failures, spread_dots, subset_errors
+from padforge.sense.studies.fibre_loss import draw_errors_by_loss
 
 FILES = (
     *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
@@ -74,7 +74,9 @@ def calibrate_into(
         write_json(folder / "calibration.json", document)
         with stage("figures"):
             draw_error_map(document, folder / "error_map.png")
-            draw_error_by_loss(document, folder / "error_by_loss.png")
+            figure, axes = new_figure(6.0, 4.4)
+            draw_errors_by_loss(axes, {"": document}, f"One network, {document['test_presses']}")
+            save_figure(figure, folder / "error_by_loss.png")
     return document
 
 
@@ -96,19 +98,4 @@ def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
     title = f"{len(errors)} presses never trained on: mean error {errors.mean():.2f} mm\n"
     axes.set_title(title, loc="left", color=INK, fontsize=11)
     add_caption(axes, "dot: true position; line: to the prediction")
-    save_figure(figure, path)
-
-
-def draw_error_by_loss(document: Mapping[str, Any], path: Path) -> None:
-    """Draw the errors of a calibration by number of failed fibres."""
-    rows = document["errors"]
-    figure, axes = new_figure(6.0, 4.4)
-    for level, row in enumerate(rows):
-        means = subset_errors(document, row["n_failed"])
-        axes.scatter(level + spread_dots(0.17, means), means, s=14, color=ALARM, alpha=0.45, linewidths=0)
-        axes.hlines(row["mean_mm"], level - 0.28, level + 0.28, color=INK, linewidth=2)
-        label = {"color": INK, "va": "center", "fontsize": 10, "weight": "bold"}
-        axes.annotate(f"{row['mean_mm']:.2f}", (level + 0.3, row["mean_mm"]), **label)
-    label_failures(axes, rows, f"One network, {document['test_presses']}")
-    axes.set(xlim=(-0.5, len(rows) - 0.3), ylim=(0, 1.08 * max(row["max_mm"] for row in rows)))
     save_figure(figure, path)

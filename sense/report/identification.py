@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from padforge.design.common.command_line import text_table
 from padforge.design.common.files import atomic_files, check_replaceable, check_writable, provenance, write_json
 from padforge.design.common.page import PageSection, figures, paragraph, table
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, add_title, save_figure, style_axes
@@ -21,6 +22,7 @@ from padforge.sense.twin.identification import Identification, identify_pad
 FORMAT = "padforge-identification/3"
 MIN_ADVANTAGE = 0.02
 """Share of the variance by which a plan must explain more than straight fibres, else it may be of another pad."""
+CHANNEL_HEAD = ["channel", "fibre", "or", "gain (mV a %)", "noise (mV)", "explained", "lateral offset (mm)"]
 COMMAND, TWIN = "padforge sense identify", "twin.json"
 
 
@@ -162,8 +164,7 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
     """Describe an identification; channels and fibres count from 1."""
     return [
         f"twin of {document['presses']} presses -> {out / TWIN}",
-        "channel fibre gain (mV/%)  noise (mV)  explained  lateral offset (mm)",
-        *map(_channel_line, document["channels"]),
+        *text_table([CHANNEL_HEAD, *map(_channel_cells, document["channels"])], text_columns=()),
         f"explained {document['explained']:.3f} of held-out responses; {document['explained_on_plan']:.3f} on the plan"
         f" as it is; noise {document['noise']:.1%} of full scale",
         f"the pad lay {_pose(document)}",
@@ -171,23 +172,20 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
     ]
 
 
-def _channel_line(row: Mapping[str, Any]) -> str:
-    line = f"{row['channel'] + 1:7d} {_fibre(row):>5} {row['gain_v'] * 10:10.1f} {row['noise_v'] * 1e3:11.2f}"
-    if "lateral_offset_mm" not in row:
-        return line
-    return f"{line} {row['explained']:10.2f} {row['lateral_offset_mm']:10.2f} +- {row['lateral_offset_std_mm']:.2f}"
+def _channel_cells(row: Mapping[str, Any]) -> list[str]:
+    explained = ["-", "-"]
+    if "lateral_offset_mm" in row:
+        offset = f"{row['lateral_offset_mm']:.2f} ± {row['lateral_offset_std_mm']:.2f}"
+        explained = [f"{row['explained']:.2f}", offset]
+    alternatives = _fibres(row["alternative_fibres"]) or "-"
+    gain, noise = f"{row['gain_v'] * 10:.1f}", f"{row['noise_v'] * 1e3:.2f}"
+    return [str(row["channel"] + 1), _fibre(row), alternatives, gain, noise, *explained]
 
 
 def _warnings(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the presses leave open."""
     if document["n_alternatives"]:
-        channels = "; ".join(
-            f"channel {row['channel'] + 1}: {_fibre(row)} or {_fibres(row['alternative_fibres'])}"
-            for row in document["channels"]
-            if row["alternative_fibres"]
-        )
-        where = f" ({channels})" if channels else ""
-        yield f"ambiguous: {document['n_alternatives']} other poses and wirings explain the presses as well{where}"
+        yield f"ambiguous: {document['n_alternatives']} other poses and wirings explain the presses as well"
     straight = document["explained_by_straight"]
     if straight is not None and document["explained_on_plan"] < straight + MIN_ADVANTAGE:
         yield (
@@ -197,22 +195,7 @@ def _warnings(document: Mapping[str, Any]) -> Iterator[str]:
 
 def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """Write the section of the report on an `identification.json` in `folder`. Raises errors as those of `sections`."""
-    rows = [
-        [
-            row["channel"] + 1,
-            _fibre(row),
-            _fibres(row["alternative_fibres"]) or "-",
-            f"{row['gain_v'] * 10:.1f}",
-            f"{row['noise_v'] * 1e3:.2f}",
-            *(
-                [f"{row['explained']:.2f}", f"{row['lateral_offset_mm']:.2f} ± {row['lateral_offset_std_mm']:.2f}"]
-                if "lateral_offset_mm" in row
-                else "--"
-            ),
-        ]
-        for row in document["channels"]
-    ]
-    head = ["channel", "fibre", "or", "gain (mV a %)", "noise (mV)", "explained", "lateral offset (mm)"]
+    channels = table(CHANNEL_HEAD, [_channel_cells(row) for row in document["channels"]])
     summary = (
         f"Identified from {document['presses']} presses: the pad lay {_pose(document)}. The twin explains"
         f" {document['explained']:.0%} of the responses to {document['held_out']} held-out presses, the plan as it is"
@@ -222,7 +205,7 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
         (folder / "twin_plan.png", "The plan, and the fibres as built over it."),
         (folder / "twin_responses.png", "Responses of each channel by position: measured, predicted, residual."),
     ]
-    body = [paragraph(summary), *map(paragraph, _warnings(document)), table(head, rows), figures(pictures)]
+    body = [paragraph(summary), *map(paragraph, _warnings(document)), channels, figures(pictures)]
     result = (f"{document['explained']:.0%}", "of the responses explained by the twin")
     return [PageSection("The pad as built", body, [result])]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,7 +36,10 @@ from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads
 
 Rows = Sequence[Mapping[str, Any]]
 
+TEST_SHARE = 0.15  # of the presses, held out at random, and again at the end
 MEMBERS = 3  # networks whose errors are averaged: they differ by their first weights
+HIDDEN, EPOCHS = 50, 200
+RIG = RigSettings(presses=1000)  # that records pads
 SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
 SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
 SLOW_PRESSES = 15  # with the last one, over whose rest levels the median is the slow baseline
@@ -57,60 +60,27 @@ SIMULATED = "simulated"  # kind of a recording, in its source and in rows
 COMPENSATIONS = ("none", "baseline", "slow baseline", "published", "windows")  # see `network_inputs`
 
 
-class PressSplit(NamedTuple):
-    """Presses by index: to train on, to stop the training by, and to test on, at random and the last ones."""
-
-    training: Indices
-    validation: Indices
-    test: Indices
-    last: Indices
-
-
-def drift_study(
-    pads: Mapping[str, Morphology],
-    recordings: Mapping[str, Recording],
-    *,
-    rig: RigSettings | None = None,
-    presses: int = 1000,
-    test_share: float = 0.15,
-    hidden: int = 50,
-    epochs: int = 200,
-    seed: int = 0,
-) -> Study:
+def drift_study(pads: Mapping[str, Morphology], recordings: Mapping[str, Recording], *, seed: int = 0) -> Study:
     """Evaluate every filter with every kind of drift compensation, and how often fibres are idle.
 
-    Args:
-        pads: by label, each recorded by the simulated rig.
-        recordings: by label.
-        rig: simulated noise, drift, creep and hysteresis, and the cycle of a press.
-        presses: of a simulated pad.
-        test_share: share of the presses held out at random, and again at the end.
-        hidden: neurons of a network.
-        epochs: of training.
-        seed: of simulated recordings, splits and networks.
-
     Raises:
-        InputError: neither a pad nor a recording, a label twice, or too few presses of known position.
+        InputError: a label twice, or a recording with too few presses of known position.
     """
-    if not pads and not recordings:
-        raise InputError("study has neither a morphology nor a recording, expected at least one of them")
     if duplicates := sorted(pads.keys() & recordings.keys()):
         raise InputError(f"{duplicates[0]}: label of a morphology and of a recording, expected each label once")
     rig_seed = int(np.random.default_rng([6, seed]).integers(2**32))
-    rig = (rig or RigSettings()).model_copy(update={"presses": presses, "seed": rig_seed})
+    rig = RIG.model_copy(update={"seed": rig_seed})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
-    kinds, n_presses = dict.fromkeys(pads, SIMULATED), dict.fromkeys(pads, presses)
+    kinds = dict.fromkeys(pads, SIMULATED)
     for label, recording in recordings.items():
         sources[label] = lambda recording=recording: recording
         kinds[label] = SIMULATED if recording.source.get("kind") == SIMULATED else "recorded"
-        n_presses[label] = int(recording.has_position.sum())
-    for label, count in n_presses.items():
         try:
-            _split(np.arange(count), test_share, seed)
+            _split(np.flatnonzero(recording.has_position), seed)
         except InputError as error:
             raise InputError(f"{label}: {error}") from error
     tasks = [
-        Task(f"{label}, filter {name}", partial(_evaluate, source, name, test_share, hidden, epochs, seed))
+        Task(f"{label}, filter {name}", partial(_evaluate, source, name, seed))
         for label, source in sources.items()
         for name in FILTERS
     ]
@@ -120,41 +90,37 @@ def drift_study(
         "rig": rig.model_dump(mode="json"),
         "filters": list(FILTERS),
         "compensations": list(COMPENSATIONS),
-        "test_share": test_share,
+        "test_share": TEST_SHARE,
         "members": MEMBERS,
-        "hidden": hidden,
-        "epochs": epochs,
+        "hidden": HIDDEN,
+        "epochs": EPOCHS,
         "seed": seed,
     }
     conclude = partial(_conclude, dict(pads), kinds, settings)
     return Study("drift", "Filters and drift compensation", settings, tasks, conclude, _draw)
 
 
-def _split(presses: Indices, share: float, seed: int) -> PressSplit:
-    """Split presses of known position: the last ones, then of the others some at random to test and validate on."""
+def _split(presses: Indices, seed: int) -> tuple[Indices, Indices, dict[str, Indices]]:
+    """Split presses of known position into those to train on, to stop by, and to "test" on, at random and the "last".
+
+    The last ones are held out first, then of the others some at random.
+    """
     rng = np.random.default_rng([7, seed])
-    first, last = split_presses(len(presses), "chronological", share, rng)
-    fitted, test = split_presses(len(first), "random", share, rng)
-    training, validation = split_presses(len(fitted), "random", share, rng)
-    return PressSplit(presses[fitted[training]], presses[fitted[validation]], presses[test], presses[last])
+    first, last = split_presses(len(presses), "chronological", TEST_SHARE, rng)
+    fitted, test = split_presses(len(first), "random", TEST_SHARE, rng)
+    training, validation = split_presses(len(fitted), "random", TEST_SHARE, rng)
+    return presses[fitted[training]], presses[fitted[validation]], {"test": presses[test], "last": presses[last]}
 
 
-def press_levels(readings: Array, down_command: Indices, up_command: Indices) -> Array:
-    """Take the levels (Q, C, 3) of each fibre before, in and after each press, from readings (R, C)."""
-    return np.stack([readings[rows] for rows in _level_indices(len(readings), down_command, up_command)], axis=2)
-
-
-def _level_indices(readings: int, down_command: Indices, up_command: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return which readings (Q,) are the levels before, in and after each press: SETTLED from the probe's commands.
+def level_indices(readings: int, down_command: Indices, up_command: Indices) -> Indices:
+    """Return which readings (Q, 3) are the levels before, in and after each press: SETTLED from the probe's commands.
 
     Where a cycle is too short, it is the nearest reading that belongs neither to another phase nor to another press.
     """
     previous, following = np.append(0, up_command[:-1]), np.append(down_command[1:], readings)
-    return (
-        np.maximum(down_command - SETTLED, previous),
-        np.minimum(down_command + SETTLED, up_command - 1),
-        np.minimum(up_command + SETTLED, following - 1),
-    )
+    before = np.maximum(down_command - SETTLED, previous)
+    pressed = np.minimum(down_command + SETTLED, up_command - 1)
+    return np.column_stack([before, pressed, np.minimum(up_command + SETTLED, following - 1)])
 
 
 def network_inputs(
@@ -168,7 +134,7 @@ def network_inputs(
         windows = inputs.windows.reshape(len(down_command), -1)
         components = np.linalg.eigh(np.cov(windows[training], rowvar=False))[1]
         return (windows - windows[training].mean(axis=0)) @ components[:, -3 * readings.shape[1] :]
-    before, pressed, after = np.moveaxis(press_levels(readings, down_command, up_command), 2, 0)
+    before, pressed, after = readings[level_indices(len(readings), down_command, up_command).T]
     if compensation == "published":
         return np.hstack([before, pressed, after])
     if compensation == "baseline":
@@ -178,7 +144,7 @@ def network_inputs(
     return pressed
 
 
-def _evaluate(source: Callable[[], Recording], name: str, share: float, hidden: int, epochs: int, seed: int) -> State:
+def _evaluate(source: Callable[[], Recording], name: str, seed: int) -> State:
     """Train and test the networks of every compensation on the readings after a filter.
 
     Returns:
@@ -193,14 +159,15 @@ def _evaluate(source: Callable[[], Recording], name: str, share: float, hidden: 
     filtered = FILTERS[name](readings)
     state: State = {"seconds": np.array((perf_counter() - begin) * 1e4 / len(readings))}
     state["idle"] = np.array(recorded_idle_share(replace(recording, readings=filtered)).mean())
-    split = _split(np.flatnonzero(recording.has_position), share, seed)
+    training, validation, tests = _split(np.flatnonzero(recording.has_position), seed)
     for number, compensation in enumerate(COMPENSATIONS):
-        inputs = network_inputs(compensation, filtered, down_command, up_command, split.training)
+        inputs = network_inputs(compensation, filtered, down_command, up_command, training)
         rngs = np.random.default_rng([8, seed]).spawn(MEMBERS)
-        validation = np.broadcast_to(inputs[split.validation], (MEMBERS, len(split.validation), inputs.shape[1]))
-        stop_by = (validation, positions_mm[split.validation])
-        networks = fit_batch(inputs[split.training], positions_mm[split.training], rngs, hidden, epochs, stop_by)
-        for part, rows in (("test", split.test), ("last", split.last)):
+        stop_by = np.broadcast_to(inputs[validation], (MEMBERS, len(validation), inputs.shape[1]))
+        networks = fit_batch(
+            inputs[training], positions_mm[training], rngs, HIDDEN, EPOCHS, (stop_by, positions_mm[validation])
+        )
+        for part, rows in tests.items():
             errors = [distances(network(inputs[rows]), positions_mm[rows]) for network in networks]
             state[f"{part}_{number}"] = np.stack(errors)
     return state | _excerpt(recording.times_s, readings, filtered, down_command, up_command)
@@ -213,19 +180,19 @@ def _excerpt(times_s: Array, readings: Array, filtered: Array, down_command: Ind
         Index of the "fibre"; "readings" (3, W): times, s, raw and filtered readings, V; "samples" (EXCERPT_PRESSES, 3,
         2): times and levels of some presses; "levels" (L, 3): times, and levels before and in presses.
     """
-    levels = press_levels(filtered, down_command, up_command)
-    responses = levels[:, :, 1] - levels[:, :, 0]
+    indices = level_indices(len(readings), down_command, up_command)
+    levels = filtered[indices]  # shape (Q, 3, C)
+    responses = levels[:, 1] - levels[:, 0]
     fibre = int(np.argmax(responses.std(axis=0)))
     count = min(EXCERPT_PRESSES, len(down_command))
     first = int(np.argmax(np.convolve(np.abs(responses[:, fibre]), np.ones(count), "valid")))
-    indices = np.stack(_level_indices(len(readings), down_command, up_command), axis=1)
     presses = slice(first, first + count)
     window = slice(max(0, indices[first, 0] - SETTLED), indices[first + count - 1, 2] + SETTLED)
     sample = np.unique(np.linspace(0, len(down_command) - 1, MAX_LEVELS).astype(int))
     return {
         "readings": np.stack([times_s[window], readings[window, fibre], filtered[window, fibre]]),
-        "samples": np.stack([times_s[indices[presses]], levels[presses, fibre]], axis=2),
-        "levels": np.column_stack([times_s[down_command[sample]], levels[sample, fibre, :2]]),
+        "samples": np.stack([times_s[indices[presses]], levels[presses, :, fibre]], axis=2),
+        "levels": np.column_stack([times_s[down_command[sample]], levels[sample, :2, fibre]]),
         "fibre": np.array(fibre),
     }
 
@@ -268,7 +235,7 @@ def _conclude(
 
 
 def _describe(settings: Mapping[str, Any], rows: Rows, idle: Rows) -> list[str]:
-    share = 100 * settings["test_share"]
+    share = 100 * TEST_SHARE
     text = [
         f"Networks of {settings['hidden']} neurons localize presses from readings after {len(settings['filters'])} "
         f"filters, with {len(settings['compensations'])} kinds of drift compensation. Errors are means of "
@@ -293,15 +260,17 @@ def _describe(settings: Mapping[str, Any], rows: Rows, idle: Rows) -> list[str]:
 
 
 def _describe_recording(rows: Rows) -> str:
-    best, best_last = (min(rows, key=lambda row: row[key]) for key in ("mean_mm", "mean_last_mm"))
-    plain = next(row for row in rows if (row["filter"], row["compensation"]) == (best["filter"], "none"))
-    same = [row for row in rows if row["compensation"] == best["compensation"]]
-    raw = next(row for row in same if row["filter"] == RAW)
-    filtered = min((row for row in same if row is not raw), key=lambda row: row["mean_mm"])
-    by_compensation = [
-        min((row for row in rows if row["compensation"] == compensation), key=lambda row: row["mean_mm"])
-        for compensation in COMPENSATIONS
-    ]
+    def least(key: str = "mean_mm", **values: str) -> Mapping[str, Any]:
+        return min((row for row in rows if values.items() <= row.items()), key=lambda row: row[key])
+
+    best, best_last = least(), least("mean_last_mm")
+    plain = least(filter=best["filter"], compensation="none")
+    raw = least(filter=RAW, compensation=best["compensation"])
+    filtered = min(
+        (least(filter=name, compensation=best["compensation"]) for name in FILTERS if name != RAW),
+        key=lambda row: row["mean_mm"],
+    )
+    by_compensation = [least(compensation=compensation) for compensation in COMPENSATIONS]
     errors = _listed([f"{row['mean_mm']:.2f} mm ({_method(row)})" for row in by_compensation])
     return (
         f"{best['recording']}, {best['kind']}: the least error on presses drawn at random is that of {_method(best)}, "

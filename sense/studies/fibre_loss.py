@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance
-from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
+from padforge.design.common.parallel import Checkpoints, State
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_type, short_repr
+from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices
@@ -25,7 +26,7 @@ from padforge.sense.localizer.calibration import fit_recording, split_unseen
 from padforge.sense.localizer.evaluation import errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
-from padforge.sense.studies.study import draw_error_map, failed_label
+from padforge.sense.studies.study import Task, compute_states, draw_error_map, failed_label
 
 FORMAT = "padforge-fibre-loss/3"
 ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document calls them
@@ -131,110 +132,86 @@ def _retrain(
 ) -> dict[Failed, Localization]:
     """Predict the test presses by a network of each set of failed fibres; finished ones are not trained again."""
     about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
-    checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
-    states = checkpoints.begin(resume=True) if checkpoints else {}
-    predictions = {
-        failed: _restore(states[number], len(test)) for failed in subsets if (number := _bit_mask(failed)) in states
-    }
-    on_progress(len(predictions), len(subsets))
     options = options.model_copy(update={"method": "published", "features": "published"})
-    missing = [failed for failed in subsets if failed not in predictions]
-    tasks = ((failed, partial(train_without, failed, recording, training, test, options)) for failed in missing)
-    with one_torch_thread():
-        for failed, prediction in run_tasks(tasks):
-            predictions[failed] = prediction
-            if checkpoints:
-                arrays = {key: value for key, value in vars(prediction).items() if key != "measures"}
-                checkpoints.save(_bit_mask(failed), arrays)
-            on_progress(len(predictions), len(subsets))
-    return predictions
+    tasks = {
+        _bit_mask(failed): Task("", partial(train_without, failed, recording, training, test, options))
+        for failed in subsets
+    }
+    checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
+    states: Mapping[int, Mapping[str, Any]] = compute_states(
+        tasks, checkpoints, lambda done, total, _: on_progress(done, total)
+    )
+    return {failed: Localization(**states[_bit_mask(failed)]) for failed in subsets}
 
 
 def train_without(
     failed: Failed, recording: Recording, training: Indices, test: Indices, options: settings.LocalizerSettings
-) -> Localization:
+) -> State:
     """Train on the other fibres alone, and predict the test presses; independent of all other trainings."""
     remaining = np.setdiff1d(np.arange(recording.fibres), failed)
     partial_recording = replace(recording, readings=recording.readings[:, remaining])
     rng = np.random.default_rng([options.seed, _bit_mask(failed)])
     localizer = fit_recording(partial_recording, training, options, rng)
-    return localizer.predict_features(localizer.scaled_features(partial_recording)[test])
+    prediction = localizer.predict_features(localizer.scaled_features(partial_recording)[test])
+    return {key: value for key, value in vars(prediction).items() if key != "measures"}
 
 
 def _bit_mask(failed: Failed) -> int:
     return sum(1 << fibre for fibre in failed)
 
 
-def _restore(state: State, presses: int) -> Localization:
-    """Return the predictions of a finished network; raises InputError if its file holds something else."""
-    shapes = {"positions_mm": (presses, 2), "std_mm": (presses, 2), "r50_mm": (presses,), "r90_mm": (presses,)}
-    arrays = {name: (array.shape, array.dtype.kind) for name, array in state.items()}
-    if arrays != {name: (shape, "f") for name, shape in shapes.items()}:
-        raise InputError(f"unfinished networks hold {short_repr(arrays)}, expected {shapes}; remove them to start anew")
-    if not all(np.isfinite(array).all() for array in state.values()):
-        raise InputError("unfinished networks hold NaN or infinity, expected finite numbers; remove them to start anew")
-    return Localization(state["positions_mm"], state["std_mm"], state["r50_mm"], state["r90_mm"])
-
-
 def fibre_loss_lines(document: dict[str, Any]) -> list[str]:
     """Format the errors of both methods as a table."""
-    head = f"error in mm on {document['test_presses']} presses (split: {document['split']})"
-    lines = [head, f"{'':12s}failed  sets   mean    std    max"]
-    for name, method in document["methods"].items():
-        lines += [
-            f"{name:<12s}{row['n_failed']:6d} {row['subsets']:5d} {row['mean_mm']:6.2f} {row['std_mm']:6.2f} "
-            f"{row['max_mm']:6.2f}"
-            for row in method["errors"]
+    cells = [
+        [
+            name,
+            f"{row['n_failed']}",
+            f"{row['subsets']}",
+            *(f"{row[f'{key}_mm']:.2f}" for key in ("mean", "std", "max")),
         ]
-    return lines
+        for name, method in document["methods"].items()
+        for row in method["errors"]
+    ]
+    head = f"error in mm on {document['test_presses']} presses (split: {document['split']})"
+    return [head, *text_table([["", "failed", "sets", "mean", "std", "max"], *cells])]
 
 
 def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
-    """Draw errors by number of failed fibres, every set as a dot; below, maps of each method's errors."""
+    """Draw errors by number of failed fibres; below, maps of each method's errors."""
     methods = document["methods"]
     columns = len(next(iter(methods.values()))["maps"])
     figure = Figure(figsize=(max(6.4, 1.9 * columns), 4.4 + 1.9 * len(methods)), layout="constrained")
     grid = figure.add_gridspec(1 + len(methods), columns, height_ratios=[4.4] + [1.9] * len(methods))
     axes = figure.add_subplot(grid[0, :])
-    style_axes(axes)
-    for number, (name, colour) in enumerate(zip(methods, (VERTICAL, HORIZONTAL), strict=False)):
-        for level, row in enumerate(methods[name]["errors"]):
-            x = level + BAR_WIDTH * (number - (len(methods) - 1) / 2)
-            means = subset_errors(methods[name], row["n_failed"])
-            axes.bar(x, row["mean_mm"], 0.9 * BAR_WIDTH, color=colour, alpha=0.35, label=None if level else name)
-            axes.scatter(x + spread_dots(0.3 * BAR_WIDTH, means), means, s=9, color=colour, linewidths=0, zorder=3)
-            axes.text(x, 0.03, f"{row['mean_mm']:.2f}", color=INK, fontsize=9, ha="center", va="bottom")
+    draw_errors_by_loss(axes, methods, f"Fibre loss, {document['test_presses']}")
     axes.legend(frameon=False, loc="upper left")
-    label_failures(axes, next(iter(methods.values()))["errors"], f"Fibre loss, {document['test_presses']}")
     panels = [panel for method in methods.values() for panel in method["maps"]]
     highest = max(cell["mean_mm"] for panel in panels for cell in panel["by_position"])
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
         axes = figure.add_subplot(grid[1 + row, column], aspect="equal")
         errors, extent = _error_grid(panel["by_position"])
-        image = draw_error_map(axes, errors, failed_label(panel["failed"]), highest, extent)
-        if column == 0:
-            axes.set_ylabel(list(methods)[row], fontsize=8, color=INK)
-        if column == columns - 1:
-            figure.colorbar(image, ax=axes, label="mm", shrink=0.9)
+        label = "" if column else f"{list(methods)[row]}, mm"
+        draw_error_map(axes, errors, failed_label(panel["failed"]), highest, extent, label)
     save_figure(figure, path)
 
 
-def subset_errors(document: Mapping[str, Any], n_failed: int) -> list[float]:
-    """Return the mean errors, mm, of all sets of some number of failed fibres, ascending."""
-    return sorted(row["mean_mm"] for row in document["by_subset"] if len(row["failed"]) == n_failed)
-
-
-def spread_dots(half_width: float, values: Sequence[float]) -> Array:
-    """Return offsets, in the order of the values, by which no dot hides another."""
-    return np.linspace(-half_width, half_width, len(values)) if len(values) > 1 else np.zeros(1)
-
-
-def label_failures(axes: Any, rows: Sequence[Mapping[str, Any]], title: str) -> None:
-    """Label axes of errors by number of failed fibres."""
-    names = [f"{row['n_failed']} failed" if row["n_failed"] else "all fibres" for row in rows]
-    sets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in rows]
-    axes.set_xticks(range(len(rows)), [f"{name}\n{count}" for name, count in zip(names, sets, strict=True)])
+def draw_errors_by_loss(axes: Any, methods: Mapping[str, Mapping[str, Any]], title: str) -> None:
+    """Draw the errors of one or two methods by number of failed fibres, every set of them as a dot."""
+    style_axes(axes)
+    levels = next(iter(methods.values()))["errors"]
+    for number, ((name, method), colour) in enumerate(zip(methods.items(), (VERTICAL, HORIZONTAL), strict=False)):
+        for level, row in enumerate(method["errors"]):
+            x = level + BAR_WIDTH * (number - (len(methods) - 1) / 2)
+            means = sorted(each["mean_mm"] for each in method["by_subset"] if len(each["failed"]) == row["n_failed"])
+            # side by side, so that no dot hides another
+            offsets = 0.3 * BAR_WIDTH * np.linspace(-1, 1, len(means)) if len(means) > 1 else np.zeros(1)
+            axes.bar(x, row["mean_mm"], 0.9 * BAR_WIDTH, color=colour, alpha=0.35, label=None if level else name)
+            axes.scatter(x + offsets, means, s=9, color=colour, linewidths=0, zorder=3)
+            axes.text(x, 0.03, f"{row['mean_mm']:.2f}", color=INK, fontsize=9, ha="center", va="bottom")
+    names = [f"{row['n_failed']} failed" if row["n_failed"] else "all fibres" for row in levels]
+    sets = [f"{row['subsets']} set{'s' if row['subsets'] > 1 else ''}" for row in levels]
+    axes.set_xticks(range(len(levels)), [f"{name}\n{count}" for name, count in zip(names, sets, strict=True)])
     axes.set_ylabel("mean error (mm)")
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_title(f"{title} presses never trained on\n", loc="left", color=INK, fontsize=11)

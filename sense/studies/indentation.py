@@ -1,6 +1,7 @@
 """Force and shape: whether the fibres that localize a press also tell how deep and hard it is, and with what object."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from itertools import product
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions
+from padforge.design.common.plotting import CURVES, INK, add_title
 from padforge.design.contact import signals
 from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
 from padforge.design.morphology import Morphology
@@ -17,14 +18,15 @@ from padforge.design.networks import fresh_presses
 from padforge.design.settings import Contact, between_fibres
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.studies.study import (
-    MEMBERS,
+    Sizes,
     Study,
     StudyResult,
     Task,
     classification_scores,
-    confusion_matrix,
+    classify,
     describe_pads,
-    fit_ensemble,
+    draw_confusions,
+    fit_and_predict,
     label_axes,
     quantize,
 )
@@ -32,7 +34,12 @@ from padforge.sense.studies.study import (
 LOG_SCALE = 4.0
 """Counts below which the logarithm of a reading becomes linear, since there it would be one of noise. To logarithms a
 deeper press adds, as it multiplies all signals."""
-DEPTHS = (0.1, 0.45)  # least and greatest, grid units
+DEPTHS = LOW, HIGH = 0.1, 0.45  # least and greatest, grid units
+MIDDLE = (LOW + HIGH) / 2
+CASES = {"depth unknown": (DEPTHS, False), "depth known": (DEPTHS, True), "one depth": ((MIDDLE, MIDDLE), False)}
+"""Range of depths, and whether the depth is an input, of the networks whose errors of the position are compared."""
+SPHERE, FORCE_SIZES = Indenter(), Sizes(2048, 1024)
+FORCE_NOISES = (1.0, 4.0)  # standard deviations of the readings' noise, counts of a 12-bit converter
 BINS = 7  # depths by which the error of the position is drawn
 COLUMNS = 4  # pads side by side in the figure of the force
 INDENTERS = {
@@ -44,174 +51,123 @@ INDENTERS = {
 FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}  # sides of each polygon; None for a circle
 SIZES = np.linspace(0.5, 0.9, 17)
 """Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""
-SHAPE_NOISE_COUNTS = 1.0
+SHAPE_NOISE_COUNTS, SHAPE_SIZES = 1.0, Sizes(4096, 2048)
 SETS = {"indenters": tuple(INDENTERS), "footprints": tuple(FOOTPRINTS)}
 
 
-def force_study(
-    pads: Mapping[str, Morphology],
-    *,
-    indenter: Indenter | None = None,
-    depths: tuple[float, float] = DEPTHS,
-    noise_counts: Sequence[float] = (1.0, 4.0),
-    presses: int = 2048,
-    test: int = 1024,
-    hidden: int = 50,
-    epochs: int = 200,
-    seed: int = 0,
-) -> Study:
+def force_study(pads: Mapping[str, Morphology], *, sizes: Sizes = FORCE_SIZES, seed: int = 0) -> Study:
     """Estimate position, depth and force of presses of random depth, from the signals of the indentation model.
 
     An unknown depth is compared with one that is an input, and with presses of the middle depth alone.
-
-    Args:
-        pads: by label.
-        indenter: a sphere of 0.7 grid units if None.
-        depths: least and greatest, grid units.
-        noise_counts: standard deviations of the readings' noise, in counts of a 12-bit converter.
-        presses: training presses.
-        test: test presses.
-        hidden: neurons of a network.
-        epochs: of training.
-        seed: of presses, noise and networks.
-
-    Raises:
-        InputError: depths that the indenter does not allow.
     """
-    indenter = indenter or Indenter()
-    indenter.contact_radius(depths)
-    middle = float(np.mean(depths))
-    cases = (("depth unknown", depths, False), ("depth known", depths, True), ("one depth", (middle, middle), False))
-    numbers = {"presses": presses, "test": test, "hidden": hidden, "epochs": epochs, "seed": seed}
     tasks = [
-        Task(
-            f"{label}, noise of {_counts(noise)}, {name}",
-            partial(_estimate_depth, pad, indenter, case_depths, is_known, noise, **numbers),
-        )
+        Task(f"{label}, noise of {_counts(noise)}, {name}", partial(_estimate_depth, pad, *case, noise, sizes, seed))
         for label, pad in pads.items()
-        for noise in noise_counts
-        for name, case_depths, is_known in cases
+        for noise in FORCE_NOISES
+        for name, case in CASES.items()
     ]
     settings = {
         "pads": describe_pads(pads),
-        "indenter": {"shape": indenter.shape, "radius": indenter.radius, "angle_deg": indenter.angle_deg},
-        "depths": list(depths),
-        "noise_counts": list(noise_counts),
+        "indenter": {"shape": SPHERE.shape, "radius": SPHERE.radius, "angle_deg": SPHERE.angle_deg},
+        "depths": list(DEPTHS),
+        "noise_counts": list(FORCE_NOISES),
         "reduced_modulus_kpa": REDUCED_MODULUS_KPA,
-        "members": MEMBERS,
-        **numbers,
+        "seed": seed,
+        **asdict(sizes),
     }
-    conclude = partial(_conclude_force, dict(pads), indenter, settings)
+    conclude = partial(_conclude_force, dict(pads), settings)
     return Study("force", "Depth and force of a press, besides its position", settings, tasks, conclude, _draw_force)
 
 
 def _estimate_depth(
-    pad: Morphology,
-    indenter: Indenter,
-    depths: tuple[float, float],
-    is_known: bool,
-    noise_counts: float,
-    *,
-    presses: int,
-    test: int,
-    hidden: int,
-    epochs: int,
-    seed: int,
+    pad: Morphology, depths: tuple[float, float], is_known: bool, noise_counts: float, sizes: Sizes, seed: int
 ) -> State:
     """Return x, y and depth of the test presses, "pressed" and "predicted", grid units; no depth where it is known."""
-    rng = np.random.default_rng([3, seed])
-    positions = fresh_presses(between_fibres(pad.layout), presses + test, int(rng.integers(2**32)))
-    depth = rng.uniform(*depths, presses + test)
-    responses = indented_signals(pad, positions, depth, indenter)
-    inputs = np.log1p(quantize(responses, responses[:presses].max(axis=0), noise_counts, rng) / LOG_SCALE)
+    rng, count = np.random.default_rng([3, seed]), sizes.presses + sizes.test
+    positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
+    depth = rng.uniform(*depths, count)
+    responses = indented_signals(pad, positions, depth, SPHERE)
+    inputs = np.log1p(quantize(responses, sizes.presses, noise_counts, rng) / LOG_SCALE)
     targets = np.column_stack([positions, depth])
     if is_known:
         inputs, targets = np.column_stack([inputs, depth]), positions
-    predict = fit_ensemble(inputs[:presses], targets[:presses], rng, hidden, epochs)
-    return {"pressed": targets[presses:], "predicted": predict(inputs[presses:])}
+    return {"pressed": targets[sizes.presses :], "predicted": fit_and_predict(inputs, targets, rng, sizes)}
 
 
 def _counts(number: float) -> str:
     return f"{number:g} count" if number == 1 else f"{number:g} counts"
 
 
-def _conclude_force(
-    pads: Mapping[str, Morphology], indenter: Indenter, settings: Mapping[str, Any], states: list[State]
-) -> StudyResult:
-    low, high = settings["depths"]
-    middle = (low + high) / 2
-    edges = np.linspace(low, high, BINS + 1)
+def _conclude_force(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
+    edges = np.linspace(LOW, HIGH, BINS + 1)
     rows, curves = [], []
     results = iter(states)
     for label, pad in pads.items():
-        unit_mm, force_n = pad.unit_mm, partial(indenter.force_n, unit_mm=pad.unit_mm)
-        force_range_n = float(force_n(high) - force_n(low))
-        for noise in settings["noise_counts"]:
-            cases = [next(results) for _ in range(3)]
-            depth, predicted = cases[0]["pressed"][:, 2], np.clip(cases[0]["predicted"][:, 2], low, high)
-            errors, *others = (
+        unit_mm, force_n = pad.unit_mm, partial(SPHERE.force_n, unit_mm=pad.unit_mm)
+        range_n = float(force_n(HIGH) - force_n(LOW))
+        for noise in FORCE_NOISES:
+            cases = [next(results) for _ in CASES]
+            depth, predicted = cases[0]["pressed"][:, 2], np.clip(cases[0]["predicted"][:, 2], LOW, HIGH)
+            errors, depth_known, one_depth = (
                 np.linalg.norm(case["predicted"][:, :2] - case["pressed"][:, :2], axis=1) for case in cases
             )
-            depth_known_mm, one_depth_mm = (float(case_errors.mean() * unit_mm) for case_errors in others)
-            force_guess_n = float(np.abs(force_n(middle) - force_n(depth)).mean())
-            force_error_n = float(np.abs(force_n(predicted) - force_n(depth)).mean())
+            depth_error = np.abs(predicted - depth).mean()
+            force_error_n, force_guess_n = (
+                float(np.abs(force_n(guess) - force_n(depth)).mean()) for guess in (predicted, MIDDLE)
+            )
             row = {
                 "pad": label,
                 "noise_counts": noise,
                 "position_grid": float(errors.mean()),
                 "position_mm": float(errors.mean() * unit_mm),
-                "position_depth_known_mm": depth_known_mm,
-                "position_one_depth_mm": one_depth_mm,
-                "depth_grid": float(np.abs(predicted - depth).mean()),
-                "depth_mm": float(np.abs(predicted - depth).mean() * unit_mm),
-                "depth_guessed_mm": float(np.abs(depth - middle).mean() * unit_mm),
+                "position_depth_known_mm": float(depth_known.mean() * unit_mm),
+                "position_one_depth_mm": float(one_depth.mean() * unit_mm),
+                "depth_grid": float(depth_error),
+                "depth_mm": float(depth_error * unit_mm),
+                "depth_guessed_mm": float(np.abs(depth - MIDDLE).mean() * unit_mm),
                 "force_n": force_error_n,
-                "force_percent": 100 * force_error_n / force_range_n,
-                "force_guessed_percent": 100 * force_guess_n / force_range_n,
+                "force_percent": 100 * force_error_n / range_n,
+                "force_guessed_percent": 100 * force_guess_n / range_n,
             }
             rows.append(row)
             bins = np.digitize(depth, edges[1:-1])
-            means = [errors[bins == bin].mean() * unit_mm if (bins == bin).any() else None for bin in range(BINS)]
-            curves.append(
-                {
-                    "pad": label,
-                    "noise_counts": noise,
-                    "pressed_mm": np.round(depth * unit_mm, 4).tolist(),
-                    "predicted_mm": np.round(predicted * unit_mm, 4).tolist(),
-                    "bin_depth_mm": ((edges[1:] + edges[:-1]) / 2 * unit_mm).tolist(),
-                    "bin_position_mm": [None if mean is None else float(mean) for mean in means],
-                }
-            )
-    return StudyResult(rows, _describe_force(indenter, settings, rows), {"curves": curves})
+            means = [float(errors[bins == bin].mean() * unit_mm) if bin in bins else None for bin in range(BINS)]
+            curve = {
+                "pad": label,
+                "noise_counts": noise,
+                "pressed_mm": np.round(depth * unit_mm, 4).tolist(),
+                "predicted_mm": np.round(predicted * unit_mm, 4).tolist(),
+                "bin_depth_mm": ((edges[1:] + edges[:-1]) / 2 * unit_mm).tolist(),
+                "bin_position_mm": means,
+            }
+            curves.append(curve)
+    return StudyResult(rows, _describe_force(settings, rows), {"curves": curves})
 
 
-def _describe_force(indenter: Indenter, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
-    low, high = settings["depths"]
-    form = f"cone of {indenter.angle_deg:g} degrees" if indenter.shape == "cone" else indenter.shape
-    size = "" if indenter.shape == "cone" else f" of radius {indenter.radius:g} grid units"
-    noises = " or ".join(f"{noise:g}" for noise in settings["noise_counts"])
-    text = [
-        f"A rigid {form}{size} is pressed {low:g} to {high:g} grid units deep at random positions. The signal of a "
-        "fibre is its lengthening by the deflected surface, read by a 12-bit converter whose full scale is the fibre's "
-        f"largest signal, with noise of {noises} counts. Networks of {settings['hidden']} neurons, of which the mean "
-        f"of {settings['members']} is taken, estimate x, y and depth from the readings' logarithms; they were trained "
-        f"on {settings['presses']} presses and tested on {settings['test']} others."
-    ]
-    for row in rows:
-        text.append(
-            f"{row['pad']}, noise of {_counts(row['noise_counts'])}: the error of the depth is {row['depth_mm']:.2f} "
-            f"mm (guessing the middle depth: {row['depth_guessed_mm']:.2f} mm), of the force {row['force_n']:.3f} N or "
-            f"{row['force_percent']:.1f} % of its range (guessing: {row['force_guessed_percent']:.1f} %). That of the "
-            f"position is {row['position_mm']:.2f} mm, {row['position_depth_known_mm']:.2f} mm where the depth is an "
-            f"input, and {row['position_one_depth_mm']:.2f} mm where all presses are {(low + high) / 2:g} grid units "
-            "deep."
-        )
-    text.append(
-        "Depth and force are related by the contact mechanics of an elastic half-space of reduced modulus "
-        f"{settings['reduced_modulus_kpa']:.0f} kPa. A pad a few millimetres thick on a hard table is stiffer than "
-        "that, and silicone creeps: forces of a built pad need a calibration against a load cell."
+def _describe_force(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+    noises = " or ".join(f"{noise:g}" for noise in FORCE_NOISES)
+    model = (
+        f"A rigid {SPHERE.shape} of radius {SPHERE.radius:g} grid units is pressed {LOW:g} to {HIGH:g} grid units deep "
+        "at random positions. The signal of a fibre is its lengthening by the deflected surface, read by a 12-bit "
+        f"converter whose full scale is the fibre's largest signal, with noise of {noises} counts. Networks of "
+        f"{settings['hidden']} neurons, of which the mean of {settings['members']} is taken, estimate x, y and depth "
+        f"from the readings' logarithms; they were trained on {settings['presses']} presses and tested on "
+        f"{settings['test']} others."
     )
-    return text
+    result = (
+        "{pad}, noise of {noise}: the error of the depth is {depth_mm:.2f} mm (guessing the middle depth: "
+        "{depth_guessed_mm:.2f} mm), of the force {force_n:.3f} N or {force_percent:.1f} % of its range (guessing: "
+        "{force_guessed_percent:.1f} %). That of the position is {position_mm:.2f} mm, {position_depth_known_mm:.2f} "
+        "mm where the depth is an input, and {position_one_depth_mm:.2f} mm where all presses are {middle:g} grid "
+        "units deep."
+    )
+    results = [result.format(**row, noise=_counts(row["noise_counts"]), middle=MIDDLE) for row in rows]
+    caution = (
+        "Depth and force are related by the contact mechanics of an elastic half-space of reduced modulus "
+        f"{REDUCED_MODULUS_KPA:.0f} kPa. A pad a few millimetres thick on a hard table is stiffer than that, and "
+        "silicone creeps: forces of a built pad need a calibration against a load cell."
+    )
+    return [model, *results, caution]
 
 
 def _draw_force(document: Mapping[str, Any]) -> Figure:
@@ -246,47 +202,34 @@ def _draw_force(document: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def shape_study(
-    pads: Mapping[str, Morphology],
-    *,
-    presses: int = 4096,
-    test: int = 2048,
-    hidden: int = 50,
-    epochs: int = 200,
-    seed: int = 0,
-) -> Study:
+def shape_study(pads: Mapping[str, Morphology], *, sizes: Sizes = SHAPE_SIZES, seed: int = 0) -> Study:
     """Classify the object: indenters of unknown depth, and footprints of unknown size, the position unknown too.
 
     Indenters follow the indentation model, footprints the published contact: polygons of one orientation.
-    Arguments are as of `force_study`.
     """
     tasks = [
-        Task(f"{label}, {kind}, {name}", partial(work, pad, kind, presses, test, hidden, epochs, seed))
+        Task(f"{label}, {kind}, {name}", partial(work, pad, kind, sizes, seed))
         for label, pad in pads.items()
         for kind in SETS
-        for name, work in (("shape", _classify), ("position", _localize))
+        for name, work in (("shape", _classify_shapes), ("position", _localize))
     ]
     settings = {
         "pads": describe_pads(pads),
         "depths": list(DEPTHS),
         "sizes": [float(SIZES[0]), float(SIZES[-1])],
         "noise_counts": SHAPE_NOISE_COUNTS,
-        "presses": presses,
-        "test": test,
-        "members": MEMBERS,
-        "hidden": hidden,
-        "epochs": epochs,
         "seed": seed,
+        **asdict(sizes),
     }
     conclude = partial(_conclude_shape, dict(pads), settings)
     return Study("shape", "Shape of what is pressed", settings, tasks, conclude, _draw_shape)
 
 
 def _simulate_shapes(
-    pad: Morphology, kind: str, training: int, test: int, seed: int
+    pad: Morphology, kind: str, sizes: Sizes, seed: int
 ) -> tuple[Array, Array, Indices, np.random.Generator]:
     """Return network inputs (Q, C), positions (Q, 2), indices of the shapes (Q,), and the generator to go on with."""
-    rng, count = np.random.default_rng([4, seed, list(SETS).index(kind)]), training + test
+    rng, count = np.random.default_rng([4, seed, list(SETS).index(kind)]), sizes.presses + sizes.test
     positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
     shape = rng.integers(len(SETS[kind]), size=count)
     responses = np.empty((count, pad.layout.fibres))
@@ -301,7 +244,7 @@ def _simulate_shapes(
             rows = (shape == index) & (size == size_index)
             contact = Contact(radius=radius * circumradius(sides), sides=sides)
             responses[rows] = signals(pad, positions[rows], contact)
-    counts = quantize(responses, responses[:training].max(axis=0), SHAPE_NOISE_COUNTS, rng)
+    counts = quantize(responses, sizes.presses, SHAPE_NOISE_COUNTS, rng)
     return np.log1p(counts / LOG_SCALE) if kind == "indenters" else counts, positions, shape, rng
 
 
@@ -310,22 +253,19 @@ def circumradius(sides: int | None) -> float:
     return 1.0 if sides is None else float(np.sqrt(2 * np.pi / (sides * np.sin(2 * np.pi / sides))))
 
 
-def _classify(pad: Morphology, kind: str, training: int, test: int, hidden: int, epochs: int, seed: int) -> State:
-    """Return the confusions (K, K) of shapes on the test presses."""
-    inputs, _, shape, rng = _simulate_shapes(pad, kind, training, test, seed)
-    classes = len(SETS[kind])
-    classify = fit_ensemble(inputs[:training], np.eye(classes)[shape[:training]], rng, hidden, epochs)
-    return confusion_matrix(shape[training:], classify(inputs[training:]).argmax(axis=1), classes)
+def _classify_shapes(pad: Morphology, kind: str, sizes: Sizes, seed: int) -> State:
+    inputs, _, shape, rng = _simulate_shapes(pad, kind, sizes, seed)
+    return classify(inputs, shape, len(SETS[kind]), rng, sizes)
 
 
-def _localize(pad: Morphology, kind: str, training: int, test: int, hidden: int, epochs: int, seed: int) -> State:
+def _localize(pad: Morphology, kind: str, sizes: Sizes, seed: int) -> State:
     """Return mean errors of the position on the test presses, grid units: shape "unknown", or "known" as an input."""
-    inputs, positions, shape, rng = _simulate_shapes(pad, kind, training, test, seed)
+    inputs, positions, shape, rng = _simulate_shapes(pad, kind, sizes, seed)
     with_shape = np.column_stack([inputs, np.eye(len(SETS[kind]))[shape]])
     errors = {}
     for name, features, member_rng in zip(("unknown", "known"), (inputs, with_shape), rng.spawn(2), strict=True):
-        predict = fit_ensemble(features[:training], positions[:training], member_rng, hidden, epochs)
-        errors[name] = np.linalg.norm(predict(features[training:]) - positions[training:], axis=1).mean()
+        predicted = fit_and_predict(features, positions, member_rng, sizes)
+        errors[name] = np.linalg.norm(predicted - positions[sizes.presses :], axis=1).mean()
     return errors
 
 
@@ -353,29 +293,25 @@ def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any],
 
 def _describe_shape(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     sphere, cone, flat = INDENTERS.values()
-    text = [
+    model = (
         f"Indenters: a sphere of radius {sphere.radius:g}, a cone whose flank makes {cone.angle_deg:g} degrees with "
-        f"the surface, and a flat punch of radius {flat.radius:g} grid units, pressed {DEPTHS[0]:g} to {DEPTHS[1]:g} "
+        f"the surface, and a flat punch of radius {flat.radius:g} grid units, pressed {LOW:g} to {HIGH:g} "
         "deep into an elastic half-space. Footprints: circle, square and triangle of equal area, that of a circle of "
         f"{SIZES[0]:g} to {SIZES[-1]:g} grid units radius, of one orientation, under the published contact model. "
         f"Readings are whole counts of 12 bits with noise of {SHAPE_NOISE_COUNTS:g}. Position, depth and size are "
         f"drawn for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} "
         f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
-    ]
-    for row in rows:
-        text.append(
-            f"{row['pad']}, {row['shapes']}: {row['accuracy_percent']:.1f} % are classified correctly (always the most "
-            f"frequent: {row['majority_percent']:.1f} %), worst the {row['worst']} with {row['worst_percent']:.1f} %. "
-            f"The error of the position is {row['position_mm']:.2f} mm, and {row['position_shape_known_mm']:.2f} mm by "
-            "networks with the shape as an input."
-        )
+    )
+    result = (
+        "{pad}, {shapes}: {accuracy_percent:.1f} % are classified correctly (always the most frequent: "
+        "{majority_percent:.1f} %), worst the {worst} with {worst_percent:.1f} %. The error of the position is "
+        "{position_mm:.2f} mm, and {position_shape_known_mm:.2f} mm by networks with the shape as an input."
+    )
+    results = [result.format(**row) for row in rows]
     ratios = [row["position_mm"] / row["position_shape_known_mm"] for row in rows]
     chance = ", where below 1 is chance in training" if min(ratios) < 1 else ""
-    text.append(
-        f"An unknown shape makes the error of the position {min(ratios):.2f} to {max(ratios):.2f} times as large"
-        f"{chance}."
-    )
-    return text
+    growth = f"{min(ratios):.2f} to {max(ratios):.2f} times as large{chance}"
+    return [model, *results, f"An unknown shape makes the error of the position {growth}."]
 
 
 def _draw_shape(document: Mapping[str, Any]) -> Figure:
@@ -386,12 +322,10 @@ def _draw_shape(document: Mapping[str, Any]) -> Figure:
     for matrix, row in zip(document["confusions"], document["rows"], strict=True):
         line, column = list(SETS).index(matrix["shapes"]), labels.index(matrix["pad"])
         axes, names = panels[line, column], matrix["names"]
-        draw_confusions(axes, matrix["counts"])
+        title, is_last = f"{matrix['pad']}: {row['accuracy_percent']:.0f} %", line == len(SETS) - 1
+        draw_confusions(axes, matrix["counts"], title, "predicted" * is_last, "" if column else "pressed")
         axes.set_xticks(range(len(names)), names, fontsize=8, color=INK)
         y_names = [""] * len(names) if column else names
         axes.set_yticks(range(len(names)), y_names, fontsize=8, color=INK, rotation=90, va="center")
-        axes.set_title(f"{matrix['pad']}: {row['accuracy_percent']:.0f} %", loc="left", color=INK, fontsize=10)
-        axes.set_ylabel("" if column else "pressed", color=INK)
-        axes.set_xlabel("predicted" if line == len(SETS) - 1 else "", color=INK)
     add_title(figure, f"Which object was pressed, per cent of {document['settings']['test']} presses never trained on")
     return figure

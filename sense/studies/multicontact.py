@@ -6,6 +6,7 @@ order.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import partial
 from itertools import takewhile
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK, add_title, draw_confusions
+from padforge.design.common.plotting import CURVES, INK, add_title
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses
@@ -22,18 +23,19 @@ from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
 from padforge.sense.arrays import Array
 from padforge.sense.studies.study import (
     ADC_COUNTS,
-    MEMBERS,
+    Sizes,
     Study,
     StudyResult,
     Task,
     classification_scores,
-    confusion_matrix,
+    classify,
     describe_pads,
-    fit_ensemble,
+    draw_confusions,
     label_axes,
     quantize,
 )
 
+SIZES = Sizes(8192, 2000, hidden=60, epochs=100)
 LABELLED = "fixed labels"
 MAX_CONTACTS = 3  # at once, where they are counted
 NOISE_COUNTS = 1.0
@@ -97,72 +99,53 @@ METHODS = {
 
 
 def fit_pairs(
-    method: PairTargets, inputs: Array, pairs: Array, rng: np.random.Generator, members: int, hidden: int, epochs: int
+    method: PairTargets, inputs: Array, pairs: Array, rng: np.random.Generator, sizes: Sizes
 ) -> Callable[[Array], Array]:
     """Fit networks to signals (Q, D) of pairs (Q, 2, 2); the result predicts pairs (T, 2, 2) from signals (T, D)."""
-    targets = method.encode(pairs)
-    networks = fit_batch(inputs, targets[0], rng.spawn(members), hidden, epochs, alternatives=targets[1:])
+    targets, rngs = method.encode(pairs), rng.spawn(sizes.members)
+    networks = fit_batch(inputs, targets[0], rngs, sizes.hidden, sizes.epochs, alternatives=targets[1:])
     return lambda features: method.decode(np.stack([network(features) for network in networks]))
 
 
-def multicontact_study(
-    pads: Mapping[str, Morphology],
-    *,
-    presses: int = 8192,
-    test: int = 2000,
-    hidden: int = 60,
-    members: int = MEMBERS,
-    epochs: int = 100,
-    seed: int = 0,
-) -> Study:
+def multicontact_study(pads: Mapping[str, Morphology], *, sizes: Sizes = SIZES, seed: int = 0) -> Study:
     """Localize two contacts at once by each of METHODS, and count up to MAX_CONTACTS contacts.
 
-    Signals of contacts add, and contacts are drawn uniformly and independently. The mean of `members` networks is
-    taken; other arguments are as of `force_study`.
+    Signals of contacts add, and contacts are drawn uniformly and independently.
     """
-    numbers = {"presses": presses, "test": test, "members": members, "hidden": hidden, "epochs": epochs, "seed": seed}
+    work = {name: partial(_localize_pairs, method) for name, method in METHODS.items()} | {COUNTING: _count_contacts}
     tasks = [
-        Task(f"{label}, {name}", partial(work, **numbers))
+        Task(f"{label}, {name}", partial(compute, pad=pad, sizes=sizes, seed=seed))
         for label, pad in pads.items()
-        for name, work in [
-            *((name, partial(_localize_pairs, pad, method)) for name, method in METHODS.items()),
-            (COUNTING, partial(_count_contacts, pad)),
-        ]
+        for name, compute in work.items()
     ]
     settings = {
         "pads": describe_pads(pads),
         "max_contacts": MAX_CONTACTS,
         "noise_counts": NOISE_COUNTS,
-        **numbers,
+        "seed": seed,
+        **asdict(sizes),
     }
     conclude = partial(_conclude, dict(pads), settings)
     return Study("multicontact", "Several contacts at once", settings, tasks, conclude, _draw)
 
 
-def _localize_pairs(
-    pad: Morphology, method: PairTargets, presses: int, test: int, members: int, hidden: int, epochs: int, seed: int
-) -> State:
+def _localize_pairs(method: PairTargets, pad: Morphology, sizes: Sizes, seed: int) -> State:
     """Return the test pairs "pressed" and "predicted"; shape (T, 2, 2), grid units."""
-    rng = np.random.default_rng([5, seed])
-    pairs = _draw_contacts(pad, presses + test, 2, rng)
+    rng, n = np.random.default_rng([5, seed]), sizes.presses
+    pairs = _draw_contacts(pad, n + sizes.test, 2, rng)
     inputs = signals(pad, pairs, PUBLISHED_CONTACT)
-    predict = fit_pairs(method, inputs[:presses], pairs[:presses], rng, members, hidden, epochs)
-    return {"pressed": pairs[presses:], "predicted": predict(inputs[presses:])}
+    predict = fit_pairs(method, inputs[:n], pairs[:n], rng, sizes)
+    return {"pressed": pairs[n:], "predicted": predict(inputs[n:])}
 
 
-def _count_contacts(
-    pad: Morphology, presses: int, test: int, members: int, hidden: int, epochs: int, seed: int
-) -> State:
+def _count_contacts(pad: Morphology, sizes: Sizes, seed: int) -> State:
     """Return the confusions (MAX_CONTACTS + 1, MAX_CONTACTS + 1) of the number of contacts on the test presses."""
-    rng = np.random.default_rng([6, seed])
-    positions = _draw_contacts(pad, presses + test, MAX_CONTACTS, rng)
-    number = rng.integers(MAX_CONTACTS + 1, size=presses + test)
+    rng, count = np.random.default_rng([6, seed]), sizes.presses + sizes.test
+    positions = _draw_contacts(pad, count, MAX_CONTACTS, rng)
+    number = rng.integers(MAX_CONTACTS + 1, size=count)
     each = signals(pad, positions.reshape(-1, 2), PUBLISHED_CONTACT).reshape(*positions.shape[:2], -1)
     summed = (each * (np.arange(MAX_CONTACTS) < number[:, None])[:, :, None]).sum(axis=1)
-    counts = quantize(summed, summed[:presses].max(axis=0), NOISE_COUNTS, rng)
-    targets = np.eye(MAX_CONTACTS + 1)[number[:presses]]
-    classify = fit_ensemble(counts[:presses], targets, rng, hidden, epochs, members)
-    return confusion_matrix(number[presses:], classify(counts[presses:]).argmax(axis=1), MAX_CONTACTS + 1)
+    return classify(quantize(summed, sizes.presses, NOISE_COUNTS, rng), number, MAX_CONTACTS + 1, rng, sizes)
 
 
 def _draw_contacts(pad: Morphology, count: int, contacts: int, rng: np.random.Generator) -> Array:
@@ -272,12 +255,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
         label_axes(axes, label, xlabel="distance of the two contacts (mm)", ylabel=ylabel)
         axes.legend(frameon=False, fontsize=8, loc="upper left")
         axes, counts = figure.add_subplot(grid[2, column]), document["confusions"][column]["counts"]
-        draw_confusions(axes, counts)
-        axes.set(xticks=range(len(counts)), yticks=range(len(counts)))
         title = f"number: {100 * np.trace(counts) / np.sum(counts):.0f} % correct"
-        axes.set_title(title, loc="left", color=INK, fontsize=10)
-        axes.set_xlabel("contacts predicted", color=INK)
-        axes.set_ylabel("" if column else "contacts pressed", color=INK)
+        draw_confusions(axes, counts, title, "contacts predicted", "" if column else "contacts pressed")
+        axes.set(xticks=range(len(counts)), yticks=range(len(counts)))
     test, most = document["settings"]["test"], document["settings"]["max_contacts"]
     add_title(figure, f"{test} presses never trained on: positions of two contacts, number of up to {most}")
     return figure

@@ -1,7 +1,7 @@
 """Robustness: accuracy of a pad as fibres are lost, by networks retrained for every set (paper, figures 3, 4 and 5)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -16,6 +16,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
+from padforge.sense.arrays import Array
 from padforge.sense.studies.study import (
     Study,
     StudyResult,
@@ -24,7 +25,6 @@ from padforge.sense.studies.study import (
     draw_error_map,
     failed_label,
     label_axes,
-    label_map_row,
 )
 
 RULES = {"published": signals_quantized, "exact": signals}
@@ -33,6 +33,8 @@ MIN_NETWORKS = 16
 """Networks of a level: where there are fewer sets of failed fibres, each is trained several times, since the error of a
 single network depends on its first weights."""
 MAX_SETS = 1024  # of failed fibres of a size that are evaluated; of more, a sample is drawn
+Respond = Callable[[Morphology, Array], Array]
+HIDDEN, TEST = 50, 2000  # neurons of a network, and fresh presses to test on
 SIDE = 33  # cells along a side of an error map
 
 
@@ -42,25 +44,12 @@ def robustness_study(
     contact: Contact | None = None,
     rule: str = "published",
     max_failures: int = 3,
-    hidden: int = 50,
     presses: int = 1024,
-    test: int = 2000,
     seed: int = 0,
 ) -> Study:
     """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
 
-    Args:
-        pads: by label.
-        contact: PUBLISHED_CONTACT if None.
-        rule: of RULES.
-        max_failures: most fibres that fail at once.
-        hidden: neurons of a network.
-        presses: training presses, a square number.
-        test: fresh presses to test on.
-        seed: of presses and networks.
-
-    Raises:
-        InputError: `presses` is no square of a number from 2.
+    Signals are by one of RULES, under PUBLISHED_CONTACT unless there is another; training presses are a square number.
     """
     side = math.isqrt(presses)
     if side**2 != presses or side < 2:
@@ -72,38 +61,28 @@ def robustness_study(
         for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
         for part in split_batches(failure_subsets(pad.layout.fibres, level, MAX_SETS))
     ]
-    evaluate = partial(_evaluate, contact=contact, rule=rule, hidden=hidden, side=side, test=test, seed=seed)
+    sizes = {"hidden": HIDDEN, "test": TEST, "seed": seed}
+    evaluate = partial(_evaluate, respond=partial(RULES[rule], contact=contact), side=side, **sizes)
     tasks = [Task(f"{label}, {len(part[0])} failed", partial(evaluate, pads[label], part)) for label, part in parts]
     settings = {
         "pads": describe_pads(pads),
         "contact": contact.model_dump(mode="json"),
         "signals": rule,
         "max_failures": max_failures,
-        "hidden": hidden,
         "presses": presses,
-        "test": test,
-        "seed": seed,
+        **sizes,
     }
     conclude = partial(_conclude, dict(pads), parts, settings)
     return Study("robustness", "Robustness to fibre loss", settings, tasks, conclude, _draw)
 
 
 def _evaluate(
-    pad: Morphology,
-    failures: list[FailureSet],
-    *,
-    contact: Contact,
-    rule: str,
-    hidden: int,
-    side: int,
-    test: int,
-    seed: int,
+    pad: Morphology, failures: list[FailureSet], respond: Respond, side: int, hidden: int, test: int, seed: int
 ) -> State:
     """Compute errors with each of L sets of failed fibres, grid units: "fresh" (L,), "training" (L,), "maps" (L, Q)."""
-    respond = partial(RULES[rule], pad, contact=contact)
-    presses = SimulatedPresses.simulate(pad, side, test, seed, respond)
+    presses = SimulatedPresses.simulate(pad, side, test, seed, partial(respond, pad))
     positions = grid_positions(between_fibres(pad.layout), SIDE)
-    responses = respond(positions)
+    responses = respond(pad, positions)
     repeats = -(-MIN_NETWORKS // math.comb(pad.layout.fibres, len(failures[0])))
     errors = [
         (
@@ -215,7 +194,6 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     for number, label in enumerate(labels):
         for column, panel in enumerate(panel for panel in document["maps"] if panel["pad"] == label):
             axes = figure.add_subplot(grid[1 + number, column], aspect="equal")
-            image = draw_error_map(axes, panel["errors"], failed_label(panel["failed"]), highest, panel["extent"])
-            if column == 0:
-                label_map_row(axes, image, label)
+            title, row_label = failed_label(panel["failed"]), "" if column else label
+            draw_error_map(axes, panel["errors"], title, highest, panel["extent"], row_label)
     return figure

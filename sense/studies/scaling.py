@@ -1,11 +1,10 @@
 """Scaling: larger surfaces, localized from equally many presses by equally large networks (paper, figures 7 and 8).
 
-The published method learns from a serpentine of presses, which on the larger grids all lie at the same phase to the
-fibres, and is evaluated on those presses themselves. The "spread" method is evaluated on fresh presses: it learns from
-presses spread over the whole surface, and its inputs are each fibre's share of its family's signal, of which the
-position is an almost linear function at any size. The "shared" method uses that tiles are alike: the largest signals
-tell the tile, and one network, given the fibres of that tile and its neighbours, the position in it. It learns from all
-presses, whatever their tile, so neither its size nor its error need grow with the surface.
+The published method learns from a serpentine of presses and is evaluated on those presses themselves. "Spread" and
+"shared" learn from presses spread over the whole surface and are evaluated on fresh ones. The inputs of "spread" are
+each fibre's share of its family's signal, of which the position is an almost linear function at any size. For "shared"
+the largest signals tell the tile, and one network for all tiles, given the fibres of it and its neighbours, the
+position in it: neither its size nor its error need grow with the surface.
 """
 
 import time
@@ -32,7 +31,6 @@ from padforge.sense.studies.study import (
     describe_pads,
     draw_error_map,
     label_axes,
-    label_map_row,
 )
 
 GRIDS = (4, 8, 16, 32, 64, 128)
@@ -47,17 +45,7 @@ CELLS = 16  # along a side of an error map
 def scaling_study(
     pads: Mapping[str, Morphology], *, grids: Sequence[int] = GRIDS, side: int = 64, seed: int = 0
 ) -> Study:
-    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile.
-
-    Args:
-        pads: tiles by label.
-        grids: sizes of the surfaces, multiples of every tile's.
-        side: of the square of presses, side^2 to train on.
-        seed: of presses and networks.
-
-    Raises:
-        InputError: a tile that is no square of one pitch, or a grid that is no multiple of a tile's.
-    """
+    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile, by side^2 training presses."""
     for label, pad in pads.items():
         if not pad.layout.is_square:
             raise InputError(f"{label} has {pad.layout}, expected tiles of M + M fibres of one pitch")
@@ -98,16 +86,9 @@ def family_shares(responses: Array) -> Array:
 
 
 def tile_inputs(responses: Array, tile: int) -> tuple[Array, Array]:
-    """Select the signals of the tile of each press and of its neighbours; beyond the edge they are 0.
+    """Select the signals (Q, 6 tile) of the tile of each press and its neighbours, and its origin (Q, 2), grid units.
 
-    In each family it is the tile with the largest sum of signals, and the middle one if all are 0.
-
-    Args:
-        responses: signals; shape (Q, 2M).
-        tile: fibres of a family of a tile.
-
-    Returns:
-        Signals; shape (Q, 6 tile). Origin of the tile, grid units; shape (Q, 2).
+    In each family, of `tile` fibres a tile, it is the tile with the largest sum, the middle one if all signals are 0.
     """
     windows, origins = [], []
     for family in np.split(responses, 2, axis=1)[::-1]:  # vertical fibres tell x, horizontal ones y
@@ -174,8 +155,7 @@ def _conclude(cases: Sequence[tuple[int, str, str]], settings: Mapping[str, Any]
 
 def _error_map(grid: int, state: State) -> Array:
     """Return mean errors by cell; shape (CELLS, CELLS)."""
-    low = 1 if grid > 1 else 0.5
-    cells = np.clip(((state["positions"] - low) / max(grid - 1, 1) * CELLS).astype(int), 0, CELLS - 1)
+    cells = np.clip(((state["positions"] - 1) / (grid - 1) * CELLS).astype(int), 0, CELLS - 1)
     number = cells[:, 1] * CELLS + cells[:, 0]
     total, count = (np.bincount(number, weights, CELLS**2) for weights in (state["errors"], None))
     return np.round(total / np.maximum(count, 1), 4).reshape(CELLS, CELLS)
@@ -237,8 +217,6 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.98))
     for panel in document["maps"]:
         row, column = labels.index(panel["pad"]), grids.index(panel["grid"])
-        axes = panels[row, column]
-        image = draw_error_map(axes, panel["errors"], f"{panel['grid']} x {panel['grid']}", highest)
-        if column == 0:
-            label_map_row(axes, image, panel["pad"])
+        title, row_label = f"{panel['grid']} x {panel['grid']}", "" if column else panel["pad"]
+        draw_error_map(panels[row, column], panel["errors"], title, highest, row_label=row_label)
     return figure

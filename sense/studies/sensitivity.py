@@ -1,6 +1,7 @@
 """Sensitivity to the object: other objects than the pad was designed for, trained with or not (paper, figure 6)."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from functools import partial
 from itertools import product
 from typing import Any
@@ -14,32 +15,18 @@ from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact
+from padforge.sense.arrays import Array
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
 
 MEMBERS = 6
 """Networks whose errors are averaged, since that of a single one depends on its first weights."""
 SIDE, TEST, HIDDEN = 32, 2000, 50
+RADII, SIDES = (0.6, 0.8, 1.0), (4, 30)  # sizes K, grid units, and shapes D of the object, which is a polygon
 
 
-def sensitivity_study(
-    pads: Mapping[str, Morphology],
-    *,
-    radii: Sequence[float] = (0.6, 0.8, 1.0),
-    sides: Sequence[int] = (4, 30),
-    seed: int = 0,
-) -> Study:
-    """Compare errors for objects of several sizes and shapes, by networks trained with the same object or another.
-
-    Args:
-        pads: by label.
-        radii: sizes K of the object, grid units.
-        sides: its shapes D, polygons.
-        seed: of presses and networks.
-
-    Raises:
-        InputError: a radius or number of sides that a contact cannot have.
-    """
-    objects = [Contact(radius=radius, sides=shape) for shape, radius in product(sides, radii)]
+def sensitivity_study(pads: Mapping[str, Morphology], *, seed: int = 0) -> Study:
+    """Compare errors for objects of several sizes and shapes, by networks trained with the same object or another."""
+    objects = [Contact(radius=radius, sides=shape) for shape, radius in product(SIDES, RADII)]
     tasks = [
         Task(f"{label}, trained with K {each.radius:g}, D {each.sides}", partial(_evaluate, pad, each, objects, seed))
         for label, pad in pads.items()
@@ -47,8 +34,8 @@ def sensitivity_study(
     ]
     settings = {
         "pads": describe_pads(pads),
-        "radii": list(radii),
-        "sides": list(sides),
+        "radii": list(RADII),
+        "sides": list(SIDES),
         "members": MEMBERS,
         "hidden": HIDDEN,
         "presses": SIDE**2,
@@ -95,14 +82,10 @@ def _conclude(
     return StudyResult(rows, _describe(settings, rows))
 
 
-def _is_trained(row: Mapping[str, Any]) -> bool:
-    return (row["trained_radius"], row["trained_sides"]) == (row["radius"], row["sides"])
-
-
-def _trained_error(rows: list[dict[str, Any]], pad: str, radius: float, sides: int) -> float:
-    """Return the mean error on an object that the networks were trained with."""
-    case = {"pad": pad, "radius": radius, "sides": sides}
-    return next(row["mean"] for row in rows if _is_trained(row) and case.items() <= row.items())
+def _error_matrix(rows: list[dict[str, Any]], label: str) -> Array:
+    """Return the mean errors of a pad by trained and tested object, each by shape, then size."""
+    means = [row["mean"] for row in rows if row["pad"] == label]
+    return np.reshape(means, (math.isqrt(len(means)), -1))
 
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
@@ -114,17 +97,16 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         "Errors are in grid units."
     ]
     for label in settings["pads"]:
-        small, large = (
-            np.mean([_trained_error(rows, label, radius, shape) for shape in sides]) for radius in (radii[0], radii[-1])
-        )
-        shapes = [np.mean([_trained_error(rows, label, radius, shape) for radius in radii]) for shape in sides]
-        trained = [row["mean"] for row in rows if row["pad"] == label and _is_trained(row)]
-        other = [row["mean"] for row in rows if row["pad"] == label and not _is_trained(row)]
+        matrix = _error_matrix(rows, label)
+        trained = np.diag(matrix).reshape(len(sides), len(radii))
+        small, *_, large = trained.mean(axis=0)
+        shapes = trained.mean(axis=1)
+        other = matrix[~np.eye(len(matrix), dtype=bool)]
         text.append(
             f"{label}: {small:.3f} with K {radii[0]:g}, {large:.3f} with K {radii[-1]:g}; "
-            f"shapes differ by {100 * (max(shapes) / min(shapes) - 1):.0f} %. The mean error for an object that the "
-            f"networks were not trained with is {np.mean(other):.3f}, at worst {max(other):.3f}, instead of "
-            f"{np.mean(trained):.3f}."
+            f"shapes differ by {100 * (shapes.max() / shapes.min() - 1):.0f} %. The mean error for an object that the "
+            f"networks were not trained with is {other.mean():.3f}, at worst {other.max():.3f}, instead of "
+            f"{trained.mean():.3f}."
         )
     return text
 
@@ -137,9 +119,8 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     grid = figure.add_gridspec(2, len(labels), height_ratios=[1.0, 1.0])
     axes = figure.add_subplot(grid[0, :])
     for number, label in enumerate(labels):
-        for shape, style in zip(sides, ("--", "-", ":", "-."), strict=False):
-            errors = [_trained_error(rows, label, radius, shape) for radius in radii]
-            colour = CURVES[number % len(CURVES)]
+        colour, trained = CURVES[number % len(CURVES)], np.diag(_error_matrix(rows, label)).reshape(len(sides), -1)
+        for shape, style, errors in zip(sides, ("--", "-", ":", "-."), trained, strict=False):
             axes.plot(radii, errors, style, color=colour, marker="o", markersize=4, label=f"{label}, D {shape}")
     label_axes(axes, grid="y", xticks=radii, ylim=(0, None), ylabel="mean error (grid units)")
     axes.set_xlabel("size K of the object, trained and tested with (grid units)")
@@ -148,7 +129,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     highest = max(row["mean"] for row in rows)
     for number, label in enumerate(labels):
         axes = figure.add_subplot(grid[1, number], aspect="equal")
-        matrix = np.array([row["mean"] for row in rows if row["pad"] == label]).reshape(len(names), len(names))
+        matrix = _error_matrix(rows, label)
         axes.imshow(matrix, cmap="magma_r", vmin=0, vmax=highest)
         for (trained, tested), value in np.ndenumerate(matrix):
             colour = "w" if value > 0.6 * highest else INK

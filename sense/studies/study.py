@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from padforge.design.common import files
+from padforge.design.common import files, plotting
+from padforge.design.common.command_line import text_table
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.plotting import FAINT, INK, save_figure, style_axes
 from padforge.design.common.settings import validate
@@ -28,11 +29,20 @@ if TYPE_CHECKING:
 
 ADC_COUNTS = 2**12 - 1
 """Full scale of the converter that studies read signals with."""
-MEMBERS = 3
-"""Networks of an ensemble: where training happens to end varies, and would hide what pads differ by."""
 NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
 """Pads without a file: straight fibres, random ones of N knots, and those of a search; their grid after an @."""
 GRID = 4
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How many presses the networks of a study learn from and are tested on, and how large they are."""
+
+    presses: int
+    test: int
+    hidden: int = 50  # neurons
+    epochs: int = 200
+    members: int = 3  # of an ensemble: where training happens to end varies, and would hide what pads differ by
 
 
 @dataclass(frozen=True)
@@ -95,14 +105,9 @@ def run(
     order = hashlib.sha256("\n".join(task.name for task in study.tasks).encode()).hexdigest()[:16]
     with _locked(out, study.name):
         checkpoints = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
-        states = checkpoints.begin(resume)
-        on_progress(len(states), len(study.tasks), "")
-        missing = [(number, partial(_compute, task)) for number, task in enumerate(study.tasks) if number not in states]
-        for number, state in run_tasks(missing, executor, max_parallel=jobs):
-            states[number] = state
-            checkpoints.save(number, state)
-            on_progress(len(states), len(study.tasks), study.tasks[number].name)
-        result = study.conclude([states[number] for number in range(len(study.tasks))])
+        tasks = dict(enumerate(study.tasks))
+        states = compute_states(tasks, checkpoints, on_progress, resume=resume, jobs=jobs, executor=executor)
+        result = study.conclude([states[number] for number in tasks])
         document = {
             "format": f"padforge-study-{study.name}/2",
             "title": study.title,
@@ -146,6 +151,28 @@ def _locked(out: Path, name: str) -> Iterator[None]:
                 path.unlink(missing_ok=True)
 
 
+def compute_states(
+    tasks: Mapping[int, Task],
+    checkpoints: Checkpoints | None,
+    on_progress: Callable[[int, int, str], None],
+    *,
+    resume: bool = True,
+    jobs: int | None = None,
+    executor: Executor | None = None,
+) -> dict[int, State]:
+    """Return the states of tasks by number: from checkpoints where they are, else computed in parallel and saved."""
+    saved = checkpoints.begin(resume) if checkpoints else {}
+    states = {number: saved[number] for number in tasks if number in saved}
+    on_progress(len(states), len(tasks), "")
+    missing = [(number, partial(_compute, task)) for number, task in tasks.items() if number not in states]
+    for number, state in run_tasks(missing, executor, max_parallel=jobs):
+        states[number] = state
+        if checkpoints:
+            checkpoints.save(number, state)
+        on_progress(len(states), len(tasks), tasks[number].name)
+    return states
+
+
 def _compute(task: Task) -> State:
     with one_torch_thread():
         return task.compute()
@@ -153,10 +180,7 @@ def _compute(task: Task) -> State:
 
 def study_lines(document: Mapping[str, Any]) -> list[str]:
     """Format a study as a table and paragraphs."""
-    cells = _table_cells(document["rows"])
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    table = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in cells]
-    return [*table, "", *document["text"]]
+    return [*text_table(_table_cells(document["rows"]), text_columns=()), "", *document["text"]]
 
 
 def _table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -250,26 +274,30 @@ def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
     }
 
 
-def quantize(signals: Array, full_scale: Array, noise_counts: float, rng: np.random.Generator) -> Array:
-    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a fibre of full scale 0 reads its noise."""
+def quantize(signals: Array, training: int, noise_counts: float, rng: np.random.Generator) -> Array:
+    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a silent fibre reads its noise.
+
+    Full scale is the largest signal of a fibre in the first `training` presses.
+    """
+    full_scale = signals[:training].max(axis=0)
     share = np.divide(signals, full_scale, out=np.zeros(signals.shape), where=full_scale > 0)
     return np.clip(np.rint(ADC_COUNTS * share + rng.normal(0, noise_counts, signals.shape)), 0, ADC_COUNTS)
 
 
-def fit_ensemble(
-    inputs: Array, targets: Array, rng: np.random.Generator, hidden: int, epochs: int, members: int = MEMBERS
-) -> Callable[[Array], Array]:
-    """Fit networks to inputs (Q, D) and targets (Q, O), each with its own split and weights; return their mean."""
+def fit_and_predict(inputs: Array, targets: Array, rng: np.random.Generator, sizes: Sizes) -> Array:
+    """Fit networks to the training presses of inputs (Q, D) and targets (Q, O); return their mean for the others."""
     from padforge.design.networks import fit_batch
 
-    networks = fit_batch(inputs, targets, rng.spawn(members), hidden, epochs)
-    return lambda features: np.mean([network(features) for network in networks], axis=0)
+    n = sizes.presses
+    networks = fit_batch(inputs[:n], targets[:n], rng.spawn(sizes.members), sizes.hidden, sizes.epochs)
+    return np.mean([network(inputs[n:]) for network in networks], axis=0)
 
 
-def confusion_matrix(true: Indices, predicted: Indices, classes: int) -> State:
-    """Count how often each class, by row, was predicted as each, by column."""
-    counts = np.bincount(true * classes + predicted, minlength=classes**2)
-    return {"confusions": counts.reshape(classes, classes)}
+def classify(inputs: Array, classes: Indices, n_classes: int, rng: np.random.Generator, sizes: Sizes) -> State:
+    """Count how often test presses of each class, by row, are classified as each, by column."""
+    predicted = fit_and_predict(inputs, np.eye(n_classes)[classes], rng, sizes).argmax(axis=1)
+    counts = np.bincount(classes[sizes.presses :] * n_classes + predicted, minlength=n_classes**2)
+    return {"confusions": counts.reshape(n_classes, n_classes)}
 
 
 def classification_scores(confusions: Array) -> dict[str, float]:
@@ -296,16 +324,22 @@ def label_axes(axes: Any, title: str = "", grid: Literal["", "x", "y"] = "", **l
     style_axes(axes)
 
 
+def draw_confusions(axes: Any, counts: Sequence[Sequence[int]], title: str, xlabel: str, ylabel: str) -> None:
+    """Draw a confusion matrix with a title, predicted classes by column."""
+    plotting.draw_confusions(axes, counts)
+    axes.set_title(title, loc="left", color=INK, fontsize=10)
+    axes.set_xlabel(xlabel, color=INK)
+    axes.set_ylabel(ylabel, color=INK)
+
+
 def draw_error_map(
-    axes: Any, errors: Any, title: str, highest: float, extent: tuple[float, float, float, float] | None = None
+    axes: Any, errors: Any, title: str, highest: float, extent: Sequence[float] | None = None, row_label: str = ""
 ) -> Any:
-    """Draw errors by cell of the pad, y upwards, and return the image."""
+    """Draw errors by cell of the pad, y upwards, and return the image; the first map of a row has a label and scale."""
     axes.set(xticks=[], yticks=[])
     axes.set_title(title, fontsize=8, color=INK)
-    return axes.imshow(errors, origin="lower", extent=extent, cmap="magma_r", vmin=0, vmax=highest)
-
-
-def label_map_row(axes: Any, image: Any, label: str) -> None:
-    """Label the first of a row of error maps, with the colour scale of all to its left."""
-    axes.set_ylabel(label, fontsize=8, color=INK)
-    axes.figure.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
+    image = axes.imshow(errors, origin="lower", extent=extent, cmap="magma_r", vmin=0, vmax=highest)
+    if row_label:
+        axes.set_ylabel(row_label, fontsize=8, color=INK)
+        axes.figure.colorbar(image, ax=axes, location="left", shrink=0.8).ax.tick_params(labelsize=7)
+    return image

@@ -20,18 +20,6 @@ def test_import_reads_csv(padforge_sense, brief: Recording) -> None:
     assert set(start["provenance"]["inputs"]) == {"r.csv"}
 
 
-def test_import_maps_columns(padforge_sense) -> None:
-    rows = [f"{100 * i};{1 + i % 7:d},5;2;{i // 10 + 1};0;{int(i % 10 > 5)}" for i in range(30)]
-    Path("lab.txt").write_text("# bench 2\nt_ms;ch1;ch2;X;Y;down\n" + "\n".join(rows))
-    mapping = "time=t_ms:ms,fibres=ch*,x=X:cm,y=Y,press=down"
-    code, out, err = padforge_sense("import", "lab.txt", "--columns", mapping)
-    assert (code, err) == (0, "")
-    assert out == "3 presses, 30 readings of 2 fibres at 10.0 Hz -> out/lab/recording\n"
-    recording = Recording.open("out/lab/recording")
-    assert recording.presses_mm.tolist() == [[10, 0], [20, 0], [30, 0]]
-    assert recording.source["columns"] == mapping
-
-
 def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:
     content = {"voltage": recording.readings[:391], "tim": recording.times_s[None, :391]}
     scipy.io.savemat("cut.mat", content | {"pos": recording.presses_mm[:10].T})

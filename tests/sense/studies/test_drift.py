@@ -14,11 +14,12 @@ from padforge.sense import Recording, open_recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
-from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, network_inputs, press_levels
-from padforge.sense.studies.study import Study, run
+from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, level_indices, network_inputs
+from padforge.sense.studies.study import run
+from tests.sense.live.conftest import first_presses
 
 PAD = Morphology.random(2, knots=3, seed=5)
-STRONG = RigSettings(drift_mv=300, creep=0, hysteresis=0)
+STRONG = RigSettings(presses=180, drift_mv=300, creep=0, hysteresis=0)
 CYCLES = 5
 DOWN, UP = 40 * np.arange(CYCLES) + 20, 40 * np.arange(1, CYCLES + 1)
 
@@ -33,48 +34,37 @@ def recorded() -> Recording:
     return replace(recording, readings=readings, presses_mm=positions_mm, source={"kind": "test"})
 
 
-def first_presses(recording: Recording, presses: int) -> Recording:
-    end = int(recording.up_command[presses - 1])
-    names = ("presses_mm", "down_command", "up_command", "depths_mm")
-    arrays = {name: getattr(recording, name)[:presses] for name in names}
-    return replace(recording, readings=recording.readings[:end], times_s=recording.times_s[:end], **arrays)
-
-
-def small_study(recorded: Recording) -> Study:
-    pads = {"winding": PAD, "square": Morphology.straight(4)}
-    return drift_study(pads, {"real": recorded}, rig=STRONG, presses=180, hidden=8, epochs=15)
-
-
 @pytest.fixture(scope="module", autouse=True)
-def two_members() -> Iterator[None]:
+def small() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(drift, "MEMBERS", 2)
+        for name, value in (("MEMBERS", 2), ("HIDDEN", 8), ("EPOCHS", 15), ("RIG", STRONG)):
+            patched.setattr(drift, name, value)
         yield
 
 
 @pytest.fixture(scope="module")
 def document(recorded: Recording, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    return run(small_study(recorded), tmp_path_factory.mktemp("drift"))
+    pads = {"winding": PAD, "square": Morphology.straight(4)}
+    return run(drift_study(pads, {"real": recorded}), tmp_path_factory.mktemp("drift"))
 
 
 def errors(document: dict[str, Any], label: str, compensation: str, key: str = "mean_mm") -> list[float]:
     return [row[key] for row in document["rows"] if (row["recording"], row["compensation"]) == (label, compensation)]
 
 
-def test_press_levels_are_the_readings_10_30_and_50_of_a_cycle() -> None:
-    levels = press_levels(np.column_stack([np.arange(40.0 * CYCLES), -np.arange(40.0 * CYCLES)]), DOWN, UP)
-    assert levels.shape == (CYCLES, 2, 3)
-    np.testing.assert_array_equal(levels[1], [[50, 70, 90], [-50, -70, -90]])
-    np.testing.assert_array_equal(levels[-1, 0], [170, 190, 199])  # there are no readings after the last press
+def test_levels_are_the_readings_10_30_and_50_of_a_cycle() -> None:
+    levels = level_indices(40 * CYCLES, DOWN, UP)
+    assert levels[1].tolist() == [50, 70, 90]
+    assert levels[-1].tolist() == [170, 190, 199]  # there are no readings after the last press
     # those of short cycles stay within their phase
-    levels = press_levels(np.arange(20.0)[:, None], np.array([3, 9, 15]), np.array([6, 12, 18]))
-    np.testing.assert_array_equal(levels[:, 0], [[0, 5, 8], [6, 11, 14], [12, 17, 19]])
+    levels = level_indices(20, np.array([3, 9, 15]), np.array([6, 12, 18]))
+    assert levels.tolist() == [[0, 5, 8], [6, 11, 14], [12, 17, 19]]
 
 
 def test_network_inputs_subtract_the_baseline_of_their_compensation() -> None:
     readings = np.random.default_rng(0).normal(2, 0.1, (40 * CYCLES, 3))
     training = np.arange(CYCLES)
-    before, pressed, after = np.moveaxis(press_levels(readings, DOWN, UP), 2, 0)
+    before, pressed, after = readings[level_indices(len(readings), DOWN, UP).T]
     inputs = {name: network_inputs(name, readings, DOWN, UP, training) for name in COMPENSATIONS}
     np.testing.assert_array_equal(inputs["none"], pressed)
     np.testing.assert_array_equal(inputs["baseline"], pressed - before)
@@ -117,15 +107,16 @@ def test_study_computes_idle_shares(document: dict[str, Any]) -> None:
 def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording) -> None:
     with pytest.raises(InputError, match="a: label of a morphology and of a recording"):
         drift_study({"a": PAD}, {"a": recorded})
+    few = np.where(np.arange(len(recorded.presses_mm))[:, None] < 3, recorded.presses_mm, np.nan)
     with pytest.raises(InputError, match="few: recording has 3 presses of known"):
-        drift_study({}, {"few": first_presses(recorded, 3)})
+        drift_study({}, {"few": replace(recorded, presses_mm=few)})
 
 
 @pytest.mark.slow
 def test_study_of_the_published_pad_and_recording(published: Path, tmp_path: Path) -> None:
     pad = Morphology.load(published / "5para_dis.mat")
     recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 300)
-    document = run(drift_study({"N=5": pad}, {"built": recording}, presses=60, hidden=8, epochs=15), tmp_path)
+    document = run(drift_study({"N=5": pad}, {"built": recording}), tmp_path)
     assert document["idle"][0]["idle_percent"] == pytest.approx(58, abs=1)
     assert max(errors(document, "built", "baseline")) < min(errors(document, "built", "none"))
     assert max(errors(document, "built", "published")) < min(errors(document, "built", "none"))

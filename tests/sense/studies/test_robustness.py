@@ -4,10 +4,10 @@ import csv
 import json
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,20 +15,23 @@ import pytest
 from padforge.design import Contact, Morphology
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import robustness_study
-from padforge.sense.studies.study import Study, load_pads, run
+from padforge.sense.studies.study import load_pads, run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 
 
-def tiny(pads: Mapping[str, Morphology], **options: Any) -> Study:
-    small: dict[str, Any] = {"max_failures": 1, "hidden": 4, "presses": 16, "test": 20}
-    return robustness_study(pads, **small | options)
+@pytest.fixture(autouse=True, scope="module")
+def small() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(robustness, "HIDDEN", 10)
+        patched.setattr(robustness, "TEST", 300)
+        yield
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("robustness")
-    return folder, run(robustness_study(PADS, max_failures=2, hidden=10, presses=144, test=300), folder)
+    return folder, run(robustness_study(PADS, max_failures=2, presses=144), folder)
 
 
 def select_rows(document: dict, **values) -> list[dict]:
@@ -65,7 +68,8 @@ def test_study_writes_the_same_numbers_into_all_files(results: tuple[Path, dict]
 @pytest.mark.slow
 def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean errors with all fibres and with one failed, measured by others with the same protocol."""
-    monkeypatch.setattr(robustness, "MIN_NETWORKS", 4)
+    for name, value in (("MIN_NETWORKS", 4), ("HIDDEN", 50), ("TEST", 2000)):
+        monkeypatch.setattr(robustness, name, value)
     expected = {"square_grid_cir": (0.217, 0.216), "5para_dis": (0.065, 0.099), "20para": (0.056, 0.080)}
     pads = load_pads(tuple(str(published / f"{name}.mat") for name in expected), 0)
     document = run(robustness_study(pads, max_failures=1), tmp_path)
@@ -77,7 +81,7 @@ def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monk
 @pytest.mark.filterwarnings("ignore")
 def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
-    study = tiny({"a": Morphology.straight(1), "b": Morphology.random(1, 1)})
+    study = robustness_study({"a": Morphology.straight(1), "b": Morphology.random(1, 1)}, max_failures=1, presses=16)
     expected = run(study, tmp_path / "local")
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
@@ -102,7 +106,7 @@ def test_study_escapes_names_of_files(tmp_path: Path) -> None:
     for path in paths:
         PADS["random"].save(path)
     pads = load_pads(tuple(map(str, paths)), 0)
-    document = run(tiny(pads, max_failures=0), tmp_path / "out")
+    document = run(robustness_study(pads, max_failures=0, presses=16), tmp_path / "out")
     assert len(document["rows"]) == len(pads) == len(names)
     for line in (tmp_path / "out" / "robustness.md").read_text().splitlines()[-len(names) :]:
         assert line.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
@@ -110,14 +114,14 @@ def test_study_escapes_names_of_files(tmp_path: Path) -> None:
 
 
 def test_study_of_a_pad_without_signals_guesses_the_middle(tmp_path: Path) -> None:
-    document = run(tiny(PADS, test=300, contact=Contact(radius=1e-6)), tmp_path)
+    document = run(robustness_study(PADS, max_failures=1, presses=16, contact=Contact(radius=1e-6)), tmp_path)
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
 
 
 def test_maps_cover_the_pressed_rectangle(tmp_path: Path) -> None:
     """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
     pad = Morphology.straight((3, 2), (8.0, 15.0))
-    document = run(tiny({"tall": pad}, max_failures=0), tmp_path)
+    document = run(robustness_study({"tall": pad}, max_failures=0, presses=16), tmp_path)
     left, right, low, high = document["maps"][0]["extent"]
     assert ((right - left) * pad.unit_mm, (high - low) * pad.unit_mm) == pytest.approx((8, 30))
     assert document["rows"][0]["mean_mm"] == pytest.approx(document["rows"][0]["mean"] * np.sqrt(8 * 15))

@@ -19,12 +19,11 @@ from padforge.design import Contact, InputError, Morphology, PadSettings, Search
 from padforge.design.optimize.search import SearchResult
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.studies import drift, scaling, sensitivity
-from padforge.sense.studies.indentation import force_study, shape_study
+from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
 from padforge.sense.studies.multicontact import multicontact_study
-from padforge.sense.studies.robustness import robustness_study
 from padforge.sense.studies.study import (
     ADC_COUNTS,
+    Sizes,
     Study,
     StudyResult,
     Task,
@@ -37,16 +36,26 @@ from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 SMALLEST: dict[str, Callable[[], Study]] = {
-    "robustness": lambda: robustness_study(PADS, max_failures=1, hidden=4, presses=16, test=20),
+    "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
     "drift": lambda: drift.drift_study(
-        *({"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
-        **{"rig": RigSettings(drift_mv=300), "presses": 40, "hidden": 4, "epochs": 2},
+        {"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}
     ),
-    "force": lambda: force_study(PADS, noise_counts=(1.0,), presses=60, test=40, hidden=4, epochs=3),
-    "shape": lambda: shape_study(PADS, presses=100, test=60, hidden=4, epochs=3),
-    "multicontact": lambda: multicontact_study(PADS, presses=100, test=60, hidden=5, members=2, epochs=3),
+    "force": lambda: indentation.force_study(PADS, sizes=Sizes(60, 40, hidden=4, epochs=3)),
+    "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
+    "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
-    "sensitivity": lambda: sensitivity.sensitivity_study(PADS, radii=(0.6, 1.0), sides=(4,)),
+    "sensitivity": lambda: sensitivity.sensitivity_study(PADS),
+}
+
+SMALLER: dict[object, dict[str, object]] = {
+    robustness: {"HIDDEN": 4, "TEST": 20},
+    drift: {
+        **{"MEMBERS": 2, "HIDDEN": 4, "EPOCHS": 2, "RIG": RigSettings(drift_mv=300, presses=40)},
+        "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
+    },
+    indentation: {"FORCE_NOISES": (1.0,)},
+    scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
+    sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "RADII": (0.6, 1.0), "SIDES": (4,)},
 }
 
 
@@ -59,14 +68,9 @@ def stop(done: int, total: int, name: str) -> None:
 def test_run_resumes_every_study_with_the_same_result(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drift, "MEMBERS", 2)
-    monkeypatch.setattr(drift, "FILTERS", {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)})
-    for module in (scaling, sensitivity):
-        monkeypatch.setattr(module, "HIDDEN", 12)
-        monkeypatch.setattr(module, "TEST", 50)
-    monkeypatch.setattr(scaling, "EPOCHS", 8)
-    monkeypatch.setattr(sensitivity, "SIDE", 8)
-    monkeypatch.setattr(sensitivity, "MEMBERS", 2)
+    for module, sizes in SMALLER.items():
+        for size, value in sizes.items():
+            monkeypatch.setattr(module, size, value)
     complete = run(SMALLEST[name](), tmp_path / "complete", jobs=1)
     study = replace(SMALLEST[name](), draw=lambda document: Figure())
     with pytest.raises(KeyboardInterrupt):
@@ -147,6 +151,7 @@ def test_run_rejects_a_lock_that_is_no_file(tmp_path: Path) -> None:
         (["robustness", "square", "square"], "another one is called square"),
         (["robustness", "square", "--presses", "1000"], "presses is 1000, allowed is a square number from 4"),
         (["scaling", "square", "--grids", "4,x"], "grids is '4,x', expected numbers from 2 to 256"),
+        *(([name, "no"], "no: no such file") for name in ("sensitivity", "force", "shape", "multicontact")),
     ],
 )
 def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -213,9 +218,10 @@ def test_load_pads_searches_with_the_given_knots_by_either_method(monkeypatch: p
         load_pads(("optimised-0",), seed=0)
 
 
-def test_quantize_gives_whole_counts_up_to_full_scale() -> None:
-    signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 2.0, 0.0]])
-    counts = quantize(signals, np.array([0.5, 1.0, 0.0]), 0.0, np.random.default_rng(0))
-    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, ADC_COUNTS, 0]])
-    noisy = quantize(np.full((4000, 1), 0.5), np.ones(1), 4.0, np.random.default_rng(0))
-    assert noisy.std() == pytest.approx(4, rel=0.1)
+def test_quantize_gives_whole_counts_up_to_full_scale_of_the_training() -> None:
+    signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 0.5, 0.0], [0.75, 2.0, 0.0]])
+    counts = quantize(signals, 3, 0.0, np.random.default_rng(0))
+    full = [ADC_COUNTS, ADC_COUNTS, 0]
+    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, 2048, 0], full])
+    noisy = quantize(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
+    assert noisy[:-1].std() == pytest.approx(4, rel=0.1)
