@@ -23,13 +23,11 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
-MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)
-"""Sections that a design depends on, and so may be varied."""
+MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # what a design depends on, and so may be varied
+# names that no file can have on Windows
 WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
-"""Names that no file can have on Windows."""
-
+# makes the mould of a pad into a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
-"""Makes the mould of a pad into a folder, and returns its costs by the keys of COSTS."""
 COSTS = {"mould_ml": "mould (ml)", "silicone_ml": "silicone (ml)", "failed": "failed checks"}
 
 

@@ -33,13 +33,10 @@ if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
-PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)
-"""Standard deviations of the sensitivity profiles, about Gaussian, that are tried."""
-SIDE, N_TEST, HIDDEN = 32, 500, 20
-"""Training presses a side, test presses, and neurons: the 50 published ones overfit the scatter, and err a tenth more
-in more time."""
-MAX_FAILURES, SUBSETS = 3, 4
-"""Failed fibres at most, and sets of a size: enough to tell pads apart by a tenth of their error."""
+PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
+SIDE, N_TEST = 32, 500  # training presses a side, test presses
+HIDDEN = 20  # neurons: the 50 published ones overfit the scatter, and err a tenth more in more time
+MAX_FAILURES, SUBSETS = 3, 4  # failed fibres, and sets of a size: pads that differ by a tenth are told apart
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,8 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
-SIGNIFICANT = 0.05
-"""Relative difference of expected errors from which trained networks agree which pad is better."""
-MAX_VIOLATIONS = 10
-"""Violations that the summary lists."""
+SIGNIFICANT = 0.05  # relative difference of expected errors from which trained networks agree which pad is better
+MAX_VIOLATIONS = 10  # violations that the summary lists
 
 
 def run_design(

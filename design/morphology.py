@@ -26,18 +26,12 @@ from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Coun
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"
-"""Format of a square pad of one pitch, which every version reads, and of any other pad."""
-MIN_SPAN = 1e-12
-"""Smallest distance of knots along a fibre's axis, grid units: slopes remain numbers that can be squared."""
-MAX_COORDINATE = 1e6
-"""Largest absolute coordinate of a position, grid units or mm."""
-MAX_KNOTS = 2**22
-"""Knots of a pad, over all its fibres."""
-MAX_SAMPLES = 2**20
-"""Points that a fibre is sampled at."""
-MARGIN = 1e-3
-"""Smallest distance of an inner knot to the pad's edge, grid units, as in the published optimiser."""
+SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"  # of a square pad of one pitch, of any other
+MIN_SPAN = 1e-12  # smallest distance of knots along an axis, grid units: slopes remain numbers that can be squared
+MAX_COORDINATE = 1e6  # largest absolute coordinate of a position, grid units or mm
+MAX_KNOTS = 2**22  # knots of a pad, over all its fibres
+MAX_SAMPLES = 2**20  # points that a fibre is sampled at
+MARGIN = 1e-3  # smallest distance of an inner knot to the pad's edge, grid units, as in the published optimiser
 
 
 def check_layout(n_fibres: int, layout: Layout | None = None) -> Layout:

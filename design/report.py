@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import Violation
 
-FORMAT = "padforge-design/2"
-"""Format of design.json."""
-TOLERANCE = 1e-3
-"""Deviation of drawn curves from exact ones, grid units."""
+FORMAT = "padforge-design/2"  # format of design.json
+TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
 
 def draw_plan(

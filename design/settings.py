@@ -17,16 +17,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.interpolate import CubicSpline
 
-DEFAULT_PITCH_MM = 11.25
-"""Pitch of the built pad."""
-MAX_FIBRES = 1024
-"""Fibres of one family, also of a pad made of tiles."""
+DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
+MAX_FIBRES = 1024  # fibres of one family, also of a pad made of tiles
 
 Pair = tuple[float, float]
-Counts = int | tuple[int, int]
-"""M horizontals and M verticals, or (horizontals, verticals)."""
-Pitch = float | Pair
-"""Distance of neighbouring fibre ends, mm: in both directions, or along x and along y."""
+Counts = int | tuple[int, int]  # M horizontals and M verticals, or (horizontals, verticals)
+Pitch = float | Pair  # distance of neighbouring fibre ends, mm: in both directions, or along x and along y
 
 
 @dataclass(frozen=True)
@@ -149,13 +145,12 @@ class Layout:
         return f"{self.horizontals} + {self.verticals} fibres, pitch {' and '.join(pitches)} mm"
 
 
+# profile measured on the built pad: a Gaussian with a smooth end instead of tails
 MEASURED_PROFILE = (
     *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
     *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
 )
-"""Profile measured on the built pad: a Gaussian with a smooth end instead of tails."""
-MEASURED_STD_MM = 6.2
-"""Standard deviation of that Gaussian."""
+MEASURED_STD_MM = 6.2  # standard deviation of that Gaussian
 MAX_OVERSHOOT = 0.15
 """Largest excursion of a spline from the range of the two points it connects, as a share of the largest weight. Smooth
 profiles stay far below; beyond it a signal would depend on weights that nobody measured."""
@@ -266,12 +261,9 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
                 )
 
 
-PUBLISHED_CONTACT = Contact(radius=0.6)
-"""Contact of the paper: a polygon of 30 sides, Manhattan lengths. Default of functions that reproduce the paper."""
-TRACK_WIDTH_MM = 0.4
-"""Default width of a track."""
-MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
-"""Smallest limit on the common length of two tracks: two straight ones at a right angle have two widths in common."""
+PUBLISHED_CONTACT = Contact(radius=0.6)  # of the paper: a polygon of 30 sides, Manhattan lengths
+TRACK_WIDTH_MM = 0.4  # default width of a track
+MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM  # two straight tracks at a right angle have two widths in common
 
 MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
@@ -312,12 +304,9 @@ MaxFailures = Annotated[
     BeforeValidator(as_tuple),
 ]
 
-WEIGHTS = (1.0, 1e-7, 5e-6)
-"""Published alpha, beta and gamma: weights of entropy, sharpness and disorder (formula (5))."""
-SIDE = 7
-"""Presses per row and column in the published search."""
-LEVELS = 4096
-"""Levels of the published 12-bit converter."""
+WEIGHTS = (1.0, 1e-7, 5e-6)  # published alpha, beta and gamma: weights of entropy, sharpness and disorder (formula (5))
+SIDE = 7  # presses per row and column in the published search
+LEVELS = 4096  # levels of the published 12-bit converter
 MAX_LEVELS = 2**24
 
 
@@ -398,11 +387,9 @@ class SearchSettings(Settings):
 
 Millimetres = Annotated[float, Field(gt=0, le=1e6)]
 Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
-Rectangle = tuple[tuple[float, float], tuple[float, float]]
-"""Low and high corner, grid units."""
+Rectangle = tuple[tuple[float, float], tuple[float, float]]  # low and high corner, grid units
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-Corners = tuple[tuple[Coordinate, Coordinate], ...]
-"""Corners of a polygon, mm from the middle of the pad."""
+Corners = tuple[tuple[Coordinate, Coordinate], ...]  # corners of a polygon, mm from the middle of the pad
 BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
 Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
@@ -556,8 +543,8 @@ def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:
 
 
 PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
+# settings of the paper, by section, where they differ from the defaults
 PUBLISHED: Mapping[str, Settings] = {
     **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
-"""Settings of the paper, by section, where they differ from the defaults."""

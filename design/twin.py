@@ -25,12 +25,9 @@ FORMAT = "padforge-twin/3"
 MAX_VOLTS, MAX_MM = 1e3, 1e4
 MAX_INFORMATION_GAIN = 1e3
 MAX_CHANNELS = 1024
-MAX_ELEMENT_LENGTH = 0.02
-"""Length of the elements that an as-built fibre is summed over, grid units."""
-MAX_ELEMENTS = 2**23
-"""Elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million."""
-UNIFORM_SENSITIVITY_STD = 0.02
-"""Standard deviation of the log-sensitivity along a fibre up to which it counts as uniform."""
+MAX_ELEMENT_LENGTH = 0.02  # length of the elements that an as-built fibre is summed over, grid units
+MAX_ELEMENTS = 2**23  # elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million
+UNIFORM_SENSITIVITY_STD = 0.02  # of the log-sensitivity along a fibre: up to there it counts as uniform
 
 
 def _check_fields(instance: object, **bounds: tuple[float, float]) -> None:

@@ -160,11 +160,6 @@ def _end_with_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        for word in sys.argv[1:]:  # a Python caller can pass what no shell can, and functions of the system fail on it
-            with suppress(UnicodeEncodeError):
-                if b"\0" not in os.fsencode(word):
-                    continue
-            raise InputError(f"{word!r}: holds characters that no argument can have")
         return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)

@@ -28,8 +28,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 from padforge.design.common.page import TEMPLATES, read_resource
 from padforge.design.common.validation import InputError
 
-HOST = "127.0.0.1"
-"""The loopback interface; other addresses are served only with a token."""
+HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN, MAX_TOKEN = 16, 256  # characters
 MAX_CONNECTIONS = 64  # at once; far fewer than the files that a process may open
 POLL_S = 0.05  # interval at which a server checks whether it is to end
@@ -41,8 +40,8 @@ RETRY_MS = 1000  # after this time a browser that lost its connection tries agai
 HTTP_PORT = 80  # which browsers omit from the Host header
 _MAX_DISCARDED = 2**20  # bytes of a too long request that are read before it is refused: a sender reads no answer
 
+# takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use
 Handler = Callable[[bytes], Mapping[str, Any] | None]
-"""Takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use."""
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):

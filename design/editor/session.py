@@ -24,19 +24,13 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
-MIN_DISTANCE = 1e-3
-"""Smallest distance of two knots along a fibre, grid units."""
-MAX_KNOTS = 64
-"""Inner knots of a fibre, as for [search] knots."""
-STRAIGHT_KNOTS = 5
-"""Inner knots of a straight fibre, as handles for editing."""
-MAX_STEPS = 1000
-"""Edits that can be undone."""
-MAX_GESTURE = 40
-"""Characters of the name of a gesture."""
+MIN_DISTANCE = 1e-3  # smallest distance of two knots along a fibre, grid units
+MAX_KNOTS = 64  # inner knots of a fibre, as for [search] knots
+STRAIGHT_KNOTS = 5  # inner knots of a straight fibre, as handles for editing
+MAX_STEPS = 1000  # edits that can be undone
+MAX_GESTURE = 40  # characters of the name of a gesture
 
-Paths = tuple[Array, ...]
-"""Knots of every fibre, shape (n, 2), grid units."""
+Paths = tuple[Array, ...]  # knots of every fibre, shape (n, 2), grid units
 
 
 class _EditHistory:

@@ -16,16 +16,12 @@ from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology, assemble_knots, split_axes
 from padforge.design.settings import Layout
 
-MAX_POINTS = 10**7
-"""Points that the curves of a pad are flattened to."""
-_ROUNDING = 1e-6
-"""Gap, relative to the width, up to which two intervals of a line are one stretch."""
-FOLD = np.pi / 2
-"""Points of a fibre keep the gap if they are `FOLD` gaps apart along it, half a turn of a circle one gap wide."""
+MAX_POINTS = 10**7  # points that the curves of a pad are flattened to
+_ROUNDING = 1e-6  # gap, relative to the width, up to which two intervals of a line are one stretch
+FOLD = np.pi / 2  # gaps along a fibre from which its points keep the gap: half a turn of a circle one gap wide
+# range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc
 UNFOLDED = 2 * np.arccos(1 / FOLD)
-"""Range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc."""
-_TINY = 1e-30
-"""Divides in position of the length of a segment whose ends coincide."""
+_TINY = 1e-30  # divides in position of the length of a segment whose ends coincide
 
 
 def _hermite(pad: Morphology) -> tuple[Array, Array, Array]:

@@ -18,23 +18,17 @@ from padforge.design.morphology import Array
 if TYPE_CHECKING:
     from ezdxf.path import Path as BezierPath
 
-MAX_BYTES = 2**22
-"""Size of a drawing; drawings of fibres are far smaller."""
+MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
 MAX_POINTS = 200_000
-MAX_PARTS = 20_000
-"""Elements of a drawing, drawn or not."""
-MAX_CURVES = 5000
-"""Curves of a drawing before they are joined."""
-MAX_COORDINATE = 1e6
-"""Largest absolute coordinate, in units of the drawing."""
-FLATNESS = 1e-5
-"""Largest distance of curve and polyline, relative to the size of the curve."""
+MAX_PARTS = 20_000  # elements of a drawing, drawn or not
+MAX_CURVES = 5000  # curves of a drawing before they are joined
+MAX_COORDINATE = 1e6  # largest absolute coordinate, in units of the drawing
+FLATNESS = 1e-5  # largest distance of curve and polyline, relative to the size of the curve
 
 _MAX_REASON = 120
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
 _PAD = "pad"
-_JOIN_TOLERANCE = 1e-6
-"""Distance of ends that are one point, relative to the size of the drawing."""
+_JOIN_TOLERANCE = 1e-6  # distance of ends that are one point, relative to the size of the drawing
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,9 @@ from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Ints
 from padforge.design.settings import Layout
 
-SPARE_LENGTH = 1e-4
-"""Length of all spare knots of a fibre, grid units: far below what can be printed."""
-_TRIAL_POSITIONS = np.array([0.15, 0.3, 0.5, 0.7, 0.85])
-"""Positions on a span at which a knot is tried."""
-_LEVEL_TOLERANCE = 1e-9
-"""Rises below this are none: positions in a file in pitches are right to rounding."""
+SPARE_LENGTH = 1e-4  # length of all spare knots of a fibre, grid units: far below what can be printed
+_TRIAL_POSITIONS = np.array([0.15, 0.3, 0.5, 0.7, 0.85])  # positions on a span at which a knot is tried
+_LEVEL_TOLERANCE = 1e-9  # rises below this are none: positions in a file in pitches are right to rounding
 
 
 def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
@@ -95,20 +92,13 @@ def _insert_knot_on_curve(path: bytes, axis: int) -> Array:
     return result
 
 
-SAMPLES = 700
-"""Samples of a polyline."""
-_MAX_ITERATIONS = 40
-"""Iterations of Levenberg-Marquardt."""
-_MAX_STEP = 0.4
-"""Largest step of a knot, as a share of the way to its neighbour."""
-_MAX_CANDIDATES = 4
-"""Knots whose removal is tried, those with the smallest misfit first."""
-_MAX_DAMPINGS = 15
-"""Increases of the damping in one iteration."""
-_SUPPORT = 4
-"""Spans that depend on a knot, from two before it."""
-_MIN_SPAN = 2e-3
-"""Smallest distance of knots along the axis, as a share of the curve's extent."""
+SAMPLES = 700  # samples of a polyline
+_MAX_ITERATIONS = 40  # iterations of Levenberg-Marquardt
+_MAX_STEP = 0.4  # largest step of a knot, as a share of the way to its neighbour
+_MAX_CANDIDATES = 4  # knots whose removal is tried, those with the smallest misfit first
+_MAX_DAMPINGS = 15  # increases of the damping in one iteration
+_SUPPORT = 4  # spans that depend on a knot, from two before it
+_MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
 
 
 def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:

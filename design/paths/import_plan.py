@@ -15,21 +15,14 @@ from padforge.design.paths.fitting import add_spare_knots, fit_knots
 from padforge.design.settings import Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
-MAX_KNOTS = 64
-"""Inner knots of a fibre, as of `[search] knots`."""
-MAX_CURVES_PER_FIBRE = 8
-"""Beyond, messages on single curves would not help."""
+MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
+MAX_CURVES_PER_FIBRE = 8  # beyond, messages on single curves would not help
 _FAMILIES = "horizontal", "vertical"
-_MAX_BACKTRACK_MM = 2e-4
-"""Largest step backwards along the axis: files are rounded."""
-_MARGIN_MM = 1.0
-"""Beyond this margin across the pad, curves are leads to its other sides, which are ignored."""
-_ASPECT_TOLERANCE = 2e-3
-"""Largest relative difference in aspect ratio of the drawn border and the pad."""
-_FIT_SHARE = 0.8
-"""Tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only."""
-_FLATNESS_MM = 1e-3
-"""Tolerance to which curves are compared."""
+_MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
+_MARGIN_MM = 1.0  # beyond this margin across the pad, curves are leads to its other sides, which are ignored
+_ASPECT_TOLERANCE = 2e-3  # largest relative difference in aspect ratio of the drawn border and the pad
+_FIT_SHARE = 0.8  # tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only
+_FLATNESS_MM = 1e-3  # tolerance to which curves are compared
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,8 @@ from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PadSettings, RulesSettings
 
-_CLEARANCE = 1.15
-"""Clearance of a passing fibre, relative to the rules': a PCHIP curve leaves the polygon of its knots by a little."""
-_LENGTH = 1.5
-"""Length of the transition to a lane, relative to the shortest one whose bends keep the rules."""
+_CLEARANCE = 1.15  # of a passing fibre, relative to the rules': a PCHIP curve leaves the polygon of its knots
+_LENGTH = 1.5  # length of the transition to a lane, relative to the shortest one whose bends keep the rules
 
 
 def keep_outs(pad: PadSettings) -> list[Polygon]:
