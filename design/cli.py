@@ -221,7 +221,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     from padforge.design.common.server import LocalPage, page_text
     from padforge.design.common.validation import InputError
 
-    from .editor.session import EditSession, free_name
+    from .editor import EditSession, free_name
 
     out = out or free_name(common.pad_folder(pad) / ("edited.json" if pad is None else f"{pad.stem}-edited.json"))
     if out.suffix.lower() != ".json":

@@ -1,4 +1,4 @@
-"""Curves of a pad: PCHIP spans as Bezier curves, lengths, crossings, common stretches, bend radii and folds.
+"""Curves of a pad: PCHIP spans as Bezier curves, lengths, crossings, common stretches, bends, folds, spare knots.
 
 A fibre is a graph over its axis, so its heading (the angle of its tangent to the axis) stays within a right angle of 0,
 and it never crosses itself.
@@ -6,6 +6,7 @@ and it never crosses itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ _ROUNDING = 1e-6  # gap, relative to the width, up to which two intervals of a l
 FOLD = np.pi / 2  # gaps along a fibre from which its points keep the gap: half a turn of a circle one gap wide
 # range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc
 UNFOLDED = 2 * np.arccos(1 / FOLD)
+SPARE_LENGTH = 1e-4  # length of all spare knots of a fibre, grid units: far below what can be printed
+_TRIAL_POSITIONS = np.array([0.15, 0.3, 0.5, 0.7, 0.85])  # positions on a span at which a knot is tried
+_LEVEL_TOLERANCE = 1e-9  # rises below this are none: positions in a file in pitches are right to rounding
 _TINY = 1e-30  # divides in position of the length of a segment whose ends coincide
 
 
@@ -196,6 +200,80 @@ def refine(knots: Array, count: int, layout: Layout) -> Array:
             along = np.insert(along, longest + 1, along[longest : longest + 2].mean())
         fibres.append(np.stack([along, curve(along)][:: 1 - 2 * axis], axis=-1))
     return assemble_knots(np.array(fibres)[:, 1:-1], layout)
+
+
+def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
+    """Give all fibres the same number of knots (F, n, 2) by adding spare ones that do not change the curve.
+
+    Args:
+        paths: knots of each fibre, as in a morphology; shape (n, 2), grid units.
+        layout: layout of the fibres.
+    """
+    n_knots = max(map(len, paths))
+    return np.stack([_add_spares(path, layout.family(i), n_knots - len(path)) for i, path in enumerate(paths)])
+
+
+def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
+    """Return the knots (n, 2) of each fibre without spare ones.
+
+    Args:
+        knots: shape (F, n, 2), grid units.
+        layout: layout of the fibres.
+    """
+    paths = []
+    for fibre, line in enumerate(knots):
+        step = np.abs(np.diff(line, axis=0))
+        axis = layout.family(fibre)
+        spare = (step[:, axis] <= SPARE_LENGTH * (1 + _LEVEL_TOLERANCE)) & (step[:, 1 - axis] <= _LEVEL_TOLERANCE)
+        spare[-1] = False
+        paths.append(line[np.append(True, ~spare)])
+    return paths
+
+
+def _add_spares(path: Array, axis: int, count: int) -> Array:
+    """Return a fibre with `count` more knots."""
+    if not count:
+        return path
+    at = _find_level_knot(path[:, axis], path[:, 1 - axis])
+    if at is None:
+        return _add_spares(_insert_knot_on_curve(path.tobytes(), axis), axis, count - 1)
+    step = min(SPARE_LENGTH, (path[at + 1, axis] - path[at, axis]) / 4) / count
+    spares = np.repeat(path[at : at + 1], count, axis=0)
+    spares[:, axis] += step * np.arange(1, count + 1)
+    return np.insert(path, at + 1, spares, axis=0)
+
+
+def _find_level_knot(along: Array, across: Array) -> int | None:
+    """Find the level knot, not next to an end, with the most room behind it; None if there is none."""
+    rise, room = np.diff(across), np.diff(along)
+    if not rise.any():
+        return int(np.argmax(room))
+    level = np.append(rise[0] == 0, rise[:-1] * rise[1:] <= 0)
+    level[[1, -1]] = False
+    return int(np.argmax(np.where(level, room, -1))) if level.any() else None
+
+
+@lru_cache(maxsize=256)  # an editor changes one fibre and leaves the others
+def _insert_knot_on_curve(path: bytes, axis: int) -> Array:
+    """Insert a knot on the curve of a fibre, knots (n, 2) as bytes, near an end, where it changes the curve least."""
+    from scipy.interpolate import PchipInterpolator
+
+    knots = np.frombuffer(path).reshape(-1, 2)
+    along, across = knots[:, axis], knots[:, 1 - axis]
+    curve = PchipInterpolator(along, across)
+    spans = sorted({0, 1, len(along) - 3, len(along) - 2} & set(range(len(along) - 1)))
+    positions = np.concatenate([along[k] + (along[k + 1] - along[k]) * _TRIAL_POSITIONS for k in spans])
+    dense = np.concatenate([np.linspace(along[k], along[k + 1], 33) for k in spans])
+    best, least = along, np.inf
+    for position in positions:
+        more = np.sort(np.append(along, position))
+        largest_change = float(np.abs(PchipInterpolator(more, curve(more))(dense) - curve(dense)).max())
+        if largest_change < least:
+            best, least = more, largest_change
+    result = np.empty((len(best), 2))
+    result[:, axis], result[:, 1 - axis] = best, curve(best)
+    result[[0, -1]] = knots[[0, -1]]
+    return result
 
 
 @dataclass(frozen=True)

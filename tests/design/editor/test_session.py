@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, Spec, check_rules
 from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
-from padforge.design.editor.session import EditSession
+from padforge.design.editor import EditSession
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 
 
