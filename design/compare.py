@@ -3,6 +3,7 @@
 import itertools
 import re
 import tomllib
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,17 +34,11 @@ COSTS = {"mould_ml": "mould (ml)", "silicone_ml": "silicone (ml)", "failed": "fa
 
 @dataclass(frozen=True)
 class Variant:
-    """A pad to compare: settings to design it by, or a finished morphology.
+    """A pad to compare: settings to design it by, or a finished morphology."""
 
-    Attributes:
-        name: name in tables and figures.
-        spec: settings.
-        pad: the finished morphology; None if it is to be designed.
-    """
-
-    name: str
+    name: str  # in tables and figures
     spec: Spec
-    pad: Morphology | None = None
+    pad: Morphology | None = None  # None if it is to be designed
 
     @property
     def folder(self) -> str:
@@ -75,9 +70,9 @@ def read_variants(
             continue
         spec, source = load_spec(path), [] if path is None else [path.stem]
         for combination in itertools.product(*varied):
-            tables: dict[str, dict[str, Any]] = {}
+            tables = defaultdict[str, dict[str, Any]](dict)
             for section, key, value in combination:
-                tables.setdefault(section, {})[key] = value
+                tables[section][key] = value
             labels = [f"{key} {str(value).strip('()').replace(', ', ' x ')}" for _, key, value in combination]
             variants.append(Variant(", ".join([*source, *labels]) or "defaults", spec.replaced(tables)))
     folders = [variant.folder.casefold() for variant in variants]  # macOS and Windows ignore case
@@ -113,13 +108,6 @@ def compare(
 
     A pad is evaluated by a small network on responses with scatter, under its own contact and on its own sensed area,
     beside straight fibres of the same layout (`errors_by_contact`).
-
-    Args:
-        variants: pads to compare.
-        out: folder of the comparison.
-        options: how each search is run.
-        seed: seed of the searches, the scatter and the networks; that of `[search]` if None.
-        make_pad: makes the mould of a pad.
 
     Returns:
         The document: a row per variant, with errors in mm with 0, 1, ... failed fibres.

@@ -13,7 +13,6 @@ import numpy as np
 
 from padforge.design.common.files import provenance, write_json
 from padforge.design.common.profiling import stage
-from padforge.design.common.validation import check_int
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import SimulatedPresses
@@ -70,15 +69,8 @@ def errors_by_contact(
 ) -> list[ContactErrors]:
     """Compute mean errors of a small network for pads of one layout under every contact, contact by contact.
 
-    Args:
-        pads: by name.
-        contacts: by name.
-        size: says what is pressed.
-        scatter: of responses.
-        seed: of presses, scatter and networks.
-        subsets: most sets of failed fibres of a size.
+    At most `subsets` sets of failed fibres of each size are tried.
     """
-    seed = check_int("seed", seed, 0, 2**64 - 1)
     fibres = size.layout.fibres
     failures = [failure_subsets(fibres, number, subsets) for number in range(min(MAX_FAILURES, fibres - 1) + 1)]
     rows = []
@@ -111,14 +103,7 @@ def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
-    """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others.
-
-    Args:
-        spec: settings of the pad, the contact and the scatter.
-        pad: the design.
-        out: folder of `contacts.json`.
-        seed: that of `[search]` if None.
-    """
+    """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others."""
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)
     contacts = alternative_contacts(design_contact(spec, settings))

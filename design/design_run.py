@@ -111,11 +111,7 @@ def run_design(
 def check_design(
     spec: "Spec", out: Path, overrides: Mapping[str, Any], regenerated: Collection[str] = (), force: bool = False
 ) -> None:
-    """Check the arguments of `run_design` without searching.
-
-    Raises:
-        InputError: invalid settings, or the pad in `out` is in use.
-    """
+    """Check the arguments of `run_design` without searching."""
     check_replaceable(out / "morphology.json", _read_request(spec, overrides)[-1], {"design.json", *regenerated}, force)
 
 
@@ -160,12 +156,7 @@ def load_result(out: Path) -> SearchResult:
 
 
 def summary_lines(result: SearchResult, out: Path) -> list[str]:
-    """Summarise a search in a few lines of text: expected errors beside those of straight fibres, and broken rules.
-
-    Args:
-        result: the result.
-        out: folder it was written to.
-    """
+    """Summarise a search in a few lines of text: expected errors beside those of straight fibres, and broken rules."""
     violations = [f"  broken: {violation}" for violation in result.violations[:MAX_VIOLATIONS]]
     remaining = len(result.violations) - len(violations)
     stopped = f" ({result.stopped}: the best so far)" if result.stopped else ""
@@ -179,10 +170,8 @@ def summary_lines(result: SearchResult, out: Path) -> list[str]:
 
 
 def _error_lines(result: SearchResult) -> list[str]:
-    designed, straight = (
-        [value for term, value in terms.items() if term.startswith("expected_error")]
-        for terms in (result.terms, result.straight)
-    )
+    designed = [value for term, value in result.terms.items() if term.startswith("expected_error")]
+    straight = [value for term, value in result.straight.items() if term.startswith("expected_error")]
     lines = [
         f"  expected error  {_format_errors(designed)} mm with {_format_errors(range(len(designed)))} failed fibres",
         f"  straight fibres {_format_errors(straight)} mm",

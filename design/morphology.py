@@ -35,15 +35,7 @@ MARGIN = 1e-3  # smallest distance of an inner knot to the pad's edge, grid unit
 
 
 def check_layout(n_fibres: int, layout: Layout | None = None) -> Layout:
-    """Return the layout of `n_fibres`, for None that of a square pad of the default pitch.
-
-    Args:
-        n_fibres: number of fibres.
-        layout: their layout.
-
-    Raises:
-        InputError: a number that is not the layout's, or without a layout no even number.
-    """
+    """Return the layout if it is one of `n_fibres`; for None that of a square pad of the default pitch."""
     if layout is None:
         if n_fibres % 2 or not n_fibres:
             raise InputError(f"these are {n_fibres} fibres, expected 2 M: as many horizontals as verticals")
@@ -59,12 +51,7 @@ def fibre_ends(layout: Layout) -> Ends:
 
 
 def split_axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
-    """Return the coordinates along and across each fibre's axis, both (P, F, n).
-
-    Args:
-        knots: x and y; shape (P, F, n, 2).
-        horizontals: number of fibres, the first ones, that run along x.
-    """
+    """Return the coordinates along and across each fibre's axis, both (P, F, n), of knots (P, F, n, 2)."""
     along, across = (
         np.concatenate([knots[:, :horizontals, :, axis], knots[:, horizontals:, :, 1 - axis]], axis=1)
         for axis in (0, 1)

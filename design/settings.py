@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -55,12 +55,7 @@ class Layout:
 
     @classmethod
     def create(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
-        """Create a layout from its short form.
-
-        Args:
-            fibres: M, (H, V), or a layout, which is returned as it is.
-            pitch_mm: one pitch, or (along x, along y), mm.
-        """
+        """Create a layout of M or (H, V) fibres and a pitch or (along x, along y); return a layout as it is."""
         if isinstance(fibres, Layout):
             return fibres
         if not isinstance(fibres, tuple | list):
@@ -181,8 +176,6 @@ class Contact(Settings):
             spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be negative. MEASURED_PROFILE if
             nothing of the contact is stated.
     """
-
-    MOVED: ClassVar[Mapping[str, str]] = {"reach": "sensitivity_profile"}
 
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
     sides: Sides = Field(default=30, description='sides D of the object, or "circle", of a shape')
@@ -311,17 +304,11 @@ MAX_LEVELS = 2**24
 
 
 class Scatter(NamedTuple):
-    """Scatter of a fibre's response from press to press at one position.
+    """Scatter of a fibre's response from press to press at one position."""
 
-    Attributes:
-        floor: standard deviation of the additive part, as a share of a straight fibre's full scale, > 0.
-        share: standard deviation of the part proportional to the response, as a share of it.
-        common: share of the proportional part's variance that all fibres have in common.
-    """
-
-    floor: float
-    share: float = 0.0
-    common: float = 0.0
+    floor: float  # standard deviation of the additive part, as a share of a straight fibre's full scale, > 0
+    share: float = 0.0  # standard deviation of the part proportional to the response, as a share of it
+    common: float = 0.0  # share of the proportional part's variance that all fibres have in common
 
     def sample_gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
         """Sample the factor, about 1, on each response; the shape is (presses, fibres)."""
@@ -340,8 +327,6 @@ class SearchSettings(Settings):
         noise: additive scatter; this and the next two default to the scatter measured on a built pad.
         contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
     """
-
-    MOVED: ClassVar[Mapping[str, str]] = {"lost": "max_failures"}
 
     method: Literal["descent", "genetic"] = Field(
         default="descent", description="gradients of the expected error, or the genetic search as published"
@@ -399,11 +384,8 @@ def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
     """Return the low and the high corner of what is pressed, grid units.
 
     The outermost of V verticals lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
-    is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0.
-
-    Args:
-        layout: positions of the fibre ends.
-        sensed_mm: "beyond" (0.5 to V + 0.5 pitches), "fibres" (1 to V, as published), or (width, height), mm.
+    is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0. Otherwise "beyond" is 0.5 to
+    V + 0.5 pitches, and "fibres" 1 to V, as published.
     """
     sides = []
     for axis, count in enumerate((layout.verticals, layout.horizontals)):
@@ -448,8 +430,6 @@ class PadSettings(Settings):
             and lies on the pad at least in part.
         bent_radius_mm: None for a flat pad. It is cast flat in either case.
     """
-
-    MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), where the next two do not say")
     horizontals: Count = Field(default=None, description='fibres along x, or as "grid"; 0: a strip of fibres across it')

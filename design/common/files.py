@@ -294,12 +294,9 @@ def to_disk(handle: int) -> None:
 
 
 class _Note(NamedTuple):
-    """What an exchange does, and the inode numbers of its destination and of itself.
+    """What an exchange does."""
 
-    Neither an archive nor a copy preserves these, so that an exchange is carried out only where it was begun.
-    """
-
-    inodes: list[int]
+    inodes: list[int]  # of its destination and itself; no copy preserves these: it is carried out only where it began
     names: list[str]
     removed: list[str]
 
@@ -427,11 +424,7 @@ def _read_note(folder: Path) -> _Note | None:
 
 
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
-    """Check that `path` is a file of limited size, rather than a pipe or device that may never end.
-
-    Returns:
-        Where to read it, see `resolve_exchange`.
-    """
+    """Return where to read a file of limited size (`resolve_exchange`); refuse a pipe or device, which may not end."""
     try:
         valid = resolve_exchange(path)
         status = valid.stat()
@@ -499,11 +492,7 @@ def provenance(
 ) -> dict[str, Any]:
     """Describe where a result comes from; without time and output folder, so that equal work gives equal bytes.
 
-    Args:
-        command: what made it.
-        seed: of its random choices.
-        inputs: files and folders it was made from; their digests are recorded.
-        packages: distributions whose versions are recorded besides those that every result depends on.
+    Recorded are digests of the files and folders it was made from, and versions of `packages` besides the usual ones.
     """
     return {
         "command": command,

@@ -210,10 +210,7 @@ class LocalPage(ConnectionServer):
 def page_text(package: str, name: str, *parts: str) -> str:
     """Read a page that a package ships, and insert the style and script that all local pages share.
 
-    Args:
-        package: that ships the page.
-        name: file of the page.
-        parts: further files of the package; each stands in the page as a line `/* its name */`.
+    Further `parts` are files of the package; each stands in the page as a line `/* its name */`.
     """
     text = read_resource(package, name)
     for owner, part in [(TEMPLATES, "local_page.css"), (TEMPLATES, "local_page.js"), *((package, p) for p in parts)]:

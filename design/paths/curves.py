@@ -112,17 +112,11 @@ def lengths(pad: Morphology) -> Array:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Crossing of two fibres.
+    """Crossing of two fibres."""
 
-    Attributes:
-        first: index of the first fibre.
-        second: index of the second fibre, > first.
-        position: x and y, grid units.
-    """
-
-    first: int
-    second: int
-    position: tuple[float, float]
+    first: int  # index of a fibre
+    second: int  # index of the other one, > first
+    position: tuple[float, float]  # x and y, grid units
 
 
 def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> list[Crossing]:
@@ -160,10 +154,6 @@ def crossing_angles(pad: Morphology, crossings: Sequence[Crossing]) -> Array:
     """Compute the angles between the tangents at crossings of a horizontal with a vertical fibre, 0..90 degrees.
 
     Fibres that touch or run along each other have a common tangent, so their angle is 0.
-
-    Args:
-        pad: the fibres.
-        crossings: the n crossings; the first fibre is the horizontal one.
     """
     x, y = np.array([c.position for c in crossings]).reshape(-1, 2).T
     dy_dx = _slopes_at(pad, np.array([c.first for c in crossings], dtype=int), x)
@@ -181,13 +171,7 @@ def _slopes_at(pad: Morphology, fibre: NDArray[np.int_], at: Array) -> Array:
 
 
 def refine(knots: Array, count: int, layout: Layout) -> Array:
-    """Insert knots on the curves, in the middle of the longest spans, up to `count` inner knots a fibre.
-
-    Args:
-        knots: shape (F, n, 2) with n - 2 <= count, grid units.
-        count: inner knots per fibre.
-        layout: layout of the F fibres.
-    """
+    """Insert knots on the curves (F, n, 2), in the middle of the longest spans, up to `count` inner knots a fibre."""
     from scipy.interpolate import PchipInterpolator
 
     fibres = []
@@ -203,23 +187,13 @@ def refine(knots: Array, count: int, layout: Layout) -> Array:
 
 
 def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
-    """Give all fibres the same number of knots (F, n, 2) by adding spare ones that do not change the curve.
-
-    Args:
-        paths: knots of each fibre, as in a morphology; shape (n, 2), grid units.
-        layout: layout of the fibres.
-    """
+    """Give all fibres (n, 2) the same number of knots (F, n, 2) by adding spare ones that do not change the curve."""
     n_knots = max(map(len, paths))
     return np.stack([_add_spares(path, layout.family(i), n_knots - len(path)) for i, path in enumerate(paths)])
 
 
 def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
-    """Return the knots (n, 2) of each fibre without spare ones.
-
-    Args:
-        knots: shape (F, n, 2), grid units.
-        layout: layout of the fibres.
-    """
+    """Return the knots (n, 2) of each fibre of (F, n, 2), grid units, without spare ones."""
     paths = []
     for fibre, line in enumerate(knots):
         step = np.abs(np.diff(line, axis=0))
@@ -278,18 +252,11 @@ def _insert_knot_on_curve(path: bytes, axis: int) -> Array:
 
 @dataclass(frozen=True)
 class CommonStretches:
-    """Stretches of lines that are entirely near another line, ordered by line, other line and position.
-
-    Attributes:
-        line: index of the line; shape (n,).
-        other: index of the line that it is near; shape (n,).
-        begin: arc length at the start, along `line`; shape (n,).
-        end: arc length at the end; shape (n,).
-    """
+    """Stretches (n,) of lines that are entirely near another line, ordered by line, other line and position."""
 
     line: NDArray[np.int_]
-    other: NDArray[np.int_]
-    begin: Array
+    other: NDArray[np.int_]  # the line that it is near
+    begin: Array  # arc length along `line`
     end: Array
 
     @property
@@ -299,14 +266,9 @@ class CommonStretches:
 
 
 def common_stretches(lines: Sequence[Array], others: Sequence[Array], width: float) -> CommonStretches:
-    """Find every stretch of `lines` that is nearer than `width` to one of `others`.
+    """Find every stretch of polylines (n, 2) that is nearer than `width` to one of `others`.
 
     Two straight lines that cross at an angle a have a stretch of 2 width / sin(a) in common.
-
-    Args:
-        lines: polylines (n, 2), one or more.
-        others: polylines (n, 2), one or more, in the same unit.
-        width: distance below which two lines count as running along each other.
     """
     near = find_near_intervals(*_concatenate(lines), *_concatenate(others), width)
     pair = near[:, 0].astype(int) * len(others) + near[:, 1].astype(int)
@@ -328,24 +290,18 @@ def _concatenate(lines: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
 
 
 def extreme_headings(slopes: Array) -> Array:
-    """Return headings (..., 2 n + 1), rad, at ends of spans and extremes of slope inside; monotone between them.
+    """Return headings (..., 2 n + 1), rad, at ends of spans and extremes of their slopes (..., n, 3) inside.
 
-    Args:
-        slopes: Bezier coefficients of each span's slope; shape (..., n, 3).
+    They are monotone between these.
     """
     pairs = np.stack([slopes[..., 0], quadratic(slopes, _stationary(slopes))], axis=-1)
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
 
 def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
-    """Sample one fibre so that it turns by at most `step` from point to point.
+    """Sample one fibre, its `beziers` and `slope_beziers`, so that it turns by at most `step`, rad, between points.
 
     Such points also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.
-
-    Args:
-        spans: Bezier control points; shape (N + 1, 4, 2).
-        slopes: Bezier coefficients of the slope; shape (N + 1, 3).
-        step: largest change of heading between points, rad.
 
     Returns:
         Points (n, 2), and the exact headings there (n,), rad.
@@ -371,11 +327,7 @@ def rolled_turns(points: Array, angles: Array, radius: float) -> Array:
 
     Rolling preserves lengths. A line at the angle a to x is then curved out of the plane by cos(a)^2 / `radius`
     (Euler's theorem), in addition to its curvature in the plane; the two are orthogonal and add as root sum of squares.
-
-    Args:
-        points: points whose headings hardly differ from one to the next; shape (n, 2).
-        angles: angles to the x axis there; shape (n,), rad.
-        radius: radius of the cylinder, in the unit of the points.
+    The headings (n,) of the points (n, 2) must hardly differ from one to the next.
     """
     curvature = np.cos(angles) ** 2 / radius
     return (curvature[1:] + curvature[:-1]) / 2 * np.hypot(*np.diff(points, axis=0).T)
@@ -418,10 +370,6 @@ def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:
 
     The polyline must not cross itself: the smallest distance is then between a vertex and a segment, or between two
     points exactly `FOLD` gaps apart.
-
-    Args:
-        line: vertices; shape (n, 2).
-        gap: distance to keep.
 
     Returns:
         Distance, and the middle (2,) of the two points; None if all keep the gap.

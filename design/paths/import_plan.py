@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from padforge.design.common.validation import InputError, check_float
+from padforge.design.common.validation import InputError
 from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Ints, Morphology
 from padforge.design.paths.curves import add_spare_knots, flatten
@@ -38,32 +38,20 @@ _MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the
 
 @dataclass(frozen=True)
 class ImportedFibre:
-    """A curve that became a fibre.
+    """A curve that became a fibre."""
 
-    Attributes:
-        name: name of the curve in the drawing.
-        end_shift_mm: distance by which its ends were moved to the fibre's.
-        max_error_mm: largest distance of fibre and curve on the pad.
-    """
-
-    name: str
-    end_shift_mm: float
-    max_error_mm: float
+    name: str  # of the curve in the drawing
+    end_shift_mm: float  # distance by which its ends were moved to the fibre's
+    max_error_mm: float  # largest distance of fibre and curve on the pad
 
 
 @dataclass(frozen=True)
 class ImportedPlan:
-    """A drawing that became a pad.
-
-    Attributes:
-        pad: the pad.
-        fibres: in the order of the pad's fibres.
-        placement: how the drawing was positioned on the pad.
-    """
+    """A drawing that became a pad."""
 
     pad: Morphology
-    fibres: tuple[ImportedFibre, ...]
-    placement: str
+    fibres: tuple[ImportedFibre, ...]  # in the order of the pad's fibres
+    placement: str  # how the drawing was positioned on the pad
 
 
 @dataclass(frozen=True)
@@ -82,16 +70,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
     The curves are those whose layer, group or name begins with fibre, horizontal or vertical, or all open curves. The
     border is what is named pad. Without one the drawing is positioned where the ends fit best: its origin in the middle
     or in a corner of the pad, or the middle of its curves in the middle. What lies beyond the pad is ignored.
-
-    Args:
-        path: an .svg or .dxf.
-        layout: layout of the pad.
-        tolerance_mm: tolerance of ends and of paths.
-
-    Raises:
-        InputError: a file that is no such drawing, naming curve and position.
     """
-    tolerance_mm = check_float("tolerance_mm", tolerance_mm, 1e-3, 10)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: ends in {path.suffix or 'nothing'}, allowed are {' and '.join(READERS)}")
