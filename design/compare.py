@@ -50,12 +50,9 @@ class Variant:
 def read_variants(
     sources: Sequence[Path], vary: Sequence[str], load_spec: Callable[[Path | None], Spec]
 ) -> list[Variant]:
-    """Return the pads to compare: morphologies, and settings under every combination of varied values.
+    """Return the pads to compare: morphologies, and settings (.toml) under every combination of varied values.
 
-    Args:
-        sources: settings (.toml) and morphologies; the default settings if empty.
-        vary: varied settings as TOML, such as "pad.grid=3,4,6"; they apply to settings only.
-        load_spec: loads settings from a file, or the default ones.
+    These are TOML, such as "pad.grid=3,4,6", and apply to settings only, the default ones if there are no sources.
 
     Raises:
         InputError: an invalid file, key or value, two variants of one name, fewer than two variants, or more than

@@ -62,13 +62,8 @@ def split_axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
 def assemble_knots(inner: Array, layout: Layout | None = None) -> Array:
     """Complete fibres from inner knots: sort them along the axis, separate coincident ones, add the fixed ends.
 
-    Args:
-        inner: knots in any order; shape (..., F, N, 2), grid units on the pad.
-        layout: layout of the F fibres; a square one if None.
-
-    Returns:
-        Knots that satisfy `Morphology`; shape (..., F, N + 2, 2). Knots at one coordinate along the axis are moved by
-        the least step that keeps the curve a graph (1e-9 grid units, far below any printer's resolution).
+    Knots (..., F, N, 2) in any order become (..., F, N + 2, 2) that satisfy `Morphology`; the layout is square if None.
+    Those at one coordinate are moved by the least step that keeps the curve a graph, far below a printer's resolution.
     """
     layout = check_layout(inner.shape[-3], layout)
     knots = np.empty((*inner.shape[:-2], inner.shape[-2] + 2, 2))
@@ -275,8 +270,6 @@ class Morphology:
                 raise InputError(f"knots have shape {knots.shape}, expected (H + V, N + 2, 2)")
             knots = knots if is_square else knots * layout.spacing  # pitches to grid units
             return cls.from_layout(knots, layout, document.get("provenance", {}))
-        except InputError:
-            raise
         except (KeyError, TypeError, OverflowError) as error:
             raise InputError(f"no valid morphology ({error!r})") from error
         except ValueError as error:

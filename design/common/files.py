@@ -69,11 +69,7 @@ def reraise_write_error(path: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be created in `folder`, or that it can be created itself.
-
-    Raises:
-        InputError: a file is in the way, or the permissions forbid it.
-    """
+    """Check that files can be created in `folder`, or that it can be created itself."""
     with reraise_write_error(folder):
         existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
         if not existing.is_dir():
@@ -242,13 +238,8 @@ def _temporary(
 def atomic_file(path: Path) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path beside it, with its suffix, which replaces it on success.
 
-    The temporary file exists, is empty and locked; write into it rather than replace it.
-
-    Args:
-        path: the destination; a path that is temporary itself is yielded as it is.
-
-    Raises:
-        InputError: `path` cannot be written, as on a full disk.
+    The temporary file exists, is empty and locked; write into it rather than replace it. A path that is temporary
+    itself is yielded as it is.
     """
     if path.name.startswith(UNFINISHED):
         yield path
@@ -306,14 +297,8 @@ def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Replace a set of files together: yield an empty folder, whose files move to `folder` on success.
 
     On failure `folder` is as it was before. If the run is killed while the files move, or one of them cannot be moved,
-    all functions of this module read the new files, and the next run completes the move.
-
-    Args:
-        folder: the destination, created if needed.
-        without: names of files in `folder` that are removed as the others come.
-
-    Raises:
-        InputError: `folder` cannot be written.
+    all functions of this module read the new files, and the next run completes the move. Files named in `without` are
+    removed as the others come.
     """
     with reraise_write_error(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -54,13 +54,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
     def __init__(
         self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler], token: str, option: str
     ) -> None:
-        """Bind the port.
-
-        Args:
-            address: host and port to listen on; port 0 for any that is free.
-            handler: of a connection.
-            token: what a client must know; "" for none.
-            option: of the command line, by which another port is chosen.
+        """Bind the port, 0 for any that is free; `option` of the command line chooses another one.
 
         Raises:
             InputError: the address cannot be used, or other machines can connect without a token of some length.
@@ -149,15 +143,9 @@ class LocalPage(ConnectionServer):
         host: str = HOST,
         token: str = "",
     ) -> None:
-        """Bind the port.
+        """Bind the port for a page with one <script> and one <style>, as `page_text` returns it.
 
-        Args:
-            port: to listen on; 0 for any that is free.
-            page: HTML with one <script> and one <style>, as `page_text` returns it.
-            handlers: what takes the posts of the page, by address; called from several threads at once.
-            max_post_bytes: size limit of a post.
-            host: address to listen on.
-            token: required from clients, see `ConnectionServer`.
+        `handlers` take its posts by address, and are called from several threads at once.
         """
         self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
         self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"

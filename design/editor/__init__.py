@@ -40,7 +40,6 @@ class _EditHistory:
 
     @property
     def paths(self) -> Paths:
-        """The current paths."""
         return self.states[self.index]
 
     def do(self, paths: Paths, gesture: str = "") -> None:
@@ -59,22 +58,14 @@ class _EditHistory:
 class EditSession:
     """A pad being edited; thread-safe.
 
-    Attributes:
-        out: the file to save to; the next free name if another program wrote to it after the session began, or other
-            files were made from the pad saved there.
+    Its file `out` becomes the next free name if another program wrote to it after the session began, or other files
+    were made from the pad saved there.
     """
 
     def __init__(
         self, spec: "Spec", source: Path | None, out: Path, publish: Callable[[dict[str, Any]], None], force: bool
     ) -> None:
-        """Load the pad to edit.
-
-        Args:
-            spec: settings to evaluate it by.
-            source: file of a morphology; straight fibres if None.
-            out: file to save to.
-            publish: sends a view to all pages.
-            force: whether to replace a pad from which other files beside it were made.
+        """Load the pad to edit, straight fibres without a `source`; `publish` sends a view to all pages.
 
         Raises:
             InputError: invalid settings, an unreadable pad, or other files were made from the pad at `out`.
@@ -120,9 +111,6 @@ class EditSession:
         "add" takes a fibre and optionally a position, "remove" a fibre and a knot, "undo" and "redo" nothing. Fibres
         and inner knots count from 1. Edits of one gesture are undone together.
 
-        Args:
-            body: the edit as JSON.
-
         Returns:
             The new view; InputError for an invalid edit, which changes nothing.
         """
@@ -152,11 +140,7 @@ class EditSession:
             return self._update(fibre, selected)
 
     def save(self, body: bytes) -> Mapping[str, Any]:
-        """Write the pad to `out`, atomically, and return the new view; `body` is ignored.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write the pad to `out`, atomically, and return the new view; `body` is ignored."""
         with self._lock:
             replaces = self._out_is_ours and (self._force or not self.unsaved or not find_dependents(self.out))
             if self.out.is_file() and not replaces:

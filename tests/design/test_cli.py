@@ -171,10 +171,9 @@ def test_check_applies_keep_outs_of_settings(here):
         assert CliRunner().invoke(design, ["check", "pad.json"]).exit_code == code
 
 
-@pytest.mark.parametrize("pitch_mm", [5.0, (20.0, 8.0)])
-def test_plan_draws_keep_outs_and_half_width_of_contact(pitch_mm):
+def test_plan_draws_keep_outs_and_half_width_of_contact():
     holes = [((-3.0, 1.0), (2.0, 1.0), (0.0, 4.0)), [[5, 5], [6, 5], [6, 6], [5, 6]]]
-    patches = draw_plan(Morphology.straight(2, pitch_mm), Contact(), (), holes).axes[0].patches
+    patches = draw_plan(Morphology.straight(2, (20.0, 8.0)), Contact(), (), holes).axes[0].patches
     drawn = [patch.get_xy()[:-1].tolist() for patch in patches if isinstance(patch, Polygon)]
     assert drawn == [np.array(hole).tolist() for hole in holes]
     (press,) = (patch for patch in patches if isinstance(patch, Circle))

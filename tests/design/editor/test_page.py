@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import chdir, contextmanager
+from contextlib import chdir
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -63,10 +63,10 @@ def pad(tmp_path: Path) -> Path:
     return path
 
 
-@contextmanager
-def at_work(folder: Path, *arguments: str) -> Iterator[Program]:
+@pytest.fixture
+def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
     """The command, which is gone afterwards whatever fails meanwhile."""
-    program = Program(folder, *arguments)
+    program = Program(tmp_path, "pad.json")
     try:
         yield program
     finally:
@@ -74,27 +74,11 @@ def at_work(folder: Path, *arguments: str) -> Iterator[Program]:
         program.process.communicate()
 
 
-@pytest.fixture
-def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
-    with at_work(tmp_path, "pad.json") as program:
-        yield program
-
-
 def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, tmp_path: Path, pad: Path) -> None:
     before = pad.read_bytes()
     assert "saves to pad-edited.json" in program.said
-    first = program.ask(do="undo")
-    port = program.origin.rpartition(":")[2]
-    move = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0}'
-    refused = [
-        program.post("/edit", move, Host="elsewhere.example", Origin="http://elsewhere.example"),
-        program.post("/edit", move, Origin=f"http://127.0.0.1:{int(port) + 1}"),
-        program.post("/edit", b" " * 100_000 + move),
-        program.post("/edit", b"[" * 4000),
-    ]
-    assert [status for status, _ in refused] == [403, 403, 413, 400]
-    assert not any(b"Traceback" in answer for _, answer in refused)
-    assert program.ask(do="undo")["fibres"] == first["fibres"]
+    assert program.post("/edit", b'{"do": "undo"}', Origin="http://elsewhere.example")[0] == 403
+    assert program.post("/edit", b"[" * 4000)[0] == 400
     program.ask(do="add", fibre=1)
     assert program.post("/save", b"{}")[0] == 200
     program.ask(do="undo")
@@ -104,15 +88,6 @@ def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pad-edited.json", "pad.json"]
     assert Morphology.load(tmp_path / "pad-edited.json").knots.shape == (4, 6, 2)
     assert pad.read_bytes() == before
-
-
-@pytest.mark.slow
-def test_editor_announces_file_it_replaces(tmp_path: Path, pad: Path) -> None:
-    with at_work(tmp_path, "pad.json", "--out", "pad.json") as program:
-        assert program.said.endswith("saves to pad.json in place of its content\n")
-        assert program.post("/save", b"{}")[0] == 200
-        code, said = program.end()
-    assert (code, "discarded" in said) == (130, False)
 
 
 def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path) -> None:
