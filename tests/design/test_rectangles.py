@@ -122,10 +122,9 @@ def test_rectangle_file_round_trip(tmp_path_factory, pad, data):
 
 PAD = Morphology.random(Layout.create((1, 2), (8.0, 15.0)), 2, seed=0)
 WRONG = [
-    *({"fibres": value} for value in ([2, 1], 3, ["1", "2"], [0, 0], None)),
-    *({"pitch_mm": value} for value in ([8.0, -1], [8.0], None)),
+    *({"fibres": value} for value in ([2, 1], 3, ["1", "2"], [0, 0])),
+    *({"pitch_mm": value} for value in ([8.0, -1], [8.0])),
     *({"knots": value} for value in ([], "many", Morphology.straight(2).to_dict()["knots"])),
-    {"format": "padforge-morphology/1"},
 ]
 
 
