@@ -122,6 +122,7 @@ REFUSED = [
     (f'{PATHS}<path id="again" d="M-20-6.01 20-6.01"/>', "w0 and again: both are horizontal 2"),
     (instead("M -20 -6 C 30 0 -30 0 20 -6"), r"w0: turns back at \(.*\) mm, expected .* along x"),
     (instead("M -20 -6 L 0 -40 L 20 -6"), r"w0: leaves the pad at"),
+    (instead("M -20 -6 L 10 -6"), r"w0: runs from .*, 10 mm from where horizontal 2 ends"),
     (instead("M -20 -3 L 20 -3"), r"w0: runs from \(-20.0, 3.0\) mm to \(20.0, 3.0\) mm, 3 mm from"),
     ('<rect id="pad" width="1" height="7"/>' + PATHS, "pad is drawn 1 by 7, expected the shape of 40 by 36"),
     (PATHS + "".join(f'<line x1="-20" y1="-6" x2="{x}" y2="0"/>' for x in (-18, -17)), "more than two"),
@@ -173,6 +174,7 @@ def test_import_refuses_hostile_files_in_one_line(tmp_path: Path, content: bytes
         with pytest.raises(InputError, match=re.escape(str(path))) as refused:
             import_plan(path, LAYOUT, 0.05)
         assert "root:" not in str(refused.value)
+        assert b"<!ENTITY" not in content or name == "plan.dxf" or "declares entities" in str(refused.value)
     with pytest.raises(InputError, match=r"allowed are \.svg and \.dxf"):
         import_plan(tmp_path / "plan.pdf", LAYOUT, 0.05)
 
