@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from padforge.design.settings import PadSettings
 
 EDIT_PORT = 8322
-POLL_S = 0.2
-"""Period of checking for Ctrl-C where the system does not wake a waiting thread, s."""
-MIN_SHOWN_MM = 5e-4
-"""Smallest shift of a fibre's ends that `import` prints, mm."""
+POLL_S = 0.2  # period of checking for Ctrl-C where the system does not wake a waiting thread, s
+MIN_SHOWN_MM = 5e-4  # smallest shift of a fibre's ends that `import` prints, mm
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 twin_option = click.option(
     "--twin",
@@ -223,7 +221,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     from padforge.design.common.server import LocalPage, page_text
     from padforge.design.common.validation import InputError
 
-    from .editor.session import EditSession, free_name
+    from .editor import EditSession, free_name
 
     out = out or free_name(common.pad_folder(pad) / ("edited.json" if pad is None else f"{pad.stem}-edited.json"))
     if out.suffix.lower() != ".json":

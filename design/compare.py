@@ -3,6 +3,7 @@
 import itertools
 import re
 import tomllib
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,29 +24,21 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
-MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)
-"""Sections that a design depends on, and so may be varied."""
+MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # what a design depends on, and so may be varied
+# names that no file can have on Windows
 WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
-"""Names that no file can have on Windows."""
-
+# makes the mould of a pad into a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
-"""Makes the mould of a pad into a folder, and returns its costs by the keys of COSTS."""
 COSTS = {"mould_ml": "mould (ml)", "silicone_ml": "silicone (ml)", "failed": "failed checks"}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A pad to compare: settings to design it by, or a finished morphology.
+    """A pad to compare: settings to design it by, or a finished morphology."""
 
-    Attributes:
-        name: name in tables and figures.
-        spec: settings.
-        pad: the finished morphology; None if it is to be designed.
-    """
-
-    name: str
+    name: str  # in tables and figures
     spec: Spec
-    pad: Morphology | None = None
+    pad: Morphology | None = None  # None if it is to be designed
 
     @property
     def folder(self) -> str:
@@ -57,12 +50,9 @@ class Variant:
 def read_variants(
     sources: Sequence[Path], vary: Sequence[str], load_spec: Callable[[Path | None], Spec]
 ) -> list[Variant]:
-    """Return the pads to compare: morphologies, and settings under every combination of varied values.
+    """Return the pads to compare: morphologies, and settings (.toml) under every combination of varied values.
 
-    Args:
-        sources: settings (.toml) and morphologies; the default settings if empty.
-        vary: varied settings as TOML, such as "pad.grid=3,4,6"; they apply to settings only.
-        load_spec: loads settings from a file, or the default ones.
+    These are TOML, such as "pad.grid=3,4,6", and apply to settings only, the default ones if there are no sources.
 
     Raises:
         InputError: an invalid file, key or value, two variants of one name, fewer than two variants, or more than
@@ -77,9 +67,9 @@ def read_variants(
             continue
         spec, source = load_spec(path), [] if path is None else [path.stem]
         for combination in itertools.product(*varied):
-            tables: dict[str, dict[str, Any]] = {}
+            tables = defaultdict[str, dict[str, Any]](dict)
             for section, key, value in combination:
-                tables.setdefault(section, {})[key] = value
+                tables[section][key] = value
             labels = [f"{key} {str(value).strip('()').replace(', ', ' x ')}" for _, key, value in combination]
             variants.append(Variant(", ".join([*source, *labels]) or "defaults", spec.replaced(tables)))
     folders = [variant.folder.casefold() for variant in variants]  # macOS and Windows ignore case
@@ -115,13 +105,6 @@ def compare(
 
     A pad is evaluated by a small network on responses with scatter, under its own contact and on its own sensed area,
     beside straight fibres of the same layout (`errors_by_contact`).
-
-    Args:
-        variants: pads to compare.
-        out: folder of the comparison.
-        options: how each search is run.
-        seed: seed of the searches, the scatter and the networks; that of `[search]` if None.
-        make_pad: makes the mould of a pad.
 
     Returns:
         The document: a row per variant, with errors in mm with 0, 1, ... failed fibres.

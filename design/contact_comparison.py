@@ -13,7 +13,6 @@ import numpy as np
 
 from padforge.design.common.files import provenance, write_json
 from padforge.design.common.profiling import stage
-from padforge.design.common.validation import check_int
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import SimulatedPresses
@@ -33,13 +32,10 @@ if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
-PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)
-"""Standard deviations of the sensitivity profiles, about Gaussian, that are tried."""
-SIDE, N_TEST, HIDDEN = 32, 500, 20
-"""Training presses a side, test presses, and neurons: the 50 published ones overfit the scatter, and err a tenth more
-in more time."""
-MAX_FAILURES, SUBSETS = 3, 4
-"""Failed fibres at most, and sets of a size: enough to tell pads apart by a tenth of their error."""
+PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
+SIDE, N_TEST = 32, 500  # training presses a side, test presses
+HIDDEN = 20  # neurons: the 50 published ones overfit the scatter, and err a tenth more in more time
+MAX_FAILURES, SUBSETS = 3, 4  # failed fibres, and sets of a size: pads that differ by a tenth are told apart
 
 
 @dataclass(frozen=True)
@@ -73,15 +69,8 @@ def errors_by_contact(
 ) -> list[ContactErrors]:
     """Compute mean errors of a small network for pads of one layout under every contact, contact by contact.
 
-    Args:
-        pads: by name.
-        contacts: by name.
-        size: says what is pressed.
-        scatter: of responses.
-        seed: of presses, scatter and networks.
-        subsets: most sets of failed fibres of a size.
+    At most `subsets` sets of failed fibres of each size are tried.
     """
-    seed = check_int("seed", seed, 0, 2**64 - 1)
     fibres = size.layout.fibres
     failures = [failure_subsets(fibres, number, subsets) for number in range(min(MAX_FAILURES, fibres - 1) + 1)]
     rows = []
@@ -114,14 +103,7 @@ def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
-    """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others.
-
-    Args:
-        spec: settings of the pad, the contact and the scatter.
-        pad: the design.
-        out: folder of `contacts.json`.
-        seed: that of `[search]` if None.
-    """
+    """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others."""
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)
     contacts = alternative_contacts(design_contact(spec, settings))

@@ -5,15 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.files import (
-    atomic_files,
-    check_replaceable,
-    provenance,
-    read_json,
-    reraise_as_input_error,
-    sha256,
-    write_json,
-)
+from padforge.design.common import files
 from padforge.design.common.parallel import Checkpoints
 from padforge.design.common.plotting import save_figure
 from padforge.design.common.profiling import stage
@@ -35,10 +27,8 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
-SIGNIFICANT = 0.05
-"""Relative difference of expected errors from which trained networks agree which pad is better."""
-MAX_VIOLATIONS = 10
-"""Violations that the summary lists."""
+SIGNIFICANT = 0.05  # relative difference of expected errors from which trained networks agree which pad is better
+MAX_VIOLATIONS = 10  # violations that the summary lists
 
 
 def run_design(
@@ -74,7 +64,7 @@ def run_design(
     """
     settings, start, origin = _read_request(spec, overrides, start_from, twin)
     path, checkpoints, regenerated = out / "morphology.json", out / "search", {"design.json", *regenerated}
-    check_replaceable(path, origin, regenerated, force)
+    files.check_replaceable(path, origin, regenerated, force)
     options = replace(options or SearchOptions(), keep_in=checkpoints)
     if twin is None:
         result = search(*settings, origin=start, run=options)
@@ -93,16 +83,16 @@ def run_design(
         "stopped": result.stopped,
         "provenance": origin,
     }
-    with stage("figures"), atomic_files(out) as folder:
+    with stage("figures"), files.atomic_files(out) as folder:
         pad, contact = settings[:2]
         Morphology.from_layout(result.morphology.knots, pad.layout, origin).save(folder / path.name)
         # checked again: an interrupted search with the same settings may end with another pad
-        check_replaceable(path, folder / path.name, regenerated, force)
-        document["morphology_sha256"] = sha256(folder / path.name)
+        files.check_replaceable(path, folder / path.name, regenerated, force)
+        document["morphology_sha256"] = files.sha256(folder / path.name)
         figure = draw_plan(result.morphology, contact, result.violations, pad.keep_out_mm)
         for name in ("design.svg", "design.png"):
             save_figure(figure, folder / name)
-        write_json(folder / "design.json", document)
+        files.write_json(folder / "design.json", document)
     on_written(result)
     if not result.stopped:
         for states in (checkpoints, *(state_folders(checkpoints).values() if twin else ())):
@@ -113,12 +103,9 @@ def run_design(
 def check_design(
     spec: "Spec", out: Path, overrides: Mapping[str, Any], regenerated: Collection[str] = (), force: bool = False
 ) -> None:
-    """Check the arguments of `run_design` without searching.
-
-    Raises:
-        InputError: invalid settings, or the pad in `out` is in use.
-    """
-    check_replaceable(out / "morphology.json", _read_request(spec, overrides)[-1], {"design.json", *regenerated}, force)
+    """Check the arguments of `run_design` without searching."""
+    origin = _read_request(spec, overrides)[-1]
+    files.check_replaceable(out / "morphology.json", origin, {"design.json", *regenerated}, force)
 
 
 def _read_request(
@@ -137,15 +124,15 @@ def _read_request(
         overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
     sections = pad, design_contact(spec, settings), settings, rules
-    origin = provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
+    origin = files.provenance("padforge design", settings.seed, inputs, packages=("torch", "pymoo"))
     origin["settings"] = {section.section(): section.model_dump(mode="json") for section in sections}
     return sections, start, origin
 
 
 def load_result(out: Path) -> SearchResult:
     """Load the result of a search from the folder of a pad; InputError if a file is damaged."""
-    document = read_json(out / "design.json", FORMAT)
-    with reraise_as_input_error(out / "design.json"):
+    document = files.read_json(out / "design.json", FORMAT)
+    with files.reraise_as_input_error(out / "design.json"):
         violations = [Violation(**violation) for violation in document["violations"]]
         list(map(str, violations))  # fails on values of the wrong type
         return SearchResult(
@@ -162,12 +149,7 @@ def load_result(out: Path) -> SearchResult:
 
 
 def summary_lines(result: SearchResult, out: Path) -> list[str]:
-    """Summarise a search in a few lines of text: expected errors beside those of straight fibres, and broken rules.
-
-    Args:
-        result: the result.
-        out: folder it was written to.
-    """
+    """Summarise a search in a few lines of text: expected errors beside those of straight fibres, and broken rules."""
     violations = [f"  broken: {violation}" for violation in result.violations[:MAX_VIOLATIONS]]
     remaining = len(result.violations) - len(violations)
     stopped = f" ({result.stopped}: the best so far)" if result.stopped else ""
@@ -181,10 +163,8 @@ def summary_lines(result: SearchResult, out: Path) -> list[str]:
 
 
 def _error_lines(result: SearchResult) -> list[str]:
-    designed, straight = (
-        [value for term, value in terms.items() if term.startswith("expected_error")]
-        for terms in (result.terms, result.straight)
-    )
+    designed = [value for term, value in result.terms.items() if term.startswith("expected_error")]
+    straight = [value for term, value in result.straight.items() if term.startswith("expected_error")]
     lines = [
         f"  expected error  {_format_errors(designed)} mm with {_format_errors(range(len(designed)))} failed fibres",
         f"  straight fibres {_format_errors(straight)} mm",

@@ -26,30 +26,16 @@ from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Coun
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"
-"""Format of a square pad of one pitch, which every version reads, and of any other pad."""
-MIN_SPAN = 1e-12
-"""Smallest distance of knots along a fibre's axis, grid units: slopes remain numbers that can be squared."""
-MAX_COORDINATE = 1e6
-"""Largest absolute coordinate of a position, grid units or mm."""
-MAX_KNOTS = 2**22
-"""Knots of a pad, over all its fibres."""
-MAX_SAMPLES = 2**20
-"""Points that a fibre is sampled at."""
-MARGIN = 1e-3
-"""Smallest distance of an inner knot to the pad's edge, grid units, as in the published optimiser."""
+SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"  # of a square pad of one pitch, of any other
+MIN_SPAN = 1e-12  # smallest distance of knots along an axis, grid units: slopes remain numbers that can be squared
+MAX_COORDINATE = 1e6  # largest absolute coordinate of a position, grid units or mm
+MAX_KNOTS = 2**22  # knots of a pad, over all its fibres
+MAX_SAMPLES = 2**20  # points that a fibre is sampled at
+MARGIN = 1e-3  # smallest distance of an inner knot to the pad's edge, grid units, as in the published optimiser
 
 
 def check_layout(n_fibres: int, layout: Layout | None = None) -> Layout:
-    """Return the layout of `n_fibres`, for None that of a square pad of the default pitch.
-
-    Args:
-        n_fibres: number of fibres.
-        layout: their layout.
-
-    Raises:
-        InputError: a number that is not the layout's, or without a layout no even number.
-    """
+    """Return the layout if it is one of `n_fibres`; for None that of a square pad of the default pitch."""
     if layout is None:
         if n_fibres % 2 or not n_fibres:
             raise InputError(f"these are {n_fibres} fibres, expected 2 M: as many horizontals as verticals")
@@ -65,12 +51,7 @@ def fibre_ends(layout: Layout) -> Ends:
 
 
 def split_axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
-    """Return the coordinates along and across each fibre's axis, both (P, F, n).
-
-    Args:
-        knots: x and y; shape (P, F, n, 2).
-        horizontals: number of fibres, the first ones, that run along x.
-    """
+    """Return the coordinates along and across each fibre's axis, both (P, F, n), of knots (P, F, n, 2)."""
     along, across = (
         np.concatenate([knots[:, :horizontals, :, axis], knots[:, horizontals:, :, 1 - axis]], axis=1)
         for axis in (0, 1)
@@ -81,13 +62,8 @@ def split_axes(knots: Array, horizontals: int) -> tuple[Array, Array]:
 def assemble_knots(inner: Array, layout: Layout | None = None) -> Array:
     """Complete fibres from inner knots: sort them along the axis, separate coincident ones, add the fixed ends.
 
-    Args:
-        inner: knots in any order; shape (..., F, N, 2), grid units on the pad.
-        layout: layout of the F fibres; a square one if None.
-
-    Returns:
-        Knots that satisfy `Morphology`; shape (..., F, N + 2, 2). Knots at one coordinate along the axis are moved by
-        the least step that keeps the curve a graph (1e-9 grid units, far below any printer's resolution).
+    Knots (..., F, N, 2) in any order become (..., F, N + 2, 2) that satisfy `Morphology`; the layout is square if None.
+    Those at one coordinate are moved by the least step that keeps the curve a graph, far below a printer's resolution.
     """
     layout = check_layout(inner.shape[-3], layout)
     knots = np.empty((*inner.shape[:-2], inner.shape[-2] + 2, 2))
@@ -294,8 +270,6 @@ class Morphology:
                 raise InputError(f"knots have shape {knots.shape}, expected (H + V, N + 2, 2)")
             knots = knots if is_square else knots * layout.spacing  # pitches to grid units
             return cls.from_layout(knots, layout, document.get("provenance", {}))
-        except InputError:
-            raise
         except (KeyError, TypeError, OverflowError) as error:
             raise InputError(f"no valid morphology ({error!r})") from error
         except ValueError as error:

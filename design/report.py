@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import Violation
 
-FORMAT = "padforge-design/2"
-"""Format of design.json."""
-TOLERANCE = 1e-3
-"""Deviation of drawn curves from exact ones, grid units."""
+FORMAT = "padforge-design/2"  # format of design.json
+TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
 
 def draw_plan(
@@ -125,11 +123,9 @@ def _half_width_mm(profile: Sequence[tuple[float, float]]) -> float:
 
 
 def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section on the fibres: plan, expected errors, design rules, terms of the objective.
+    """Write the section on the fibres of a folder and its `design.json`: plan, expected errors, rules, objective.
 
-    Args:
-        folder: folder of the pad.
-        document: its `design.json`; if it is damaged, any of the built-in errors is raised.
+    A damaged document raises any of the built-in errors.
     """
     terms, violations, settings = document["terms"], document["violations"], document["provenance"]["settings"]
     enforced, search = settings["rules"]["enforce"], settings["search"]
@@ -200,12 +196,7 @@ def contact_line(document: Mapping[str, Any]) -> str:
 
 
 def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Return how the simulated errors in a `contacts.json` depend on the contact model.
-
-    Args:
-        folder: folder of the pad.
-        document: its `contacts.json`; if it is damaged, any of the built-in errors is raised.
-    """
+    """Return how the simulated errors in a `contacts.json` depend on the contact model; see `design_sections`."""
     rows, scatter = document["rows"], document["scatter"]
     levels = range(max(len(row["errors_mm"]) for row in rows))
     lead = (

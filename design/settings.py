@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -17,16 +17,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from scipy.interpolate import CubicSpline
 
-DEFAULT_PITCH_MM = 11.25
-"""Pitch of the built pad."""
-MAX_FIBRES = 1024
-"""Fibres of one family, also of a pad made of tiles."""
+DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
+MAX_FIBRES = 1024  # fibres of one family, also of a pad made of tiles
 
 Pair = tuple[float, float]
-Counts = int | tuple[int, int]
-"""M horizontals and M verticals, or (horizontals, verticals)."""
-Pitch = float | Pair
-"""Distance of neighbouring fibre ends, mm: in both directions, or along x and along y."""
+Counts = int | tuple[int, int]  # M horizontals and M verticals, or (horizontals, verticals)
+Pitch = float | Pair  # distance of neighbouring fibre ends, mm: in both directions, or along x and along y
 
 
 @dataclass(frozen=True)
@@ -59,12 +55,7 @@ class Layout:
 
     @classmethod
     def create(cls, fibres: "Counts | Layout", pitch_mm: Pitch = DEFAULT_PITCH_MM) -> "Layout":
-        """Create a layout from its short form.
-
-        Args:
-            fibres: M, (H, V), or a layout, which is returned as it is.
-            pitch_mm: one pitch, or (along x, along y), mm.
-        """
+        """Create a layout of M or (H, V) fibres and a pitch or (along x, along y); return a layout as it is."""
         if isinstance(fibres, Layout):
             return fibres
         if not isinstance(fibres, tuple | list):
@@ -149,13 +140,12 @@ class Layout:
         return f"{self.horizontals} + {self.verticals} fibres, pitch {' and '.join(pitches)} mm"
 
 
+# profile measured on the built pad: a Gaussian with a smooth end instead of tails
 MEASURED_PROFILE = (
     *((0.0, 1.0), (2.25, 0.936), (4.5, 0.768), (6.75, 0.551), (9.0, 0.346)),
     *((11.25, 0.188), (13.5, 0.085), (15.75, 0.029), (18.5625, 0.0)),
 )
-"""Profile measured on the built pad: a Gaussian with a smooth end instead of tails."""
-MEASURED_STD_MM = 6.2
-"""Standard deviation of that Gaussian."""
+MEASURED_STD_MM = 6.2  # standard deviation of that Gaussian
 MAX_OVERSHOOT = 0.15
 """Largest excursion of a spline from the range of the two points it connects, as a share of the largest weight. Smooth
 profiles stay far below; beyond it a signal would depend on weights that nobody measured."""
@@ -186,8 +176,6 @@ class Contact(Settings):
             spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be negative. MEASURED_PROFILE if
             nothing of the contact is stated.
     """
-
-    MOVED: ClassVar[Mapping[str, str]] = {"reach": "sensitivity_profile"}
 
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
     sides: Sides = Field(default=30, description='sides D of the object, or "circle", of a shape')
@@ -266,12 +254,9 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
                 )
 
 
-PUBLISHED_CONTACT = Contact(radius=0.6)
-"""Contact of the paper: a polygon of 30 sides, Manhattan lengths. Default of functions that reproduce the paper."""
-TRACK_WIDTH_MM = 0.4
-"""Default width of a track."""
-MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM
-"""Smallest limit on the common length of two tracks: two straight ones at a right angle have two widths in common."""
+PUBLISHED_CONTACT = Contact(radius=0.6)  # of the paper: a polygon of 30 sides, Manhattan lengths
+TRACK_WIDTH_MM = 0.4  # default width of a track
+MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM  # two straight tracks at a right angle have two widths in common
 
 MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
@@ -312,27 +297,18 @@ MaxFailures = Annotated[
     BeforeValidator(as_tuple),
 ]
 
-WEIGHTS = (1.0, 1e-7, 5e-6)
-"""Published alpha, beta and gamma: weights of entropy, sharpness and disorder (formula (5))."""
-SIDE = 7
-"""Presses per row and column in the published search."""
-LEVELS = 4096
-"""Levels of the published 12-bit converter."""
+WEIGHTS = (1.0, 1e-7, 5e-6)  # published alpha, beta and gamma: weights of entropy, sharpness and disorder (formula (5))
+SIDE = 7  # presses per row and column in the published search
+LEVELS = 4096  # levels of the published 12-bit converter
 MAX_LEVELS = 2**24
 
 
 class Scatter(NamedTuple):
-    """Scatter of a fibre's response from press to press at one position.
+    """Scatter of a fibre's response from press to press at one position."""
 
-    Attributes:
-        floor: standard deviation of the additive part, as a share of a straight fibre's full scale, > 0.
-        share: standard deviation of the part proportional to the response, as a share of it.
-        common: share of the proportional part's variance that all fibres have in common.
-    """
-
-    floor: float
-    share: float = 0.0
-    common: float = 0.0
+    floor: float  # standard deviation of the additive part, as a share of a straight fibre's full scale, > 0
+    share: float = 0.0  # standard deviation of the part proportional to the response, as a share of it
+    common: float = 0.0  # share of the proportional part's variance that all fibres have in common
 
     def sample_gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
         """Sample the factor, about 1, on each response; the shape is (presses, fibres)."""
@@ -351,8 +327,6 @@ class SearchSettings(Settings):
         noise: additive scatter; this and the next two default to the scatter measured on a built pad.
         contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
     """
-
-    MOVED: ClassVar[Mapping[str, str]] = {"lost": "max_failures"}
 
     method: Literal["descent", "genetic"] = Field(
         default="descent", description="gradients of the expected error, or the genetic search as published"
@@ -398,11 +372,9 @@ class SearchSettings(Settings):
 
 Millimetres = Annotated[float, Field(gt=0, le=1e6)]
 Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
-Rectangle = tuple[tuple[float, float], tuple[float, float]]
-"""Low and high corner, grid units."""
+Rectangle = tuple[tuple[float, float], tuple[float, float]]  # low and high corner, grid units
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-Corners = tuple[tuple[Coordinate, Coordinate], ...]
-"""Corners of a polygon, mm from the middle of the pad."""
+Corners = tuple[tuple[Coordinate, Coordinate], ...]  # corners of a polygon, mm from the middle of the pad
 BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
 Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
@@ -412,11 +384,8 @@ def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
     """Return the low and the high corner of what is pressed, grid units.
 
     The outermost of V verticals lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
-    is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0.
-
-    Args:
-        layout: positions of the fibre ends.
-        sensed_mm: "beyond" (0.5 to V + 0.5 pitches), "fibres" (1 to V, as published), or (width, height), mm.
+    is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0. Otherwise "beyond" is 0.5 to
+    V + 0.5 pitches, and "fibres" 1 to V, as published.
     """
     sides = []
     for axis, count in enumerate((layout.verticals, layout.horizontals)):
@@ -461,8 +430,6 @@ class PadSettings(Settings):
             and lies on the pad at least in part.
         bent_radius_mm: None for a flat pad. It is cast flat in either case.
     """
-
-    MOVED: ClassVar[Mapping[str, str]] = {"fibre_diameter_mm": "[fibre] diameter_mm"}
 
     grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), where the next two do not say")
     horizontals: Count = Field(default=None, description='fibres along x, or as "grid"; 0: a strip of fibres across it')
@@ -556,8 +523,8 @@ def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:
 
 
 PUBLISHED_PAD, PUBLISHED_SEARCH = PadSettings(sensed_mm="fibres"), SearchSettings(noise=0.005, scatter=0.0)
+# settings of the paper, by section, where they differ from the defaults
 PUBLISHED: Mapping[str, Settings] = {
     **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
-"""Settings of the paper, by section, where they differ from the defaults."""

@@ -25,12 +25,9 @@ FORMAT = "padforge-twin/3"
 MAX_VOLTS, MAX_MM = 1e3, 1e4
 MAX_INFORMATION_GAIN = 1e3
 MAX_CHANNELS = 1024
-MAX_ELEMENT_LENGTH = 0.02
-"""Length of the elements that an as-built fibre is summed over, grid units."""
-MAX_ELEMENTS = 2**23
-"""Elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million."""
-UNIFORM_SENSITIVITY_STD = 0.02
-"""Standard deviation of the log-sensitivity along a fibre up to which it counts as uniform."""
+MAX_ELEMENT_LENGTH = 0.02  # length of the elements that an as-built fibre is summed over, grid units
+MAX_ELEMENTS = 2**23  # elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million
+UNIFORM_SENSITIVITY_STD = 0.02  # of the log-sensitivity along a fibre: up to there it counts as uniform
 
 
 def _check_fields(instance: object, **bounds: tuple[float, float]) -> None:
@@ -48,19 +45,12 @@ def _check_pair(name: str, values: tuple[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class PlanTransform:
-    """Similarity transform from the arm's frame to the plan: scale R(turn) mirror(p) + shift.
+    """Similarity transform from the arm's frame to the plan: scale R(turn) mirror(p) + shift."""
 
-    Attributes:
-        mirrored: whether x is reversed, as on a casting that was turned over.
-        turn_deg: rotation, counter-clockwise.
-        shift_mm: translation, from the middle of the pad.
-        scale: mm of the plan per mm of the arm, > 0.
-    """
-
-    mirrored: bool = False
-    turn_deg: float = 0.0
-    shift_mm: tuple[float, float] = (0.0, 0.0)
-    scale: float = 1.0
+    mirrored: bool = False  # whether x is reversed, as on a casting that was turned over
+    turn_deg: float = 0.0  # rotation, counter-clockwise
+    shift_mm: tuple[float, float] = (0.0, 0.0)  # translation, from the middle of the pad
+    scale: float = 1.0  # mm of the plan per mm of the arm, > 0
 
     def __post_init__(self) -> None:
         check_type("mirrored", self.mirrored, bool)
@@ -80,21 +70,13 @@ class PlanTransform:
 
 @dataclass(frozen=True)
 class TwinChannel:
-    """A channel of the recording.
+    """A channel of the recording."""
 
-    Attributes:
-        channel: index, from 0.
-        fibre: index of the fibre it reads, from 0 as in the knots; None where no fibre explains it.
-        gain_v: V for a relative stretch of 1; below 0 where a press lowers the reading.
-        noise_v: standard deviation of a response that neither position nor history explains, V.
-        explained: explained share of the variance of responses on held-out presses; 0 without a fibre.
-    """
-
-    channel: int
-    fibre: int | None
-    gain_v: float
-    noise_v: float
-    explained: float
+    channel: int  # index, from 0
+    fibre: int | None  # index of the fibre it reads, from 0 as in the knots; None where no fibre explains it
+    gain_v: float  # V for a relative stretch of 1; below 0 where a press lowers the reading
+    noise_v: float  # standard deviation of a response that neither position nor history explains, V
+    explained: float  # explained share of the variance of responses on held-out presses; 0 without a fibre
 
     def __post_init__(self) -> None:
         check_int("channel", self.channel, 0, MAX_CHANNELS)
@@ -105,17 +87,11 @@ class TwinChannel:
 
 @dataclass(frozen=True)
 class TwinScatter:
-    """Part of the scatter of responses that grows with them.
+    """Part of the scatter of responses that grows with them."""
 
-    Attributes:
-        share: standard deviation of a response from press to press, as a share of the response.
-        common: share of that variance that all channels have in common.
-        floor: standard deviation of the additive part, as a share of a channel's `noise_v`.
-    """
-
-    share: float = 0.0
-    common: float = 0.0
-    floor: float = 1.0
+    share: float = 0.0  # standard deviation of a response from press to press, as a share of the response
+    common: float = 0.0  # share of that variance that all channels have in common
+    floor: float = 1.0  # standard deviation of the additive part, as a share of a channel's `noise_v`
 
     def __post_init__(self) -> None:
         _check_fields(self, share=(0, 1), common=(0, 0.99), floor=(0, 1))
@@ -123,21 +99,13 @@ class TwinScatter:
 
 @dataclass(frozen=True)
 class TwinReadings:
-    """Noise, drift and hysteresis of the readings, for simulations.
+    """Noise, drift and hysteresis of the readings, for simulations."""
 
-    Attributes:
-        noise_mv: standard deviation of the white noise of a reading.
-        drift_mv: standard deviation of the drifting baseline.
-        hysteresis: residual response after a press, of opposite sign, as a share of its response.
-        hysteresis_s: time constant of its decay.
-        information_gain: Fisher information on the position in all readings of a press, as a multiple of that in the
-            twin's responses with their `noise_v`; 1 or more.
-    """
-
-    noise_mv: float
-    drift_mv: float
-    hysteresis: float
-    hysteresis_s: float
+    noise_mv: float  # standard deviation of the white noise of a reading
+    drift_mv: float  # standard deviation of the drifting baseline
+    hysteresis: float  # residual response after a press, of opposite sign, as a share of its response
+    hysteresis_s: float  # time constant of its decay
+    # Fisher information on the position in all readings of a press over that in the twin's responses with `noise_v`
     information_gain: float = 1.0
 
     def __post_init__(self) -> None:

@@ -39,13 +39,7 @@ force_option = click.option("--force", is_flag=True, help="Replace files that ot
 
 
 def out_option(default: str = "", what: str = "Folder for the results", file: bool = False) -> Callable[..., Any]:
-    """Make the option `--out`.
-
-    Args:
-        default: shown and used if the option is missing; "" where the command uses `pad_folder`.
-        what: of the help text.
-        file: whether the results are a file rather than a folder.
-    """
+    """Make the option `--out` for a folder or a file; its default is "" where the command uses `pad_folder`."""
     return click.option(
         "--out",
         type=click.Path(file_okay=file, dir_okay=not file, path_type=Path),
@@ -55,11 +49,7 @@ def out_option(default: str = "", what: str = "Folder for the results", file: bo
 
 
 def pad_folder(source: Path | None = None) -> Path:
-    """Return the folder for results without `--out`: that of the pad they belong to.
-
-    Args:
-        source: a morphology.json or the folder of a recording, both in the folder of their pad; NAME.mat for out/NAME.
-    """
+    """Return the folder for results without `--out`, that of the pad they belong to; of NAME.mat it is out/NAME."""
     if source is None:
         return Path("out/pad")
     if source.is_dir() or source.suffix.lower() == ".json":
@@ -112,12 +102,7 @@ def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> No
 
 
 def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0,)) -> list[str]:
-    """Format cells in aligned columns, a line per row; a short row ends in "-".
-
-    Args:
-        rows: cells, the header first.
-        text_columns: indices of the columns of words; others are of numbers, and right-aligned.
-    """
+    """Format cells in aligned columns, a line per row, numbers right-aligned; a short row ends in "-"."""
     columns = []
     for number, column in enumerate(zip_longest(*rows, fillvalue="-")):
         width = max(map(len, column))
@@ -131,10 +116,7 @@ INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     """Run a command line on the arguments of this process, errors as one line on stderr; return the exit code.
 
-    Args:
-        command: the root command.
-        name: of the program.
-        extras: optional dependencies that its commands need, by their first word; for others all of these.
+    `extras` are the optional dependencies that its commands need, by their first word; others need all of these.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
@@ -160,11 +142,6 @@ def _end_with_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        for word in sys.argv[1:]:  # a Python caller can pass what no shell can, and functions of the system fail on it
-            with suppress(UnicodeEncodeError):
-                if b"\0" not in os.fsencode(word):
-                    continue
-            raise InputError(f"{word!r}: holds characters that no argument can have")
         return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)

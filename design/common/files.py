@@ -69,11 +69,7 @@ def reraise_write_error(path: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be created in `folder`, or that it can be created itself.
-
-    Raises:
-        InputError: a file is in the way, or the permissions forbid it.
-    """
+    """Check that files can be created in `folder`, or that it can be created itself."""
     with reraise_write_error(folder):
         existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
         if not existing.is_dir():
@@ -242,13 +238,8 @@ def _temporary(
 def atomic_file(path: Path) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path beside it, with its suffix, which replaces it on success.
 
-    The temporary file exists, is empty and locked; write into it rather than replace it.
-
-    Args:
-        path: the destination; a path that is temporary itself is yielded as it is.
-
-    Raises:
-        InputError: `path` cannot be written, as on a full disk.
+    The temporary file exists, is empty and locked; write into it rather than replace it. A path that is temporary
+    itself is yielded as it is.
     """
     if path.name.startswith(UNFINISHED):
         yield path
@@ -294,12 +285,9 @@ def to_disk(handle: int) -> None:
 
 
 class _Note(NamedTuple):
-    """What an exchange does, and the inode numbers of its destination and of itself.
+    """What an exchange does."""
 
-    Neither an archive nor a copy preserves these, so that an exchange is carried out only where it was begun.
-    """
-
-    inodes: list[int]
+    inodes: list[int]  # of its destination and itself; no copy preserves these: it is carried out only where it began
     names: list[str]
     removed: list[str]
 
@@ -309,14 +297,8 @@ def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Replace a set of files together: yield an empty folder, whose files move to `folder` on success.
 
     On failure `folder` is as it was before. If the run is killed while the files move, or one of them cannot be moved,
-    all functions of this module read the new files, and the next run completes the move.
-
-    Args:
-        folder: the destination, created if needed.
-        without: names of files in `folder` that are removed as the others come.
-
-    Raises:
-        InputError: `folder` cannot be written.
+    all functions of this module read the new files, and the next run completes the move. Files named in `without` are
+    removed as the others come.
     """
     with reraise_write_error(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -427,11 +409,7 @@ def _read_note(folder: Path) -> _Note | None:
 
 
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
-    """Check that `path` is a file of limited size, rather than a pipe or device that may never end.
-
-    Returns:
-        Where to read it, see `resolve_exchange`.
-    """
+    """Return where to read a file of limited size (`resolve_exchange`); refuse a pipe or device, which may not end."""
     try:
         valid = resolve_exchange(path)
         status = valid.stat()
@@ -499,11 +477,7 @@ def provenance(
 ) -> dict[str, Any]:
     """Describe where a result comes from; without time and output folder, so that equal work gives equal bytes.
 
-    Args:
-        command: what made it.
-        seed: of its random choices.
-        inputs: files and folders it was made from; their digests are recorded.
-        packages: distributions whose versions are recorded besides those that every result depends on.
+    Recorded are digests of the files and folders it was made from, and versions of `packages` besides the usual ones.
     """
     return {
         "command": command,

@@ -7,7 +7,7 @@ import base64
 import hashlib
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -37,19 +37,12 @@ _RESULTS = ("pass", "warn", "fail")  # cells of these words are coloured
 
 @dataclass(frozen=True)
 class PageSection:
-    """A section of a page, listed in its contents.
+    """A section of a page, listed in its contents."""
 
-    Attributes:
-        title: heading, unique in the page.
-        body: HTML elements, made by the functions of this module.
-        figures: key figures for the head of the page, as (value, description).
-        script: JavaScript that runs once the page is loaded.
-    """
-
-    title: str
-    body: Sequence[str]
-    figures: Sequence[tuple[str, str]] = field(default=())
-    script: str = ""
+    title: str  # heading, unique in the page
+    body: Sequence[str]  # HTML elements, made by the functions of this module
+    figures: Sequence[tuple[str, str]] = ()  # key figures for the head of the page, as (value, description)
+    script: str = ""  # JavaScript that runs once the page is loaded
 
     @property
     def anchor(self) -> str:

@@ -178,9 +178,7 @@ def clear_stale_kernels(package: Path) -> None:
 class Checkpoints:
     """The states of the tasks of a search, each in a small file of arrays, from which they resume after a kill.
 
-    Attributes:
-        folder: created with the first state.
-        settings: what the search depends on, JSON by section and key; states of other settings are refused.
+    The folder is created with the first state; states of other settings, by section and key, are refused.
     """
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:

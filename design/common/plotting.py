@@ -15,12 +15,9 @@ CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float = 150) -> None:
-    """Save a figure atomically and byte-reproducibly (no dates, stable ids).
+    """Save a figure as .svg or .png, atomically and byte-reproducibly (no dates, stable ids).
 
-    Args:
-        figure: the figure.
-        path: .svg or .png; a PNG has a palette of 256 colours, a third of the size without visible difference.
-        dpi: resolution of a PNG.
+    A PNG has a palette of 256 colours, a third of the size without visible difference.
     """
     import matplotlib as mpl
     import numpy as np

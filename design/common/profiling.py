@@ -11,23 +11,11 @@ from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
 
+# libraries whose import takes noticeable time
 HEAVY = (
-    *(
-        "OCP",
-        "build123d",
-        "ezdxf",
-        "h5py",
-        "manifold3d",
-        "matplotlib",
-        "numba",
-        "numpy",
-        "pydantic",
-        "pymoo",
-        "rtde_control",
-    ),
-    *("scipy", "serial", "shapely", "torch", "trimesh"),
+    *("OCP", "build123d", "ezdxf", "h5py", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "pymoo"),
+    *("rtde_control", "scipy", "serial", "shapely", "torch", "trimesh"),
 )
-"""Libraries whose import takes noticeable time."""
 _OTHER = "elsewhere"
 
 

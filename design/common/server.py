@@ -28,8 +28,7 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 from padforge.design.common.page import TEMPLATES, read_resource
 from padforge.design.common.validation import InputError
 
-HOST = "127.0.0.1"
-"""The loopback interface; other addresses are served only with a token."""
+HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN, MAX_TOKEN = 16, 256  # characters
 MAX_CONNECTIONS = 64  # at once; far fewer than the files that a process may open
 POLL_S = 0.05  # interval at which a server checks whether it is to end
@@ -41,8 +40,8 @@ RETRY_MS = 1000  # after this time a browser that lost its connection tries agai
 HTTP_PORT = 80  # which browsers omit from the Host header
 _MAX_DISCARDED = 2**20  # bytes of a too long request that are read before it is refused: a sender reads no answer
 
+# takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use
 Handler = Callable[[bytes], Mapping[str, Any] | None]
-"""Takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use."""
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):
@@ -55,13 +54,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
     def __init__(
         self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler], token: str, option: str
     ) -> None:
-        """Bind the port.
-
-        Args:
-            address: host and port to listen on; port 0 for any that is free.
-            handler: of a connection.
-            token: what a client must know; "" for none.
-            option: of the command line, by which another port is chosen.
+        """Bind the port, 0 for any that is free; `option` of the command line chooses another one.
 
         Raises:
             InputError: the address cannot be used, or other machines can connect without a token of some length.
@@ -150,15 +143,9 @@ class LocalPage(ConnectionServer):
         host: str = HOST,
         token: str = "",
     ) -> None:
-        """Bind the port.
+        """Bind the port for a page with one <script> and one <style>, as `page_text` returns it.
 
-        Args:
-            port: to listen on; 0 for any that is free.
-            page: HTML with one <script> and one <style>, as `page_text` returns it.
-            handlers: what takes the posts of the page, by address; called from several threads at once.
-            max_post_bytes: size limit of a post.
-            host: address to listen on.
-            token: required from clients, see `ConnectionServer`.
+        `handlers` take its posts by address, and are called from several threads at once.
         """
         self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
         self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"
@@ -211,10 +198,7 @@ class LocalPage(ConnectionServer):
 def page_text(package: str, name: str, *parts: str) -> str:
     """Read a page that a package ships, and insert the style and script that all local pages share.
 
-    Args:
-        package: that ships the page.
-        name: file of the page.
-        parts: further files of the package; each stands in the page as a line `/* its name */`.
+    Further `parts` are files of the package; each stands in the page as a line `/* its name */`.
     """
     text = read_resource(package, name)
     for owner, part in [(TEMPLATES, "local_page.css"), (TEMPLATES, "local_page.js"), *((package, p) for p in parts)]:

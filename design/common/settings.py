@@ -6,7 +6,7 @@ import sys
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
@@ -23,9 +23,6 @@ class Settings(BaseModel):
     """A table of `pad.toml`: immutable, without unknown keys and NaN; the description of a field is its comment."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
-
-    MOVED: ClassVar[Mapping[str, str]] = {}
-    """Former keys of this table, and where they are now."""
 
     def __init__(self, **values: Any) -> None:
         try:
@@ -188,8 +185,6 @@ def _to_input_error(error: ValidationError, model: type[Settings], where: str) -
         return InputError(f"{where} {first['msg']}")
     key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
     if first["type"] == "extra_forbidden":
-        if moved := model.MOVED.get(str(first["loc"][0])):
-            return InputError(f"{where} {first['loc'][0]}: no such key, it is {moved} now")
         allowed = f", allowed are {', '.join(model.model_fields)}" if len(first["loc"]) == 1 else ""
         return InputError(f"{where} {'.'.join(map(str, first['loc']))}: no such key{allowed}")
     return InputError(f"{where} {key}: got {short_repr(first['input'])}, {first['msg'].lower()}")

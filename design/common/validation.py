@@ -51,9 +51,7 @@ _DISTRIBUTIONS |= dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde")
 def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
     """Say in one line how to install a missing library; None if no extra of padforge brings it.
 
-    Args:
-        error: of its import.
-        wanted: extras, separated by commas, that the command needs in any case.
+    `wanted` are extras, separated by commas, that the command needs in any case.
     """
     from importlib.metadata import PackageNotFoundError, requires
 

@@ -1,4 +1,4 @@
-"""Curves of a pad: PCHIP spans as Bezier curves, lengths, crossings, common stretches, bend radii and folds.
+"""Curves of a pad: PCHIP spans as Bezier curves, lengths, crossings, common stretches, bends, folds, spare knots.
 
 A fibre is a graph over its axis, so its heading (the angle of its tangent to the axis) stays within a right angle of 0,
 and it never crosses itself.
@@ -6,6 +6,7 @@ and it never crosses itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +17,15 @@ from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology, assemble_knots, split_axes
 from padforge.design.settings import Layout
 
-MAX_POINTS = 10**7
-"""Points that the curves of a pad are flattened to."""
-_ROUNDING = 1e-6
-"""Gap, relative to the width, up to which two intervals of a line are one stretch."""
-FOLD = np.pi / 2
-"""Points of a fibre keep the gap if they are `FOLD` gaps apart along it, half a turn of a circle one gap wide."""
+MAX_POINTS = 10**7  # points that the curves of a pad are flattened to
+_ROUNDING = 1e-6  # gap, relative to the width, up to which two intervals of a line are one stretch
+FOLD = np.pi / 2  # gaps along a fibre from which its points keep the gap: half a turn of a circle one gap wide
+# range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc
 UNFOLDED = 2 * np.arccos(1 / FOLD)
-"""Range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc."""
-_TINY = 1e-30
-"""Divides in position of the length of a segment whose ends coincide."""
+SPARE_LENGTH = 1e-4  # length of all spare knots of a fibre, grid units: far below what can be printed
+_TRIAL_POSITIONS = np.array([0.15, 0.3, 0.5, 0.7, 0.85])  # positions on a span at which a knot is tried
+_LEVEL_TOLERANCE = 1e-9  # rises below this are none: positions in a file in pitches are right to rounding
+_TINY = 1e-30  # divides in position of the length of a segment whose ends coincide
 
 
 def _hermite(pad: Morphology) -> tuple[Array, Array, Array]:
@@ -112,17 +112,11 @@ def lengths(pad: Morphology) -> Array:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Crossing of two fibres.
+    """Crossing of two fibres."""
 
-    Attributes:
-        first: index of the first fibre.
-        second: index of the second fibre, > first.
-        position: x and y, grid units.
-    """
-
-    first: int
-    second: int
-    position: tuple[float, float]
+    first: int  # index of a fibre
+    second: int  # index of the other one, > first
+    position: tuple[float, float]  # x and y, grid units
 
 
 def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> list[Crossing]:
@@ -160,10 +154,6 @@ def crossing_angles(pad: Morphology, crossings: Sequence[Crossing]) -> Array:
     """Compute the angles between the tangents at crossings of a horizontal with a vertical fibre, 0..90 degrees.
 
     Fibres that touch or run along each other have a common tangent, so their angle is 0.
-
-    Args:
-        pad: the fibres.
-        crossings: the n crossings; the first fibre is the horizontal one.
     """
     x, y = np.array([c.position for c in crossings]).reshape(-1, 2).T
     dy_dx = _slopes_at(pad, np.array([c.first for c in crossings], dtype=int), x)
@@ -181,13 +171,7 @@ def _slopes_at(pad: Morphology, fibre: NDArray[np.int_], at: Array) -> Array:
 
 
 def refine(knots: Array, count: int, layout: Layout) -> Array:
-    """Insert knots on the curves, in the middle of the longest spans, up to `count` inner knots a fibre.
-
-    Args:
-        knots: shape (F, n, 2) with n - 2 <= count, grid units.
-        count: inner knots per fibre.
-        layout: layout of the F fibres.
-    """
+    """Insert knots on the curves (F, n, 2), in the middle of the longest spans, up to `count` inner knots a fibre."""
     from scipy.interpolate import PchipInterpolator
 
     fibres = []
@@ -202,20 +186,77 @@ def refine(knots: Array, count: int, layout: Layout) -> Array:
     return assemble_knots(np.array(fibres)[:, 1:-1], layout)
 
 
+def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
+    """Give all fibres (n, 2) the same number of knots (F, n, 2) by adding spare ones that do not change the curve."""
+    n_knots = max(map(len, paths))
+    return np.stack([_add_spares(path, layout.family(i), n_knots - len(path)) for i, path in enumerate(paths)])
+
+
+def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
+    """Return the knots (n, 2) of each fibre of (F, n, 2), grid units, without spare ones."""
+    paths = []
+    for fibre, line in enumerate(knots):
+        step = np.abs(np.diff(line, axis=0))
+        axis = layout.family(fibre)
+        spare = (step[:, axis] <= SPARE_LENGTH * (1 + _LEVEL_TOLERANCE)) & (step[:, 1 - axis] <= _LEVEL_TOLERANCE)
+        spare[-1] = False
+        paths.append(line[np.append(True, ~spare)])
+    return paths
+
+
+def _add_spares(path: Array, axis: int, count: int) -> Array:
+    """Return a fibre with `count` more knots."""
+    if not count:
+        return path
+    at = _find_level_knot(path[:, axis], path[:, 1 - axis])
+    if at is None:
+        return _add_spares(_insert_knot_on_curve(path.tobytes(), axis), axis, count - 1)
+    step = min(SPARE_LENGTH, (path[at + 1, axis] - path[at, axis]) / 4) / count
+    spares = np.repeat(path[at : at + 1], count, axis=0)
+    spares[:, axis] += step * np.arange(1, count + 1)
+    return np.insert(path, at + 1, spares, axis=0)
+
+
+def _find_level_knot(along: Array, across: Array) -> int | None:
+    """Find the level knot, not next to an end, with the most room behind it; None if there is none."""
+    rise, room = np.diff(across), np.diff(along)
+    if not rise.any():
+        return int(np.argmax(room))
+    level = np.append(rise[0] == 0, rise[:-1] * rise[1:] <= 0)
+    level[[1, -1]] = False
+    return int(np.argmax(np.where(level, room, -1))) if level.any() else None
+
+
+@lru_cache(maxsize=256)  # an editor changes one fibre and leaves the others
+def _insert_knot_on_curve(path: bytes, axis: int) -> Array:
+    """Insert a knot on the curve of a fibre, knots (n, 2) as bytes, near an end, where it changes the curve least."""
+    from scipy.interpolate import PchipInterpolator
+
+    knots = np.frombuffer(path).reshape(-1, 2)
+    along, across = knots[:, axis], knots[:, 1 - axis]
+    curve = PchipInterpolator(along, across)
+    spans = sorted({0, 1, len(along) - 3, len(along) - 2} & set(range(len(along) - 1)))
+    positions = np.concatenate([along[k] + (along[k + 1] - along[k]) * _TRIAL_POSITIONS for k in spans])
+    dense = np.concatenate([np.linspace(along[k], along[k + 1], 33) for k in spans])
+    best, least = along, np.inf
+    for position in positions:
+        more = np.sort(np.append(along, position))
+        largest_change = float(np.abs(PchipInterpolator(more, curve(more))(dense) - curve(dense)).max())
+        if largest_change < least:
+            best, least = more, largest_change
+    result = np.empty((len(best), 2))
+    result[:, axis], result[:, 1 - axis] = best, curve(best)
+    result[[0, -1]] = knots[[0, -1]]
+    return result
+
+
 @dataclass(frozen=True)
 class CommonStretches:
-    """Stretches of lines that are entirely near another line, ordered by line, other line and position.
-
-    Attributes:
-        line: index of the line; shape (n,).
-        other: index of the line that it is near; shape (n,).
-        begin: arc length at the start, along `line`; shape (n,).
-        end: arc length at the end; shape (n,).
-    """
+    """Stretches (n,) of lines that are entirely near another line, ordered by line, other line and position."""
 
     line: NDArray[np.int_]
-    other: NDArray[np.int_]
-    begin: Array
+    other: NDArray[np.int_]  # the line that it is near
+    begin: Array  # arc length along `line`
     end: Array
 
     @property
@@ -225,14 +266,9 @@ class CommonStretches:
 
 
 def common_stretches(lines: Sequence[Array], others: Sequence[Array], width: float) -> CommonStretches:
-    """Find every stretch of `lines` that is nearer than `width` to one of `others`.
+    """Find every stretch of polylines (n, 2) that is nearer than `width` to one of `others`.
 
     Two straight lines that cross at an angle a have a stretch of 2 width / sin(a) in common.
-
-    Args:
-        lines: polylines (n, 2), one or more.
-        others: polylines (n, 2), one or more, in the same unit.
-        width: distance below which two lines count as running along each other.
     """
     near = find_near_intervals(*_concatenate(lines), *_concatenate(others), width)
     pair = near[:, 0].astype(int) * len(others) + near[:, 1].astype(int)
@@ -254,24 +290,18 @@ def _concatenate(lines: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
 
 
 def extreme_headings(slopes: Array) -> Array:
-    """Return headings (..., 2 n + 1), rad, at ends of spans and extremes of slope inside; monotone between them.
+    """Return headings (..., 2 n + 1), rad, at ends of spans and extremes of their slopes (..., n, 3) inside.
 
-    Args:
-        slopes: Bezier coefficients of each span's slope; shape (..., n, 3).
+    They are monotone between these.
     """
     pairs = np.stack([slopes[..., 0], quadratic(slopes, _stationary(slopes))], axis=-1)
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
 
 def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
-    """Sample one fibre so that it turns by at most `step` from point to point.
+    """Sample one fibre, its `beziers` and `slope_beziers`, so that it turns by at most `step`, rad, between points.
 
     Such points also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.
-
-    Args:
-        spans: Bezier control points; shape (N + 1, 4, 2).
-        slopes: Bezier coefficients of the slope; shape (N + 1, 3).
-        step: largest change of heading between points, rad.
 
     Returns:
         Points (n, 2), and the exact headings there (n,), rad.
@@ -297,11 +327,7 @@ def rolled_turns(points: Array, angles: Array, radius: float) -> Array:
 
     Rolling preserves lengths. A line at the angle a to x is then curved out of the plane by cos(a)^2 / `radius`
     (Euler's theorem), in addition to its curvature in the plane; the two are orthogonal and add as root sum of squares.
-
-    Args:
-        points: points whose headings hardly differ from one to the next; shape (n, 2).
-        angles: angles to the x axis there; shape (n,), rad.
-        radius: radius of the cylinder, in the unit of the points.
+    The headings (n,) of the points (n, 2) must hardly differ from one to the next.
     """
     curvature = np.cos(angles) ** 2 / radius
     return (curvature[1:] + curvature[:-1]) / 2 * np.hypot(*np.diff(points, axis=0).T)
@@ -344,10 +370,6 @@ def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:
 
     The polyline must not cross itself: the smallest distance is then between a vertex and a segment, or between two
     points exactly `FOLD` gaps apart.
-
-    Args:
-        line: vertices; shape (n, 2).
-        gap: distance to keep.
 
     Returns:
         Distance, and the middle (2,) of the two points; None if all keep the gap.

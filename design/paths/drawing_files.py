@@ -18,54 +18,34 @@ from padforge.design.morphology import Array
 if TYPE_CHECKING:
     from ezdxf.path import Path as BezierPath
 
-MAX_BYTES = 2**22
-"""Size of a drawing; drawings of fibres are far smaller."""
+MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
 MAX_POINTS = 200_000
-MAX_PARTS = 20_000
-"""Elements of a drawing, drawn or not."""
-MAX_CURVES = 5000
-"""Curves of a drawing before they are joined."""
-MAX_COORDINATE = 1e6
-"""Largest absolute coordinate, in units of the drawing."""
-FLATNESS = 1e-5
-"""Largest distance of curve and polyline, relative to the size of the curve."""
+MAX_PARTS = 20_000  # elements of a drawing, drawn or not
+MAX_CURVES = 5000  # curves of a drawing before they are joined
+MAX_COORDINATE = 1e6  # largest absolute coordinate, in units of the drawing
+FLATNESS = 1e-5  # largest distance of curve and polyline, relative to the size of the curve
 
 _MAX_REASON = 120
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
-_PAD = "pad"
-_JOIN_TOLERANCE = 1e-6
-"""Distance of ends that are one point, relative to the size of the drawing."""
+_JOIN_TOLERANCE = 1e-6  # distance of ends that are one point, relative to the size of the drawing
 
 
 @dataclass(frozen=True)
 class DrawnCurve:
-    """A curve of a drawing.
+    """A curve of a drawing."""
 
-    Attributes:
-        name: name in the file, or kind and number.
-        points: vertices; shape (n, 2), in units of the drawing, y upwards.
-        groups: names of the curve and of all groups or layers that contain it.
-        closed: whether it ends where it begins.
-    """
-
-    name: str
-    points: Array
-    groups: tuple[str, ...] = ()
+    name: str  # in the file, or kind and number
+    points: Array  # vertices; shape (n, 2), in units of the drawing, y upwards
+    groups: tuple[str, ...] = ()  # names of the curve and of all groups or layers that contain it
     closed: bool = False
 
 
 @dataclass
 class DrawnPlan:
-    """Content of a drawing.
+    """Content of a drawing."""
 
-    Attributes:
-        unit_mm: unit of the drawing, mm.
-        note: assumptions that were made.
-        curves: its curves.
-    """
-
-    unit_mm: float = 1.0
-    note: str = ""
+    unit_mm: float = 1.0  # of the drawing
+    note: str = ""  # assumptions that were made
     curves: list[DrawnCurve] = field(default_factory=list)
     _parts: int = 0
     _points: int = 0
@@ -92,8 +72,10 @@ class DrawnPlan:
     def border(self) -> Array | None:
         """Low and high corner (2, 2) of what is named "pad"; None if nothing is."""
         outlines = [curve.points for curve in self.curves if _is_pad(curve)]
-        points = np.vstack(outlines) if outlines else None
-        return None if points is None else np.array([points.min(axis=0), points.max(axis=0)])
+        if not outlines:
+            return None
+        points = np.vstack(outlines)
+        return np.array([points.min(axis=0), points.max(axis=0)])
 
     @property
     def fibres(self) -> list[DrawnCurve]:
@@ -109,7 +91,7 @@ class DrawnPlan:
 
 
 def _is_pad(curve: DrawnCurve) -> bool:
-    return _PAD in (group.lower() for group in curve.groups)
+    return "pad" in (group.lower() for group in curve.groups)
 
 
 def _join(curves: list[DrawnCurve]) -> Iterator[DrawnCurve]:
@@ -398,15 +380,9 @@ def read_dxf(path: Path) -> DrawnPlan:
 
 
 def _check_bounds(entity: Any) -> None:
-    """Refuse an entity that would take long to flatten."""
+    """Refuse an entity that would take long to flatten; `_flatten` refuses the coordinates of others."""
     points: Any = []
     match entity.dxftype():
-        case "LINE":
-            points = [entity.dxf.start, entity.dxf.end]
-        case "ARC":
-            points = [entity.dxf.center, [entity.dxf.radius]]
-        case "ELLIPSE":
-            points = [entity.dxf.center, entity.dxf.major_axis]
         case "LWPOLYLINE":
             points = list(entity.get_points("xyb"))
         case "POLYLINE":

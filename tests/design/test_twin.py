@@ -69,21 +69,18 @@ def test_as_built_stretch_matches_the_contact_model(twin):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"channels": (TwinChannel(0, 9, 0.1, 0.0, 0.9),)}, "a channel reads fibre 9"),
         ({"channels": tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))}, "two channels read the same fibre"),
         ({"weight": WEIGHT[:-1]}, "weight of sensitivity_profile"),
-        ({"weight": np.where(WEIGHT == 0, 0.1, WEIGHT)}, "the last weight must be 0"),
         ({"as_built_mm": (None,)}, "as_built_mm must have"),
         ({"sensitivity": (None, None, None, None)}, "sensitivity must have"),
-        ({"noise": float("nan")}, "noise"),
         ({"sensed_mm": (20.0, 0.0)}, "sensed_mm"),
-        ({"presses": 0}, "presses"),
     ],
 )
-def test_twin_refuses_inconsistent_values(twin, change, said):
-    with pytest.raises(InputError, match=said):
+def test_twin_refuses_inconsistent_values(twin, change, message):
+    with pytest.raises(InputError, match=message):
         replace(twin, **change)
 
 
@@ -92,18 +89,10 @@ def test_twin_refuses_inconsistent_values(twin, change, said):
     [
         ({"format": "padforge-design/1"}, "padforge-twin/3"),
         ({"channels": [{"gain": 1}]}, "no valid twin"),
-        ({"morphology": {}}, "morphology"),
         ({"frame__scale": -1}, "scale"),
-        ({"readings__information_gain": 0.5}, "information_gain"),
-        ({"readings__hysteresis": 1.0}, "hysteresis"),
-        ({"readings__drift_mv": -1}, "drift_mv"),
         ({"readings__noise_mv": "much"}, "noise_mv"),
-        ({"readings__warmth": 3}, "warmth"),
         # a file of some kilobytes would take gigabytes, and an hour for a few presses
-        (
-            {"as_built_mm": [[[-9e3, -9e3], [9e3, 9e3]] * 40, None, None, None]},
-            r"as_built_mm are 2.*e\+06 mm long in all",
-        ),
+        ({"as_built_mm": [[[-9e3, -9e3], [9e3, 9e3]] * 40, None, None, None]}, r"as_built_mm are 2.*e\+06 mm long"),
     ],
 )
 def test_twin_load_refuses_other_files_in_one_line(twin, tmp_path, change, message):

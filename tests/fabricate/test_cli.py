@@ -66,7 +66,7 @@ def test_check_of_a_morphology(morphology):
         (
             "pad.json",
             "[pad]\nfibre_diameter_mm = 0.4",
-            "[pad] fibre_diameter_mm: no such key, it is [fibre] diameter_mm",
+            "[pad] fibre_diameter_mm: no such key, allowed are grid",
         ),
         ("pad.json", '[mould]\nlevels = "two"', "2 crossings"),
         ("absent.json", "", "absent.json"),

@@ -40,12 +40,13 @@ def test_atomic_file_keeps_the_old_file_when_writing_fails(tmp_path):
 def test_pipes_are_neither_read_nor_replaced(tmp_path):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
-    with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
-        files.read_json(pipe, "x/1")
-    with pytest.raises(InputError, match=r"pipe\.json: cannot be written"):
-        files.write_json(pipe, {})
-    with pytest.raises(InputError, match=r"pipe\.json: cannot be read \(a pipe or device"):
-        files.sha256(pipe)
+    for use, problem in (
+        (lambda: files.read_json(pipe, "x/1"), r"read \(a pipe or device"),
+        (lambda: files.sha256(pipe), r"read \(a pipe or device"),
+        (lambda: files.write_json(pipe, {}), "written"),
+    ):
+        with pytest.raises(InputError, match=rf"pipe\.json: cannot be {problem}"):
+            use()
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
 
@@ -183,20 +184,16 @@ def test_find_unchanged_compares_digests_in_one_folder_and_sha256_covers_folders
         files.write_json(path, {})
     digest = files.sha256(tmp_path / "a")
     (tmp_path / "b").write_text("changed")
-    names = ["a", "b", "c", "../a", "/", "", "..", "in", "in/c", str(tmp_path / "a"), "a\0", "a" * 1000, "\ud800"]
+    names = ["a", "b", "c", "../a", "", "in", "in/c", str(tmp_path / "a"), "a\0", "a" * 1000, "\ud800"]
     assert files.find_unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
     assert files.find_unchanged(tmp_path, {"a": None, "c": [1]}) == set()
-    (tmp_path / "a").write_text("1")
     before = files.sha256(tmp_path)
     (tmp_path / "a").write_text("2")
     assert files.sha256(tmp_path) != before
-    (tmp_path / "a").write_text("1")
+    files.write_json(tmp_path / "a", {})
     assert files.sha256(tmp_path) == before
-    (tmp_path / "a").rename(tmp_path / "b")
+    (tmp_path / "a").rename(tmp_path / os.fsdecode(b"\xff") if sys.platform == "linux" else tmp_path / "d")
     assert files.sha256(tmp_path) != before
-    if sys.platform == "linux":
-        (tmp_path / os.fsdecode(b"\xff")).touch()
-        assert len(files.sha256(tmp_path)) == 64
 
 
 @pytest.fixture
@@ -243,9 +240,8 @@ PAD = "morphology.json"
 
 def document(path: Path, inputs: object = None, **more: object) -> Path:
     path.parent.mkdir(exist_ok=True)
-    files.write_json(
-        path, {"format": "padforge-some/1", "provenance": {"command": path.name, "inputs": inputs}, **more}
-    )
+    provenance = {"command": path.name, "inputs": inputs}
+    files.write_json(path, {"format": "padforge-some/1", "provenance": provenance, **more})
     return path
 
 
@@ -273,9 +269,7 @@ def test_find_dependents_follows_chains(folder: Path) -> None:
     assert files.find_dependents(folder / "edited.json") == files.find_dependents(folder / "contacts.json") == []
 
 
-@pytest.mark.parametrize(
-    "content", ["", "3", "[]", '{"provenance": 3}', '{"provenance": {"inputs": [1]}}', "[" * 10**5]
-)
+@pytest.mark.parametrize("content", ["", "[]", '{"provenance": 3}', '{"provenance": {"inputs": [1]}}', "[" * 10**5])
 def test_find_dependents_ignores_other_files(folder: Path, content: str) -> None:
     before = files.find_dependents(folder / PAD)
     (folder / "other.json").write_text(content)

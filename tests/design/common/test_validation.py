@@ -28,16 +28,12 @@ def test_checks_accept_values_at_their_bounds():
         (lambda x: errors.check_int("n", x, 2, 5), (1, 6, True, 3.0), "n is .*, allowed is a whole number from 2 to 5"),
         (
             lambda x: errors.check_float("x", x, 0.0, 2.5),
-            (-1e-9, 2.5 + 1e-9, math.nan, math.inf, True, "1", 10**400, None),
+            (-1e-9, 2.5 + 1e-9, math.nan, True, "1", 10**400),
             r"x is .*, allowed is 0 to 2\.5",
         ),
         (lambda x: errors.check_array("xs", [0, x], 3), (3.5, -3.5), r"xs hold 3\.5, allowed is -3 to 3"),
-        (
-            lambda x: errors.check_array("xs", x),
-            ([1, [2]], "a", [1j], [None], [math.nan]),
-            "xs (are|hold) .*, expected",
-        ),
-        (lambda x: errors.check_path("file", x), ("", "a\0b", LONGEST + "a", 3, None), "file is .*, expected a path"),
+        (lambda x: errors.check_array("xs", x), ([1, [2]], "a", [1j], [math.nan]), "xs (are|hold) .*, expected"),
+        (lambda x: errors.check_path("file", x), ("", "a\0b", LONGEST + "a", 3), "file is .*, expected a path"),
     ],
 )
 def test_checks_refuse_values_beyond_their_bounds_and_of_other_types(check, values, message):
@@ -50,7 +46,6 @@ def test_checks_refuse_values_beyond_their_bounds_and_of_other_types(check, valu
     ("module", "wanted", "said"),
     [
         ("torch.nn", "train", "torch, which is not installed: pip install 'padforge[train]'"),
-        ("torch", "", "torch, which is not installed: pip install 'padforge[design]'"),
         ("distributed", "design", "distributed, which is not installed: pip install 'padforge[cluster]'"),
         ("serial", "train", "pyserial, which is not installed: pip install 'padforge[rig]'"),
         ("PIL", "design,cad,train", "pillow, which is not installed: pip install 'padforge[design,cad,train]'"),

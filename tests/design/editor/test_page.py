@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import chdir, contextmanager
+from contextlib import chdir
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -63,10 +63,10 @@ def pad(tmp_path: Path) -> Path:
     return path
 
 
-@contextmanager
-def at_work(folder: Path, *arguments: str) -> Iterator[Program]:
+@pytest.fixture
+def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
     """The command, which is gone afterwards whatever fails meanwhile."""
-    program = Program(folder, *arguments)
+    program = Program(tmp_path, "pad.json")
     try:
         yield program
     finally:
@@ -74,32 +74,11 @@ def at_work(folder: Path, *arguments: str) -> Iterator[Program]:
         program.process.communicate()
 
 
-@pytest.fixture
-def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
-    with at_work(tmp_path, "pad.json") as program:
-        yield program
-
-
 def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, tmp_path: Path, pad: Path) -> None:
     before = pad.read_bytes()
     assert "saves to pad-edited.json" in program.said
-    first = program.ask(do="undo")
-    port = program.origin.rpartition(":")[2]
-    move = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": 0, "y_mm": 0}'
-    refused = [
-        program.post("/edit", move, Origin="http://elsewhere.example"),
-        program.post("/edit", move, Host="elsewhere.example", Origin="http://elsewhere.example"),
-        program.post("/edit", move, Origin=f"http://127.0.0.1:{int(port) + 1}"),
-        program.post("/save", b"{}", Origin="null"),
-        program.post("/shell", move),
-        program.post("/edit", b" " * 100_000 + move),
-        program.post("/edit", b"[" * 4000),
-        program.post("/edit", move.replace(b'"x_mm": 0', b'"x_mm": NaN')),
-        program.post("/edit", b'{"do": "move", "a": ' + b'{"a": ' * 500 + b"1" + b"}" * 501),
-    ]
-    assert [status for status, _ in refused] == [403, 403, 403, 403, 404, 413, 400, 400, 400]
-    assert not any(b"Traceback" in answer for _, answer in refused)
-    assert program.ask(do="undo")["fibres"] == first["fibres"]
+    assert program.post("/edit", b'{"do": "undo"}', Origin="http://elsewhere.example")[0] == 403
+    assert program.post("/edit", b"[" * 4000)[0] == 400
     program.ask(do="add", fibre=1)
     assert program.post("/save", b"{}")[0] == 200
     program.ask(do="undo")
@@ -111,33 +90,19 @@ def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, 
     assert pad.read_bytes() == before
 
 
-@pytest.mark.slow
-def test_editor_announces_file_it_replaces(tmp_path: Path, pad: Path) -> None:
-    with at_work(tmp_path, "pad.json", "--out", "pad.json") as program:
-        assert program.said.endswith("saves to pad.json in place of its content\n")
-        program.ask(do="add", fibre=1)
-        assert program.post("/save", b"{}")[0] == 200
-        code, said = program.end()
-    assert (code, "discarded" in said) == (130, False)
-    assert Morphology.load(pad).knots.shape == (4, 6, 2)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
+def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path) -> None:
+    for arguments, message in (
         (["missing.json"], "missing.json"),
         (["pad.json", "--out", "pad.mat"], r"--out is pad.mat, allowed is a name that ends in \.json"),
         (["pad.json", "--out", "pad.json/x.json"], r"pad.json: cannot be written"),
-    ],
-)
-def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path, arguments: list[str], told: str) -> None:
-    with chdir(tmp_path):
-        assert re.search(told, str(CliRunner().invoke(edit, arguments).exception))
+    ):
+        with chdir(tmp_path):
+            assert re.search(message, str(CliRunner().invoke(edit, arguments).exception))
 
 
 @pytest.mark.slow
 def test_editor_does_not_import_torch() -> None:
-    code = "import padforge.design.editor.session, sys; sys.exit('torch' in sys.modules)"
+    code = "import padforge.design.editor, sys; sys.exit('torch' in sys.modules)"
     root = Path(__file__).resolve().parents[3]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 

@@ -4,12 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, Spec, check_rules
-from padforge.design.cli import design
 from padforge.design.common.files import sha256, write_json
-from padforge.design.editor.session import EditSession
+from padforge.design.editor import EditSession
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 
 
@@ -98,16 +96,13 @@ def test_save_writes_view_with_provenance(tmp_path):
     assert saved["fibres"][0]["knots"][1][1] == 2.0
     assert pad.provenance["command"] == "padforge design edit"
     assert pad.provenance["inputs"] == {"pad.json": read}
-    broken = [str(rule) for rule in check_rules(pad, RulesSettings())]
-    assert [rule["text"] for rule in saved["rules"]] == broken
-    checked = CliRunner().invoke(design, ["check", str(tmp_path / "out.json")], catch_exceptions=False)
-    assert checked.output.splitlines() == broken
+    assert [rule["text"] for rule in saved["rules"]] == [str(rule) for rule in check_rules(pad, RulesSettings())]
     assert (editor.unsaved, ask(editor, do="undo")["unsaved"]) == (False, True)
 
 
 MOVE = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0, "gesture": %s}'
 HOSTILE = (
-    *(b"", b"nonsense", b"[]", b"null", b"4", b"[" * 4000, b'{"do":' * 600, b'"\\ud800"', b"\xff\xfe", b"9" * 4000),
+    *(b"", b"[]", b"[" * 4000, b'{"do":' * 600, b'"\\ud800"', b"\xff\xfe", b"9" * 4000),
     *(b"{}", b'{"do": "shell"}', b'{"do": ["move"]}', b'{"do": "move"}', b'{"do": "remove", "fibre": 1}'),
     *(b'{"do": "remove", "fibre": 1, "knot": %d}' % knot for knot in (-1, 0, 6, 10**30)),
     *(b'{"do": "add", "fibre": %s}' % fibre for fibre in (b"0", b"5", b"1.5", b"true", b"NaN", b'"1"', b"[1]")),
@@ -124,15 +119,12 @@ def test_invalid_edits_are_refused_and_change_nothing(tmp_path):
         assert len(str(error.value)) < 300, body
     assert len(views) == 2
     assert ask(editor, do="undo")["fibres"] == views[1]["fibres"]
-    editor, _ = session(tmp_path, Morphology.straight(1))
-    assert ask(editor, do="add", fibre=1)["selected"] == (0, 1)
-    ask(editor, do="remove", fibre=1, knot=1)
-    with pytest.raises(InputError, match="no inner knot"):
-        ask(editor, do="remove", fibre=1, knot=1)
-    full_pad = Morphology.random(1, 64, 0)
-    full, _ = session(tmp_path, full_pad)
-    with pytest.raises(InputError, match="64 knots"):
-        ask(full, do="add", fibre=1)
+    for pad, edit, message in (
+        (Morphology.straight(1), {"do": "remove", "fibre": 1, "knot": 1}, "no inner knot"),
+        (Morphology.random(1, 64, 0), {"do": "add", "fibre": 1}, "64 knots"),
+    ):
+        with pytest.raises(InputError, match=message):
+            ask(session(tmp_path, pad)[0], **edit)
     editor, _ = session(tmp_path, grid=1)
     move(editor, 1, 1, 0.0, 3.0)
     (tmp_path / "out.json").mkdir()

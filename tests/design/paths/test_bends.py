@@ -1,7 +1,8 @@
-"""Bends and folds against closed forms and slow oracles."""
+"""Bends, folds and common stretches against closed forms and slow oracles."""
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
@@ -12,6 +13,7 @@ from padforge.design.paths.curves import (
     UNFOLDED,
     bend_radius,
     beziers,
+    common_stretches,
     extreme_headings,
     fold_gap,
     slope_beziers,
@@ -113,3 +115,18 @@ def test_fold_gap_of_corners_is_their_opening():
     for turn, folds in ((UNFOLDED - 1e-6, False), (UNFOLDED + 1e-6, True)):
         line = np.array([[-np.cos(turn / 2), -np.sin(turn / 2)], [0, 0], [np.cos(turn / 2), -np.sin(turn / 2)]])
         assert (fold_gap(line, 0.5) is not None) == folds
+
+
+@pytest.mark.parametrize(("knots", "seed"), [(3, 0), (9, 1), (21, 2)])
+def test_common_stretches_of_tangled_fibres_match_buffers(knots, seed):
+    pad = Morphology.random(3, knots, seed)
+    lines = [pad.to_mm(line) for line in flatten(pad, 1e-4)]
+    shared = common_stretches(lines[:3], lines[3:], 0.4)
+    assert len(shared.length) > 9
+    for line in range(3):
+        for other in range(3):
+            near = shapely.buffer(shapely.LineString(lines[3 + other]), 0.4, quad_segs=200)
+            within = shapely.intersection(shapely.LineString(lines[line]), near)
+            lengths = [part.length for part in shapely.get_parts(shapely.line_merge(within))]
+            ours = shared.length[(shared.line == line) & (shared.other == other)]
+            assert sorted(ours) == pytest.approx(sorted(lengths), abs=2e-3)

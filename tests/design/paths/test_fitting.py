@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
-from padforge.design.paths.fitting import SPARE_LENGTH, add_spare_knots, fit_knots, remove_spare_knots
+from padforge.design.paths.curves import SPARE_LENGTH, add_spare_knots, remove_spare_knots
+from padforge.design.paths.import_plan import fit_knots
 
 
 def off(knots, points):
