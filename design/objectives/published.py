@@ -19,7 +19,6 @@ from padforge.design.contact import (
     signals,
 )
 from padforge.design.kernels import published as kernels
-from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import (
     LEVELS,
@@ -50,17 +49,6 @@ def joint_entropy(levels: Array) -> float:
 def published_sharpness(levels: Array) -> float:
     """Return Z of formula (4): the sum over columns of |second difference| along the press order."""
     return float(kernels.sum_second_differences(np.asarray(levels, dtype=np.float64)))
-
-
-def disorder_area(pad: Morphology) -> float:
-    """Compute the area by which fibres of a family stand in the wrong order, squared grid units.
-
-    The sum over pairs i < j of a family of the integral of max(curve_i - curve_j, 0), exact on the PCHIP curves; the
-    published disorder C approaches it times (samples - 1) / (M + 1).
-    """
-    along, across, ends, _ = fibre_axes(pad)
-    slopes = population_slopes(along, across)[0]
-    return max(0.0, float(kernels.integrate_disorder(along[0], across[0], slopes, ends.horizontals)))
 
 
 def idle_share(signals: Array) -> float:

@@ -13,7 +13,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.optimize import brentq
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.contact import fibre_axes, signals_and_spans
+from padforge.design.common.profiling import profiled
+from padforge.design.contact import fibre_axes
 from padforge.design.kernels.measured_signals import PRECISION
 from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, Layout
@@ -98,8 +99,9 @@ def test_profile_signals_match_the_oracle(length):
 def test_profile_signals_and_gradient_are_0_beyond_its_end():
     """Of a small pad, and of a large one pressed near one corner."""
     contact = contact_of(PROFILES["broad"])
-    found, looked_at = signals_and_spans(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
-    assert looked_at == 4  # fibres 1 and 2 of both families
+    with profiled() as profile:
+        found = signals(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
+    assert profile.counts["spans, press by press"][0] == 4  # fibres 1 and 2 of both families
     assert not found[1].any()
     assert found[0, 0] == found[0, 4] > 0 > found[0, 1] == found[0, 5]
     assert not found[0, [2, 3, 6, 7]].any()

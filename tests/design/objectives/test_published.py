@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.benchmarks import objective
+from padforge.benchmarks import contact as objective
 from padforge.design import Morphology, published_objective, signals
 from padforge.design.contact import serpentine_presses
 from padforge.design.objectives.published import (
