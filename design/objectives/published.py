@@ -67,15 +67,7 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
 
         I >= mean_a [ln det(C_a / sigma^2) / 2] - mean_a ln mean_b exp(-D_ab)    (in nats)
 
-    (pairwise bound on the entropy of a mixture: Kolchinsky and Tracey, Entropy 2017, equation (10)). Without the
-    covariance in a cell and without noise the second term alone is the joint entropy of the presses' signals, at most
-    log2 of their number. Two cells that the pad confuses cost the same in both.
-
-    Args:
-        pad: the fibres.
-        contact: what a press does to a fibre; the measured one if None.
-        noise: converter counts, > 0.
-        side: cells a side, at least 2.
+    (pairwise bound on the entropy of a mixture: Kolchinsky and Tracey, Entropy 2017, equation (10)).
     """
     low, high = np.array(between_fibres(pad.layout))
     x, y = ((np.arange(side) + 0.5) / side * (high - low)[axis] + low[axis] for axis in (0, 1))

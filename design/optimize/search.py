@@ -375,16 +375,8 @@ def search_for_twin(
     It searches from random starts, and from the default pad, which needs no measurement. Of these pads, the default pad
     and straight fibres it returns the one with the least error of networks trained under the contact, and never one
     that locates less well than plain ones do. `candidate` is "twin", "from default", "default" or "straight fibres". A
-    search that is stopped ends with the best so far.
-
-    Args:
-        pad: settings of the pad.
-        contact: as measured.
-        settings: of the search, with the scatter as measured.
-        rules: the limits.
-        default_settings: settings of the search for the default pad, which is for the default contact.
-        origin: the morphology to start from; random if None.
-        run: callbacks, checkpoints, time budget and executor.
+    search that is stopped ends with the best so far. `default_settings` are those of the search for the default pad,
+    which is for the default contact.
     """
     run = run or SearchOptions()
     plain = search(pad, None, default_settings, rules, run=_part_options(run, "default"))
@@ -415,8 +407,7 @@ def search_for_twin(
 def choose(errors: Mapping[str, Array]) -> str:
     """Return the pad of least mean error, among those that are worse than the plain ones with no number of failures.
 
-    Args:
-        errors: with 0, 1, ... fibres failed, by pad; "default" and "straight fibres" are the plain ones, if present.
+    Errors are with 0, 1, ... fibres failed; "default" and "straight fibres" are the plain ones, if present.
     """
     plain = [errors[name] for name in ("default", "straight fibres") if name in errors]
     ratios = {name: error / np.min(plain or list(errors.values()), axis=0) for name, error in errors.items()}
