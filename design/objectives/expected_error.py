@@ -146,7 +146,7 @@ def evaluation_windows(rectangle: Rectangle) -> list[Rectangle]:
 
 
 def place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
-    """Return a window at a share of the way from the lower to the upper corner of a rectangle: all of it unless large."""
+    """Return a window at a share of the way from corner to corner of a rectangle, or all of it if it is small."""
     low, high = np.array(rectangle)
     size = np.minimum(high - low, WINDOW)
     corner = low + share * (high - low - size)
@@ -154,7 +154,7 @@ def place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
 
 
 def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> PressWindow:
-    """Return side x side presses on a randomly shifted grid over a window, and coarse ones over the remaining pad."""
+    """Return side x side presses on a randomly shifted grid over a window, and coarse ones over all that is beside."""
 
     def shifted_grid(low: Array, high: Array, counts: Array) -> Array:
         cells = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
@@ -175,9 +175,8 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
 def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
     """Find the far presses whose responses are nearest to some press of a window, under any set of failed fibres.
 
-    They are at most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths of the kernel or more. Responses
-    of the window (F, Q) and of the remaining pad (F, N) are weighted as in the kernel; `masks` (L, F) are 1 for a fibre
-    that works.
+    They are at most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths or more. Responses of
+    the window (F, Q) and of the remaining pad (F, N) are weighted as in the kernel; `masks` are (L, F).
     """
     if not far.shape[1]:
         return torch.empty(0, dtype=torch.int64)

@@ -46,11 +46,6 @@ def joint_entropy(levels: Array) -> float:
     return float(kernels.compute_row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
 
 
-def published_sharpness(levels: Array) -> float:
-    """Return Z of formula (4): the sum over columns of |second difference| along the press order."""
-    return float(kernels.sum_second_differences(np.asarray(levels, dtype=np.float64)))
-
-
 def idle_share(signals: Array) -> float:
     """Return the share of signals (Q, C), changes from rest, that are 0: of presses in which a fibre is idle."""
     return float((signals == 0).mean()) if signals.size else 0.0
