@@ -234,16 +234,10 @@ def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tup
 
 
 def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
-    """Return side x side presses in serpentine order, so that presses next in order are neighbours.
+    """Return side x side presses (side^2, 2) in serpentine order: x ascends in even rows and descends in odd ones.
 
-    Args:
-        rectangle: low and high corner, as from `sensed_rectangle`; grid units.
-        side: presses per row, and rows.
-        jitter: each press is moved by U(0, jitter) along both axes; grid units.
-        seed: seed of NumPy's legacy RandomState, which the published values were computed with.
-
-    Returns:
-        Presses; shape (side^2, 2), grid units; x ascends in even rows and descends in odd ones.
+    Each is moved by U(0, jitter) along both axes, by NumPy's legacy RandomState, with which the published values were
+    computed.
     """
     rows = grid_positions(rectangle, side).reshape(side, side, 2)
     rows[1::2] = rows[1::2, ::-1]

@@ -131,14 +131,9 @@ def published_terms(
 ) -> list[PublishedTerms]:
     """Compute the terms of formula (5), as the published code does, for every pad of a population.
 
-    Args:
-        pads: a morphology, or knots (P, F, N + 2, 2) of a population.
-        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
-        presses: in an order of neighbours; the 49 published ones if None; shape (Q, 2).
-        samples: points per fibre of the quantised signals and of C.
-        weights: alpha, beta, gamma.
-        layout: of a population's fibres; as many horizontals as verticals, the default pitch apart, if None.
-        levels: whole levels that signals are rounded up to, 1 to 2^24.
+    The pads are a morphology, or knots (P, F, N + 2, 2) of a `layout`, by default as many horizontals as verticals, the
+    default pitch apart. `presses` (Q, 2) are in an order of neighbours, by default the 49 published ones. Signals have
+    so many `samples` a fibre, as C has, and are rounded up to so many `levels`.
     """
     if weights is not WEIGHTS and check_array("weights", weights, 1e12).shape != (3,):
         raise InputError(f"weights are {short_repr(weights)}, expected three numbers: alpha, beta, gamma")
@@ -171,9 +166,9 @@ def published_objective(
 
     Args:
         pad: the fibres.
-        contact: as in `published_terms`.
-        presses: as in `published_terms`.
-        samples: as in `published_terms`.
+        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
+        presses: in an order of neighbours; the 49 published ones if None; shape (Q, 2).
+        samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
     """
     return published_terms(check_type("pad", pad, Morphology), contact, presses, samples, weights)[0].objective

@@ -326,12 +326,8 @@ def _name(problem: SearchProblem, start: int) -> str:
 def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
     """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
 
-    Profile and rectangle stay as they are in mm on a pad of another pitch; the rectangle is cut to the pad.
-
-    Args:
-        spec: settings; where it states no fibres or pitch, those of the twin count.
-        path: of the `twin.json`.
-        pad: whose fibres and pitch count instead.
+    Profile and rectangle stay as they are in mm on a pad of another pitch; the rectangle is cut to the pad. Where
+    `spec` states no fibres or pitch, those of the twin count, or instead of both those of `pad`.
 
     Raises:
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
