@@ -196,6 +196,7 @@ def run_benches(
             documents[bench.name] = _to_document(bench, measured)
             figure = _draw(bench.name, _medians(documents[bench.name]["rows"]), bench.error_label)
             save_figure(figure, out / f"{bench.name}.png")
+            write_json(out / "bench.json", _to_content(documents))
 
     def slower_trials() -> set[tuple[str, TrialKey]]:
         return {(change.bench, change.key) for change in find_worsenings(earlier, documents) if change.what == SLOWER}
@@ -208,9 +209,7 @@ def run_benches(
         for bench in benches:
             if slower := {key for name, key in slower_trials() if name == bench.name}:
                 measure(bench, "recheck", slower.__contains__)
-    content = {"format": FORMAT, "summary": _summarise(documents), "benches": documents}
-    write_json(out / "bench.json", content)
-    return content, find_worsenings(earlier, documents)
+    return _to_content(documents), find_worsenings(earlier, documents)
 
 
 def _to_document(bench: Bench, rounds: BenchRounds) -> dict[str, Any]:
@@ -232,8 +231,8 @@ def _to_document(bench: Bench, rounds: BenchRounds) -> dict[str, Any]:
     }
 
 
-def _summarise(documents: Documents) -> list[Row]:
-    """Return a row per case with the default way beside the reference."""
+def _to_content(documents: Documents) -> dict[str, Any]:
+    """Return all results, with a summary of a row per case: the default way beside the reference."""
     summary: list[Row] = []
     for name, document in documents.items():
         medians = {_key(row)[:3]: row for row in _medians(document["rows"])}
@@ -244,7 +243,7 @@ def _summarise(documents: Documents) -> list[Row]:
                 row |= {f"reference_{column}": reference[column] for column in ("error", "seconds")}
                 row |= {"way": _way(*document["best"]), "error": default["error"], "seconds": default["seconds"]}
                 summary.append(row | {"speed": reference["seconds"] / default["seconds"]})
-    return summary
+    return {"format": FORMAT, "summary": summary, "benches": dict(documents)}
 
 
 def _medians(rows: Sequence[Row]) -> list[Row]:
