@@ -1,8 +1,11 @@
 """Expected localisation error: the error of a regression of positions on responses, and the bound that noise sets.
 
 The response x of a fibre is its relative stretch in full scales of straight fibres. It scatters by a floor and by a
-share of itself, of whose variance all fibres have a part in common. For presses a and the set K of fibres that still
-work, two terms are added, as trained networks weigh them:
+share of itself, of whose variance all fibres have a part in common:
+
+    x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
+
+For presses a and the set K of fibres that still work, two terms are added, as trained networks weigh them:
 
     L_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|x_a - x_b|^2_K / 2 w^2),
     B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' S_a^-1 J_a + 12 / size^2,     J_a = dx / dp there,
