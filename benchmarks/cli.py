@@ -7,7 +7,12 @@ import click
 from padforge.design.common.command_line import json_option, out_option, progress, show_result
 from padforge.design.common.validation import InputError
 
-BENCHES = ("contact", "objective", "search", "networks", "filter", "localizer", "twin", "mould")
+BENCHES = {
+    "contact": "contact:CONTACT",
+    "objective": "contact:OBJECTIVE",
+    **{name: f"{name}:BENCH" for name in ("search", "networks", "filter", "localizer", "twin", "mould")},
+}
+"""Where each benchmark is defined."""
 
 
 @click.command()
@@ -16,7 +21,7 @@ BENCHES = ("contact", "objective", "search", "networks", "filter", "localizer", 
     "--against",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="bench.json or NAME.json of an earlier run; exit code 1 if anything is worse now.",
+    help="bench.json of an earlier run; exit code 1 if anything is worse now.",
 )
 @out_option("out/bench")
 @json_option
@@ -30,7 +35,7 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
                                                   localizer, twin, mould
     padforge bench --against before/bench.json    what is slower or less accurate now, as ratios
 
-    Writes NAME.json, NAME.csv and NAME.png for each, and bench.json and bench.csv with the summary.
+    Writes bench.json with all results and their summary, and NAME.png for each.
     """
     from dataclasses import asdict
     from pkgutil import resolve_name
@@ -43,7 +48,7 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
         raise InputError(f"{against}: has none of the benchmarks {', '.join(BENCHES)}")
     with progress() as bar:
         task = bar.add_task("bench", total=None, note="")
-        benches = [resolve_name(f"padforge.benchmarks.{name}:BENCH") for name in names]
+        benches = [resolve_name(f"padforge.benchmarks.{BENCHES[name]}") for name in names]
         summary, changes = run_benches(benches, out, lambda step: bar.update(task, note=step), earlier)
     lines = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
     lines += summary_lines(summary["summary"])

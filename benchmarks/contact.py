@@ -1,6 +1,6 @@
-"""Run time against error of the contact kernel, beside the published rule, plainly and compiled."""
+"""Run time against error of the contact kernel and of the published objective, beside plain and compiled ways."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from itertools import pairwise
 from typing import Any
@@ -12,9 +12,11 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.contact import quantized_signals_and_samples, signals_and_spans, signals_sparse
+from padforge.design.common.profiling import profiled
+from padforge.design.contact import signals, signals_quantized, signals_sparse
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology
+from padforge.design.objectives import published
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
 
 SAMPLES = (250, 500, 1000, 2000, 4000, 8000, 16000)
@@ -22,6 +24,8 @@ KNOTS = (1, 5, 20)
 GRIDS = (4, 8, 16, 32, 64, 128)
 PUBLISHED = 2000
 """Samples of a fibre in the published program."""
+BETA, GAMMA = 1e-7, 5e-6
+"""Published weights of sharpness and disorder."""
 
 
 def plain_signals(pad: Morphology, presses: Array, contact: Contact, samples: int) -> Array:
@@ -103,50 +107,103 @@ def reference_signals(pad: Morphology, presses: Array, contact: Contact) -> Arra
     return signals
 
 
-def trials() -> Iterator[BenchTrial]:
+def contact_trials() -> Iterator[BenchTrial]:
     """Yield the signals of random pads by all ways and sample counts, and the time per press for pads of GRIDS."""
     rng = np.random.default_rng(0)
     for knots in KNOTS:
         yield from _ways(Morphology.random(4, knots, seed=knots), rng.uniform(1, 4, (49, 2)), PUBLISHED_CONTACT)
     for grid in GRIDS:
         pad, presses = Morphology.straight(grid), rng.uniform(1, grid, (2000, 2))
-
-        def visited(result: object, pad: Morphology = pad, presses: Array = presses) -> Mapping[str, float]:
-            spans = signals_and_spans(pad, presses[:100], PUBLISHED_CONTACT)[1]
-            return {"visited": spans / (100 * len(pad.knots))}
-
         work = partial(signals_sparse, pad, presses, PUBLISHED_CONTACT)
-        yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, visited, items=len(presses))
+        evaluate = partial(_visited, pad, presses[:100])
+        yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, evaluate, items=len(presses))
+
+
+def _visited(pad: Morphology, presses: Array, result: object) -> dict[str, float]:
+    """Return the share of the spans that the exact kernel visits."""
+    with profiled() as profile:
+        signals(pad, presses, PUBLISHED_CONTACT)
+    visited, total = profile.counts["spans, press by press"]
+    return {"visited": visited / total}
 
 
 def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTrial]:
-    case, pairs = f"N={pad.knots.shape[1] - 2}", len(presses) * len(pad.knots)
-    exact = cache(lambda: signals_and_spans(pad, presses, contact)[0])
+    case, work = f"N={pad.knots.shape[1] - 2}", partial(signals, pad, presses, contact)
+    exact = cache(work)
 
-    def evaluate(signals: Array, visited: float = 1.0, truth: Any = exact) -> Mapping[str, float]:
-        return {"error": float(np.sqrt(((signals - truth()) ** 2).mean() / (truth() ** 2).mean())), "visited": visited}
+    def evaluate(result: Array, truth: Callable[[], Array] = exact) -> dict[str, float]:
+        return {"error": float(np.sqrt(((result - truth()) ** 2).mean() / (truth() ** 2).mean()))}
 
     for samples in SAMPLES:
         plain = partial(plain_signals, pad, presses, contact, samples)
         scan = partial(scanned_signals, pad.knots, presses, contact.radius, contact.sides or 0, samples)
-        cull = partial(quantized_signals_and_samples, pad, presses, contact, samples)
+        culled = partial(signals_quantized, pad, presses, contact, samples)
         yield BenchTrial(case, "plain", samples, plain, evaluate)
         yield BenchTrial(case, "scanned", samples, scan, evaluate)
-        yield BenchTrial(
-            case, "culled", samples, cull, lambda result, n=pairs * samples: evaluate(result[0], result[1] / n)
-        )
+        yield BenchTrial(case, "culled", samples, culled, evaluate)
     reference = cache(partial(reference_signals, pad, presses, contact))
-    spans = pairs * (pad.knots.shape[1] - 1)
-    work = partial(signals_and_spans, pad, presses, contact)
-    yield BenchTrial(case, "exact", 0, work, lambda result: evaluate(result[0], result[1] / spans, reference))
+    yield BenchTrial(
+        case, "exact", 0, work, lambda result: evaluate(result, reference) | _visited(pad, presses, result)
+    )
 
 
-BENCH = Bench(
+def objective_trials() -> Iterator[BenchTrial]:
+    """Yield the objective of random pads by all ways and sample counts."""
+    for knots in KNOTS:
+        pad, case = Morphology.random(4, knots, seed=knots), f"N={knots}"
+        exact = cache(partial(exact_objective, pad))
+
+        def evaluate(objective: float, exact: Callable[[], float] = exact) -> dict[str, float]:
+            return {"error": abs(objective - exact()) / exact()}
+
+        for samples in SAMPLES:
+            gamma = GAMMA * (PUBLISHED - 1) / (samples - 1)  # disorder is a sum over samples
+            yield BenchTrial(case, "plain", samples, partial(plain_objective, pad, samples, gamma), evaluate)
+            compiled = partial(published.published_objective, pad, samples=samples, weights=(1.0, BETA, gamma))
+            yield BenchTrial(case, "compiled", samples, compiled, evaluate)
+
+
+def exact_objective(pad: Morphology) -> float:
+    """Compute the published objective from exact signals, and the disorder from a hundred times as many samples."""
+    levels = published.quantize(signals(pad, published.published_presses(pad.grid), PUBLISHED_CONTACT))
+    entropy = published.joint_entropy(levels[:, : pad.grid]) + published.joint_entropy(levels[:, pad.grid :])
+    many = 100 * PUBLISHED
+    disorder = published.published_terms(pad, samples=many)[0].disorder * (PUBLISHED - 1) / (many - 1)
+    return float(1 / (1 + entropy) + BETA * np.abs(np.diff(levels, 2, axis=0)).sum() + GAMMA * disorder)
+
+
+def plain_objective(pad: Morphology, samples: int = PUBLISHED, gamma: float = GAMMA) -> float:
+    """Compute the published objective from `plain_signals` by NumPy alone."""
+    responses = plain_signals(pad, published.published_presses(pad.grid), PUBLISHED_CONTACT, samples)
+    span = np.ptp(responses, axis=0)
+    levels = np.ceil((responses - responses.min(axis=0)) / np.where(span > 0, span, 1) * 4096)
+    entropy = disorder = 0.0
+    for family in (levels[:, : pad.grid], levels[:, pad.grid :]):
+        share = np.unique(family, axis=0, return_counts=True)[1] / len(family)
+        entropy -= (share * np.log2(share)).sum()
+    along = np.linspace(0, pad.grid + 1, samples)
+    for axis in (0, 1):
+        fibres = pad.knots[axis * pad.grid : (axis + 1) * pad.grid]
+        curves = [PchipInterpolator(knots[:, axis], knots[:, 1 - axis])(along) for knots in fibres]
+        for i, lower in enumerate(curves):
+            disorder -= sum(np.minimum(upper - lower, 0).sum() for upper in curves[i + 1 :])
+    return float(1 / (1 + entropy) + BETA * np.abs(np.diff(levels, 2, axis=0)).sum() + gamma * disorder)
+
+
+CONTACT = Bench(
     "contact",
-    trials,
+    contact_trials,
     "relative error (rms)",
     reference=("scanned", PUBLISHED),
     default=("exact", 0),
     baselines=("plain", "scanned"),
     prepare=lambda: scanned_signals(Morphology.straight(1).knots, np.ones((1, 2)), 0.6, 30, 2),
+)
+OBJECTIVE = Bench(
+    "objective",
+    objective_trials,
+    "relative error",
+    reference=("plain", PUBLISHED),
+    default=("compiled", PUBLISHED),
+    baselines=("plain",),
 )

@@ -67,10 +67,6 @@ def fibre(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
 
     A press stretches the fibre by up to 0.1 V, or not at all; the silicone creeps while pressed and recovers slowly.
     The noise is 1.5 LSB; one reading in a hundred is an outlier of up to 60 LSB.
-
-    Args:
-        count: number of readings.
-        rng: draws presses and noise.
     """
     presses, phase = -(-count // PERIOD), np.arange(PERIOD // 2)
     height = rng.uniform(0.01, 0.1, presses) * (rng.random(presses) < 0.5)

@@ -2,12 +2,9 @@
 
 Disturbances only add to run time and last for a while. Hence the minimum over rounds counts, with other trials between.
 The pace of the machine is the time of a fixed reference work, measured before and after every trial, so that two runs
-can be compared by relative times. Results are written as JSON, CSV and work-precision figures.
+can be compared by relative times. Results are written as JSON and work-precision figures.
 """
 
-import csv
-import io
-import platform
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -22,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from padforge.design.common.command_line import text_table
-from padforge.design.common.files import check_writable, provenance, read_json, write_json, write_text
+from padforge.design.common.files import check_writable, provenance, read_json, write_json
 from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, save_figure, style_axes
 from padforge.design.common.validation import InputError
 
@@ -36,14 +33,14 @@ LONG_S = 1.0
 MAX_BASELINE_S = 0.1
 """Baselines that take longer are measured in the first round only, s: their run time is not compared between runs."""
 
-FORMAT, SUMMARY_FORMAT = "padforge-bench/1", "padforge-benches/1"
-"""Formats of NAME.json and bench.json; runs of earlier versions stay comparable, so keys must not change."""
+FORMAT = "padforge-benches/1"
+"""Format of bench.json; runs of earlier versions stay comparable, so keys must not change."""
 
 Row = dict[str, Any]
-"""A trial: "case", "way", "size", "repetition", "error", "seconds", "paces", "visited", "speed" and more."""
+"""A trial: "case", "way", "size", "repetition", "error", "seconds", "paces", "visited" and more."""
 TrialKey = tuple[str, str, float, int]
 Documents = Mapping[str, Mapping[str, Any]]
-"""Contents of NAME.json by the name of the benchmark."""
+"""Results in bench.json by the name of the benchmark."""
 KEY = ("case", "way", "size", "repetition")
 """Columns that identify a trial."""
 
@@ -60,24 +57,17 @@ MIN_ERROR, MIN_VISITED = 1e-15, 1e-3
 class BenchTrial:
     """One measurement.
 
-    Attributes:
-        case: the problem.
-        way: the method that solves it.
-        size: parameter of the method, such as samples or steps; 0 if it has none.
-        work: the timed function.
-        evaluate: returns the quality of its result: "error" in the unit of the bench, "visited", the share of the
-            scene that was computed, and columns of the bench.
-        items: number by which the time is divided.
-        repetition: number among trials that differ in the seed only; tables show medians.
+    `evaluate` returns the quality of the result of `work`: "error" in the unit of the bench, "visited", the share of
+    the scene that was computed, and columns of the bench.
     """
 
-    case: str
-    way: str
-    size: float
-    work: Callable[[], Any]
+    case: str  # the problem
+    way: str  # the method that solves it
+    size: float  # parameter of the method, such as samples or steps; 0 if it has none
+    work: Callable[[], Any]  # the timed function
     evaluate: Callable[[Any], Mapping[str, float | None]] = lambda result: {}
-    items: int = 1
-    repetition: int = 0
+    items: int = 1  # number by which the time is divided
+    repetition: int = 0  # number among trials that differ in the seed only; tables show medians
 
     @property
     def key(self) -> TrialKey:
@@ -87,25 +77,15 @@ class BenchTrial:
 
 @dataclass(frozen=True)
 class Bench:
-    """A benchmark.
-
-    Attributes:
-        name: name of its files.
-        trials: yields all trials, in the same order every time.
-        error_label: meaning of "error", with its unit.
-        reference: (way, size) to which speeds are relative.
-        default: (way, size) that the package uses.
-        baselines: ways that are not the package's own; `--against` ignores them.
-        prepare: compiles and imports what baselines need, before anything is timed.
-    """
+    """A benchmark."""
 
     name: str
-    trials: Callable[[], Iterator[BenchTrial]]
-    error_label: str
-    reference: tuple[str, float]
-    default: tuple[str, float]
-    baselines: Collection[str] = ()
-    prepare: Callable[[], object] = lambda: None
+    trials: Callable[[], Iterator[BenchTrial]]  # all trials, in the same order every time
+    error_label: str  # meaning of "error", with its unit
+    reference: tuple[str, float]  # (way, size) to which speeds are relative
+    default: tuple[str, float]  # (way, size) that the package uses
+    baselines: Collection[str] = ()  # ways that are not the package's own; `--against` ignores them
+    prepare: Callable[[], object] = lambda: None  # compiles and imports what baselines need, before anything is timed
 
 
 class BenchRounds:
@@ -120,23 +100,14 @@ class BenchRounds:
 
 @dataclass(frozen=True)
 class Worsening:
-    """A trial that is worse than in an earlier run.
+    """A trial that is worse than in an earlier run."""
 
-    Attributes:
-        bench: name of the benchmark.
-        key: identity of the trial.
-        what: SLOWER, LESS_ACCURATE or VISITS_MORE.
-        before: seconds per item, error or visited share in the earlier run.
-        now: the same in this run.
-        ratio: ratio of the two; of times as far as the pace of the machine does not explain it.
-    """
-
-    bench: str
-    key: TrialKey
-    what: str
-    before: float
-    now: float
-    ratio: float
+    bench: str  # name of the benchmark
+    key: TrialKey  # identity of the trial
+    what: str  # SLOWER, LESS_ACCURATE or VISITS_MORE
+    before: float  # seconds per item, error or visited share in the earlier run
+    now: float  # the same in this run
+    ratio: float  # of the two; of times as far as the pace of the machine does not explain it
 
     def __str__(self) -> str:
         case, way, size, repetition = self.key
@@ -147,14 +118,7 @@ class Worsening:
 def measure_round(
     bench: Bench, rounds: BenchRounds, on_progress: Callable[[str], None], repeat: Callable[[TrialKey], bool]
 ) -> int:
-    """Measure new trials, repeat others, and return how many were measured.
-
-    Args:
-        bench: the benchmark.
-        rounds: measurements so far, to which this round is added.
-        on_progress: receives the name of every trial.
-        repeat: whether to repeat a trial; slow baselines are never repeated.
-    """
+    """Add a round to the measurements: new trials, and those to `repeat` but slow baselines; return their number."""
     if not rounds.seconds:
         bench.prepare()
     n_measured = 0
@@ -216,16 +180,10 @@ def _measure_pace() -> list[float]:
 def run_benches(
     benches: Sequence[Bench], out: Path, on_progress: Callable[[str], None], earlier: Documents
 ) -> tuple[dict[str, Any], list[Worsening]]:
-    """Measure benchmarks, write the files of each, and `bench.json` and `bench.csv` with the summary.
-
-    Args:
-        benches: benchmarks to measure.
-        out: folder of the files; InputError if it is not writable.
-        on_progress: receives what is being measured.
-        earlier: documents of an earlier run to compare with; may be empty.
+    """Measure benchmarks, and write `bench.json` and a figure of each.
 
     Returns:
-        The content of `bench.json`, and what is worse than in the earlier run; slower only if so in all rounds.
+        The content of `bench.json`, and what is worse than in the `earlier` run; slower only if so in all rounds.
     """
     check_writable(out)
     rounds = {bench.name: BenchRounds() for bench in benches}
@@ -235,7 +193,10 @@ def run_benches(
         measured = rounds[bench.name]
         if measure_round(bench, measured, lambda step: on_progress(f"{bench.name}, {label}, {step}"), repeat):
             measured.pace_s = min(other.pace_s for other in rounds.values())
-            documents[bench.name] = _write_bench(bench, measured, out)
+            documents[bench.name] = _to_document(bench, measured)
+            figure = _draw(bench.name, _medians(documents[bench.name]["rows"]), bench.error_label)
+            save_figure(figure, out / f"{bench.name}.png")
+            write_json(out / "bench.json", _to_content(documents))
 
     def slower_trials() -> set[tuple[str, TrialKey]]:
         return {(change.bench, change.key) for change in find_worsenings(earlier, documents) if change.what == SLOWER}
@@ -248,40 +209,30 @@ def run_benches(
         for bench in benches:
             if slower := {key for name, key in slower_trials() if name == bench.name}:
                 measure(bench, "recheck", slower.__contains__)
-    return _write_summary(documents, out), find_worsenings(earlier, documents)
+    return _to_content(documents), find_worsenings(earlier, documents)
 
 
-def _write_bench(bench: Bench, rounds: BenchRounds, out: Path) -> dict[str, Any]:
-    """Write `NAME.json`, `NAME.csv` and `NAME.png` of a benchmark, and return the content of the first."""
+def _to_document(bench: Bench, rounds: BenchRounds) -> dict[str, Any]:
+    """Return the results of a benchmark as plain data."""
     rows = [
         dict(zip(KEY, key, strict=True))
         | {"error": None, "seconds": min(rounds.seconds[key]), "paces": min(rounds.paces[key]), "visited": None}
         | dict(result)
         for key, result in rounds.results.items()
     ]
-    medians = _medians(rows)
-    reference_s = {row["case"]: row["seconds"] for row in medians if (row["way"], row["size"]) == bench.reference}
-    for row in rows:
-        row["speed"] = reference_s[row["case"]] / row["seconds"] if row["case"] in reference_s else None
-    document = {
-        "format": FORMAT,
+    return {
         "bench": bench.name,
         "reference": list(bench.reference),
         "best": list(bench.default),
         "plain": sorted(bench.baselines),
-        "machine": f"{platform.machine()}, {platform.system()}",
         "pace_s": rounds.pace_s,
         "rows": rows,
         "provenance": provenance(f"padforge bench {bench.name}", packages=("numba",)),
     }
-    _write_csv(rows, out / f"{bench.name}.csv")
-    save_figure(_draw(bench.name, medians, bench.error_label), out / f"{bench.name}.png")
-    write_json(out / f"{bench.name}.json", document)
-    return document
 
 
-def _write_summary(documents: Documents, out: Path) -> dict[str, Any]:
-    """Write and return `bench.json` with all documents, and write `bench.csv`: default ways beside the reference."""
+def _to_content(documents: Documents) -> dict[str, Any]:
+    """Return all results, with a summary of a row per case: the default way beside the reference."""
     summary: list[Row] = []
     for name, document in documents.items():
         medians = {_key(row)[:3]: row for row in _medians(document["rows"])}
@@ -292,18 +243,7 @@ def _write_summary(documents: Documents, out: Path) -> dict[str, Any]:
                 row |= {f"reference_{column}": reference[column] for column in ("error", "seconds")}
                 row |= {"way": _way(*document["best"]), "error": default["error"], "seconds": default["seconds"]}
                 summary.append(row | {"speed": reference["seconds"] / default["seconds"]})
-    document = {"format": SUMMARY_FORMAT, "summary": summary, "benches": dict(documents)}
-    _write_csv(summary, out / "bench.csv")
-    write_json(out / "bench.json", document)
-    return document
-
-
-def _write_csv(rows: Sequence[Row], path: Path) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+    return {"format": FORMAT, "summary": summary, "benches": dict(documents)}
 
 
 def _medians(rows: Sequence[Row]) -> list[Row]:
@@ -391,11 +331,10 @@ def _draw(name: str, medians: Sequence[Row], error_label: str) -> Figure:
 
 
 def read_earlier(path: Path) -> Documents:
-    """Read the documents of an earlier run, by name of the benchmark, from `bench.json` or `NAME.json`."""
-    content = read_json(path, SUMMARY_FORMAT, FORMAT)
+    """Read the results of an earlier run from its `bench.json`."""
+    content = read_json(path, FORMAT)
     try:
-        listed = content["benches"].values() if content["format"] == SUMMARY_FORMAT else [content]
-        documents = {document["bench"]: document for document in listed}
+        documents = {document["bench"]: document for document in content["benches"].values()}
         find_worsenings(documents, documents)  # reads everything that a comparison reads
     except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"{path}: not as padforge bench writes it ({error!r})") from error
@@ -431,13 +370,7 @@ def _common_trials(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[Tr
 
 
 def comparison_lines(changes: Sequence[Worsening], before: Documents, now: Documents) -> list[str]:
-    """Format the comparison of two runs as text.
-
-    Args:
-        changes: what is worse.
-        before: documents of the earlier run.
-        now: documents of this run.
-    """
+    """Format the comparison of two runs, and what is worse, as text."""
     n_trials = sum(len(_common_trials(before[name], now[name])) for name in before.keys() & now.keys())
     if not changes:
         return [f"{n_trials} trials compared: none is slower, less accurate or visits more"]

@@ -9,15 +9,18 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design import Morphology
 from padforge.design.common.parallel import one_torch_thread
+from padforge.design.networks import fit_batch, initial_weights
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.network import combine_members, predict_members
-from padforge.sense.localizer.scaler import FeatureScaler
+from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses
+from padforge.sense.localizer.training import MIN_BATCHES, train_members
 from padforge.sense.localizer.training import PUBLISHED_HIDDEN as HIDDEN
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.simulated_recording import simulate
@@ -92,10 +95,6 @@ class _PublishedNetwork:
     """The published network with its squared error, for optimisers that use gradients."""
 
     def __init__(self, x: Array, y: Array) -> None:
-        import torch
-
-        from padforge.design.networks import initial_weights
-
         rng = np.random.default_rng(0)
         weights = initial_weights(np.ptp(x, axis=0) > 0, HIDDEN, rng), rng.uniform(-0.5, 0.5, (y.shape[1], HIDDEN + 1))
         self.weights = [torch.from_numpy(matrix).requires_grad_() for matrix in weights]
@@ -116,16 +115,12 @@ class _PublishedNetwork:
 
 
 def _train_marquardt(x: Array, y: Array, epochs: int) -> Predict:
-    from padforge.design.networks import fit_batch
-
     held_out = np.arange(len(x)) % 12 == 0
     validation = x[held_out][None], y[held_out]
     return fit_batch(x[~held_out], y[~held_out], [np.random.default_rng(0)], HIDDEN, epochs, validation)[0]
 
 
 def _train_lbfgs(x: Array, y: Array, iterations: int) -> Predict:
-    import torch
-
     network = _PublishedNetwork(x, y)
     torch.optim.LBFGS(
         network.weights, max_iter=iterations, tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe"
@@ -134,8 +129,6 @@ def _train_lbfgs(x: Array, y: Array, iterations: int) -> Predict:
 
 
 def _train_adam(x: Array, y: Array, passes: int) -> Predict:
-    import torch
-
     network, generator = _PublishedNetwork(x, y), torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(network.weights, lr=ADAM_RATE)
     for _ in range(passes):
@@ -146,9 +139,6 @@ def _train_adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _train_masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    from padforge.sense.localizer.scaler import TrainingPresses
-    from padforge.sense.localizer.training import MIN_BATCHES, train_members
-
     presses = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
     batches = max(MIN_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
     options = settings.LocalizerSettings(epochs=-(-steps // batches))

@@ -62,13 +62,7 @@ def _fit_all_plain(presses: SimulatedPresses, failures: Sequence[FailureSet]) ->
 
 
 def fit_plain(inputs: Array, targets: Array, rng: np.random.Generator) -> Network:
-    """Fit the published network by textbook Levenberg-Marquardt: full Jacobian, all weights at once.
-
-    Args:
-        inputs: signals; shape (Q, F).
-        targets: positions; shape (Q, 2).
-        rng: draws the initial weights and the split into training and validation samples.
-    """
+    """Fit the published network by textbook Levenberg-Marquardt: full Jacobian, all weights at once."""
     input_scale, target_scale = RangeScaler.fit(inputs), RangeScaler.fit(targets)
     order = rng.permutation(len(inputs))
     n_train = round(TRAINING_SHARE * len(inputs))

@@ -1,14 +1,12 @@
 """Error of optimised pads against the time of the search: the published search beside the gradient search."""
 
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, Future
+from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
 
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.networks import localisation_error
 from padforge.design.objectives.rules import check_rules
-from padforge.design.optimize.search import SearchOptions, SearchResult, search
+from padforge.design.optimize.search import SearchResult, search
 from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
 
 KNOTS = (5, 20)
@@ -17,16 +15,6 @@ GENERATIONS = (5, 20)
 STEPS = (50, 150)
 SUBSETS = 2
 """Sets of failed fibres of each size, of up to 56: enough to distinguish the ways in a few minutes."""
-
-
-class SynchronousExecutor(Executor):
-    """Executes in the calling thread, whose time is measured; every trial has one start."""
-
-    def submit(self, work: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Execute the work and return its finished future."""
-        future: Future[Any] = Future()
-        future.set_result(work(*arguments, **options))
-        return future
 
 
 def trials() -> Iterator[BenchTrial]:
@@ -44,8 +32,7 @@ def trials() -> Iterator[BenchTrial]:
         for way, size, changes, rules in ways:
             for seed in SEEDS:
                 settings = PUBLISHED_SEARCH.model_copy(update={**changes, "knots": knots, "seed": seed})
-                options = SearchOptions(executor=SynchronousExecutor())
-                work = partial(search, PUBLISHED_PAD, PUBLISHED_CONTACT, settings, rules, run=options)
+                work = partial(search, PUBLISHED_PAD, PUBLISHED_CONTACT, settings, rules)
                 yield BenchTrial(f"N={knots}", way, size, work, evaluate_pad, repetition=seed)
 
 

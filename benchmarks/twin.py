@@ -78,13 +78,8 @@ def printed_pad(
 ) -> Twin:
     """Simulate a printed pad: turned over, wired in random order, with fibres beside their planned paths.
 
-    Args:
-        plan: the designed pad.
-        rng: draws pose, wiring, gains and offsets.
-        profile: sensitivity profile: "gaussian", "disc" or "skirted".
-        lateral_offset_mm: standard deviation of the distance of fibres from their planned paths, mm.
-        n_dead: channels that read nothing.
-        noise: standard deviation of a response, share of full scale.
+    `lateral_offset_mm` is the standard deviation of their distance from these, `noise` that of a response as a share of
+    full scale; `n_dead` channels read nothing.
     """
     fibres, unit_mm = len(plan.knots), plan.unit_mm
     distance, weight = _sensitivity_profile(profile)

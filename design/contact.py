@@ -61,32 +61,22 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
     Raises:
         InputError: presses of the wrong shape or not finite.
     """
-    return signals_and_spans(pad, presses, or_default("contact", contact, Contact))[0]
-
-
-def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
-    """Compute the relative stretch (Q, F) of each fibre, which is what a voltage divider measures: signal over length.
-
-    A fibre is a strain gauge: its resistance grows with its relative stretch, so one stretch gives less on a longer
-    fibre.
-
-    Args:
-        pad: the fibres.
-        presses: centres; shape (Q, 2), grid units.
-        contact: contact model.
-    """
-    return signals(pad, presses, contact) / lengths(pad)
-
-
-def signals_and_spans(pad: Morphology | Array, presses: ArrayLike, contact: Contact) -> tuple[Array, int]:
-    """Compute `signals` and the number of spans visited for them."""
+    contact = or_default("contact", contact, Contact)
     along, across, ends, batch = fibre_axes(pad)
     centres, press_counts = check_presses(presses, several=True)
     fibres = along.shape[1]
     check_memory(len(along) * len(centres) * fibres)
     out = np.zeros(len(along) * len(centres) * fibres)
-    visited = _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _DENSE, out)
-    return _sum_simultaneous(out, (*batch, *press_counts, fibres)), visited
+    _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _DENSE, out)
+    return _sum_simultaneous(out, (*batch, *press_counts, fibres))
+
+
+def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
+    """Compute the relative stretch (Q, F) of each fibre, which is what a voltage divider measures: signal over length.
+
+    A fibre is a strain gauge: its resistance grows with its relative stretch, less on a longer fibre.
+    """
+    return signals(pad, presses, contact) / lengths(pad)
 
 
 def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
@@ -114,8 +104,8 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
 def _run_exact(
     along: Array, across: Array, ends: geometry.Ends, presses: Array, shape: PressShape, sparse: _Sparse, out: Array
-) -> int:
-    """Run `exact_signals` on all cores; return the number of spans visited."""
+) -> None:
+    """Run `exact_signals` on all cores."""
     max_offsets, curves = geometry.max_offsets(across, ends), (along, across, population_slopes(along, across))
 
     def compute(begin: int, end: int) -> int:
@@ -124,7 +114,6 @@ def _run_exact(
     visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
     if profiling.is_profiling():
         record_visits(along, max_offsets, ends, presses, shape[1], visited)
-    return visited
 
 
 def record_visits(
@@ -207,13 +196,6 @@ def signals_quantized(
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
     contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    return quantized_signals_and_samples(pad, presses, contact, samples)[0]
-
-
-def quantized_signals_and_samples(
-    pad: Morphology | Array, presses: ArrayLike, contact: Contact, samples: int
-) -> tuple[Array, int]:
-    """Compute `signals_quantized` and the number of samples visited for them."""
     along, across, ends, batch = fibre_axes(pad)
     pads, fibres, _ = along.shape
     shape, samples = press_shape(contact, grid_unit_mm(pad)), check_samples(samples, fibres)
@@ -221,11 +203,11 @@ def quantized_signals_and_samples(
     check_memory(pads * len(centres) * fibres)
     out = np.zeros((pads, len(centres), fibres))
 
-    def compute(begin: int, end: int) -> int:
-        return quantized_signals(along, across, ends.horizontals, centres, shape, samples, begin, end, out)
+    def compute(begin: int, end: int) -> None:
+        quantized_signals(along, across, ends.horizontals, centres, shape, samples, begin, end, out)
 
-    visited = sum(map_chunks(compute, pads * fibres, max(1, 200_000 // (samples + len(centres)))))
-    return _sum_simultaneous(out, (*batch, *press_counts, fibres)), visited
+    map_chunks(compute, pads * fibres, max(1, 200_000 // (samples + len(centres))))
+    return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
 def check_memory(values: int) -> None:
@@ -240,18 +222,7 @@ def check_samples(samples: int, fibres: int) -> int:
 
 
 def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
-    """Return presses as a contiguous array of positions.
-
-    Args:
-        presses: shape (Q, 2), or (Q, C, 2) for C simultaneous presses; grid units.
-        several: whether simultaneous presses are allowed.
-
-    Returns:
-        Positions (Q C, 2), and (Q, C) with C = 1 for (Q, 2).
-
-    Raises:
-        InputError: presses of another shape or not finite.
-    """
+    """Return presses (Q, 2), or if `several` (Q, C, 2) simultaneous ones, as contiguous (Q C, 2), and their (Q, C)."""
     positions = check_array("presses", presses, MAX_COORDINATE)
     if positions.shape == (0,):
         positions = positions.reshape(0, 2)
@@ -263,16 +234,10 @@ def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tup
 
 
 def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
-    """Return side x side presses in serpentine order, so that presses next in order are neighbours.
+    """Return side x side presses (side^2, 2) in serpentine order: x ascends in even rows and descends in odd ones.
 
-    Args:
-        rectangle: low and high corner, as from `sensed_rectangle`; grid units.
-        side: presses per row, and rows.
-        jitter: each press is moved by U(0, jitter) along both axes; grid units.
-        seed: seed of NumPy's legacy RandomState, which the published values were computed with.
-
-    Returns:
-        Presses; shape (side^2, 2), grid units; x ascends in even rows and descends in odd ones.
+    Each is moved by U(0, jitter) along both axes, by NumPy's legacy RandomState, with which the published values were
+    computed.
     """
     rows = grid_positions(rectangle, side).reshape(side, side, 2)
     rows[1::2] = rows[1::2, ::-1]
@@ -280,11 +245,6 @@ def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, see
 
 
 def grid_positions(rectangle: Rectangle, side: int) -> Array:
-    """Return evenly spaced positions (side^2, 2) from corner to corner of a rectangle, row by row from below.
-
-    Args:
-        rectangle: low and high corner.
-        side: positions per row, and rows.
-    """
+    """Return evenly spaced positions (side^2, 2) from corner to corner of a rectangle, row by row from below."""
     x, y = (np.linspace(low, high, side) for low, high in zip(*rectangle, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -1,10 +1,8 @@
 """Batched Levenberg-Marquardt with variable projection: networks of one hidden layer trained side by side.
 
 The output weights that are best for given hidden ones solve a ridge regression, so only the hidden weights are searched
-for (G. H. Golub, V. Pereyra, SIAM Journal on Numerical Analysis 10, 1973; the Jacobian J is that of L. Kaufman, BIT 15,
-1975: output weights held). With activations H, Z Z' = H (H'H + ridge)^-1 H' and the residual projector R = 1 - Z Z', a
-step solves (J'R J + damping) change = J'e, or the dual equations where there are fewer residuals than weights. The
-damping follows H. B. Nielsen (IMM-REP-1999-05, 1999).
+for. With activations H, Z Z' = H (H'H + ridge)^-1 H' and the residual projector R = 1 - Z Z', a step solves
+(J'R J + damping) change = J'e, or the dual equations; J is that of Kaufman. `docs/method.md` names the sources.
 
 Shapes: S networks, Q samples, D inputs, H hidden neurons, O outputs, A alternative targets, P = (D + 1) H weights.
 """
@@ -35,13 +33,7 @@ Samples = tuple[Tensor, Tensor]
 def train_batch(
     hidden: Tensor, training: Samples, validation: Samples, max_steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Train every network until validation stalls for MAX_STALLED_STEPS, or no step lowers its loss.
-
-    Args:
-        hidden: initial hidden weights; shape (S, D + 1, H).
-        training: samples to fit.
-        validation: samples by which the best step is chosen.
-        max_steps: most accepted steps of a network.
+    """Train every network from its hidden weights until validation stalls, or no step lowers its loss.
 
     Returns:
         Hidden (S, D + 1, H) and output weights (S, H + 1, O) that did best on `validation`, and (S,) accepted steps.

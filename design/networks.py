@@ -93,11 +93,8 @@ def fit_batch(
         validation: inputs (S, C, D) and targets (C, O); if given, all samples are for training.
         alternatives: targets (A, Q, O) as valid as `targets`: a sample counts by the nearest one.
 
-    Raises:
-        InputError: fewer than 3 samples, not as many targets as inputs, nothing to learn from or with, or numbers that
-            are not finite.
     """
-    inputs = _check_samples(inputs, targets, len(rngs), hidden)
+    inputs = np.broadcast_to(inputs, (len(rngs), *inputs.shape[-2:]))
     options = targets[None] if alternatives is None else np.concatenate([targets[None], alternatives])
     scalers = [RangeScaler.fit(samples) for samples in inputs]
     target_scaler = RangeScaler.fit(options.reshape(-1, targets.shape[1]))
@@ -121,21 +118,6 @@ def fit_batch(
     ]
 
 
-def _check_samples(inputs: Array, targets: Array, networks: int, hidden: int) -> Array:
-    """Return inputs (S, Q, D) of all networks, if they and the targets (Q, O) can be learnt."""
-    if min(networks, hidden, inputs.shape[-1]) < 1:
-        raise InputError(
-            f"{networks} networks of {hidden} neurons for {inputs.shape[-1]} inputs, allowed is at least 1 of each"
-        )
-    if not (np.isfinite(inputs).all() and np.isfinite(targets).all()):
-        raise InputError("inputs or targets hold NaN or infinity, expected finite numbers")
-    inputs = np.broadcast_to(inputs, (networks, *inputs.shape[-2:]))
-    samples = inputs.shape[1]
-    if samples != len(targets) or samples < 3:
-        raise InputError(f"{samples} inputs and {len(targets)} targets, allowed is as many of both, at least 3")
-    return inputs
-
-
 def best_device() -> str:
     """Return torch's name of the GPU, if there is one, else of the processor."""
     return "cuda" if torch.cuda.is_available() else "cpu"
@@ -144,10 +126,7 @@ def best_device() -> str:
 def initial_weights(varies: NDArray[np.bool_], hidden: int, rng: np.random.Generator) -> Array:
     """Draw hidden weights (H, D + 1), biases last, by Nguyen and Widrow (IJCNN 1990): regions spread over [-1, 1]^D.
 
-    Args:
-        varies: which inputs vary; the others get weight 0, as if they were absent; shape (D,).
-        hidden: neurons H.
-        rng: source of the weights.
+    Inputs that do not vary, by `varies` (D,), get weight 0, as if they were absent.
     """
     weights = rng.uniform(-1, 1, (hidden, len(varies))) * varies
     length = 0.7 * hidden ** (1 / max(1, varies.sum()))
@@ -249,15 +228,10 @@ class SimulatedPresses:
         respond: Callable[[Array], Array],
         size: PadSettings | None = None,
     ) -> "SimulatedPresses":
-        """Simulate a serpentine of training presses and uniformly drawn test presses.
+        """Simulate a serpentine of `side`^2 training presses, and `test` uniformly drawn test presses.
 
-        Args:
-            pad: the fibres.
-            side: square root of the number of training presses.
-            test: test presses.
-            seed: of the presses and the networks.
-            respond: gives the signals (Q, F) for positions (Q, 2) in grid units.
-            size: says what is pressed, without keep-outs; if None, what lies between the outermost fibres.
+        `respond` gives the signals (Q, F) for positions (Q, 2), grid units. `size` says what is pressed, without
+        keep-outs; if None, what lies between the outermost fibres.
         """
         rectangle = between_fibres(pad.layout) if size is None else size.sensed
         training, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
@@ -266,12 +240,7 @@ class SimulatedPresses:
         return cls(training, respond(training), fresh, respond(fresh), seed)
 
     def failure_errors(self, failures: Sequence[Sequence[FailureSet]], hidden: int) -> list[FailureError]:
-        """Train and test networks of `hidden` neurons for every set of failed fibres.
-
-        Args:
-            failures: the sets, by number of failed fibres.
-            hidden: neurons of a network.
-        """
+        """Train and test networks of `hidden` neurons for every set of failed fibres, sorted by their number."""
 
         def mean_errors(batch: list[FailureSet]) -> Array:
             networks = self.fit(batch, hidden)
@@ -290,10 +259,7 @@ class SimulatedPresses:
     def fit(self, failures: Sequence[FailureSet], hidden: int, repeat: int = 0) -> list[Network]:
         """Train a network on the working fibres for each set of failed fibres of one size.
 
-        Args:
-            failures: sets of failed fibres.
-            hidden: neurons of a network.
-            repeat: another one gives other first weights and another split of the presses.
+        Another `repeat` gives other first weights and another split of the presses.
         """
         rngs = [np.random.default_rng([2, self.seed, len(failed), *failed, repeat]) for failed in failures]
         inputs = np.stack([self.train_signals[:, self._working(failed)] for failed in failures])

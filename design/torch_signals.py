@@ -19,12 +19,7 @@ from padforge.design.settings import Contact
 
 
 def pchip_slopes(t: Tensor, v: Tensor) -> Tensor:
-    """Compute slopes (..., n) of PCHIP interpolants, as the kernels do to rounding; differentiable almost everywhere.
-
-    Args:
-        t: ascending coordinates; shape (..., n).
-        v: values; shape (..., n).
-    """
+    """Compute slopes of PCHIP interpolants of values v at ascending t, all (..., n), as the kernels do to rounding."""
     h = t.diff(dim=-1)
     m = v.diff(dim=-1) / h
     if t.shape[-1] == 2:
@@ -46,13 +41,7 @@ def _end_slope(h0: Tensor, h1: Tensor, m0: Tensor, m1: Tensor) -> Tensor:
 
 
 def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """Return values and slopes, both (..., F), of PCHIP interpolants.
-
-    Args:
-        t: ascending coordinates; shape (..., n).
-        v: values; shape (..., n).
-        at: coordinates to evaluate at; shape (F,).
-    """
+    """Return values and slopes (..., F), at coordinates (F,), of PCHIP interpolants of v at ascending t (..., n)."""
     d = pchip_slopes(t, v)
     inner = t[..., 1:-1].detach().contiguous()
     j = torch.searchsorted(inner, at.expand(*t.shape[:-1], -1).contiguous(), right=True)
@@ -66,12 +55,9 @@ def pchip_sample(t: Tensor, v: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
-    """Return points (..., P, 2) and slopes (..., P) of PCHIP interpolants, denser towards the ends, where spans bend.
+    """Return points (..., P, 2) and slopes (..., P) of PCHIP interpolants of v at ascending t (..., n).
 
-    Args:
-        t: ascending coordinates; shape (..., n).
-        v: values; shape (..., n).
-        per_span: samples per span; P = (n - 1) per_span + 1.
+    They are `per_span` for each span, denser towards its ends, where it bends, and the last knot.
     """
     d = pchip_slopes(t, v)
     t0, v0, d0, d1 = (x[..., None] for x in (t[..., :-1], v[..., :-1], d[..., :-1], d[..., 1:]))
@@ -87,13 +73,7 @@ def span_samples(t: Tensor, v: Tensor, per_span: int) -> tuple[Tensor, Tensor]:
 
 
 def arc_lengths(along: Tensor, across: Tensor, slope: Tensor) -> Tensor:
-    """Compute the arc lengths (F,) of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep.
-
-    Args:
-        along: knots along the axis; shape (F, n).
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots; shape (F, n).
-    """
+    """Compute the arc lengths (F,) of PCHIP curves by Gauss-Legendre quadrature, to 1e-3 where they are steep."""
     nodes, weights = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(8))
     s = (nodes + 1) / 2
     h, d0, d1 = along.diff(dim=-1)[..., None], slope[:, :-1, None], slope[:, 1:, None]
@@ -107,16 +87,8 @@ def press_signals(
 ) -> Tensor:
     """Compute the signals (F, Q) of one pad, grid units for weights without unit, with their analytic gradient.
 
-    They are exact for a shape, and within PRECISION of `measured_signals` for a sensitivity profile.
-
-    Args:
-        along: knots along the axis; shape (F, n), float64.
-        across: knots across it; shape (F, n).
-        slope: slopes at the knots, held independent; shape (F, n).
-        presses: centres; shape (Q, 2), grid units.
-        contact: contact model.
-        ends: positions of the fibre ends.
-        unit_mm: the pad's grid unit, mm.
+    They are exact for a shape, and within PRECISION of `measured_signals` for a sensitivity profile. Slopes at the
+    knots are independent of them, all (F, n) in float64; `presses` are (Q, 2).
     """
     return _PressSignals.apply(along, across, slope, presses, contact, ends, unit_mm)  # pyright: ignore[reportReturnType]
 
@@ -128,11 +100,8 @@ class _PressSignals(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> Tensor:
         t, v, d = (x.detach().numpy() for x in inputs[:3])
         presses, contact, ends, unit_mm = inputs[3:]
-        shape, max_offsets, out = (
-            press_shape(contact, unit_mm),
-            compute_max_offsets(v[None], ends),
-            np.zeros((len(presses), len(t))),
-        )
+        shape, max_offsets = press_shape(contact, unit_mm), compute_max_offsets(v[None], ends)
+        out = np.zeros((len(presses), len(t)))
         if contact.sensitivity_profile:  # elements are cut once for both directions
             law, spacing = shape[2], element_spacing(contact.profile_points(unit_mm))
             elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacing)

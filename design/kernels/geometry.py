@@ -20,35 +20,24 @@ NO_PROFILE = np.empty((0, 5))
 
 
 class Ends(NamedTuple):
-    """Positions of fibre ends: horizontal i (from 0) at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x.
+    """Positions of fibre ends: horizontal i (from 0) is at the height (i + 1) spacing_y, vertical i alike."""
 
-    Attributes:
-        horizontals: number of horizontals.
-        verticals: number of verticals.
-        spacing_y: distance of horizontals, grid units.
-        spacing_x: distance of verticals, grid units.
-    """
-
-    horizontals: int
-    verticals: int
-    spacing_y: float
-    spacing_x: float
+    horizontals: int  # number of horizontals
+    verticals: int  # number of verticals
+    spacing_y: float  # distance of horizontals, grid units
+    spacing_x: float  # distance of verticals, grid units
 
 
 class WeightLaw(NamedTuple):
     """Weight of a fibre element in a press.
 
-    Attributes:
-        radius: circumradius of the shape, or the distance at which a profile ends.
-        weight: UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE.
-        length: MANHATTAN or EUCLIDEAN.
-        profile: rows of a squared distance and the coefficients of a cubic in the excess over it, up to the next row's;
-            shape (B, 5); NO_PROFILE for a weight with a formula.
+    A profile (B, 5) has rows of a squared distance and the coefficients of a cubic in the excess over it, up to the
+    next row's.
     """
 
-    radius: float
-    weight: int
-    length: int
+    radius: float  # circumradius of the shape, or the distance at which a profile ends
+    weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
+    length: int  # MANHATTAN or EUCLIDEAN
     profile: Array = NO_PROFILE
 
 
@@ -128,19 +117,11 @@ def max_offsets(across: Any, ends: Any) -> Any:
     out = np.zeros((population, 2))
     for p in range(population):
         for f in range(fibres):
-            family, first, _, spacing = _family_of(f, ends)
-            level = (f - first + 1) * spacing
+            family = 0 if f < ends.horizontals else 1
+            level = (f + 1) * ends.spacing_y if family == 0 else (f - ends.horizontals + 1) * ends.spacing_x
             for at in across[p, f]:
                 out[p, family] = max(out[p, family], abs(at - level))
     return out
-
-
-@njit(cache=True, error_model="numpy")
-def _family_of(fibre: int, ends: Any) -> tuple[int, int, int, float]:
-    """Return a fibre's family, 0 or 1, its first fibre and the one after its last, and the spacing of their ends."""
-    if fibre < ends.horizontals:
-        return 0, 0, ends.horizontals, ends.spacing_y
-    return 1, ends.horizontals, ends.horizontals + ends.verticals, ends.spacing_x
 
 
 @njit(cache=True, error_model="numpy")
@@ -238,33 +219,20 @@ def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, A
     return sides, segments, lines
 
 
-@njit(cache=True, error_model="numpy")
-def _cumulate_lengths(points: Any, first: Any) -> Any:
-    """Return the arc length (n,) of each vertex along its polyline."""
-    arcs = np.zeros(len(points))
-    for line in range(len(first) - 1):
-        for k in range(first[line] + 1, first[line + 1]):
-            arcs[k] = arcs[k - 1] + math.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
-    return arcs
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, width: float) -> Any:
     """Find the intervals of polylines that are nearer than `width` to segments of other polylines.
 
-    Args:
-        points: vertices of all polylines, one after the other; shape (n, 2).
-        first: index of each polyline's first vertex, and n; shape (L + 1,).
-        others: vertices of the polylines to compare with; shape (m, 2).
-        other_first: as `first`, for these; shape (M + 1,).
-        width: distance below which they are near.
-
-    Returns:
-        Polyline, other polyline, and arc length of start and end of the interval; shape (k, 4).
+    `points` (n, 2) are the vertices of all polylines, one after the other, `first` (L + 1,) the index of the first one
+    of each, and n; the same for the others. Intervals (k, 4) are the polyline, the other one, and the arc lengths of
+    start and end.
     """
     sides, segments, lines = _bound_segments(points, first, width)
     other_sides, other_segments, other_lines = _bound_segments(others, other_first, 0.0)
-    arcs = _cumulate_lengths(points, first)
+    arcs = np.zeros(len(points))  # of each vertex along its polyline
+    for line in range(len(first) - 1):
+        for k in range(first[line] + 1, first[line + 1]):
+            arcs[k] = arcs[k - 1] + math.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
     intervals, count = np.empty((64, 4)), 0
     for box in range(len(sides)):
         x_min, y_min, x_max, y_max = sides[box]
@@ -394,15 +362,10 @@ def sum_overlaps(
 ) -> float:
     """Sum how much nearer than `width`, relative to it, points of fibres are to the tangent of one of the other family.
 
-    Args:
-        samples: samples of the fibres, along and across their axis; shape (F, P, 2).
-        slope: slopes at the samples; shape (F, P).
-        arc: arc lengths at the samples; shape (F, P).
-        pairs: fibre of each middle, and the one of the other family that it is near; two of shape (K,).
-        middles: arc length of each middle; shape (K,).
-        half: arc length from a middle to the two points before and after it.
-        width: distance at which a point has no overlap.
-        gradient: derivative of the sum by `samples`, for points at fixed arc lengths, is added; shape (F, P, 2).
+    Two points count for each of the `middles` (K,), at the arc length `half` before and after it. `pairs` are the fibre
+    of each middle and the one of the other family that it is near. `samples` (F, P, 2) of the fibres are along and
+    across their axis, with `slope` and `arc` lengths (F, P). The derivative of the sum by `samples`, for points at
+    fixed arc lengths, is added to `gradient`.
     """
     (fibres, neighbours), n_samples, total = pairs, samples.shape[1], 0.0
     for k in range(len(fibres)):

@@ -30,34 +30,20 @@ MAX_PIECES = 512
 
 
 class Elements(NamedTuple):
-    """Fibres cut into E elements, in the order of fibres and along each of them.
+    """Fibres cut into E elements, in the order of fibres and along each of them; all but two of shape (E,)."""
 
-    Attributes:
-        horizontals: number of fibres, the first ones, that run along x.
-        starts: index of the first element of each span, and in the last column of the next fibre; shape (F, n).
-        along: coordinate along the fibre's axis; shape (E,), grid units.
-        across: coordinate across it; shape (E,), grid units.
-        length: length; shape (E,), grid units.
-        share: position on its span, 0..1; shape (E,).
-        weight: quadrature weight, as a share of the span; shape (E,).
-    """
-
-    horizontals: int
-    starts: Any
-    along: Array
-    across: Array
-    length: Array
-    share: Array
-    weight: Array
+    horizontals: int  # number of fibres, the first ones, that run along x
+    starts: Any  # first element of each span, and in the last column of the next fibre; shape (F, n)
+    along: Array  # coordinate along the fibre's axis, grid units
+    across: Array  # coordinate across it, grid units
+    length: Array  # grid units
+    share: Array  # position on its span, 0..1
+    weight: Array  # quadrature weight, as a share of the span
 
 
 @lru_cache(maxsize=64)
 def element_spacing(points: tuple[tuple[float, float], ...]) -> float:
-    """Return the largest spacing of elements at which a straight fibre at any distance is within PRECISION.
-
-    Args:
-        points: profile as (distance in grid units, weight).
-    """
+    """Return the largest spacing at which a straight fibre is within PRECISION, by (distance, weight) of a profile."""
     profile, end = profile_coefficients(points), points[-1][0]
     distances, shifts = end * np.arange(32)[:, None, None] / 32, np.arange(16)[:, None] / 16
 

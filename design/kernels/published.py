@@ -6,15 +6,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from padforge.design.kernels.geometry import (
-    MANHATTAN,
-    SCRATCH,
-    UNIFORM,
-    find_unit_roots,
-    select_frame,
-    shell_sort,
-    weigh,
-)
+from padforge.design.kernels.geometry import MANHATTAN, UNIFORM, select_frame, shell_sort, weigh
 from padforge.design.kernels.pchip import extremes, pchip_sample, piece_of
 
 
@@ -106,8 +98,8 @@ def _sum_stretch(
 @njit(cache=True, error_model="numpy")
 def _sample_fibre_signals(
     t: Any, v: Any, curve: Any, step: float, presses: Any, family: int, shape: Any, out: Any
-) -> int:
-    """Compute the signals (Q,) of one fibre sampled at 0, step, ...; return the number of samples visited.
+) -> None:
+    """Compute the signals (Q,) of one fibre sampled at 0, step, ...
 
     Fibres are monotone between knots, so the samples that a press can touch are index ranges: by its extent along the
     axis, then by bisection across it.
@@ -125,7 +117,6 @@ def _sample_fibre_signals(
     starts[n - 1] = segments
     low, high = extremes(v)
     bottom, top = low - extents[3], high - extents[2]
-    visited = 0
     for q in range(len(presses)):
         ct, cv = presses[q, family], presses[q, 1 - family]
         out[q] = 0.0
@@ -145,32 +136,28 @@ def _sample_fibre_signals(
                 # one more on either side: rounding may break the order of sampled values that bisection relies on
                 a, b = max(a - 1, first, starts[j]), min(b + 1, last, starts[j + 1])
                 out[q] += _sum_stretch(curve, segment_lengths, a, b, step, ct, cv, shape)
-                visited += b - a
             j += 1
-    return visited
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def quantized_signals(
     along: Any, across: Any, horizontals: int, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
-) -> int:
+) -> None:
     """Compute signals (P, Q, F) of fibres `begin` to `end` of all P F: sums of sampled segments that start inside.
 
-    The shape is (chains, extents, law), `samples` the points per fibre. Returns the number of samples visited.
+    The shape is (chains, extents, law), `samples` the points per fibre.
     """
     fibres = along.shape[1]
     curve, column = np.empty(samples), np.empty(len(presses))
-    visited = 0
     for index in range(begin, end):
         p, f = index // fibres, index % fibres
         family = 0 if f < horizontals else 1
         t, v = along[p, f], across[p, f]
         step = t[-1] / (samples - 1)
         pchip_sample(t, v, step, curve)
-        visited += _sample_fibre_signals(t, v, curve, step, presses, family, select_frame(shape, family), column)
+        _sample_fibre_signals(t, v, curve, step, presses, family, select_frame(shape, family), column)
         for q in range(len(presses)):
             out[p, q, f] = column[q]
-    return visited
 
 
 @njit(cache=True, error_model="numpy")
@@ -264,54 +251,3 @@ def published_terms(
         )
         out[p, 1] = sum_second_differences(scaled)
         out[p, 2] = _sum_disorder(curves, horizontals)
-
-
-@njit(cache=True, error_model="numpy")
-def _add_cubic(t: Any, v: Any, d: Any, k: int, a: float, width: float, sign: float, p: Any) -> None:
-    """Add `sign` times span k of a fibre on [a, a + width] to p (4,), powers of u in [0, 1]."""
-    h, rise = t[k + 1] - t[k], v[k + 1] - v[k]
-    a1, a2, a3 = h * d[k], 3 * rise - h * (2 * d[k] + d[k + 1]), h * (d[k] + d[k + 1]) - 2 * rise
-    s, w = (a - t[k]) / h, width / h
-    p[0] += sign * (v[k] + s * (a1 + s * (a2 + s * a3)))
-    p[1] += sign * w * (a1 + s * (2 * a2 + 3 * s * a3))
-    p[2] += sign * w * w * (a2 + 3 * s * a3)
-    p[3] += sign * w**3 * a3
-
-
-@njit(cache=True, error_model="numpy")
-def _integrate_area_above(t: Any, v: Any, d: Any, other_t: Any, other_v: Any, other_d: Any) -> float:
-    """Integrate max(curve - other, 0) of two PCHIP curves exactly, from their knots and slopes."""
-    roots, work, p = np.empty(4), np.empty(SCRATCH), np.empty(4)
-    i, j, total, a = 0, 0, 0.0, t[0]
-    while i < len(t) - 1 and j < len(other_t) - 1:
-        b = min(t[i + 1], other_t[j + 1])
-        if b > a:
-            p[:] = 0.0
-            _add_cubic(t, v, d, i, a, b - a, 1.0, p)
-            _add_cubic(other_t, other_v, other_d, j, a, b - a, -1.0, p)
-            count = find_unit_roots(p, np.int64(3), 1e-15 * (abs(v[i]) + abs(v[i + 1])), roots, np.int64(0), work)
-            roots[count] = 1.0
-            start, before = 0.0, 0.0
-            for r in range(count + 1):
-                u = roots[r]
-                after = u * (p[0] + u * (p[1] / 2 + u * (p[2] / 3 + u * p[3] / 4)))
-                u = 0.5 * (start + roots[r])
-                if p[0] + u * (p[1] + u * (p[2] + u * p[3])) > 0:
-                    total += (b - a) * (after - before)
-                start, before = roots[r], after
-        a = b
-        if t[i + 1] <= b:
-            i += 1
-        if other_t[j + 1] <= b:
-            j += 1
-    return total
-
-
-@njit(cache=True, error_model="numpy")
-def integrate_disorder(along: Any, across: Any, slope: Any, horizontals: int) -> float:
-    """Sum `_integrate_area_above` over pairs i < j of each family."""
-    total = 0.0
-    for i in range(len(along)):
-        for j in range(i + 1, horizontals if i < horizontals else len(along)):
-            total += _integrate_area_above(along[i], across[i], slope[i], along[j], across[j], slope[j])
-    return total

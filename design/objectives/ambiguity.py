@@ -48,14 +48,9 @@ def free_presses(size: PadSettings) -> Array:
 
 
 def ambiguity(signals: "Tensor", presses: "Tensor", masks: "Tensor", weights: "Tensor", noise: float) -> "Tensor":
-    """Compute A of the module's formula, weighted over sets of failed fibres; differentiable.
+    """Compute A of the module's formula, averaged by `weights` (L,) over sets of failed fibres; differentiable.
 
-    Args:
-        signals: shape (F, Q).
-        presses: shape (Q, 2), grid units.
-        masks: 1 for a fibre that works, 0 for a failed one; shape (L, F).
-        weights: of each set, sum 1; shape (L,).
-        noise: sigma of a signal, grid units, > 0.
+    `signals` (F, Q) at `presses` (Q, 2) have `noise` sigma, grid units; `masks` (L, F) are 1 for a fibre that works.
     """
     import torch  # not above: the editor maps the ambiguity without it
 
@@ -71,15 +66,7 @@ def ambiguity(signals: "Tensor", presses: "Tensor", masks: "Tensor", weights: "T
 def ambiguities(
     pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
-    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed on a grid of presses.
-
-    Args:
-        pad: the fibres.
-        contact: what a press does to them.
-        max_failures: most failed fibres, or weights of 0, 1, ... failed.
-        noise: of a signal, share of full scale.
-        size: says what is pressed.
-    """
+    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed on a grid of presses; noise in full scales."""
     import torch
 
     presses = free_presses(size)
@@ -108,12 +95,8 @@ def ambiguity_map(
 ) -> Array:
     """Compute the ambiguity (K, Q), grid units, of every press with 0, 1, ... K - 1 fibres failed, fast enough to edit.
 
-    Args:
-        pad: the fibres.
-        presses: positions, each of which may be taken for any other; shape (Q, 2), grid units.
-        contact: exact, but for a sensitivity profile within the PRECISION of `measured_signals`.
-        max_failures: most failed fibres, or weights of 0, 1, ... failed.
-        noise: of a signal, share of full scale.
+    Each of the `presses` (Q, 2) may be taken for any other. Signals are exact, but for a sensitivity profile within the
+    PRECISION of `measured_signals`; `noise` is a share of full scale.
     """
     stretch = _fast_signals(pad, presses, contact) / lengths(pad)
     largest = stretch.max(axis=0)
@@ -129,7 +112,7 @@ def ambiguity_map(
 
 
 def _fast_signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
-    """Return signals (Q, F) as precise as a search needs them."""
+    """Return signals (Q, F) as precise as a search needs them, without torch."""
     if not contact.sensitivity_profile:
         return signals(pad, presses, contact)
     along, across, ends, _ = fibre_axes(pad)

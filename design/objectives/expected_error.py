@@ -1,7 +1,7 @@
 """Expected localisation error: the error of a regression of positions on responses, and the bound that noise sets.
 
-The response x of a fibre is its relative stretch (signal over length, as a divider shows it), in full scales of
-straight fibres. It scatters by a floor and by a share of itself, of whose variance all fibres have a part in common:
+The response x of a fibre is its relative stretch in full scales of straight fibres. It scatters by a floor and by a
+share of itself, of whose variance all fibres have a part in common:
 
     x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
 
@@ -11,17 +11,12 @@ For presses a and the set K of fibres that still work, two terms are added, as t
     B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' S_a^-1 J_a + 12 / size^2,     J_a = dx / dp there,
     expected error = 0.85 B_K + 0.47 L_K.
 
-L_K is the leave-one-out error of kernel ridge regression, in closed form (C. E. Rasmussen, C. K. I. Williams, Gaussian
-Processes for Machine Learning, 2006, chapter 2 and section 5.4.2; w is the width of the kernel, r the ridge, c_aa C's
-diagonal, p the positions from their middle). It counts confusions by their distance, as the ambiguity does; and it
-counts what a localizer has to learn between presses: responses that fold the pad too often are far apart for
-neighbours. B_K is the Cramer-Rao bound (van Trees 1968, section 2.4) with a prior over the pad: no localizer does
-better, however many presses it is trained on. S_a is the covariance of the responses, a diagonal matrix and a product
-of one vector. Its dependence on the position, which has a few per cent more information, is left out.
+L_K is the leave-one-out error of kernel ridge regression, in closed form, with w the width of the kernel, r the ridge,
+c_aa C's diagonal and p the positions from their middle; B_K is the Cramer-Rao bound with a prior over the pad, S_a the
+covariance of the responses there. `docs/method.md` names sources and reasons.
 
-Presses are compared on a fine grid over a window of the pad. Where the pad is larger, presses of a coarse grid over the
-remaining pad whose responses resemble some press of the window are added to the regression, so that distant positions
-may not look alike. The cost of a window grows with the pad's area, by the coarse presses, up to MAX_FAR.
+Presses are compared on a fine grid over a window of the pad. Presses of a coarse grid over the remaining pad whose
+responses resemble some press of the window are added to the regression, so that distant positions may not look alike.
 """
 
 import math
@@ -90,11 +85,7 @@ class PressWindow(NamedTuple):
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
     """Compute the expected errors, grid units, with 0, 1, ... fibres failed, always on the same presses.
 
-    Args:
-        pad: the fibres.
-        contact: what a press does to them.
-        search: says how many fibres may fail, and how responses scatter.
-        size: says what is pressed.
+    `search` says how many fibres may fail, and how responses scatter; `size` says what is pressed.
     """
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
@@ -126,15 +117,9 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
 
 
 def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> float:
-    """Compute the full scale of responses: the mean over straight fibres of their largest relative stretch.
-
-    Args:
-        layout: where the fibres end.
-        contact: what a press does to them.
-        sensed_mm: what is pressed, as in `PadSettings`.
-    """
+    """Compute the full scale of responses: the mean over straight fibres of their largest relative stretch."""
     rectangle = sensed_rectangle(layout, sensed_mm)
-    presses = grid_positions(_place_window(rectangle, 0.5), FULL_SCALE_SIDE)
+    presses = grid_positions(place_window(rectangle, 0.5), FULL_SCALE_SIDE)
     largest = relative_stretch(Morphology.straight(layout), presses, contact).max(axis=0)
     if (np.ptp(rectangle, axis=0) > WINDOW).any():  # fibres beside the presses are as those of their family among them
         for rows in layout.families:
@@ -163,13 +148,8 @@ def evaluation_windows(rectangle: Rectangle) -> list[Rectangle]:
     return [(tuple(corner.tolist()), tuple((corner + size).tolist())) for corner in corners]
 
 
-def sample_window(rectangle: Rectangle, rng: np.random.Generator) -> Rectangle:
-    """Draw a window anywhere in what is pressed: all of it unless it is large."""
-    return _place_window(rectangle, rng.random(2))
-
-
-def _place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
-    """Return a window at a share of the way from the lower corner of a rectangle to the upper one."""
+def place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
+    """Return a window at a share of the way from corner to corner of a rectangle, or all of it if it is small."""
     low, high = np.array(rectangle)
     size = np.minimum(high - low, WINDOW)
     corner = low + share * (high - low - size)
@@ -177,14 +157,7 @@ def _place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
 
 
 def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> PressWindow:
-    """Return presses on a randomly shifted grid over a window, and coarse ones over the remaining pad.
-
-    Args:
-        size: says what is pressed.
-        window: its corners, grid units.
-        side: presses along a side of the window.
-        rng: source of the shifts, by up to a cell.
-    """
+    """Return side x side presses on a randomly shifted grid over a window, and coarse ones over all that is beside."""
 
     def shifted_grid(low: Array, high: Array, counts: Array) -> Array:
         cells = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
@@ -205,12 +178,8 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
 def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
     """Find the far presses whose responses are nearest to some press of a window, under any set of failed fibres.
 
-    They are at most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths of the kernel or more.
-
-    Args:
-        near: responses of the window, weighted as in the kernel; shape (F, Q).
-        far: those over the remaining pad; shape (F, N).
-        masks: 1 for a fibre that works; shape (L, F).
+    They are at most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths or more. Responses of
+    the window (F, Q) and of the remaining pad (F, N) are weighted as in the kernel; `masks` are (L, F).
     """
     if not far.shape[1]:
         return torch.empty(0, dtype=torch.int64)
@@ -251,12 +220,9 @@ def expected_error(
 
 
 def aggregate_failures(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
-    """Return the geometric mean of errors over numbers of failed fibres: relative gains count alike at each.
+    """Return the geometric mean of errors (L,) over numbers of failed fibres: relative gains count alike at each.
 
-    Args:
-        errors: shape (L,).
-        masks: the sets of failed fibres that they belong to; shape (L, F).
-        shares: P(k) of k = 0, 1, ... failed; numbers that do not occur in `masks` are left out.
+    `masks` (L, F) are the sets of failed fibres, `shares` P(k) of k = 0, 1, ... failed, as far as they occur there.
     """
     n_failed = (masks == 0).sum(dim=1)
     levels = [k for k in range(len(shares)) if (n_failed == k).any()]

@@ -12,13 +12,7 @@ DRAWS = 2
 
 
 def failure_subsets(fibres: int, n_failed: int, max_subsets: int = 256) -> list[tuple[int, ...]]:
-    """Return all sets of failed fibres of one size, in order; if there are too many, always the same sample of them.
-
-    Args:
-        fibres: number of fibres.
-        n_failed: size of a set.
-        max_subsets: most sets.
-    """
+    """Return all sets of failed fibres of one size, in order; if there are too many, always the same sample of them."""
     if math.comb(fibres, n_failed) <= max_subsets:
         return list(itertools.combinations(range(fibres), n_failed))
     rng = np.random.default_rng(0)
@@ -35,10 +29,9 @@ def failure_masks(fibres: int, n_failed: int, max_subsets: int) -> Array:
 
 
 def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
-    """Return the probabilities P(k) that k = 0, 1, ... fibres have failed.
+    """Return the probabilities P(k) that k = 0, 1, ... fibres have failed, from their weights.
 
-    Args:
-        max_failures: most failed fibres: half for none, and equal from 1 to it; or weights of 0, 1, ... failed.
+    Or, for the most failed fibres alone: half for none, and equal from 1 to it.
     """
     weights = (max(max_failures, 1.0), *(1.0,) * max_failures) if isinstance(max_failures, int) else max_failures
     return tuple(weight / sum(weights) for weight in weights)
@@ -47,10 +40,7 @@ def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
 def sample_failures(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> Array:
     """Draw masks (L, F), 1 for a fibre that works, of DRAWS sets of failed fibres of each size, and of one of size 0.
 
-    Args:
-        fibres: number of fibres.
-        shares: P(k) of k = 0, 1, ... failed; sizes of probability 0, and those that leave no fibre, are left out.
-        rng: source of the draws.
+    Sizes of probability 0 by the `shares` P(k), and those that leave no fibre, are left out.
     """
     draws = [size for size, share in enumerate(shares[:fibres]) if share > 0 for _ in range(DRAWS if size else 1)]
     masks = np.ones((len(draws), fibres))

@@ -90,12 +90,7 @@ def penalties(
 ) -> dict[str, Tensor]:
     """Compute the penalty of each rule that can be broken: scalars with gradient by the knots, by name.
 
-    Args:
-        along: coordinates of the knots along their fibres; shape (F, N + 2), grid units.
-        across: those at right angles to them.
-        pad: settings of the pad.
-        rules: the limits.
-        margin: factor on the limits, so that a curve with penalty 0 passes the exact check.
+    The knots are (F, N + 2) coordinates along and across the fibres, grid units; `margin` is a factor on the limits.
 
     Raises:
         InputError: so many fibres and knots that a comparison of their samples does not fit into memory.

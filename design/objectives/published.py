@@ -19,7 +19,6 @@ from padforge.design.contact import (
     signals,
 )
 from padforge.design.kernels import published as kernels
-from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology
 from padforge.design.settings import (
     LEVELS,
@@ -47,22 +46,6 @@ def joint_entropy(levels: Array) -> float:
     return float(kernels.compute_row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
 
 
-def published_sharpness(levels: Array) -> float:
-    """Return Z of formula (4): the sum over columns of |second difference| along the press order."""
-    return float(kernels.sum_second_differences(np.asarray(levels, dtype=np.float64)))
-
-
-def disorder_area(pad: Morphology) -> float:
-    """Compute the area by which fibres of a family stand in the wrong order, squared grid units.
-
-    The sum over pairs i < j of a family of the integral of max(curve_i - curve_j, 0), exact on the PCHIP curves; the
-    published disorder C approaches it times (samples - 1) / (M + 1).
-    """
-    along, across, ends, _ = fibre_axes(pad)
-    slopes = population_slopes(along, across)[0]
-    return max(0.0, float(kernels.integrate_disorder(along[0], across[0], slopes, ends.horizontals)))
-
-
 def idle_share(signals: Array) -> float:
     """Return the share of signals (Q, C), changes from rest, that are 0: of presses in which a fibre is idle."""
     return float((signals == 0).mean()) if signals.size else 0.0
@@ -79,15 +62,7 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
 
         I >= mean_a [ln det(C_a / sigma^2) / 2] - mean_a ln mean_b exp(-D_ab)    (in nats)
 
-    (pairwise bound on the entropy of a mixture: Kolchinsky and Tracey, Entropy 2017, equation (10)). Without the
-    covariance in a cell and without noise the second term alone is the joint entropy of the presses' signals, at most
-    log2 of their number. Two cells that the pad confuses cost the same in both.
-
-    Args:
-        pad: the fibres.
-        contact: what a press does to a fibre; the measured one if None.
-        noise: converter counts, > 0.
-        side: cells a side, at least 2.
+    (pairwise bound on the entropy of a mixture: Kolchinsky and Tracey, Entropy 2017, equation (10)).
     """
     low, high = np.array(between_fibres(pad.layout))
     x, y = ((np.arange(side) + 0.5) / side * (high - low)[axis] + low[axis] for axis in (0, 1))
@@ -156,14 +131,9 @@ def published_terms(
 ) -> list[PublishedTerms]:
     """Compute the terms of formula (5), as the published code does, for every pad of a population.
 
-    Args:
-        pads: a morphology, or knots (P, F, N + 2, 2) of a population.
-        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
-        presses: in an order of neighbours; the 49 published ones if None; shape (Q, 2).
-        samples: points per fibre of the quantised signals and of C.
-        weights: alpha, beta, gamma.
-        layout: of a population's fibres; as many horizontals as verticals, the default pitch apart, if None.
-        levels: whole levels that signals are rounded up to, 1 to 2^24.
+    The pads are a morphology, or knots (P, F, N + 2, 2) of a `layout`, by default as many horizontals as verticals, the
+    default pitch apart. `presses` (Q, 2) are in an order of neighbours, by default the 49 published ones. Signals have
+    so many `samples` a fibre, as C has, and are rounded up to so many `levels`.
     """
     if weights is not WEIGHTS and check_array("weights", weights, 1e12).shape != (3,):
         raise InputError(f"weights are {short_repr(weights)}, expected three numbers: alpha, beta, gamma")
@@ -196,9 +166,9 @@ def published_objective(
 
     Args:
         pad: the fibres.
-        contact: as in `published_terms`.
-        presses: as in `published_terms`.
-        samples: as in `published_terms`.
+        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
+        presses: in an order of neighbours; the 49 published ones if None; shape (Q, 2).
+        samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.
     """
     return published_terms(check_type("pad", pad, Morphology), contact, presses, samples, weights)[0].objective

@@ -287,10 +287,10 @@ class GradientSearch:
         search, pad = self.problem.search, self.problem.pad
         slope = pchip_slopes(along, across)
         length = arc_lengths(along, across, slope)[:, None]
-        # 1. a random window, another one if it lies in a keep-out, and random failures
+        # 1. a random window, all of the pad unless it is large; another one if it lies in a keep-out; random failures
         presses = None
         while presses is None or not presses.free.any():
-            window = objective.sample_window(pad.sensed, self.rng)
+            window = objective.place_window(pad.sensed, self.rng.random(2))
             presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
         shares = failure_shares(search.max_failures)
         failures = sample_failures(pad.layout.fibres, shares, self.rng)

@@ -48,13 +48,6 @@ def build_problem(
 ) -> SearchProblem:
     """Build the problem of some settings.
 
-    Args:
-        pad: settings of the pad.
-        contact: what a press does to a fibre.
-        settings: how to search.
-        rules: the limits.
-        origin: morphology to start from; None for random starts.
-
     Raises:
         InputError: settings that do not fit each other, the origin or this machine.
     """

@@ -326,12 +326,8 @@ def _name(problem: SearchProblem, start: int) -> str:
 def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
     """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
 
-    Profile and rectangle stay as they are in mm on a pad of another pitch; the rectangle is cut to the pad.
-
-    Args:
-        spec: settings; where it states no fibres or pitch, those of the twin count.
-        path: of the `twin.json`.
-        pad: whose fibres and pitch count instead.
+    Profile and rectangle stay as they are in mm on a pad of another pitch; the rectangle is cut to the pad. Where
+    `spec` states no fibres or pitch, those of the twin count, or instead of both those of `pad`.
 
     Raises:
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
@@ -375,16 +371,8 @@ def search_for_twin(
     It searches from random starts, and from the default pad, which needs no measurement. Of these pads, the default pad
     and straight fibres it returns the one with the least error of networks trained under the contact, and never one
     that locates less well than plain ones do. `candidate` is "twin", "from default", "default" or "straight fibres". A
-    search that is stopped ends with the best so far.
-
-    Args:
-        pad: settings of the pad.
-        contact: as measured.
-        settings: of the search, with the scatter as measured.
-        rules: the limits.
-        default_settings: settings of the search for the default pad, which is for the default contact.
-        origin: the morphology to start from; random if None.
-        run: callbacks, checkpoints, time budget and executor.
+    search that is stopped ends with the best so far. `default_settings` are those of the search for the default pad,
+    which is for the default contact.
     """
     run = run or SearchOptions()
     plain = search(pad, None, default_settings, rules, run=_part_options(run, "default"))
@@ -415,8 +403,7 @@ def search_for_twin(
 def choose(errors: Mapping[str, Array]) -> str:
     """Return the pad of least mean error, among those that are worse than the plain ones with no number of failures.
 
-    Args:
-        errors: with 0, 1, ... fibres failed, by pad; "default" and "straight fibres" are the plain ones, if present.
+    Errors are with 0, 1, ... fibres failed; "default" and "straight fibres" are the plain ones, if present.
     """
     plain = [errors[name] for name in ("default", "straight fibres") if name in errors]
     ratios = {name: error / np.min(plain or list(errors.values()), axis=0) for name, error in errors.items()}

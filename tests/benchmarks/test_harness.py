@@ -1,6 +1,5 @@
 """Measuring benchmarks: rounds, files, the summary, and the comparison with an earlier run. No times are asserted."""
 
-import csv
 import json
 
 import pytest
@@ -59,18 +58,13 @@ def test_run_benches_writes_measurements(tmp_path):
     summary, changes = run_benches([bench()], tmp_path, steps.append, {})
     assert steps
     assert not changes
-    assert {path.name for path in tmp_path.iterdir()} == {"x.json", "x.csv", "x.png", "bench.json", "bench.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"x.png", "bench.json"}
     assert json.loads((tmp_path / "bench.json").read_text()) == summary
-    assert read_earlier(tmp_path / "bench.json") == summary["benches"] == read_earlier(tmp_path / "x.json")
+    assert read_earlier(tmp_path / "bench.json") == summary["benches"]
     written = summary["benches"]["x"]
-    assert json.loads((tmp_path / "x.json").read_text()) == written
-    assert [(row["case"], row["way"]) for row in written["rows"]] == [
-        *(("a", "plain"), ("a", "ours"), ("b", "plain"), ("b", "ours"))
+    assert [(row["case"], row["way"], row["error"]) for row in written["rows"]] == [
+        *(("a", "plain", 0.5), ("a", "ours", 0.1), ("b", "plain", 0.5), ("b", "ours", 0.1))
     ]
-    assert [row["speed"] for row in written["rows"][::2]] == [1, 1]
-    assert b"\r" not in (tmp_path / "x.csv").read_bytes()
-    with (tmp_path / "x.csv").open() as file:
-        assert [row["error"] for row in csv.DictReader(file)] == ["0.5", "0.1"] * 2
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
     assert len(bench_lines(written)) == len(written["rows"]) + 3
     assert [(row["case"], row["reference_error"], row["error"]) for row in summary["summary"]] == [
@@ -116,8 +110,8 @@ def test_find_worsenings_reports_worse_trials(before, now, what):
 @pytest.mark.parametrize(
     "text",
     [
-        *("", "[]", "{}", '{"format": "padforge-benches/1"}', '{"format": "padforge-benches/1", "benches": 3}'),
-        *('{"format": "padforge-bench/1"}', '{"format": "padforge-benches/1", "benches": {"contact": {"rows": [1]}}}'),
+        *("", '{"format": "padforge-bench/1"}', '{"format": "padforge-benches/1", "benches": 3}'),
+        '{"format": "padforge-benches/1", "benches": {"contact": {"rows": [1]}}}',
     ],
 )
 def test_read_earlier_refuses_other_files(tmp_path, text):

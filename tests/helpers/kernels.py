@@ -33,7 +33,6 @@ def use_kernels() -> None:
     """Call what has kernels: contacts, objectives, a search, a mould's check, filters, a calibration and a twin."""
     from padforge import design, fabricate, sense
     from padforge.design.objectives.ambiguity import ambiguity_map
-    from padforge.design.objectives.published import disorder_area
     from padforge.design.settings import PUBLISHED_CONTACT
     from padforge.sense.deploy.streaming import ThresholdDetector
 
@@ -44,7 +43,6 @@ def use_kernels() -> None:
         design.signals_sparse(pad, presses, contact)
     design.signals_quantized(pad, presses)
     design.published_objective(pad)
-    disorder_area(pad)
     ambiguity_map(pad, presses, contacts[0], 1, 0.1)
     design.indented_signals(pad, presses, 0.1, design.Indenter())
     design.check_rules(pad, design.RulesSettings())

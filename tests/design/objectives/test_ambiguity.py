@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design import Contact, Morphology
-from padforge.design.contact import relative_stretch, signals
+from padforge.design.contact import signals
 from padforge.design.objectives.ambiguity import ambiguities, ambiguity, ambiguity_map, free_presses, full_scale
 from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets, sample_failures
 from padforge.design.objectives.score import sharpness
@@ -29,16 +29,6 @@ def test_ambiguity_ignores_failed_fibres():
     masks = torch.tensor([[0.0, 1.0], [1.0, 1.0]])
     assert ambiguity(signals, PAIR, masks, torch.tensor([1.0, 0.0]), noise=0.1).item() == pytest.approx(0.5)
     assert ambiguity(signals, PAIR, masks, torch.tensor([0.5, 0.5]), noise=0.1).item() == pytest.approx(0.25)
-
-
-def test_ambiguity_is_between_zero_and_the_mean_distance():
-    rng = np.random.default_rng(0)
-    places = torch.tensor(rng.uniform(1, 4, (16, 2)))
-    masks = torch.ones(1, 4, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-    blind = ambiguity(torch.zeros(4, 16, dtype=torch.float64), places, *masks, noise=0.2)
-    assert blind.item() == pytest.approx(torch.cdist(places, places).mean().item())
-    sharp = ambiguity(torch.tensor(100 * rng.standard_normal((4, 16))), places, *masks, noise=0.2)
-    assert sharp.item() < 1e-9
 
 
 def test_ambiguity_and_sharpness_gradients_match_finite_differences():
@@ -84,21 +74,6 @@ def test_failure_subsets_are_all_or_a_sample():
     assert len(drawn) == 20
     assert all(0 <= a < b < c < 8 for a, b, c in drawn)
     assert {fibre for loss in drawn for fibre in loss} == set(range(8))
-
-
-def test_ambiguities_average_over_failures_of_each_number():
-    """On the module's own grid of presses, each mask of losses counted alike."""
-    pad, contact, noise, size = Morphology.random(2, 3, seed=0), PUBLISHED_CONTACT, 0.07, PadSettings(grid=2)
-    line = np.linspace(0.5, 2.5, 20)
-    presses = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    stretch = torch.tensor(relative_stretch(pad, presses, contact).T)
-    sigma = noise * stretch.amax(dim=1).mean().item()
-    expected = []
-    for masks in (np.ones((1, 4)), 1 - np.eye(4)):
-        weight = torch.full((len(masks),), 1 / len(masks), dtype=torch.float64)
-        expected.append(ambiguity(stretch, torch.tensor(presses), torch.tensor(masks), weight, sigma).item())
-    assert ambiguities(pad, contact, 1, noise, size) == pytest.approx(expected, rel=1e-3)
-    assert len(ambiguities(pad, contact, 9, noise, size)) == 4
 
 
 def test_ambiguities_do_not_depend_on_untouched_fibres():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from padforge.design.contact import grid_positions, relative_stretch, signals
+from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import expected_error as module
 from padforge.design.objectives.expected_error import (
@@ -18,17 +18,11 @@ from padforge.design.objectives.expected_error import (
     expected_error,
     expected_errors,
     kernel_weights,
-    sample_window,
+    place_window,
     straight_full_scale,
     window_presses,
 )
-from padforge.design.paths.curves import lengths
-from padforge.design.settings import (
-    Contact,
-    PadSettings,
-    Scatter,
-    SearchSettings,
-)
+from padforge.design.settings import Contact, PadSettings, Scatter, SearchSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SIDE, SIZE = 14, np.array([4.0, 4.0])
@@ -48,7 +42,6 @@ def errors(signals: np.ndarray, masks, scatter=SILENT, free=FREE) -> list[float]
 
 
 def error(signals: np.ndarray, scatter=SILENT) -> float:
-    """With all fibres."""
     return errors(signals, [[1.0] * len(signals)], scatter)[0]
 
 
@@ -78,7 +71,7 @@ def bound(signals: np.ndarray, scatter: Scatter) -> float:
 def test_evaluation_windows_tile_the_pressed_area(size):
     low, high = np.array(size.sensed)
     windows = [np.array(window) for window in evaluation_windows(size.sensed)]
-    for window in (*windows, np.array(sample_window(size.sensed, np.random.default_rng(1)))):
+    for window in (*windows, np.array(place_window(size.sensed, np.array([0.0, 0.9])))):
         assert (window[0] >= low - 1e-9).all()
         assert (window[1] <= high + 1e-9).all()
         assert np.ptp(window, axis=0).max() <= module.WINDOW + 1e-9
@@ -89,7 +82,7 @@ def test_evaluation_windows_tile_the_pressed_area(size):
 
 def test_window_presses_sample_the_remaining_pad_coarsely():
     size = PadSettings(grid=9)
-    window = sample_window(size.sensed, np.random.default_rng(0))
+    window = place_window(size.sensed, 0.6)
     presses = window_presses(size, window, SIDE, np.random.default_rng(2))
     each = presses.positions.reshape(SIDE, SIDE, 2)
     assert np.diff(each[..., 0], axis=1) == pytest.approx(presses.step[0])
@@ -120,11 +113,6 @@ def test_expected_error_ignores_presses_in_keep_outs():
     assert errors(answers, kept, SILENT, presses.free)[0] == pytest.approx(expected, rel=1e-5)
 
 
-def test_expected_error_without_noise_matches_explicit_leave_one_out():
-    signals = random_responses()
-    assert error(signals) == pytest.approx(REGRESSION_WEIGHT * leave_one_out_error(signals), rel=1e-6)
-
-
 def test_expected_error_ignores_failed_fibres():
     other = random_responses()
     other[1] = other[1, ::-1]
@@ -146,9 +134,7 @@ def test_aggregate_failures_is_a_weighted_geometric_mean():
         better[level] *= 0.9
         assert aggregate_failures(better, kept, even).item() == pytest.approx(0.9 ** (1 / 3) * usual)
     assert aggregate_failures(given[:3], kept[:3], (0.2, 0.8, 0.0)).item() == pytest.approx(0.1**0.2 * 0.3**0.8)
-    assert aggregate_failures(given[:1], kept[:1], even).item() == pytest.approx(0.1), (
-        "what cannot be lost counts for nothing"
-    )
+    assert aggregate_failures(given[:1], kept[:1], even).item() == pytest.approx(0.1)
 
 
 def test_bound_matches_explicit_covariances():
@@ -195,13 +181,6 @@ def test_expected_error_gradient_matches_finite_differences(scatter):
         slope = (joint(signals + 1e-6 * way) - joint(signals - 1e-6 * way)) / 2e-6
     assert signals.grad is not None
     assert slope.item() == pytest.approx((signals.grad * way).sum().item(), rel=1e-3)
-
-
-def test_expected_error_in_single_precision():
-    signals = random_responses(8)
-    given = torch.tensor(PLACES), STEP, torch.tensor(FREE), torch.ones(1, 8), Scatter(0.01, 0.18, 0.36), torch.ones(8)
-    fine, coarse = (expected_error(torch.tensor(each), *given).item() for each in (signals, signals.astype(np.float32)))
-    assert coarse == pytest.approx(fine, rel=1e-3)
 
 
 def test_expected_error_counts_distant_presses_with_equal_responses():
@@ -260,32 +239,9 @@ def test_kernel_weights_scale_fibres_of_a_strip():
     full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, Contact(), "beyond")
     assert (weights.numpy() * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
     assert kernel_weights(PadSettings(grid=4).layout).numpy() == pytest.approx(np.ones(8))
-    search = SearchSettings(max_failures=0)
-    strip, square = (
-        expected_errors(Morphology.straight(each.layout), Contact(), search, each)[0]
-        for each in (size, PadSettings(grid=4))
-    )
-    assert strip < 1.3 * square
-
-
-def test_relative_stretch_is_signal_by_length():
-    pad, presses = Morphology.random(3, knots=4, seed=2), grid_positions(((0.5, 0.5), (3.5, 3.5)), 9)
-    stretch = relative_stretch(pad, presses, Contact())
-    assert stretch * lengths(pad) == pytest.approx(signals(pad, presses, Contact()))
-    scale = straight_full_scale(pad.layout, Contact(), "beyond")
-    # a fibre right under the press: the whole profile, over a length of 4
-    under = signals(Morphology.straight(3), [[2.0, 2.0]], Contact())[0].max() / 4
-    assert scale == pytest.approx(under, rel=1e-2)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_bound_of_one_informative_direction_keeps_the_prior_of_the_other(dtype):
     along = np.stack([PLACES[:, 0], 2 * PLACES[:, 0]]).astype(dtype)
     assert bound(along, Scatter(1e-9)) == pytest.approx(SIZE[1] / np.sqrt(12), rel=1e-3)
-
-
-def test_expected_errors_of_a_pad_without_signals():
-    asked = Contact(radius=1e-9), SearchSettings(max_failures=1, noise=0.01), PadSettings(grid=2)
-    found = expected_errors(Morphology.straight(2), *asked)
-    assert found == pytest.approx([found[0]] * 2)
-    assert found[0] > 0.8

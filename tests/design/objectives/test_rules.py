@@ -2,26 +2,16 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import InputError, Morphology, Spec, crossings
+from padforge.design.contact import fibre_axes
+from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
-from padforge.design.paths.curves import common_stretches, crossing_angles, flatten, slopes
-from padforge.design.settings import PUBLISHED, RulesSettings
-from tests.design.objectives.pads import bent
-
-NONE = RulesSettings(
-    min_bend_radius_mm=0,
-    min_gap_mm=0,
-    same_family_crossings=10**6,
-    border_mm=0,
-    max_length_mm=1e6,
-    max_common_track_mm=None,
-)
-
-
-def only(**limits):
-    return NONE.model_copy(update=limits)
+from padforge.design.paths.curves import common_stretches, flatten, slopes
+from padforge.design.settings import PUBLISHED, PadSettings, RulesSettings
+from tests.design.objectives.pads import bent, climbing, only, swung
 
 
 def test_check_rules_of_the_straight_grid_at_its_limits():
@@ -75,27 +65,12 @@ def test_violation_reads_as_one_line():
 
 
 def test_min_crossing_angle_is_measured_exactly():
-    """Half-way up a span that is as high as long, between two turning points, a PCHIP has slope 1.5."""
-    swung = np.array([[0, 1], [0.5, 0.5], [1.5, 1.5], [2, 1]])
-    pad = Morphology(np.stack([swung, [[1, 0], [1, 0.5], [1, 1.5], [1, 2]]]))
-    found = check_rules(pad, only(min_crossing_angle_deg=40))
+    found = check_rules(swung(), only(min_crossing_angle_deg=40))
     assert [(v.rule, v.fibres) for v in found] == [("min_crossing_angle_deg", (1, 2))]
     assert found[0].measured == pytest.approx(np.degrees(np.arctan(1 / 1.5)), abs=1e-6)
     assert found[0].place_mm == pytest.approx((0, 0), abs=1e-3)
-    assert check_rules(pad, only(min_crossing_angle_deg=33)) == []
+    assert check_rules(swung(), only(min_crossing_angle_deg=33)) == []
     assert check_rules(Morphology.straight(4), only(min_crossing_angle_deg=90)) == []
-
-
-def test_min_crossing_angle_names_each_pair_once():
-    pad = Morphology.random(3, 8, seed=1)
-    across = [c for c in crossings(pad, 1e-6) if c.first < 3 <= c.second]
-    least = {}
-    for c, angle in zip(across, crossing_angles(pad, across), strict=True):
-        pair = (c.first + 1, c.second + 1)
-        least[pair] = min(angle, least.get(pair, 30))
-    found = check_rules(pad, only(min_crossing_angle_deg=30, same_family_crossings=10**6))
-    assert {v.fibres: v.measured for v in found} == {pair: angle for pair, angle in least.items() if angle < 30}
-    assert len(found) > 1
 
 
 def test_same_family_crossings_are_placed():
@@ -222,16 +197,13 @@ def test_max_common_track_names_each_pair_once():
 @pytest.mark.parametrize("family", [0, 1])
 @pytest.mark.parametrize("end", [0, -1])
 def test_min_bend_radius_passes_lead_kinks_up_to_half_a_radian(rise, breaks, family, end):
-    """A straight climb from the end on, which a PCHIP keeps to; leads go straight on along the fibre's axis."""
-    at = np.array([0, 0.4, 0.8, 1.4, 2.0])
-    cross = np.array([1, 1 + 0.4 * rise, 1 + 0.8 * rise, 1, 1])
-    climbing = np.column_stack([at, cross] if end == 0 else [2 - at[::-1], cross[::-1]])
-    level = np.column_stack([np.ones(5), at])
-    fibres = [climbing, level] if family == 0 else [level[:, ::-1], climbing[:, ::-1]]
-    pad = Morphology(np.stack(fibres))
+    """Of the check and of the penalty; leads go straight on along the fibre's axis."""
+    pad, rules = climbing(rise, family, end), only(min_bend_radius_mm=1.0)
     angle = np.arctan(slopes(pad)[family, end])
-    found = check_rules(pad, only(min_bend_radius_mm=1.0))
+    found = check_rules(pad, rules)
     assert (abs(angle) > 0.5) == breaks
+    along, across = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
+    assert (penalties(along, across, PadSettings(grid=1), rules)["min_bend_radius_mm"] > 0) == breaks
     assert [v.fibres for v in found] == ([(family + 1,)] if breaks else [])
     if breaks:
         assert found[0].measured == pytest.approx(0.5 / abs(angle), rel=0.02)

@@ -6,7 +6,6 @@ import torch
 
 from padforge.design import Contact, Morphology
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.published import disorder_area, published_terms
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import Parametrization
@@ -51,9 +50,6 @@ def test_score_rules_and_plan_of_wild_pads_are_finite(kind, seed):
     terms = score(pad, contact, seed % 9, (1e-9, 0.1, 10.0)[seed % 3], rules)
     assert np.isfinite([*terms.values()]).all()
     assert 0 <= terms["published_entropy"] <= 2 * np.log2(49) + 1e-9
-    area, samples = disorder_area(pad), 20_001
-    sampled = published_terms(pad, samples=samples)[0].disorder * (pad.grid + 1) / (samples - 1)
-    assert sampled == pytest.approx(area, abs=2e-3 * (1 + area))
     findings = check_rules(pad, rules)
     assert np.isfinite([[finding.measured, finding.limit] for finding in findings]).all()
     draw_plan(pad, contact, findings).draw_without_rendering()

@@ -12,7 +12,7 @@ from padforge.design.contact import fibre_axes
 from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
-from padforge.design.optimize.gradient import ZIGZAG_START, GradientSearch, Parametrization, border_width, initial_paths
+from padforge.design.optimize.gradient import ZIGZAG_START, GradientSearch, Parametrization, initial_paths
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.optimize.search import search
 from padforge.design.paths.curves import lengths, refine
@@ -78,16 +78,6 @@ def test_arc_lengths_match_lengths():
     assert arc_lengths(travel, cross, pchip_slopes(travel, cross)).numpy() == pytest.approx(lengths(pad), rel=1e-3)
 
 
-@pytest.mark.parametrize("knots", [1, 2, 6, 7, 20, 64])
-@pytest.mark.parametrize("rules", [RulesSettings(), FREE])
-def test_initial_paths_are_a_pad_and_depend_on_the_generator(knots, rules):
-    for grid, start in ((1, 0), (4, 0), (8, ZIGZAG_START)):
-        pad = PadSettings(grid=grid)
-        courses = [initial_paths(pad, rules, knots, None, start, np.random.default_rng(seed)) for seed in (0, 1)]
-        assert Morphology(courses[0], pad.pitch_mm).knots.shape == (2 * grid, knots + 2, 2)
-        assert not np.array_equal(courses[0], courses[1])
-
-
 def test_initial_paths_from_an_origin_are_it_and_near_it():
     origin = Morphology.random(4, 5, seed=3)
     courses = [
@@ -109,13 +99,6 @@ def test_starts_are_nearly_straight_or_zigzag_by_contact(contact, gentle):
     assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
 
 
-def test_border_wider_than_the_pad_leaves_knots_in_the_middle():
-    rules = RulesSettings(border_mm=400)
-    pad = Morphology.random(4, 5)
-    knots = Parametrization.from_knots(pad.knots, pad.layout, border_width(PadSettings(), rules)).knots()
-    assert "border_mm" in {violation.rule for violation in check_rules(Morphology(knots), rules)}
-
-
 def test_gradient_search_resumes_bit_for_bit():
     """Before the first step, amid the steps, before the repair and in it."""
     asked = SearchSettings(knots=3, steps=10, max_failures=1), RulesSettings(max_length_mm=34)
@@ -131,14 +114,6 @@ def test_gradient_search_resumes_bit_for_bit():
         assert first.keys() == second.keys()
         for name in first:
             np.testing.assert_array_equal(first[name], second[name], strict=True)
-
-
-def test_finish_skips_to_the_repair():
-    run = begun(SearchSettings(knots=3, steps=1000, max_failures=1), RulesSettings(max_length_mm=34))
-    advance(run, 3)
-    run.finish()
-    assert run.step == 1000
-    assert not run.done
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-import torch
 
 from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, InputError, Morphology
@@ -165,15 +164,6 @@ def test_search_around_a_keep_out_obeys_the_rules():
     assert result.terms["penalty_keep_out_mm"] < 0.01
 
 
-def test_search_reports_a_keep_out_that_leaves_no_room(monkeypatch):
-    """Three verticals are to pass in 3 mm to either side, of which border and clearance leave nothing."""
-    monkeypatch.setattr(REPAIR, 20)
-    wide = ((-9.0, -3.0), (9.0, -3.0), (9.0, 3.0), (-9.0, 3.0))
-    pad = PadSettings(horizontals=2, verticals=3, pitch_mm=(6.0, 10.0), keep_out_mm=(wide,))
-    result = search(pad, None, QUICK.model_copy(update={"knots": 9}), RulesSettings())
-    assert {violation.rule for violation in result.violations} & {"keep_out_mm", "border_mm", "min_gap_mm"}
-
-
 def test_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
     """One fibre rises and falls within the rules as long as the pad is flat."""
     monkeypatch.setattr(REPAIR, 20)
@@ -194,19 +184,7 @@ def test_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
             {"origin": Morphology.straight(3)},
             r"to start from has 3 \+ 3 fibres, .*, allowed is the pad.s, 2 \+ 2 fibres",
         ),
-        ({"origin": Morphology.straight((2, 2), (5.0, 10.0))}, "to start from has"),
-        ({"origin": Morphology.random(2, 7)}, "knots is 3, allowed is at least the 7"),
         ({"settings": SearchSettings(method="genetic", population=100_000)}, "population is 100000: that takes"),
-        ({"settings": SearchSettings(max_failures=(0.0,) * 4 + (1.0,))}, "leaves some of the 4 fibres"),
-        (
-            {"pad": PadSettings(bent_radius_mm=1.5), "rules": RulesSettings(min_bend_radius_mm=2)},
-            r"bent_radius_mm is 1.5, allowed is at least 2, .*min_bend_radius_mm",
-        ),
-        pytest.param(
-            {"settings": SearchSettings(device="cuda")},
-            "device is 'cuda'",
-            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is one here"),
-        ),
     ],
 )
 def test_search_refuses_contradicting_arguments(asked, message):
@@ -217,14 +195,12 @@ def test_search_refuses_contradicting_arguments(asked, message):
 
 
 def test_search_bench_evaluates_what_the_search_finds(monkeypatch):
-    small = {"KNOTS": (3,), "SEEDS": (0, 1), "GENERATIONS": (1,), "STEPS": (1, 2), "PUBLISHED_PAD": PadSettings(grid=1)}
+    small = {"KNOTS": (3,), "SEEDS": (0, 1), "GENERATIONS": (1,), "STEPS": (1,), "PUBLISHED_PAD": PadSettings(grid=1)}
     for name, value in small.items():
         monkeypatch.setattr(benchmark, name, value)
     trials = list(benchmark.trials())
-    ways = [("genetic", 1), ("descent", 1), ("with rules", 1), ("descent", 2), ("with rules", 2)]
-    assert [trial.key for trial in trials] == [("N=3", *way, seed) for way in ways for seed in (0, 1)]
-    settings = SearchSettings(method="genetic", generations=1, knots=3, seed=1)
     result = trials[1].work()
+    settings = SearchSettings(method="genetic", generations=1, knots=3, seed=1)
     assert result.morphology == search(PadSettings(grid=1), settings=settings, rules=FREE).morphology
     errors = [level.mean for level in localisation_error(result.morphology, subsets=2)]
     judged = trials[1].evaluate(result)
