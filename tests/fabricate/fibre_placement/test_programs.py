@@ -9,9 +9,7 @@ import pytest
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import Fabrication, build
-from padforge.fabricate.fibre_placement.gcode import gcode
-from padforge.fabricate.fibre_placement.toolpath import plan_toolpath
-from padforge.fabricate.fibre_placement.urscript import urscript
+from padforge.fabricate.fibre_placement import gcode, plan_toolpath, urscript
 from padforge.fabricate.outputs.drawings import toolpath_svg
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan

@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design.morphology import Morphology, assemble_knots
-from padforge.fabricate.fibre_placement.toolpath import Stroke, check_toolpath, plan_toolpath
+from padforge.fabricate.fibre_placement import Stroke, check_toolpath, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import with_settings
