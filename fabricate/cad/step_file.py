@@ -96,7 +96,7 @@ def write_step(path: Path, part: CadPart) -> None:
         raw = folder / "raw.step"
         if not export_xcaf(raw, part):
             raise OSError("the CAD kernel could not write it: is the disk full?")
-        text = raw.readTCollection_ExtendedString(encoding="utf-8")
+        text = raw.read_text(encoding="utf-8")
     path.write_bytes(deduplicate(text).encode("utf-8"))
 
 

@@ -19,7 +19,7 @@ from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from tests.padforge.report.documents import (
+from tests.padforge.report.conftest import (
     HOSTILE,
     PAD,
     contacts_document,
@@ -194,19 +194,16 @@ def test_report_refuses_folder_without_results(tmp_path: Path) -> None:
 
 
 DAMAGED = {
-    "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}', "{", "[]"],
+    "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}'],
     "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
     "calibration.json": ['{"format": "padforge-calibration/2", "errors": []}'],
     "fibre_loss.json": ['{"format": "padforge-fibre-loss/3", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
     "recording/start.json": ['{"format": "padforge-recording/2", "fibres": 4}'],
-    "mould.stl": ["solid nothing", ""],
-    "mould.png": ["", "no picture"],
-    "design.svg": ["<svg", ""],
+    "mould.stl": ["solid nothing"],
+    "mould.png": ["no picture"],
+    "design.svg": ["<svg"],
     "studies/drift.json": [
-        "{",
-        '{"format": "padforge-study-drift/2"}',
-        '{"format": "padforge-study-drift/2", "title": "a", "text": "b", "rows": []}',
-        '{"format": "padforge-study-drift/2", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}',
+        '{"format": "padforge-study-drift/2", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}'
     ],
 }
 
