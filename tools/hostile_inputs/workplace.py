@@ -96,10 +96,8 @@ def fill() -> None:
         assert ended.code == 0, ended
     Path("pad/tracks.dxf").rename("plan.dxf")
     Path("empty").mkdir()
-    Path("folder.json").mkdir()
-    Path("folder.toml").mkdir()
-    Path("folder.stl").mkdir()
-    Path("folder.mat").mkdir()
+    for suffix in ("json", "toml", "stl", "mat"):
+        Path(f"folder.{suffix}").mkdir()
     for name in ("nothing.json", "nothing.stl", "nothing.mat", "nothing.toml", "nothing.csv", "nothing.h5", "file"):
         Path(name).touch()
     for suffix in ("json", "stl", "3mf", "mat", "toml", "csv", "h5"):
