@@ -154,7 +154,8 @@ class PlanarMap:
         cells = np.where(code[sides] < 0, -1, sides)
         cell_beside: dict[GridEdge, int] = {}
         for k, (left, right) in zip(border, cells[border].tolist(), strict=True):
-            cell_beside |= {subdivision.edges[k]: left, subdivision.edges[k][::-1]: right}
+            a, b = subdivision.edges[k]
+            cell_beside[a, b], cell_beside[b, a] = left, right
         curve_of_edge = {subdivision.edges[k]: int(subdivision.curve_of_edge[k]) for k in border}
         runs = _orient_runs(_join_runs(curve_of_edge), subdivision.curves)
         # Runs that vanish where exact curves meet are contracted, which may move other meetings: until none is left
@@ -174,7 +175,9 @@ class PlanarMap:
             self._run_length[forward] = self._run_length[backward] = len(run.vertices) - 1
             if a != b:
                 self._edge_at[forward], self._edge_at[backward] = (len(self.edges), True), (len(self.edges), False)
-                self.edges.append(MapEdge(run.curve, *s, (a, b), cell_beside[forward], cell_beside[forward[::-1]]))
+                self.edges.append(
+                    MapEdge(run.curve, *s, (a, b), cell_beside[forward], cell_beside[forward[1], forward[0]])
+                )
 
     def faces(self, cells: Sequence[int]) -> Iterator[list[Wire]]:
         """Yield every connected region of the union of cells as its wires, the outer one first."""
