@@ -32,9 +32,7 @@ from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.checks.surface import TriangleMesh
-from padforge.fabricate.fibre_placement.gcode import gcode
-from padforge.fabricate.fibre_placement.toolpath import Step, check_toolpath, plan_toolpath
-from padforge.fabricate.fibre_placement.urscript import urscript
+from padforge.fabricate.fibre_placement import Step, check_toolpath, gcode, plan_toolpath, urscript
 from padforge.fabricate.materials import PLASTICS
 from padforge.fabricate.mesh import build_mesh, mesh_arrays, write_3mf, write_stl
 from padforge.fabricate.mould import Body, bed_frame, lid_holes, printed_bodies, sizes
@@ -135,45 +133,29 @@ def _check_cad(fabrication: Fabrication) -> list[Finding]:
     return [check_result("cad_solid", True, measured, limit, message)]
 
 
-def _check_toolpath(fabrication: Fabrication) -> list[Finding]:
-    return check_toolpath(fabrication.plan, fabrication.toolpath)
+def _program(file: str, language: Callable[[Plan, Sequence[Step]], str]) -> dict[str, Callable[..., None]]:
+    """Return the files of a program: with it comes a drawing of the toolpath, the same for all languages."""
+    return {
+        file: lambda f, path: _write_utf8(path, language(f.plan, f.toolpath)),
+        "toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath)),
+    }
 
 
-class ExportFormat(NamedTuple):
-    """An export format.
-
-    Attributes:
-        files: writer of each file, called with the fabrication, the body where the name has "*" for it, and the path.
-        check: what has to be checked for it before anything is written.
-    """
-
-    files: Mapping[str, Callable[..., None]]
-    check: Callable[[Fabrication], list[Finding]] = lambda _: []
-
-
-def _program_format(file: str, language: Callable[[Plan, Sequence[Step]], str]) -> ExportFormat:
-    """Return the format of a program: with it comes a drawing of the toolpath, the same for all languages."""
-    program = {file: lambda f, path: _write_utf8(path, language(f.plan, f.toolpath))}
-    drawing = {"toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath))}
-    return ExportFormat(program | drawing, _check_toolpath)
-
-
-FORMATS = {
-    "stl": ExportFormat({"*.stl": lambda _, body, path: write_stl(path, body.vertices, body.triangles)}),
-    "3mf": ExportFormat({"*.3mf": _write_body_3mf}),
-    "step": ExportFormat({"mould.step": _write_cad}, _check_cad),
+FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
+    "stl": {"*.stl": lambda _, body, path: write_stl(path, body.vertices, body.triangles)},
+    "3mf": {"*.3mf": _write_body_3mf},
+    "step": {"mould.step": _write_cad},
     # drawings and pictures show the tray, compensated for shrinkage
-    "svg": ExportFormat({"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))}),
-    "dxf": ExportFormat({"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))}),
-    "png": ExportFormat(
-        {
-            "mould.png": lambda f, path: draw_mould(f.plan.shrinkage_compensated, f.findings, path),
-            "tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
-        }
-    ),
-    "gcode": _program_format("laying.gcode", gcode),
-    "urscript": _program_format("laying.script", urscript),
+    "svg": {"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))},
+    "dxf": {"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))},
+    "png": {
+        "mould.png": lambda f, path: draw_mould(f.plan.shrinkage_compensated, f.findings, path),
+        "tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
+    },
+    "gcode": _program("laying.gcode", gcode),
+    "urscript": _program("laying.script", urscript),
 }
+"""Writers of the files of every format, called with the fabrication, the body where the name has "*", and the path."""
 
 
 def require_formats(formats: Sequence[str]) -> None:
@@ -224,11 +206,12 @@ def build(
         bodies = [PrintedBody(name, body, mesh, *mesh_arrays(mesh)) for name, body, mesh in meshes]
     with profiling.stage("checks"):
         fabrication = Fabrication(plan, bodies, _check_bodies(plan, bodies))
-    wanted = [name for name in FORMATS if name in formats]
-    for check in dict.fromkeys(FORMATS[name].check for name in reversed(wanted)):  # the toolpath's before CAD's
-        with profiling.stage("checks"):
-            fabrication.findings.extend(check(fabrication))
-    writers = _choose_writers(fabrication, [FORMATS[name] for name in wanted])
+    writers = _choose_writers(fabrication, [files for name, files in FORMATS.items() if name in formats])
+    with profiling.stage("checks"):
+        if "toolpath.svg" in writers:
+            fabrication.findings.extend(check_toolpath(plan, fabrication.toolpath))
+        if "mould.step" in writers:
+            fabrication.findings.extend(_check_cad(fabrication))
     document = _compile_document(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
     writers["laying.md"] = partial(_write_utf8, text=laying_page(document))
@@ -253,10 +236,12 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
     return by_body[0] + check_plan(plan)
 
 
-def _choose_writers(fabrication: Fabrication, formats: Sequence[ExportFormat]) -> dict[str, Callable[[Path], None]]:
+def _choose_writers(
+    fabrication: Fabrication, formats: Sequence[Mapping[str, Callable[..., None]]]
+) -> dict[str, Callable[[Path], None]]:
     """Return the writer of each file, those of the bodies first."""
     writers = {}
-    files = [item for export in formats for item in export.files.items()]
+    files = [item for export in formats for item in export.items()]
     for body, (file, write) in product(fabrication.bodies, files):
         if "*" in file:
             writers[file.replace("*", body.name)] = partial(write, fabrication, body)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -131,24 +130,15 @@ def straight_leads(ends_mm: Array, layout: Layout, border_mm: float) -> Leads:
     return Leads(tuple(pairs), (-x, -y, x, y))
 
 
-class LeadSpacing(NamedTuple):
-    """Distances of leads to one side.
+def lead_spacing(
+    settings: FabricationSettings, max_height_mm: float, flare_mm: float
+) -> tuple[float, float, float, float]:
+    """Compute the distances of leads to one side, from the tallest ridge's height and the walls' outward lean.
 
-    Attributes:
-        border_mm: width of the silicone around the pad in which they are straight.
-        pitch_mm: between the centre lines of neighbours.
-        radius_mm: of their bends.
-        edge_mm: from the outermost lead's centre line to the silicone's edge.
+    Returns:
+        Width of the silicone around the pad in which leads are straight, distance between the centre lines of
+        neighbours, radius of their bends, and distance from the outermost centre line to the silicone's edge; mm.
     """
-
-    border_mm: float
-    pitch_mm: float
-    radius_mm: float
-    edge_mm: float
-
-
-def lead_spacing(settings: FabricationSettings, max_height_mm: float, flare_mm: float) -> LeadSpacing:
-    """Compute the distances of leads to one side, from the tallest ridge's height and the walls' outward lean."""
     mould, radius = settings.mould, settings.min_bend_radius_mm
     foot = mould.ridge_width_mm + 2 * max_height_mm * settings.ridge_slope
     pitch = max(foot + mould.min_silicone_mm, settings.rules.min_gap_mm)
@@ -158,11 +148,11 @@ def lead_spacing(settings: FabricationSettings, max_height_mm: float, flare_mm: 
     edge = max(pitch / 2, foot / 2 + mould.min_silicone_mm)
     # a fibre may meet its lead at a corner, which the rule for bends allows only within a straight stretch
     border = max(mould.border_mm, radius / 2)
-    return LeadSpacing(border, pitch, max(radius, (foot + mould.min_silicone_mm) / 2), edge)
+    return border, pitch, max(radius, (foot + mould.min_silicone_mm) / 2), edge
 
 
-def one_side_leads(ends_mm: Array, layout: Layout, spacing: LeadSpacing) -> Leads:
-    """Compute leads that all end on the lower edge; fibre ends of shape (F, 2, 2), mm."""
+def one_side_leads(ends_mm: Array, layout: Layout, spacing: tuple[float, float, float, float]) -> Leads:
+    """Compute leads that all end on the lower edge from fibre ends (F, 2, 2), mm, and their `lead_spacing`."""
     (half_x, half_y), (horizontals, verticals) = (side / 2 for side in layout.size_mm), layout.counts
     border, gap, radius, edge = spacing
     inner = half_x + border + radius  # x of the lowest horizontal's lead

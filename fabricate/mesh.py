@@ -108,15 +108,9 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
-    """Write a 3MF, mm, of one object of one material in the colour of its body.
+    """Write a 3MF, mm, of one object of one material in the colour of its body: vertices (n, 3), triangles (m, 3).
 
-    Args:
-        path: file to write.
-        vertices: shape (n, 3), with the same digits as the STL's floats.
-        triangles: vertex indices; shape (m, 3).
-        name: of the body, one of `BODY_COLOURS`.
-        title: of the file, for people.
-        material: to print it in.
+    Coordinates have the same digits as the STL's floats; `name` is one of `BODY_COLOURS`, `title` for people.
     """
     points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
@@ -148,8 +142,7 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: 
 def read_mesh(path: Path) -> tuple[Array, Numbers]:
     """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl or .3mf, all objects of a 3MF together.
 
-    Args:
-        path: an STL counts as mm; a 3MF states its unit.
+    An STL counts as mm; a 3MF states its unit.
 
     Raises:
         InputError: the file is missing, or not a mesh with triangles.

@@ -85,11 +85,7 @@ def terraces(height_mm: float, terrace_mm: float) -> list[float]:
 
 
 def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
-    """Build the inverse mould: tray, ridges, exits, numbers, pillars and pins.
-
-    Args:
-        plan: of the mould, compensated for shrinkage.
-        wells: outlines that belong to the ridges of each layer, mm; none for a pad with fibres.
+    """Build the inverse mould of a compensated plan: tray, ridges with wells if any, exits, numbers, pillars and pins.
 
     Raises:
         InputError: pins that do not fit on the walls.

@@ -56,12 +56,9 @@ _MAX_WHITE = 0.7
 
 
 def assign_layers(counts: tuple[int, int], clashes: Sequence[Crossing], deep_horizontal: bool) -> tuple[int, ...]:
-    """Compute the layer index (H + V,) of every fibre, 0 the shallowest, by colouring the graph of crossings.
+    """Compute the layer index of every fibre, 0 the shallowest, by colouring the graph of crossings in a family.
 
-    Args:
-        counts: numbers of horizontal and vertical fibres, H and V.
-        clashes: crossings of fibres of one family, in any order.
-        deep_horizontal: whether horizontals are the deep family, which has the upper indices.
+    Horizontals, counted first, or else verticals are the deep family, which has the upper indices.
     """
     horizontal, vertical = range(counts[0]), range(counts[0], sum(counts))
     layers: dict[int, int] = {}

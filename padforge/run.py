@@ -69,7 +69,7 @@ class Run:
         spec: settings of all stages.
         out: folder of the pad.
         seed: seed of every random choice; that of each section if None.
-        formats: file formats of the mould, see `padforge.fabricate.build.FORMATS`.
+        formats: file formats of the mould, see `padforge.fabricate.export.FORMATS`.
         resume: whether to reuse the stages that an earlier run has finished.
         time_budget: seconds for all stages together; unlimited if None.
         force: whether to replace a pad from which other files in `out` were made, and a localizer that was not trained

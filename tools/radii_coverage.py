@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge.design import Morphology
 from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
-from tools.threads import on_one_thread
+from tools.kills import on_one_thread
 
 PRESSES = (300, 3000)
 GRIDS = (2, 3, 4, 5)

@@ -137,13 +137,9 @@ def _insert_vertices(ring: Array, points: Array) -> Array:
 def outline_curves(
     area: BaseGeometry, joints: Joints, z_range: tuple[float, float], fit_mm: float
 ) -> list[OutlineCurve]:
-    """Return the curves of all rings of an area that is drawn within `FINE_MM`.
+    """Return the curves of all rings of an area that is drawn within `FINE_MM`, splines within `fit_mm` of the rings.
 
-    Args:
-        area: polygons.
-        joints: vertices at which the curvature jumps; directions may be opposite to the ring's.
-        z_range: heights between which the outline's wall stands, mm.
-        fit_mm: tolerance of splines against the rings.
+    At joints the curvature jumps; the wall of the outline stands between two heights `z_range`, mm.
     """
     curves = (curve for rings in polygon_rings(area) for ring in rings for curve in ring_curves(ring, joints, fit_mm))
     return [replace(curve, z_range=z_range) for curve in curves]
@@ -264,7 +260,7 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
     def fit(knots: Array, rows: NDArray[np.intp] | slice) -> tuple[BSpline, NDArray[np.bool_]]:
         """Fit a spline to some samples; tell at which of all it is within the tolerance."""
         padded = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
-        basis = _basis(padded, s)
+        basis = BSpline.design_matrix(s, padded, 3).toarray()
         poles = _fit_poles(knots, basis[rows], samples[rows], tangents)
         error = basis @ poles - samples
         across = np.abs((error * normals).sum(axis=1))
@@ -301,25 +297,6 @@ def _fit_poles(knots: Array, basis: Array, samples: Array, tangents: Sequence[Ar
         inner = basis[:, 2:-2]
         poles[2:-2] = np.linalg.solve(inner.T @ inner, inner.T @ (samples - basis @ poles))
     return poles
-
-
-def _basis(padded: Array, s: Array) -> Array:
-    """Cubic B-spline basis functions at parameters s (n,), by de Boor's recurrence; shape (n, poles)."""
-    last = len(padded) - 5
-    span = np.clip(np.searchsorted(padded, s, side="right") - 1, 3, last)
-    below = [s - padded[span - i] for i in range(3)]
-    above = [padded[span + 1 + i] - s for i in range(3)]
-    values = [np.ones(len(s))]
-    for degree in range(1, 4):
-        carried, raised = np.zeros(len(s)), []
-        for i, value in enumerate(values):
-            part = value / (above[i] + below[degree - 1 - i])
-            raised.append(carried + above[i] * part)
-            carried = below[degree - 1 - i] * part
-        values = [*raised, carried]
-    basis = np.zeros((len(s), last + 1))
-    basis[np.arange(len(s))[:, None], span[:, None] + np.arange(-3, 1)] = np.stack(values, axis=1)
-    return basis
 
 
 def _next_site(a: int, b: int, vertices: NDArray[np.intp]) -> int:

@@ -136,19 +136,14 @@ def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> "C
 
 
 def build_mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> CadModel:
-    """Build the CAD model of the mould of a plan.
-
-    Args:
-        plan: plan of what is printed.
-        name: name of the model.
-        wells: outlines that belong to the ridges of each layer; empty for a pad whose fibres are placed.
+    """Build the CAD model of the mould of a plan of what is printed, with wells that belong to its ridges, if any.
 
     Raises:
         InputError: the CAD kernel finds a solid invalid at every tolerance.
     """
     for fit_mm in FIT_TOLERANCES_MM:
         cells, fills = fill_cells(plan, fit_mm, wells)
-        solids = _build_valid({fill.name: partial(build_solids, cells, fill.z_ranges) for fill in fills})
+        solids = _build_valid({part: partial(build_solids, cells, z_ranges) for part, z_ranges in fills.items()})
         if solids:
             break
     else:
@@ -165,10 +160,6 @@ def build_mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ())
 def build_body_model(body: Body, name: str) -> CadModel:
     """Build the CAD model of a body of few prisms: a lid or a holder.
 
-    Args:
-        body: prisms of the body.
-        name: one of `BODY_COLOURS`.
-
     Raises:
         InputError: the CAD kernel finds the solid invalid.
     """
@@ -179,11 +170,7 @@ def build_body_model(body: Body, name: str) -> CadModel:
 
 
 def build_models(plan: Plan, bodies: Mapping[str, Body]) -> list[CadModel]:
-    """Build the CAD models of all bodies of a pad, in their order.
-
-    Args:
-        plan: plan of the pad as used.
-        bodies: bodies by name; moulds are built from the plan instead.
+    """Build the CAD models of all bodies of a pad, in their order; moulds are built from the plan of the pad as used.
 
     Raises:
         InputError: the CAD kernel finds a solid invalid.
@@ -201,12 +188,7 @@ def build_models(plan: Plan, bodies: Mapping[str, Body]) -> list[CadModel]:
 
 
 def assemble(models: Sequence[CadModel], plan: Plan) -> CadPart:
-    """Return the assembly of all bodies of a pad: the lid on the rim of the mould, the others side by side.
-
-    Args:
-        models: models of the bodies, the mould first.
-        plan: plan of the mould.
-    """
+    """Return the assembly of all bodies, the mould first: the lid on the rim of the mould, the others side by side."""
     if len(models) == 1:
         return models[0].part
     x_mm, parts = 0.0, []

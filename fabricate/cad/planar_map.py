@@ -47,12 +47,7 @@ _NEWTON_STEPS = 12
 
 FLOOR, RIM = -1, -2
 """Numbers of the floor and the rim among those of the walls' planes."""
-PARTS = TRAY, HORIZONTAL_TRACKS, VERTICAL_TRACKS, NUMBERS = (
-    "tray",
-    "horizontal tracks",
-    "vertical tracks",
-    "numbers",
-)
+PARTS = TRAY, HORIZONTAL_TRACKS, VERTICAL_TRACKS, NUMBERS = "tray", "horizontal tracks", "vertical tracks", "numbers"
 
 
 class Subdivision:
@@ -157,10 +152,10 @@ class PlanarMap:
         code = np.array([*(codes.setdefault(kind, len(codes)) for kind in kinds), -1])
         border = np.flatnonzero(code[sides[:, 0]] != code[sides[:, 1]]).tolist()
         cells = np.where(code[sides] < 0, -1, sides)
-        cell_beside = {subdivision.edges[k]: cell for k, cell in zip(border, cells[border, 0].tolist(), strict=True)}
-        cell_beside |= {
-            subdivision.edges[k][::-1]: cell for k, cell in zip(border, cells[border, 1].tolist(), strict=True)
-        }
+        cell_beside: dict[GridEdge, int] = {}
+        for k, (left, right) in zip(border, cells[border].tolist(), strict=True):
+            a, b = subdivision.edges[k]
+            cell_beside[a, b], cell_beside[b, a] = left, right
         curve_of_edge = {subdivision.edges[k]: int(subdivision.curve_of_edge[k]) for k in border}
         runs = _orient_runs(_join_runs(curve_of_edge), subdivision.curves)
         # Runs that vanish where exact curves meet are contracted, which may move other meetings: until none is left
@@ -180,7 +175,9 @@ class PlanarMap:
             self._run_length[forward] = self._run_length[backward] = len(run.vertices) - 1
             if a != b:
                 self._edge_at[forward], self._edge_at[backward] = (len(self.edges), True), (len(self.edges), False)
-                self.edges.append(MapEdge(run.curve, *s, (a, b), cell_beside[forward], cell_beside[forward[::-1]]))
+                self.edges.append(
+                    MapEdge(run.curve, *s, (a, b), cell_beside[forward], cell_beside[forward[1], forward[0]])
+                )
 
     def faces(self, cells: Sequence[int]) -> Iterator[list[Wire]]:
         """Yield every connected region of the union of cells as its wires, the outer one first."""
@@ -392,6 +389,8 @@ class TrayWalls:
 
 Surface = float | tuple[TrayWalls, int]
 """A height, mm, or a plane of the walls."""
+Fills = dict[str, list["ZRange | None"]]
+"""What each of the `PARTS` fills of every cell; None for nothing."""
 
 
 class ZRange(NamedTuple):
@@ -399,19 +398,6 @@ class ZRange(NamedTuple):
 
     bottom: Surface
     top: Surface
-
-
-@dataclass(frozen=True)
-class PartFill:
-    """A named part.
-
-    Attributes:
-        name: one of `PARTS`.
-        z_ranges: what the part fills of every cell; None for nothing.
-    """
-
-    name: str
-    z_ranges: Sequence[ZRange | None]
 
 
 class _RaisedOutline(NamedTuple):
@@ -423,16 +409,11 @@ class _RaisedOutline(NamedTuple):
     curves: list[OutlineCurve]
 
 
-def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) -> tuple[Subdivision, list[PartFill]]:
+def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) -> tuple[Subdivision, Fills]:
     """Divide the plan of a mould into cells, and fill them with its parts.
 
     Parts touch and do not overlap: tracks and numbers stand on the tray, and the taller track passes through at a
-    crossing.
-
-    Args:
-        plan: plan of what is printed.
-        fit_mm: tolerance of splines against the finely drawn outlines.
-        wells: outlines that belong to the ridges of each layer; empty for a pad whose fibres are placed.
+    crossing. Splines follow the drawn outlines within `fit_mm`; wells belong to the ridges of each layer.
     """
     walls = TrayWalls.from_plan(plan)
     rim_mm = walls.floor_mm + walls.depth_mm
@@ -448,7 +429,7 @@ def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) ->
     ground: list[Surface] = [walls.floor_mm if k == FLOOR else rim_mm if k == RIM else (walls, k) for k in planes]
     for cell in np.flatnonzero(shapely.contains_xy(plan.pillars, points)):
         ground[cell] = heights[cell] = rim_mm
-    fills: dict[str, list[ZRange | None]] = {name: [None] * len(ground) for name in PARTS}
+    fills: Fills = {name: [None] * len(ground) for name in PARTS}
     free = np.ones(len(ground), dtype=bool)
     for prism in prisms:
         shapely.prepare(prism.outline)
@@ -460,7 +441,7 @@ def fill_cells(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry] = ()) ->
     for sliver, neighbour in cells.find_slivers().items():
         for z_ranges in fills.values():
             z_ranges[sliver] = z_ranges[neighbour]
-    return cells, [PartFill(name, z_ranges) for name, z_ranges in fills.items() if any(z_ranges)]
+    return cells, {name: z_ranges for name, z_ranges in fills.items() if any(z_ranges)}
 
 
 def _ridge_prisms(plan: Plan, fit_mm: float, wells: Sequence[BaseGeometry]) -> Iterator[_RaisedOutline]:
@@ -486,18 +467,16 @@ def _number_prisms(plan: Plan) -> Iterator[_RaisedOutline]:
             yield _RaisedOutline(NUMBERS, top, outline, edge_curves(outline.boundary))
 
 
-def compute_contact_area(cells: Subdivision, fills: Sequence[PartFill]) -> float:
+def compute_contact_area(cells: Subdivision, fills: Fills) -> float:
     """Return the area where parts touch, mm²: undersides, crossings, ends at upright walls."""
     area = 0.0
     owner = np.full(len(cells.cells) + 1, -1)  # the last entry stands for no cell
     bottom, top = np.zeros(len(owner)), np.zeros(len(owner))
-    for number, fill in enumerate(
-        sorted(fills, key=lambda fill: fill.name != TRAY)
-    ):  # what stands on the tray hides it
-        for cell, z_range in enumerate(fill.z_ranges):
+    for number, name in enumerate(sorted(fills, key=lambda name: name != TRAY)):  # what stands on the tray hides it
+        for cell, z_range in enumerate(fills[name]):
             if z_range is not None:
                 owner[cell], bottom[cell], top[cell] = number, _base_height(z_range.bottom), _base_height(z_range.top)
-                if fill.name != TRAY:
+                if name != TRAY:
                     ground = z_range.bottom
                     lean = math.hypot(*ground[0].normal(ground[1])) if isinstance(ground, tuple) else 1.0
                     area += lean * cells.cells[cell].area

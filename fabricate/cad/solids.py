@@ -15,7 +15,7 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,9 +67,6 @@ def build_solids(subdivision: Subdivision, z_ranges: Sequence[ZRange | None]) ->
     Args:
         subdivision: cells.
         z_ranges: what the part fills of every cell; None for nothing.
-
-    Yields:
-        The CAD kernel's `TopoDS_Solid`.
     """
     planar_map = PlanarMap(subdivision, z_ranges)
     groups = _connect_cells(subdivision, z_ranges)
@@ -125,10 +122,8 @@ def _build_solid(planar_map: PlanarMap, cells: list[int], edges: list[int], z_ra
 def _wall_faces(shell: "_Shell", k: int, z_ranges: Sequence[Any]) -> Iterator[_WallFace]:
     """Yield the upright faces over an edge: where one side is solid and the other is not."""
     edge = shell.planar_map.edges[k]
-    for cell, neighbour, faces_right in (
-        (edge.left_cell, edge.right_cell, True),
-        (edge.right_cell, edge.left_cell, False),
-    ):
+    left, right = edge.left_cell, edge.right_cell
+    for cell, neighbour, faces_right in ((left, right, True), (right, left, False)):
         if cell < 0:
             continue
         bottom, top = z_ranges[cell]
@@ -151,7 +146,7 @@ class _Shell:
         self._corners: dict[int, set[int]] = defaultdict(set)  # heights over a node at which vertical edges are split
         self._vertices: dict[tuple[int, int], Any] = {}
         self._edges: dict[Any, Any] = {}
-        self._walls: dict[int, Wall] = {}
+        self._walls: dict[int, _PlaneWall] = {}
 
     def collect_tolerances(self, edges: list[int], z_ranges: Sequence[Any]) -> None:
         """Widen the tolerances of nodes where sloped walls meet level surfaces, as curves deviate there."""
@@ -213,12 +208,8 @@ class _Shell:
         rising = self._vertical_edges(end, low[1], high[1])
         falling = self._vertical_edges(start, low[0], high[0])[::-1]
         bottom, top = self._horizontal_edge(k, face.bottom), self._horizontal_edge(k, face.top)
-        wire = [
-            (bottom, True),
-            *((edge, True) for edge, _ in rising),
-            (top, False),
-            *((edge, False) for edge, _ in falling),
-        ]
+        up, down = [(edge, True) for edge, _ in rising], [(edge, False) for edge, _ in falling]
+        wire = [(bottom, True), *up, (top, False), *down]
         if not wall.normal_is_right:
             wire = [(edge, not forward) for edge, forward in reversed(wire)]
         for edge, height in ((bottom, face.bottom), (top, face.top)):
@@ -267,11 +258,16 @@ class _Shell:
         if curve is not None:
             self._builder.UpdateEdge(edge, curve, surface, TopLoc_Location(), _TOLERANCE_MM)
 
-    def _wall(self, k: int) -> "Wall":
+    def _wall(self, k: int) -> "_PlaneWall":
         if k not in self._walls:
             edge = self.planar_map.edges[k]
-            ends = self.planar_map.nodes[list(edge.nodes)]
-            self._walls[k] = make_wall(self.planar_map.curves[edge.curve], edge, ends)
+            curve = self.planar_map.curves[edge.curve]
+            if curve.spline is not None:
+                self._walls[k] = _SplineWall(curve, curve.spline, edge)
+            elif curve.arc is not None:
+                self._walls[k] = _ArcWall(curve.arc, curve.length, edge)
+            else:
+                self._walls[k] = _PlaneWall(self.planar_map.nodes[list(edge.nodes)])
         return self._walls[k]
 
     def _horizontal_edge(self, k: int, surface: Surface) -> Any:
@@ -319,8 +315,8 @@ def _height(surface: Surface) -> Height:
     return lambda points: walls.plane_heights(plane, points)
 
 
-class Wall(Protocol):
-    """Upright surface over an edge of a planar map, and the curves on it.
+class _PlaneWall:
+    """Upright surface over a straight edge of a planar map, and the curves on it; base of arcs' and splines' walls.
 
     Lines rise to planes, arcs to cylinders and splines to extrusions. The first parameter of a surface is that of the
     curve, the second grows with the height.
@@ -329,56 +325,31 @@ class Wall(Protocol):
         normal_is_right: whether the surface's own normal points to the right of the curve's direction.
     """
 
-    normal_is_right: bool
-
-    def curve(self, z: Height) -> tuple[Any, float, float]:
-        """Return the curve at a height, with its first and last parameter."""
-        ...
-
-    def surface(self, z: Height) -> Any:
-        """Return the upright surface through the curve at a height, unbounded."""
-        ...
-
-    def horizontal_pcurve(self, z: Height) -> Any:
-        """Return the curve at a height in the surface's parameters; None if that is a plane."""
-        ...
-
-    def vertical_pcurve(self, side: int, z: float) -> Any:
-        """Return the line upwards from a height at the start (0) or end (1) in the surface's parameters, or None."""
-        ...
-
-
-def make_wall(curve: OutlineCurve, edge: MapEdge, ends: Array) -> Wall:
-    """Return the wall over an edge of a curve whose nodes lie at `ends`; shape (2, 2)."""
-    if curve.spline is not None:
-        return _SplineWall(curve, curve.spline, edge)
-    return _PlaneWall(ends) if curve.arc is None else _ArcWall(curve.arc, curve.length, edge)
-
-
-class _PlaneWall:
     normal_is_right = True
 
     def __init__(self, ends: Array) -> None:
         self._ends = ends
 
     def curve(self, z: Height) -> tuple[Any, float, float]:
+        """Return the curve at a height, with its first and last parameter."""
         heights = _heights(z, self._ends)
         start, end = (gp_Pnt(*xy, height) for xy, height in zip(self._ends.tolist(), heights, strict=True))
         direction = gp_Dir(end.X() - start.X(), end.Y() - start.Y(), end.Z() - start.Z())
         return Geom_Line(start, direction), 0.0, start.Distance(end)
 
     def surface(self, z: Height) -> Any:
+        """Return the upright surface through the curve at a height, unbounded."""
         (x0, y0), (x1, y1) = self._ends.tolist()
         return Geom_Plane(gp_Pnt(x0, y0, _heights(z, self._ends)[0]), gp_Dir(y1 - y0, x0 - x1, 0))
 
-    def horizontal_pcurve(self, z: Height) -> None:
-        return None
+    def horizontal_pcurve(self, z: Height) -> Any:
+        """Return the curve at a height in the surface's parameters; None, as a plane needs none."""
 
-    def vertical_pcurve(self, side: int, z: float) -> None:
-        return None
+    def vertical_pcurve(self, side: int, z: float) -> Any:
+        """Return the line upwards from a height at the start (0) or end (1) in the surface's parameters, or None."""
 
 
-class _ArcWall:
+class _ArcWall(_PlaneWall):
     """Its parameter is the angle, counted clockwise for a clockwise arc."""
 
     def __init__(self, arc: Arc, length: float, edge: MapEdge) -> None:
@@ -425,13 +396,11 @@ class _ArcWall:
         return Geom2d_Line(gp_Pnt2d(self._sign * self._range[side], z), gp_Dir2d(0, 1))
 
 
-class _SplineWall:
+class _SplineWall(_PlaneWall):
     """Extrusion of a spline from the foot of its wall; its parameters are the arc length and the height above the foot.
 
     At the foot and the top the edges share the full curve, which files hold once; elsewhere each has a part.
     """
-
-    normal_is_right = True
 
     def __init__(self, curve: OutlineCurve, spline: BSpline, edge: MapEdge) -> None:
         self._z_range, self._spline = curve.z_range, spline

@@ -89,10 +89,6 @@ class CadPart:
 def write_step(path: Path, part: CadPart) -> None:
     """Write an assembly with its names and colours as a STEP file, mm; the same bytes for the same shapes.
 
-    Args:
-        path: file to write.
-        part: assembly.
-
     Raises:
         OSError: the file cannot be written.
     """
@@ -108,23 +104,21 @@ def export_xcaf(path: Path, part: CadPart) -> bool:
     """Write a STEP file by the CAD kernel's XCAF document; return whether it could be written."""
     for printer in Message.DefaultMessenger_s().Printers():
         printer.SetTraceLevel(Message_Gravity.Message_Fail)  # it reports its progress on stdout
-    document = TDocStd_Document(_text("XmlOcaf"))
-    XCAFApp_Application.GetApplication_s().NewDocument(_text("MDTV-XCAF"), document)
+    document = TDocStd_Document(TCollection_ExtendedString("XmlOcaf"))
+    XCAFApp_Application.GetApplication_s().NewDocument(TCollection_ExtendedString("MDTV-XCAF"), document)
     XCAFDoc_DocumentTool.SetLengthUnit_s(document, 1e-3)
-    shapes, colours = (
-        XCAFDoc_DocumentTool.ShapeTool_s(document.Main()),
-        XCAFDoc_DocumentTool.ColorTool_s(document.Main()),
-    )
+    shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
+    colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
     shapes.SetAutoNaming_s(False)
 
     def add(part: CadPart) -> Any:
         label = shapes.NewShape() if part.children else shapes.AddShape(part.compound, False)
-        TDataStd_Name.Set_s(label, _text(part.name))
+        TDataStd_Name.Set_s(label, TCollection_ExtendedString(part.name))
         for child in part.children:
             move = gp_Trsf()
             move.SetTranslation(gp_Vec(*child.position_mm))
             component = shapes.AddComponent(label, add(child), TopLoc_Location(move))
-            TDataStd_Name.Set_s(component, _text(child.name))
+            TDataStd_Name.Set_s(component, TCollection_ExtendedString(child.name))
             if child.colour:
                 colours.SetColor(component, _colour(child.colour), XCAFDoc_ColorType.XCAFDoc_ColorGen)
         if part.colour:
@@ -145,13 +139,9 @@ def export_xcaf(path: Path, part: CadPart) -> bool:
 
 
 def deduplicate(text: str) -> str:
-    """Return a STEP file in which each entity of geometry and style stands once, its coordinates in few digits.
+    """Return the kernel's STEP file with each entity of geometry and style once, its coordinates in few digits.
 
-    Args:
-        text: file as the CAD kernel writes it, without brackets, semicolons or # in names.
-
-    Returns:
-        File of the same shapes; shapes in their order, then styles in the order of the shapes.
+    Names have no brackets, semicolons or #. Shapes keep their order, styles follow in the order of the shapes.
     """
     head, _, body = text.partition("DATA;\n")
     data, _, tail = body.rpartition("ENDSEC;")
@@ -236,7 +226,3 @@ def _colour(colour: str) -> Quantity_Color:
     result = Quantity_Color()
     Quantity_Color.ColorFromHex_s(colour, result)
     return result
-
-
-def _text(name: str) -> TCollection_ExtendedString:
-    return TCollection_ExtendedString(name)

@@ -37,16 +37,7 @@ class Finding:
 def check_result(
     name: str, status: Status | bool, measured: Number, limit: Number, message: str, positions: Iterable[Any] = ()
 ) -> Finding:
-    """Build a finding.
-
-    Args:
-        name: name of the check.
-        status: its status, or whether it passes.
-        measured: measured value.
-        limit: limit of the measured value.
-        message: one sentence for the user.
-        positions: coordinates of any kind; shape (n, 2), mm.
-    """
+    """Build a finding from its status, or from whether it passes, and from coordinates (n, 2), mm, of any kind."""
     if not isinstance(status, str):
         status = "pass" if status else "fail"
     return Finding(name, status, measured, limit, message, tuple((float(x), float(y)) for x, y in positions))

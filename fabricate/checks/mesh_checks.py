@@ -63,14 +63,11 @@ def check_triangles(
     genus: int | None = None,
     has_plan: bool = False,
 ) -> list[Finding]:
-    """Run all checks on a mesh that stands as it is printed, open side up.
+    """Run all checks on a mesh that stands as it is printed, open side up, with the arguments of `check_mesh`.
 
     Args:
         vertices: (n, 3) mm; equal ones are merged.
         triangles: (m, 3) vertex indices, counter-clockwise seen from outside.
-        printer: nozzle, layer and bed.
-        min_silicone_mm: least thickness of the silicone between tracks.
-        genus: required number of through holes; None if unknown.
         has_plan: whether the mould's plan is checked as well, which gives widths exactly and faster.
 
     Returns:
@@ -99,12 +96,7 @@ def check_triangles(
 
 
 def check_solid(mesh: TriangleMesh, genus: int | None = None) -> list[Finding]:
-    """Run the SOLID_CHECKS alone, in a fraction of the time of all.
-
-    Args:
-        mesh: the welded mesh.
-        genus: required number of through holes; None if unknown.
-    """
+    """Run the SOLID_CHECKS alone, in a fraction of the time of all; `genus` is the required number of through holes."""
     status, volume = mesh.solid.status().name, float(mesh.signed_volumes.sum())
     findings = [
         check_result("manifold", status == "NoError", int(status == "NoError"), 1, f"manifold3d says {status}"),

@@ -41,10 +41,6 @@ def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Fin
 def check_file(source: Path, settings: FabricationSettings = DEFAULTS) -> CheckedMesh:
     """Run all checks on a mesh file (.stl, .3mf), or on the mould of the morphology in any other file.
 
-    Args:
-        source: the file.
-        settings: settings of fabrication.
-
     Raises:
         InputError: the file cannot be read, or settings contradict each other.
     """

@@ -281,14 +281,9 @@ class Slab:
 
 
 def build_slabs(mesh: TriangleMesh, layer_mm: float) -> list[Slab]:
-    """Cut a solid at its largest horizontal faces, and high slabs in two until there are enough.
+    """Cut a solid at its largest horizontal faces, and high slabs in two until there are enough; from below.
 
-    Args:
-        mesh: closed surface of the solid.
-        layer_mm: layer of the printer; slabs below half of it are not printed and left out, if others remain.
-
-    Returns:
-        The slabs, from below.
+    Slabs of less than half a printed layer are not printed and left out, if others remain.
     """
     (*_, low), (*_, high) = mesh.bounds.tolist()
     z = mesh.corners[:, :, 2]
@@ -335,16 +330,7 @@ def _drop_specks(area: BaseGeometry | Shapes) -> Shapes:
 
 
 def find_thin_patches(area: BaseGeometry, width: float, within: BaseGeometry) -> Shapes:
-    """Find the patches of an area that its morphological opening removes, corners included.
-
-    Args:
-        area: area of material.
-        width: width of the opening, mm.
-        within: area to which the patches are clipped.
-
-    Returns:
-        Polygons of more than SPECK_MM2, (k,).
-    """
+    """Find the patches (k,) that an opening of a width, mm, removes from an area, corners included, but specks."""
     return _drop_specks(overlap(without(area, _open(area, width)), within))
 
 
@@ -366,15 +352,10 @@ def tested_width(limit: float) -> float:
 
 
 def find_narrow_parts(area: BaseGeometry, limit: float, within: BaseGeometry | None = None) -> tuple[Shapes, float]:
-    """Find the parts of an area narrower than `limit`, and the least width.
-
-    Args:
-        area: area of material.
-        limit: least width, mm; `tested_width` of it is tested.
-        within: area to which the parts are clipped; None for no clipping.
+    """Find the parts (k,) of an area narrower than `tested_width` of a limit, mm, clipped to another area, if any.
 
     Returns:
-        The parts as polygons (k,), and the width of the narrowest by bisection, mm; `limit` without any.
+        The parts, and the width of the narrowest by bisection, mm; `limit` without any.
     """
     low, high, tip = 0.0, tested_width(limit), _TIP * limit
     parts = narrow = _find_thin_walls(area, high, tip)

@@ -20,7 +20,7 @@ from shapely.geometry.base import BaseGeometry
 from padforge.design.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import beziers
-from padforge.fabricate.fibre_placement.toolpath import Step, mirror_x
+from padforge.fabricate.fibre_placement import Step, mirror_x
 from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS, Plan, fibre_layers, fibre_name, polygon_rings
 
 Point = Sequence[float] | Array
@@ -39,11 +39,7 @@ _EDGE, _NOTE = "#888", "#555555"
 
 @dataclass(frozen=True)
 class _SvgWriter:
-    """Writer of SVG elements in SVG coordinates, mm.
-
-    Attributes:
-        decimals: decimal places of all numbers.
-    """
+    """Writer of SVG elements in SVG coordinates, mm, with so many decimal places."""
 
     decimals: int
 
@@ -116,12 +112,7 @@ _SVG = _SvgWriter(decimals=2)
 
 
 def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
-    """Return the sentence on the orientation of a pad and of the numbers of its fibres.
-
-    Args:
-        counts: numbers of horizontal and vertical fibres.
-        leads: `leads` of `[pad]`.
-    """
+    """Return the sentence on the orientation of a pad of horizontal and vertical fibres, and of their numbers."""
     rules = [f"{numbering} {start}" for numbering, start in zip(_NUMBERING, _STARTS[leads], strict=True)]
     fibres = f"horizontal fibres {rules[0]}, vertical ones {rules[1]}"
     if 0 in counts:
@@ -132,15 +123,7 @@ def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
 
 @dataclass(frozen=True)
 class _Panel:
-    """A view of the pad from above.
-
-    Attributes:
-        x: of the pad's centre on the drawing, mm.
-        y: of the pad's centre on the drawing, mm.
-        scale: of the plan.
-        mirrored: whether the pad is turned over.
-        turn_deg: angle of the pad, counter-clockwise.
-    """
+    """A view of the pad from above, its centre at (x, y) mm, turned over if `mirrored`, then counter-clockwise."""
 
     x: float
     y: float
@@ -454,10 +437,6 @@ def toolpath_svg(plan: Plan, steps: Sequence[Step]) -> str:
 
     A ring with the fibre's number marks where it is fastened, a dot with its turn where it is cut. Travel moves above
     the pad are dashed, and the needle's box is red.
-
-    Args:
-        plan: of the mould.
-        steps: the toolpath, by layer.
     """
     svg = _SvgWriter(decimals=3)
     strokes = [stroke for step in steps for stroke in step.strokes]

@@ -237,12 +237,7 @@ def _print_lines(document: Document) -> Iterator[str]:
 
 
 def print_settings_rows(mould: MouldSettings, printer: PrinterSettings) -> list[tuple[str, ...]]:
-    """Return the slicer settings for a filament printer, rows below `PRINT_SETTINGS_HEAD`.
-
-    Args:
-        mould: settings of the mould.
-        printer: settings of the printer.
-    """
+    """Return the slicer settings for a filament printer, rows below `PRINT_SETTINGS_HEAD`."""
     ridge, layer = mould.ridge_width_mm, printer.layer_mm
     n_lines = max(1, int(ridge / (_MIN_LINE * printer.nozzle_mm) + 1e-6))
     line = max(ridge / n_lines, _MIN_LINE * printer.nozzle_mm)

@@ -45,12 +45,7 @@ _SHADES = 8
 
 
 def mould_relief(plan: Plan, width: int, height: int) -> tuple[Array, Ints]:
-    """Rasterize a mould seen from above.
-
-    Args:
-        plan: of the mould.
-        width: of the tray, pixels.
-        height: of the tray, pixels.
+    """Rasterize a mould seen from above in pixels of its tray.
 
     Returns:
         Heights above the tray's floor, mm, and classes of pixels; shape (height, width).
@@ -72,12 +67,7 @@ def mould_relief(plan: Plan, width: int, height: int) -> tuple[Array, Ints]:
 
 
 def mesh_relief(vertices: Array, triangles: Ints, pixels: int) -> tuple[Array, Bounds]:
-    """Rasterize the upper surface of any mesh, closed or not.
-
-    Args:
-        vertices: of the mesh; shape (n, 3), mm.
-        triangles: vertex indices; shape (m, 3).
-        pixels: along the longer side.
+    """Rasterize the upper surface of any mesh, closed or not, in so many pixels along the longer side.
 
     Returns:
         Heights at the pixels' centres in the frame of the mesh, -inf beside it, and their x_min, y_min, x_max, y_max.
@@ -204,11 +194,6 @@ def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
     """Write the mould from above as PNG: colour stands for family and height, shade for the slope.
 
     Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
-
-    Args:
-        plan: of the mould.
-        findings: of its checks.
-        path: of the PNG file.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
@@ -231,12 +216,7 @@ def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
 
 
 def draw_tracks(plan: Plan, path: Path) -> None:
-    """Write the fibres as they lie in the tray, from above, as PNG; the deeper of two that cross covers the other.
-
-    Args:
-        plan: of the mould.
-        path: of the PNG file.
-    """
+    """Write the fibres as they lie in the tray, from above, as PNG; the deeper of two that cross covers the other."""
     x_min, y_min, x_max, y_max = plan.silicone.bounds
     room = 0.06 * (x_max - x_min)
     layers, clashes, layout = fibre_layers(plan), plan.clash_positions_mm, plan.pad.layout
@@ -260,11 +240,7 @@ def draw_tracks(plan: Plan, path: Path) -> None:
 def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
     """Write any mesh from above as PNG: colour stands for the height, shade for the slope, marks for findings.
 
-    Args:
-        vertices: of the mesh, finite; shape (n, 3), mm.
-        triangles: vertex indices; shape (m, 3), m >= 1.
-        findings: with positions in the frame of the mesh.
-        path: of the PNG file.
+    Vertices (n, 3), mm, are finite, and there is at least one triangle (m, 3).
     """
     from matplotlib.colors import LinearSegmentedColormap
 

@@ -83,9 +83,6 @@ class PackedMesh:
 def pack_mesh(path: Path) -> PackedMesh | None:
     """Pack the mesh of a file into `MAX_BYTES`, simplified as far as necessary; None if that does not suffice.
 
-    Args:
-        path: of an STL or 3MF file.
-
     Raises:
         InputError: the file is missing, or holds no mesh.
     """

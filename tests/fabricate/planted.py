@@ -35,18 +35,6 @@ def with_settings(
     return replace(DEFAULTS, **{name: models[name].model_validate(keys or {}) for name, keys in changed.items()})
 
 
-def mild_pad(grid: int, knots: int, seed: int) -> Morphology:
-    """Fibres that wind about their straight courses, as designed ones do."""
-    rng = np.random.default_rng(seed)
-    along = (np.arange(1, knots + 1) / (knots + 1) + rng.uniform(-0.2, 0.2, (2 * grid, knots)) / knots) * (grid + 1)
-    aside = np.tile(np.arange(1, grid + 1), 2)[:, None] + rng.uniform(-0.6, 0.6, (2 * grid, knots))
-    places = np.stack([along, aside], axis=2)
-    places[grid:] = places[grid:, :, ::-1]
-    straight = Morphology.straight(grid)
-    ends = [straight.knots[:, :1], places, straight.knots[:, -1:]]
-    return Morphology(np.concatenate(ends, axis=1), straight.pitch_mm)
-
-
 def exact_fibre(pad: Morphology, fibre: int, step_mm: float = 5e-3) -> np.ndarray:
     """(n, 2) mm: places of a fibre by scipy's own PCHIP, a step apart along it, and its knots."""
     family, knots = pad.layout.family(fibre), pad.to_mm(pad.knots[fibre])

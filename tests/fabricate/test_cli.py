@@ -58,16 +58,7 @@ def test_check_of_a_morphology(morphology):
 @pytest.mark.parametrize(
     ("file", "table", "line"),
     [
-        (
-            "pad.json",
-            '[silicone]\nname = "Eco 20"',
-            "[silicone] name: got 'Eco 20', allowed are published, EcoFlex 00-1",
-        ),
-        (
-            "pad.json",
-            "[pad]\nfibre_diameter_mm = 0.4",
-            "[pad] fibre_diameter_mm: no such key, allowed are grid",
-        ),
+        ("pad.json", "[pad]\nfibre_diameter_mm = 0.4", "[pad] fibre_diameter_mm: no such key, allowed are grid"),
         ("pad.json", '[mould]\nlevels = "two"', "2 crossings"),
         ("absent.json", "", "absent.json"),
     ],

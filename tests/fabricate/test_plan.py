@@ -60,12 +60,6 @@ def test_shrinkage_compensated_plan_shrinks_to_the_pad():
     assert (mould.depths_mm, mould.thickness_mm) == (mould.heights_mm, mould.silicone_mm)
 
 
-def test_shrinkage_compensated_plan_without_shrinkage_is_itself():
-    plan = Plan(Morphology.straight(2), with_settings(silicone={"name": "EcoFlex 00-20", "shrinkage": 0.0}))
-    assert plan.shrinkage_compensated is plan
-    assert Plan(Morphology.straight(2)).shrinkage_compensated.pad.pitch_mm == 11.25
-
-
 @settings(max_examples=50)
 @given(st.integers(1, 6), st.data())
 def test_assign_layers_separates_crossing_fibres(grid, data):

@@ -102,7 +102,7 @@ def test_mould_of_few_fibres_is_sound(fibres, leads):
 def test_one_side_leads_keep_their_spacing(fibres, pitches, border):
     pad = Morphology.straight(fibres, pitches)
     plan = Plan(pad, settings(pad, {"border_mm": border}, leads="one side"))
-    apart = min(lead_spacing(plan.settings, plan.heights_mm[-1], plan.flare_mm).pitch_mm, *pitches)
+    apart = min(lead_spacing(plan.settings, plan.heights_mm[-1], plan.flare_mm)[1], *pitches)
     ways = []
     for fibre, pair in enumerate(plan.leads.pairs):
         for lead in pair:

@@ -14,7 +14,7 @@ import pytest
 from padforge.design.common.files import find_unchanged, write_json
 from padforge.design.morphology import Morphology
 from tests.helpers.door import contents
-from tools.hostile_inputs.files import CHEAP, require_whole_file
+from tools.hostile_inputs.workplace import CHEAP, require_whole_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")]
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from padforge.cli import main as padforge_main
-from tools.threads import on_one_thread
+from tools.kills import on_one_thread
 
 from . import calls, command_lines, spoilt_files
 from .judging import MOST_CPU_S, MOST_MEMORY, outcome, suspect, violations
@@ -35,20 +35,10 @@ from .workplace import Workplace
 
 LIBRARIES = (
     *("torch", "matplotlib.figure", "matplotlib.font_manager", "shapely", "trimesh", "h5py", "pyarrow"),
-    *(
-        "rosbags.rosbag2",
-        "scipy.io",
-        "padforge.sense.deploy.onnx_export",
-        "ezdxf",
-        "lxml.etree",
-        "pymoo.core.problem",
-    ),
-    *(
-        "padforge.fabricate.export",
-        "padforge.sense.report.sections",
-        "padforge.sense.live.pipeline",
-        "padforge.sense.rig.operation",
-    ),
+    *("rosbags.rosbag2", "scipy.io", "padforge.sense.deploy.onnx_export", "ezdxf", "lxml.etree"),
+    "pymoo.core.problem",
+    *("padforge.fabricate.export", "padforge.sense.report.sections", "padforge.sense.live.pipeline"),
+    "padforge.sense.rig.operation",
 )
 """Imported before, not by each process again; not build123d, which few need and which makes each copy take longer."""
 SHARES = {"command line": 0.35, "file": 0.4, "call": 0.25}

@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 import scipy.io
 
-from .files import published
 from .texts import FLOATS, Rng, numbers, pick, some_bytes
 from .values import EXTREMES
+from .workplace import published
 
 _BOASTS = (2**31 - 1, 2**32, 2**40, 2**63 - 1, -1, 10**9)
 """Sizes that a file may say it has."""

@@ -5,8 +5,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from .files import require_whole_file
 from .limited import MIB, Ended
+from .workplace import require_whole_file
 
 MOST_MEMORY, MOST_CPU_S = 1024 * MIB, 10.0
 """Bytes that a process may have resident, and seconds that it may compute."""

@@ -22,24 +22,8 @@ TEXTS = (
 )
 
 VALUES = (
-    None,
-    True,
-    -1,
-    0,
-    1e308,
-    10**400,
-    2**64,
-    "",
-    "a",
-    "ÿ",
-    [],
-    [[]],
-    {},
-    [None],
-    [1e400],
-    {"a": {}},
-    1.5,
-    "\ud800",
+    *(None, True, -1, 0, 1e308, 10**400, 2**64, "", "a", "ÿ", []),
+    *([[]], {}, [None], [1e400], {"a": {}}, 1.5, "\ud800"),
 )
 """What a place in a JSON document may hold in place of what is right."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.design import InputError, Morphology
-from tools.hostile_inputs.files import SPECIAL
+from tools.hostile_inputs.workplace import SPECIAL
 
 Array = NDArray[np.float64]
 
@@ -21,42 +21,15 @@ LONG = "x" * 300
 HOSTILE = (
     *("", " ", "-", "--", "-1", "0", "1", "2", "3", "9" * 20, "-" + "9" * 20, "1e400", "nan", "inf"),
     *("-inf", "NaN", "0x10", "1_000", "1.5", "٣", "½", "true", "none", "None", "null", "é", "日本"),
-    *(
-        "\udc80\udcff",
-        "\x01",
-        "a\nb",
-        "a\tb",
-        "\x1b[31m",
-        "%s%n",
-        "{0}",
-        "$HOME",
-        "~",
-        "*",
-        "../x",
-        "0,1",
-        "0,,1",
-        ",",
-        "0,0",
-    ),
+    *("\udc80\udcff", "\x01", "a\nb", "a\tb", "\x1b[31m", "%s%n", "{0}", "$HOME", "~", "*", "../x", "0,1", "0,,1"),
+    *(",", "0,0"),
     *("1" * 5000, "x" * 70_000),
 )
 """Values that are wrong nearly everywhere."""
 
 PATHS = (
-    *(
-        ".",
-        "..",
-        "",
-        "pad",
-        "empty",
-        "file",
-        "file/below",
-        "new",
-        "new/deep/er",
-        "nowhere/",
-        "pad/",
-        "pad/recording",
-    ),
+    *(".", "..", "", "pad", "empty", "file", "file/below", "new", "new/deep/er", "nowhere/", "pad/"),
+    "pad/recording",
     *("pad/morphology.json", "pad/mould.stl", "pad/mould.3mf", "pad/design.json", "pad/recording/start.json"),
     *("presses.csv", "presses.h5", "pad.toml", "other.toml", "bad.toml", "nested.json", "nested.toml", "list.json"),
     *(f"{kind}.{suffix}" for kind in ("junk", "zero", "dangling", "loop") for suffix in ("json", "stl", "mat", "toml")),
@@ -64,31 +37,10 @@ PATHS = (
     *(f"{kind}.{suffix}" for kind in ("folder", "nothing") for suffix in ("json", "stl", "mat")),
     *SPECIAL,
     *("/dev/null", "/dev/full", "/dev/zero", "/dev/stdin/x", "/proc/self/mem", "/proc/nowhere/x", "/sys/x", "new.svg"),
-    *(
-        LONG,
-        f"{LONG}.json",
-        f"new/{LONG}/x",
-        "/".join(["y" * 100] * 60),
-        "日本",
-        "\udc80\udcff",
-        "a\nb",
-        "-",
-        "--",
-        " ",
-        "~",
-    ),
-    *(
-        "new.json",
-        "new.csv",
-        "new.h5",
-        "new.png",
-        "new.stl",
-        "new.mat",
-        "\x1b[31m.json",
-        "pad/../pad",
-        "con",
-        "x" * 250 + ".svg",
-    ),
+    *(LONG, f"{LONG}.json", f"new/{LONG}/x", "/".join(["y" * 100] * 60), "日本", "\udc80\udcff", "a\nb", "-", "--"),
+    *(" ", "~"),
+    *("new.json", "new.csv", "new.h5", "new.png", "new.stl", "new.mat", "\x1b[31m.json", "pad/../pad", "con"),
+    "x" * 250 + ".svg",
 )
 """Paths of all kinds, some of which are right for each command."""
 
@@ -118,20 +70,8 @@ _NUMBERS: list[Any] = [
 
 _OTHERS: list[Any] = [
     *(None, "", "4", "text", "a\nb", "\0", "\udc80", b"x", "uniform", "sphere", "x" * 100_000, ..., object(), object),
-    *(
-        [],
-        [[]],
-        [None],
-        [0.5, "a"],
-        [[1], [1, 2]],
-        (),
-        {},
-        {1: 2},
-        {"radius": 0.5},
-        {"grid": {"a": [1]}},
-        set(),
-        [[[]]],
-    ),
+    *([], [[]], [None], [0.5, "a"], [[1], [1, 2]], (), {}, {1: 2}, {"radius": 0.5}, {"grid": {"a": [1]}}, set()),
+    [[[]]],
     *(range(3), iter([1]), len, Rude(), [Rude()], Morphology, InputError, datetime.date(2020, 1, 1), slice(3)),
     *(pathlib.Path("/dev/null/y.json"), "/dev/null/x", "x" * 5000, _endless()),
 ]
@@ -139,13 +79,8 @@ _OTHERS: list[Any] = [
 _ARRAYS: list[Any] = [
     *(np.empty(0), np.empty((0, 2)), np.empty((2, 0)), np.empty((3, 0, 2)), np.empty((0, 3, 2)), np.array(3.0)),
     *(np.ones(3), np.ones((4, 3)), np.ones((1, 2, 3, 4)), np.full((2, 2), np.nan), np.full((2, 2), np.inf)),
-    *(
-        np.full((2, 2), 1e300),
-        np.full((2, 2), 5e-324),
-        np.full((2, 2), "a"),
-        np.full((2, 2), None),
-        np.ones((2, 2)) * 1j,
-    ),
+    *(np.full((2, 2), 1e300), np.full((2, 2), 5e-324), np.full((2, 2), "a"), np.full((2, 2), None)),
+    np.ones((2, 2)) * 1j,
     *(np.ones((2, 2), bool), np.ones((2, 2), np.int8), np.ones((2, 2), ">f4"), np.zeros((2, 2), "M8[s]")),
     *(np.zeros(3, [("x", float)]), np.ma.masked_all((2, 2)), np.broadcast_to(1.0, (2**40, 2)), np.ones((2, 2), "f2")),
     np.broadcast_to(1.0, (2**20, 2**10, 2)),

@@ -8,7 +8,7 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
-from build123d import Compound, GeomType, import_step
+from build123d import Compound, GeomType
 from OCP.Standard import Standard_Failure
 from scipy.spatial import KDTree
 
@@ -24,11 +24,10 @@ from padforge.fabricate.cad.model import (
     build_mould,
     build_mould_model,
 )
-from padforge.fabricate.cad.step_file import write_step
 from padforge.fabricate.mesh import build_mesh
 from padforge.fabricate.mould import conductive_plan, holder_body, lid_body, mould_body, well_outlines
 from padforge.fabricate.plan import Plan
-from tests.fabricate.planted import exact_fibre, level_pad, mild_pad, winding_pad, with_settings
+from tests.fabricate.planted import exact_fibre, level_pad, winding_pad, with_settings
 
 PLAIN: dict[str, object] = {"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0}
 
@@ -256,21 +255,3 @@ def test_build_mould_model_fits_finer_curves_until_solids_are_valid(monkeypatch,
     else:
         with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
             build_mould_model(Plan(Morphology.straight(1)), "second")
-
-
-def test_step_file_of_a_mild_pad_is_small_and_curved(tmp_path):
-    """What a CAD user opens."""
-    pad = mild_pad(1, 8, seed=2)
-    plan = Plan(pad)
-    model = judged(plan)
-    write_step(tmp_path / "mould.step", model.part)
-    assert (tmp_path / "mould.step").stat().st_size < 1.5e6
-    read = import_step(tmp_path / "mould.step")
-    assert read.is_valid
-    faces = read.faces()
-    assert len(faces) == len(model.shape.faces()) < 1500
-    tracks = [child for child in read.children if child.label.endswith("tracks")]
-    upright = [face for track in tracks for face in track.faces() if abs(face.normal_at().Z) < 0.5]
-    curved = sum(face.area for face in upright if face.geom_type in (GeomType.EXTRUSION, GeomType.CYLINDER))
-    within = pad.unit_mm * lengths(pad).reshape(2, -1).sum(axis=1) @ [1.2, 0.4]
-    assert curved > 0.9 * (2 * within - 4 * 0.4 * 0.4)  # less where the deep ones go through the others

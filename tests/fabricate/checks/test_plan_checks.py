@@ -41,22 +41,20 @@ def test_moulds_of_tangled_pads_are_solids(grid, knots, seed):
 
 
 RESIN = {"nozzle_mm": 0.2, "resin": True}
+UNEVEN = {"floor_mm": 2.05, "shallow_ridge_height_mm": 0.45, "deep_ridge_height_mm": 1.25}
 SHRINKING = {"silicone": {"shrinkage": 0.02}, "fibre": {"diameter_mm": 0.395}}
 
 
 @pytest.mark.parametrize(
     ("name", "settings", "status", "measured", "limit"),
     [
-        ("layers", {"printer": {"layer_mm": 0.1}}, "pass", 4, ...),
         ("layers", {"printer": {"layer_mm": 0.2}}, "pass", 2, ...),
         ("layers", {"printer": {"layer_mm": 0.16}}, "warn", 2.5, ...),
+        *(("layers", {"mould": {key: mm}}, "warn", ..., ...) for key, mm in UNEVEN.items()),
         ("layers", {"printer": {"layer_mm": 0.3}}, "fail", 4 / 3, ...),
-        ("ridge_width", {}, "pass", 0.4, 0.4),
         ("ridge_width", {"mould": {"ridge_width_mm": 0.39}}, "fail", 0.39, 0.4),
         ("ridge_width", {"printer": RESIN}, "pass", 0.4, 0.4),
         ("ridge_width", {"printer": RESIN | {"nozzle_mm": 0.21}}, "fail", 0.4, 0.42),
-        ("ridge_width", {"printer": {"nozzle_mm": 0.21}}, "pass", 0.4, 0.21),
-        ("track_size", {"fibre": {"diameter_mm": 0.5}}, "fail", 0.4, 0.5),
         ("track_size", {"fibre": {"diameter_mm": 0.4}}, "pass", 0.4, 0.4),
         ("track_size", {"mould": {"ridge_width_mm": 0.5}, "fibre": {"diameter_mm": 0.41}}, "fail", 0.4, 0.41),
         ("track_size", {"mould": {"shallow_ridge_height_mm": 0.6}, "fibre": {"diameter_mm": 0.41}}, "fail", 0.4, 0.41),
@@ -67,31 +65,21 @@ SHRINKING = {"silicone": {"shrinkage": 0.02}, "fibre": {"diameter_mm": 0.395}}
         ("layers", SHRINKING, "pass", 4, ...),
         ("crossing_gap", {"mould": {"deep_ridge_height_mm": 1.1}}, "pass", 0.4, ...),
         ("crossing_gap", {"mould": {"deep_ridge_height_mm": 1.09}}, "warn", 0.39, ...),
-        ("crossing_gap", {"mould": {"deep_ridge_height_mm": 0.7}}, "fail", 0.0, ...),
         ("slenderness", {"mould": {"deep_ridge_height_mm": 2.0}}, "pass", 5.0, ...),
         ("slenderness", {"mould": {"deep_ridge_height_mm": 2.04}}, "warn", 5.1, ...),
         ("slenderness", {"mould": {"deep_ridge_height_mm": 4.0}}, "warn", 10.0, ...),
         ("slenderness", {"mould": {"deep_ridge_height_mm": 4.04}}, "fail", 10.1, ...),
         ("cover", {"mould": {"silicone_mm": 2.2}}, "pass", 1.0, ...),
         ("cover", {"mould": {"silicone_mm": 2.19}}, "warn", 0.99, ...),
-        ("cover", {"mould": {"silicone_mm": 2.0}}, "warn", 0.8, ...),
     ],
 )
 def test_findings_of_a_straight_pad_by_settings(name, settings, status, measured, limit):
     finding = find(Morphology.straight(1), name, with_settings(**settings))
     assert finding.status == status
-    assert finding.measured == pytest.approx(measured, abs=1e-9)
+    assert measured is ... or finding.measured == pytest.approx(measured, abs=1e-9)
     assert limit is ... or finding.limit == pytest.approx(limit)
     if name in ("ridge_width", "slenderness"):
         assert len(finding.positions_mm) == (0 if status == "pass" else {"ridge_width": 2, "slenderness": 1}[name])
-
-
-@pytest.mark.parametrize(
-    ("key", "height"), [("floor_mm", 2.05), ("shallow_ridge_height_mm", 0.45), ("deep_ridge_height_mm", 1.25)]
-)
-def test_layers_warns_of_uneven_heights(key, height):
-    finding = find(Morphology.straight(1), "layers", with_settings({key: height}))
-    assert (finding.status, finding.message) == ("warn", f"{key}: not a whole number of 0.1 mm layers")
 
 
 @pytest.mark.parametrize(("grid", "named"), [(2, "numbers 1, 2, 3, 4"), (5, "10 numbers")])

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.export import Fabrication, build
-from padforge.fabricate.fibre_placement.gcode import gcode
-from padforge.fabricate.fibre_placement.toolpath import plan_toolpath
-from padforge.fabricate.fibre_placement.urscript import urscript
+from padforge.fabricate.export import Fabrication
+from padforge.fabricate.fibre_placement import gcode, plan_toolpath, urscript
 from padforge.fabricate.outputs.drawings import toolpath_svg
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
@@ -96,14 +94,6 @@ def test_gcode_has_nothing_that_a_firmware_misreads():
         assert re.fullmatch(r"M0 \([^();]+\)", line)
         assert not re.search(r"[sSpP]\s*\d", line)
     assert max(len(line) for line in lines if line[0] in "GM") < 80
-
-
-def test_build_writes_a_program_in_each_language_and_one_drawing(tmp_path):
-    pad = Morphology.random(1, 2, seed=1)
-    document = build(pad, tmp_path, ["urscript", "gcode"])
-    assert document["files"] == ["laying.gcode", "laying.script", "toolpath.svg"]
-    assert [finding["name"] for finding in document["findings"][-2:]] == ["dispenser_box", "dispenser_tip"]
-    assert (tmp_path / "laying.gcode").read_text() == program(Plan(pad), gcode) == program(Plan(pad), gcode)
 
 
 def test_fibre_settings_set_depth_and_speed():

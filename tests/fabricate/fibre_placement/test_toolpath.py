@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from padforge.design.morphology import Morphology, assemble_knots
-from padforge.fabricate.fibre_placement.toolpath import Stroke, check_toolpath, plan_toolpath
+from padforge.design.morphology import Morphology
+from padforge.fabricate.fibre_placement import Stroke, check_toolpath, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import with_settings
@@ -72,20 +72,6 @@ def test_feed_in_a_bend_follows_from_its_radius(radius_mm, acceleration, stretch
     slow_mm = horizontal.steps_mm[horizontal.feeds_mm_s == feed].sum()
     ends_mm = 4 * 2 * 0.3  # of both quarters: beside them the needle has half a diameter to get slower in
     assert slow_mm == pytest.approx(math.pi * radius_mm if feed < 10 else horizontal.steps_mm.sum(), abs=ends_mm)
-
-
-def test_feed_is_reduced_only_near_a_bend():
-    """A corner in mid-way: beyond a millimetre of it the needle is as fast as it may be, on the leads as well."""
-    inner = np.zeros((2, 3, 2))
-    inner[0] = [(0.6, 1.0), (1.0, 1.0), (1.02, 1.2)]
-    inner[1] = [(1, 0.5), (1, 1.0), (1, 1.5)]
-    bent, straight = strokes(Plan(Morphology(assemble_knots(inner), 10.0)))
-    assert straight.feeds_mm_s.tolist() == [10.0]
-    assert len(straight.positions_mm) == 2
-    at_most = bent.feeds_mm_s == 10
-    assert 0 < bent.steps_mm[~at_most].sum() < 6
-    assert at_most[[0, -1]].all()
-    assert bent.feeds_mm_s.min() < 6
 
 
 def test_strokes_have_the_cut_length_of_the_laying_page():

@@ -1,4 +1,4 @@
-"""Toolpaths of a needle that places the fibres of a pad, their checks, and the instructions for any machine."""
+"""Toolpaths of a needle that places the fibres of a pad, their checks, and programs for gantries and arms."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -62,10 +62,7 @@ class Step:
 def plan_toolpath(plan: Plan, diameter_mm: float, max_strain: float = math.inf) -> list[Step]:
     """Compute the toolpath of every fibre in the order of the laying page, the deepest layer first.
 
-    Args:
-        plan: of the pad, with the leads and the dispenser of its settings.
-        diameter_mm: of the fibre.
-        max_strain: elongation that the fibre bears, 1 for twice its length; inf if unknown.
+    `max_strain` is the elongation that the fibre bears, 1 for twice its length; inf if unknown.
     """
     lead_mm = plan.settings.mould.lead_mm
     paths, traces = plan.paths(_FLAT_SHARE * TOLERANCE_MM, lead_mm), plan.trace(_MAX_TURN, lead_mm)
@@ -194,8 +191,7 @@ class Pause:
     message: str
 
 
-Instruction = LinearMove | Stroke | Pause
-"""A stroke starts where the move before it ended."""
+Instruction = LinearMove | Stroke | Pause  # a stroke starts where the move before it ended
 
 
 def build_instructions(plan: Plan, steps: Sequence[Step]) -> Iterator[Instruction]:
@@ -239,9 +235,124 @@ def summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
 
 
 def format_mm(*values_mm: float) -> str:
-    """Format coordinates for a program, to a micrometre and without -0, separated by commas.
-
-    Args:
-        *values_mm: coordinates.
-    """
+    """Format coordinates for a program, to a micrometre and without -0, separated by commas."""
     return ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values_mm)
+
+
+# G-code
+
+
+def gcode(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath, in the machine's coordinates with the pad's middle at the dispenser's origin.
+
+    Both Marlin and GRBL read it. M0 waits until all moves are done, then for the operator. There is no G0: GRBL moves
+    at the machine's maximum speed then, whatever the feed, and hands are near.
+    """
+    dispenser = plan.settings.dispenser
+    x, y = dispenser.origin_mm
+    lines = [
+        *(f"; {line}" for line in summary_lines(plan, steps)),
+        f"; the pad's middle is at X{format_mm(x)} Y{format_mm(y)};"
+        " set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
+        "G21",
+        "G90",
+        "M0 (needle over the pad, zero of z is set)",
+        f"G1 Z{format_mm(dispenser.travel_height_mm)} F{_format_feed(dispenser.travel_mm_s)}",
+    ]
+    words: dict[str, str] = {}
+    for instruction in build_instructions(plan, steps):
+        if isinstance(instruction, Pause):
+            lines.append(f"M0 ({instruction.message})")
+            continue
+        for (u, v, z), speed in _moves(instruction):
+            axes = {"X": format_mm(x + u), "Y": format_mm(y + v), "Z": format_mm(z)}
+            target = axes | {"F": _format_feed(speed)}
+            changed = [letter + number for letter, number in target.items() if words.get(letter) != number]
+            if any(word[0] != "F" for word in changed):  # else the needle is there already
+                lines.append(" ".join(["G1", *changed]))
+                words = target
+    return "\n".join([*lines, ""])
+
+
+def _moves(instruction: Instruction) -> Iterator[tuple[tuple[float, float, float], float]]:
+    """Yield the target positions and speeds of a move or a stroke."""
+    if isinstance(instruction, LinearMove):
+        yield instruction.position_mm, instruction.speed_mm_s
+    elif not isinstance(instruction, Pause):
+        feeds = instruction.feeds_mm_s.tolist()
+        for (x, y), feed in zip(instruction.positions_mm[1:].tolist(), feeds, strict=True):
+            yield (x, y, instruction.z_mm), feed
+
+
+def _format_feed(speed_mm_s: float) -> str:
+    return f"{max(1, round(60 * speed_mm_s))}"  # mm/min; firmwares ignore a feed of 0
+
+
+# URScript
+
+_BLEND_SHARE = 0.4
+"""Maximum blend as a share of the shorter of two segments: the arcs at its ends may not meet."""
+_UNKNOWN = "where the pad lies is unknown: [dispenser] arm_pose in pad.toml says it"
+
+
+def urscript(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath for an arm of Universal Robots, transformed from the pad's frame by `at`.
+
+    Along a fibre the tip rounds the corners by arcs within the toolpath's tolerance. While the pose of the pad is
+    unknown, the program says so and ends before anything moves.
+    """
+    dispenser = plan.settings.dispenser
+    pose, dynamics = dispenser.arm_pose or (0.0,) * 6, _dynamics(dispenser.travel_mm_s, dispenser)
+    lines = [
+        "def padforge_laying():",
+        *(f"  # {line}" for line in summary_lines(plan, steps)),
+        "  # the TCP is the mouth of the needle; pad is the middle of its upper face in the base of the arm, m and rad",
+        f"  pad = p[{', '.join(f'{value:.10g}' for value in pose)}]",
+        *([_popup(_UNKNOWN), "  halt"] if dispenser.arm_pose is None else []),
+        "  def at(x, y, z):",
+        f"    return pose_trans(pad, p[x / 1000, y / 1000, z / 1000, {math.pi:.9f}, 0, 0])",
+        "  end",
+        _popup("needle over the pad, all its ways free?"),
+        "  here = pose_trans(pose_inv(pad), get_actual_tcp_pose())",
+        f"  movel(at(here[0] * 1000, here[1] * 1000, {format_mm(dispenser.travel_height_mm)}), {dynamics})",
+        *(line for instruction in build_instructions(plan, steps) for line in _lines(instruction, dispenser)),
+        "end",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _lines(instruction: Instruction, dispenser: DispenserSettings) -> Iterator[str]:
+    if isinstance(instruction, Pause):
+        yield _popup(instruction.message)
+    elif isinstance(instruction, LinearMove):
+        position = format_mm(*instruction.position_mm)
+        yield f"  movel(at({position}), {_dynamics(instruction.speed_mm_s, dispenser)})"
+    else:
+        corners = np.round(instruction.positions_mm, 3)
+        feeds, blends = instruction.feeds_mm_s.tolist(), _blend_radii(corners).tolist()
+        for (x, y), feed, blend in zip(corners[1:].tolist(), feeds, blends, strict=True):
+            position = format_mm(x, y, instruction.z_mm)
+            yield f"  movep(at({position}), {_dynamics(feed, dispenser)}, r={blend / 1000:.7g})"
+
+
+def _blend_radii(corners: Array) -> Array:
+    """Compute the distance (n - 1,) from each corner but the first to the start of its arc, mm; 0 at the end.
+
+    An arc that starts b from a corner where the path turns by t passes the corner at b tan(t / 4).
+    """
+    steps = np.diff(corners, axis=0)
+    length = np.hypot(*steps.T)
+    headings = np.arctan2(*steps.T[::-1])
+    turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
+    room = _BLEND_SHARE * np.minimum(length[:-1], length[1:])
+    within = TOLERANCE_MM / np.tan(np.maximum(turns, 1e-6) / 4)
+    return np.append(np.floor(1e4 * np.minimum(room, within)) / 1e4, 0.0)
+
+
+def _dynamics(speed_mm_s: float, dispenser: DispenserSettings) -> str:
+    return f"a={dispenser.acceleration_mm_s2 / 1000:.6g}, v={speed_mm_s / 1000:.6g}"
+
+
+def _popup(message: str) -> str:
+    return f'  popup("{message}", title="padforge", blocking=True)'

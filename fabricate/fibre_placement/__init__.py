@@ -1,1 +1,0 @@
-"""Toolpaths of a machine that places the fibres, as G-code and URScript."""
