@@ -3,6 +3,7 @@
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from numbers import Integral, Real
@@ -57,14 +58,16 @@ def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
 
     module = (error.name or "").partition(".")[0]
     library = _DISTRIBUTIONS.get(module, module)
-    requirement = re.compile(rf"""{library}\b(?![-\w]).*extra == ['"](?!(?:all|test|figures)\b)([\w-]+)""")
+    requirement = re.compile(r"""([\w-]+).*extra == ['"](?!(?:all|test|figures)\b)([\w-]+)""")
     try:
-        extras = [match[1] for line in requires("padforge") or () if (match := requirement.match(line))]
+        matches = [match for line in requires("padforge") or () if (match := requirement.match(line))]
     except PackageNotFoundError:
         return None
+    sizes = Counter(match[2] for match in matches)
+    extras = [match[2] for match in matches if match[1] == library]
     if not extras:
         return None
-    extra = wanted if {*wanted.split(",")} & {*extras} else extras[0]
+    extra = wanted if {*wanted.split(",")} & {*extras} else min(extras, key=sizes.__getitem__)
     return f"this needs {library}, which is not installed: pip install 'padforge[{extra}]'"
 
 

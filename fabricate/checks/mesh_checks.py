@@ -63,11 +63,14 @@ def check_triangles(
     genus: int | None = None,
     has_plan: bool = False,
 ) -> list[Finding]:
-    """Run all checks on a mesh that stands as it is printed, open side up, with the arguments of `check_mesh`.
+    """Run all checks on a mesh that stands as it is printed, open side up.
 
     Args:
         vertices: (n, 3) mm; equal ones are merged.
         triangles: (m, 3) vertex indices, counter-clockwise seen from outside.
+        printer: as `check_mesh`.
+        min_silicone_mm: as `check_mesh`.
+        genus: as `check_mesh`.
         has_plan: whether the mould's plan is checked as well, which gives widths exactly and faster.
 
     Returns:

@@ -281,9 +281,9 @@ def recalibration_lines(document: Mapping[str, Any]) -> list[str]:
         conclusion = f"{names}: errors shrink by {gain:.3f} mm (standard error {standard_error:.3f} mm)"
     return [
         f"{document['presses']} new presses, each predicted by what was changed without it",
-        "lost  sets  before mm  after mm  in r90 before  in r90 after",
+        "failed  sets  before mm  after mm  in r90 before  in r90 after",
         *(
-            f"{old['n_failed']:4d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
+            f"{old['n_failed']:6d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
             f"{old['within_r90']:13.1%}  {new['within_r90']:12.1%}"
             for old, new in zip(document["before"], document["after"], strict=True)
         ),

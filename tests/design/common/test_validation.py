@@ -46,6 +46,7 @@ def test_checks_refuse_values_beyond_their_bounds_and_of_other_types(check, valu
     ("module", "wanted", "said"),
     [
         ("torch.nn", "train", "torch, which is not installed: pip install 'padforge[train]'"),
+        ("torch", "", "torch, which is not installed: pip install 'padforge[train]'"),
         ("distributed", "design", "distributed, which is not installed: pip install 'padforge[cluster]'"),
         ("serial", "train", "pyserial, which is not installed: pip install 'padforge[rig]'"),
         ("PIL", "design,cad,train", "pillow, which is not installed: pip install 'padforge[design,cad,train]'"),

@@ -56,7 +56,7 @@ def test_conformal_takes_a_quantile_one_rank_higher() -> None:
     assert spread == pytest.approx(np.sqrt((np.square(2 * ranks)).mean() / 2))
     assert r50 == pytest.approx(3 * 0.50)
     assert r90 == pytest.approx(1.5 * 0.90)
-    few = Localization(*(part[:5] for part in (found.positions_mm, found.std_mm, found.r50_mm, found.r90_mm)))
+    few = Localization(found.positions_mm[:5], found.std_mm[:5], found.r50_mm[:5], found.r90_mm[:5])
     assert conformal([few], places[:5])[2] == pytest.approx((1.5 * ranks[:5]).max())
 
 
