@@ -195,3 +195,11 @@ def test_import_bag_writes_nothing_beside_sqlite_without_an_index(tmp_path: Path
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_import_bag_refuses_a_file_cut_anywhere(bag: Path, tmp_path: Path) -> None:
+    content = bag.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    for size in sorted({*range(0, 200, 9), *np.linspace(200, len(content) - 1, 30).astype(int), len(content) - 1}):
+        cut.write_bytes(content[:size])
+        refusal_of(cut, "")

@@ -150,3 +150,21 @@ def test_measures_are_saved_but_not_in_the_digest(recording: Recording, tmp_path
         assert Recording.open(tmp_path / str(number)) == each
     with pytest.raises(ValueError, match="read-only"):
         measured.forces_n[0] = 1
+
+
+def test_open_while_recording(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    readings = rng.standard_normal((30, 3))
+    recorder = Recorder(tmp_path / "live", 3, {}, {})
+    recorder.append(np.arange(20.0), readings[:20])
+    recorder.begin((1.5, -2.5), 10)
+    recorder.finish(20)
+    recorder.append(np.arange(20.0, 26.0), readings[20:26])
+    recorder.begin((3.0, 4.0), 26)
+    recorder.sync()
+    recorder.append(np.arange(26.0, 30.0), readings[26:])
+    opened = Recording.open(tmp_path / "live")
+    recorder.__exit__(None, None, None)
+    assert np.array_equal(opened.readings, readings[:26])
+    assert opened.presses_mm.tolist() == [[1.5, -2.5]]
+    assert (opened.down_command.tolist(), opened.up_command.tolist()) == ([10], [20])

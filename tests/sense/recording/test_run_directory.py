@@ -412,3 +412,19 @@ def test_resume_reads_the_journal_after_the_lock(folder: Path, monkeypatch: pyte
     monkeypatch.setattr("padforge.sense.recording.run_directory.lock", finish_before_lock)
     with Recorder.resume(folder) as recorder:
         assert 9999 in recorder.done
+
+
+def test_abort_repeats_the_press(tmp_path):
+    with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
+        time_s = record(recorder, range(2), 0.0)
+        recorder.append([time_s], np.zeros((1, FIBRES)))
+        recorder.begin((2, -2), recorder.n_readings, 2)
+        recorder.abort("the arm was stopped")
+        recorder.abort("a second time")
+    events = [json.loads(line)["event"] for line in (tmp_path / "run" / JOURNAL).read_text().splitlines()]
+    assert events[-2:] == ["started", "aborted"]
+    assert len(Recording.open(tmp_path / "run").presses_mm) == 2
+    with Recorder.resume(tmp_path / "run") as recorder:
+        assert recorder.done == {0, 1}
+        record(recorder, range(2, 4), time_s + 1)
+    assert len(Recording.open(tmp_path / "run").presses_mm) == 4

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from padforge.benchmarks.filter import admm, fibre, linear_program
 from padforge.design.common.validation import InputError
 from padforge.sense import (
     RunningMedian,
@@ -303,3 +304,16 @@ def test_filters_refuse_wrong_arguments_in_one_line(call, message):
     with pytest.raises(InputError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
+
+
+def test_total_variation_agrees_with_the_solvers_of_the_bench():
+    clean, y = fibre(1000, np.random.default_rng(3))
+    for lam in (1.0, 4.0, 17.3):
+        least = objective(y, total_variation(y, lam), lam)
+        assert objective(y, linear_program(y, lam), lam) == pytest.approx(least, rel=1e-9)
+    least = objective(y, total_variation(y, 4), 4)
+    assert least <= objective(y, admm(y, 4, 1000), 4) <= 1.01 * least
+    error = (y - clean) / STEP_V
+    assert np.median(np.abs(error)) < 2
+    assert 0.003 < (np.abs(error) > 8).mean() < 0.03
+    assert np.abs(total_variation(y, 4) - clean).mean() < 0.3 * np.abs(y - clean).mean()
