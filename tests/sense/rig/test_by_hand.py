@@ -17,6 +17,7 @@ from padforge.design import Contact, Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording
+from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand
 from padforge.sense.rig.by_hand import (
@@ -40,6 +41,7 @@ from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
+from tests.sense.conftest import QUICK
 from tests.sense.rig.fakes import Time
 
 IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
@@ -459,3 +461,11 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
     assert validator.is_touched(BASELINE) is True
     validator.reset_baseline()
     assert validator.is_touched(BASELINE) is None
+
+
+@pytest.mark.slow
+def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
+    hand, recording = clumsy
+    _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
+    scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
+    assert document["errors"][0]["mean_mm"] < 0.55 * scale_mm
