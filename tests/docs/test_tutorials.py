@@ -1,9 +1,9 @@
 """Tutorials and how-to pages print what they show.
 
-A block of shell commands after a comment `<!-- run -->` is run here, after all such blocks above it and those of the page
-that it continues. What it prints must be what the page shows below: text and whole numbers exactly, decimals exactly or
-within the share of a comment like `<!-- run: decimals within 20 % -->`; probabilities such as 1e8 may then differ as
-well. Times always may. With REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
+A block of shell commands after a comment `<!-- run -->` is run here, after all such blocks above it and those of the
+page that it continues. What it prints must be what the page shows below: text and whole numbers exactly, decimals
+exactly or within the share of a comment like `<!-- run: decimals within 20 % -->`; probabilities such as 1e8 may then
+differ as well. Times always may. With REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
 """
 
 import os
