@@ -1,6 +1,7 @@
 """What the documentation site has beside the pages of this folder: pages of the house, and pages made from the code."""
 
 import ast
+import json
 import posixpath
 import re
 from collections.abc import Iterator
@@ -9,6 +10,8 @@ from pathlib import Path
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+
+from padforge.run import section_models
 
 ROOT = Path(__file__).resolve().parents[1]
 HOUSE = {
@@ -30,6 +33,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for picture in sorted((ROOT / "out" / "gallery").iterdir()):
         files.append(File.generated(config, f"gallery/{picture.name}", abs_src_path=str(picture)))
     files.append(File.generated(config, "commands.md", content=commands()))
+    files.append(File.generated(config, "settings.md", content=settings()))
     for package in API:
         files.append(File.generated(config, f"api-{package}.md", content=reference(package)))
     return files
@@ -58,9 +62,21 @@ def commands() -> str:
     return "# Commands\n\n::: mkdocs-click\n" + "".join(f"    :{name}: {value}\n" for name, value in options.items())
 
 
+def settings() -> str:
+    """Write the page of all settings with defaults and units."""
+    lines = ["# Settings", "", "Keys of `pad.toml`; every key is optional. `padforge init` writes them all."]
+    for name, model in section_models().items():
+        lines += ["", f"## [{name}]", "", "| key | default | meaning |", "|---|---|---|"]
+        values = model().model_dump()
+        for key, field in model.model_fields.items():
+            value = json.dumps(values[key], ensure_ascii=False).replace("|", "\\|")
+            lines.append(f"| `{key}` | `{value}` | {(field.description or '').replace('|', chr(92) + '|')} |")
+    return "\n".join(lines) + "\n"
+
+
 def reference(package: str) -> str:
-    """The page of all that a package hands out, which mkdocstrings fills in."""
-    return f"# In Python: {package}\n\n" + "".join(f"::: {name}\n\n" for name in names(package))
+    """Write the page of what a package exports, which mkdocstrings fills in."""
+    return f"# padforge.{package}\n\n" + "".join(f"::: {name}\n\n" for name in names(package))
 
 
 def names(package: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ from padforge.design import Morphology
 from padforge.sense.recording.recording import Recording
 from tests.docs.pages import BLOCK, ROOT
 
-PAGE = ROOT / "docs" / "devices.md"
+PAGE = ROOT / "docs" / "howto-boards.md"
 SPEC = """
 [rig]
 board = "noise"

@@ -1,10 +1,9 @@
-"""Tutorials do as they say.
+"""Tutorials and how-to pages print what they show.
 
-A comment `<!-- run -->` before a block of shell commands says that it is run here, after all such blocks above it and
-those of the first tutorial, which makes the pad. What it prints must be what the page shows below: text and whole
-numbers exactly, decimals too, or within the share that a comment like `<!-- run: decimals within 20 % -->` grants where
-they hang on the machine; the chances that it calls 1e8 may then differ as well. Seconds always may. With REWRITE_DOCS
-set in the environment the pages are rewritten by what is printed, to be looked at before they are kept.
+A block of shell commands after a comment `<!-- run -->` is run here, after all such blocks above it and those of the
+page that it continues. What it prints must be what the page shows below: text and whole numbers exactly, decimals
+exactly or within the share of a comment like `<!-- run: decimals within 20 % -->`; probabilities such as 1e8 may then
+differ as well. Times always may. With REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
 """
 
 import os
@@ -26,7 +25,16 @@ from tests.docs.pages import BLOCK, ROOT, relative
 from tests.helpers.door import call
 from tests.helpers.once import Once
 
-TUTORIALS = [ROOT / "docs" / f"tutorial-{stage}.md" for stage in ("design", "fabricate", "sense", "study", "twin")]
+BASES = {
+    "tutorial-design": None,
+    "tutorial-fabricate": "tutorial-design",
+    "tutorial-sense": "tutorial-design",
+    "tutorial-study": "tutorial-design",
+    "tutorial-twin": "tutorial-design",
+    "howto-ros": "tutorial-sense",
+    "howto-microcontroller": "tutorial-sense",
+}
+"""Pages that are run, and the page that each continues."""
 REWRITE = "REWRITE_DOCS" in os.environ
 SHORTER = 1 if REWRITE else 10
 """What finds faults learns for this share of its time, which no page shows."""
@@ -96,23 +104,22 @@ def slack(number: str, share: float) -> float:
     return max(share * abs(float(number)), 1.001 * 10.0**-digits)
 
 
-@pytest.fixture(scope="session")
-def designed(once: Once) -> tuple[Path, str]:
-    """The folder in which the first tutorial was followed, on which the others build, and where the page was wrong."""
-    return once("tutorial", lambda folder: (folder, follow(TUTORIALS[0], folder)))
+def followed(page: str, once: Once) -> tuple[Path, str]:
+    """Return the folder in which a page was followed, and where the page was wrong."""
+
+    def make(folder: Path) -> tuple[Path, str]:
+        if base := BASES[page]:
+            shutil.copytree(followed(base, once)[0], folder, dirs_exist_ok=True)
+        return folder, follow(ROOT / "docs" / f"{page}.md", folder)
+
+    return once(page, make)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not all(map(shutil.which, ("sh", "awk", "sed"))), reason="needs the tools of a Unix shell")
-@pytest.mark.parametrize(
-    "page", [pytest.param(page, marks=pytest.mark.xdist_group(page.stem), id=page.stem) for page in TUTORIALS]
-)
-def test_tutorials_print_what_they_show(page: Path, designed: tuple[Path, str], tmp_path: Path) -> None:
-    if page == TUTORIALS[0]:
-        wrong = designed[1]
-    else:
-        shutil.copytree(designed[0], tmp_path, dirs_exist_ok=True)
-        wrong = follow(page, tmp_path)
+@pytest.mark.parametrize("page", [pytest.param(page, marks=pytest.mark.xdist_group(page)) for page in BASES])
+def test_pages_print_what_they_show(page: str, once: Once) -> None:
+    _, wrong = followed(page, once)
     assert REWRITE or not wrong, wrong
 
 

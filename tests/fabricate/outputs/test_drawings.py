@@ -294,7 +294,7 @@ def test_orientation_svg_omits_absent_numbers():
 
 
 def test_bench_page_has_orientation_sentence():
-    page = " ".join((DOCS / "bench.md").read_text(encoding="utf-8").split())
+    page = " ".join((DOCS / "howto-pad.md").read_text(encoding="utf-8").split())
     assert page.count(orientation_sentence((4, 4), "edges")) == 1
     assert page.count("with its tracks up") >= 2  # under an arm, in the holder
     assert "with its tracks down" not in page

@@ -40,7 +40,7 @@ class Output(NamedTuple):
 
 def tutorial_code(name: str, language: str) -> str:
     """The code in the tutorial that follows the comment of a name."""
-    text = (ROOT / "docs" / "tutorial-sense.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "howto-microcontroller.md").read_text(encoding="utf-8")
     match = re.search(rf"<!-- {name} -->\n```{language}\n(.*?)```", text, re.DOTALL)
     assert match is not None
     return match[1]

@@ -18,7 +18,7 @@ from padforge.sense.rig.devices import BoardSamples
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
 FIRMWARE = Path(line_board.__file__).parent / "firmware" / "padforge_line"
-PAGE = Path(__file__).parents[4] / "docs" / "devices.md"
+PAGE = Path(__file__).parents[4] / "docs" / "howto-boards.md"
 NAME = (("name", "padforge-line"),)
 HEADERS = {
     "ESP32": LineHeader(500, 12, 3.3, 16, extra=(*NAME, ("serial", "a1b2c3d4e5f6"))),
