@@ -18,7 +18,7 @@ from padforge.sense.rig.boards.line_board import (
 )
 from padforge.sense.rig.devices import BoardSamples, RigFault
 
-PAGE = Path(__file__).parents[4] / "docs" / "devices.md"
+PAGE = Path(__file__).parents[4] / "docs" / "howto-boards.md"
 HEADER = LineHeader(500, 12, 3.3, 4, extra=(("name", "my-board"),))
 SAMPLES = [LineSample(2000 * (k + 1), (2048 + k, 1991, 870 + k, 2003)) for k in range(3)]
 LINES = [format_sample(sample.time_us, sample.counts, True) for sample in SAMPLES]
