@@ -131,3 +131,14 @@ def test_errors_by_contact_grow_with_scatter_and_heed_keep_outs():
         for size, scatter in ((ASKED[0], Scatter(0.01)), (ASKED[0], Scatter(0.1)), (hole, Scatter(0.01)))
     ]
     assert means[1] > 1.5 * means[0] != means[2]
+
+
+def test_networks_ignore_the_signals_of_failed_fibres():
+    pad = Morphology.straight(3)
+    presses = SimulatedPresses.simulate(pad, 12, 50, 0, lambda positions: signals(pad, positions))
+    failed = (0, 4)
+    [network] = presses.fit([failed], hidden=8)
+    changed = presses.test_signals.copy()
+    changed[:, failed] = np.nan
+    errors = presses.position_errors(network, failed, changed, presses.test_positions)
+    np.testing.assert_array_equal(errors, presses.test_errors(network, failed))
