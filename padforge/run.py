@@ -237,6 +237,10 @@ def run_stages(
             options = SearchOptions(on_progress, resume=run.resume, time_budget=run.remaining_s(SEARCH_SHARE))
             return run_design(spec, out, seed, None, options, None, note, _regenerated_files(), run.force)[1]
 
+    def fabricate(note: object) -> dict[str, Any]:
+        settings = FabricationSettings.from_spec(spec)
+        return build(pad, out, run.formats, settings, source, warn=on_message).to_dict()
+
     def calibrate(note: object) -> dict[str, Any]:
         options, budget = spec.section(LocalizerSettings, **seed), run.remaining_s(reserve_s=RESERVE_S)
         with training_progress() as report:
@@ -259,7 +263,7 @@ def run_stages(
     mould = cache.get(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
-        lambda note: build(pad, out, run.formats, FabricationSettings.from_spec(spec), source, warn=on_message),
+        fabricate,
         pad=digest,
         formats=sorted(run.formats),
     )
