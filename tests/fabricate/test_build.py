@@ -172,6 +172,8 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     assert sizes["cavity_mm"] * 0.96 == pytest.approx(sizes["pad_mm"]) == pytest.approx(kept.sizes["pad_mm"])
     assert sizes["cavity_depth_mm"] == 6.2  # 6.25 mm in whole layers
     assert sizes["pad_thickness_mm"] == pytest.approx(6.2 * 0.96)
+    assert grown.frame is not None
+    assert kept.frame is not None
     assert grown.frame["surface_mm"] == pytest.approx(2 + 6.2 * 0.96)
     assert grown.frame["pad_mm"] == kept.frame["pad_mm"]
     assert (tmp_path / "kept" / "holder.stl").read_bytes() == (tmp_path / "grown" / "holder.stl").read_bytes()
