@@ -95,7 +95,7 @@ class Fabrication:
             return build_models(self.plan, {body.name: body.body for body in self.bodies})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Build:
     """A mould that was written: all that a lab needs to print, cast, cut and place fibres.
 
@@ -133,7 +133,7 @@ class Build:
     laying_order: list[list[int]]
     crossings: dict[str, Any]
     common_tracks: list[dict[str, Any]]
-    exits: list[int] | None
+    exits: list[int] | None = None
     frame: dict[str, Any] | None
     settings: dict[str, Any]
     provenance: dict[str, Any]
@@ -314,7 +314,7 @@ def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[s
         mould_volume_ml=round(mould.mesh.volume() / 1000, 4),
         silicone_volume_ml=laying["silicone"]["volume_ml"],
         findings=fabrication.findings,
-        **({"exits": None} | laying),
+        **laying,
         frame=bed_frame(plan) if settings.mould.holder else None,
         settings={
             "pitch_mm": plan.pad.pitch_mm,
