@@ -237,10 +237,6 @@ def run_stages(
             options = SearchOptions(on_progress, resume=run.resume, time_budget=run.remaining_s(SEARCH_SHARE))
             return run_design(spec, out, seed, None, options, None, note, _regenerated_files(), run.force)[1]
 
-    def fabricate(note: object) -> dict[str, Any]:
-        settings = FabricationSettings.from_spec(spec)
-        return build(pad, out, run.formats, settings, source, warn=on_message).to_dict()
-
     def calibrate(note: object) -> dict[str, Any]:
         options, budget = spec.section(LocalizerSettings, **seed), run.remaining_s(reserve_s=RESERVE_S)
         with training_progress() as report:
@@ -260,10 +256,11 @@ def run_stages(
     if not design.stopped:
         Checkpoints(out / "search", {}).clear()  # a kill leaves them just after the results are written
     pad, source, digest = design.morphology, [out / PAD], sha256(out / PAD)
+    settings = FabricationSettings.from_spec(spec)
     mould = cache.get(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
-        fabricate,
+        lambda note: build(pad, out, run.formats, settings, source, warn=on_message).to_dict(),
         pad=digest,
         formats=sorted(run.formats),
     )

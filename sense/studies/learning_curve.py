@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
@@ -32,58 +32,32 @@ EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried
 RESAMPLINGS = 400
 
 
-class CurvePoint(NamedTuple):
-    """Mean error on the test presses after a training on a number of presses."""
-
-    presses: int
-    mean_mm: float
-    standard_error_mm: float
-
-
-class PowerLaw(NamedTuple):
-    """Error by number of presses n: floor + factor n^-exponent."""
-
-    floor_mm: float
-    factor_mm: float
-    exponent: float
-
-
-class Forecast(NamedTuple):
-    """Mean error expected of a number of presses; 80 % of resamplings are within `low_mm` and `high_mm`."""
-
-    presses: int
-    mean_mm: float
-    low_mm: float
-    high_mm: float
-
-
 @dataclass(frozen=True)
 class LearningCurve:
     """Error against the number of training presses.
 
     Attributes:
         test_presses: their number, the same for all points.
-        points: one a number of training presses, the smallest first.
-        fit: to the points.
-        forecast: for twice as many presses; the test presses and the residuals are resampled.
+        points: "presses", "mean_mm" and "standard_error_mm", by number of training presses.
+        fit: "floor_mm", "factor_mm" and "exponent" of the power law.
+        forecast: "presses", twice as many, "mean_mm", and the interval "low_mm" to "high_mm" of 80 % of resamplings of
+            the test presses and the residuals.
         advice: in words.
         settings: of the training.
         provenance: of the study.
     """
 
     test_presses: int
-    points: list[CurvePoint]
-    fit: PowerLaw
-    forecast: Forecast
+    points: list[dict[str, Any]]
+    fit: dict[str, float]
+    forecast: dict[str, Any]
     advice: str
     settings: dict[str, Any]
     provenance: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `learning_curve.json`."""
-        points = [point._asdict() for point in self.points]
-        rows = {"points": points, "fit": self.fit._asdict(), "forecast": self.forecast._asdict()}
-        return {"format": FORMAT} | vars(self) | rows
+        return {"format": FORMAT} | vars(self)
 
 
 def learning_curve(
@@ -126,14 +100,14 @@ def learning_curve(
     return LearningCurve(
         test_presses=len(test),
         points=[
-            CurvePoint(size, float(row.mean()), float(row.std(ddof=1) / np.sqrt(len(row))))
+            {"presses": size, "mean_mm": row.mean(), "standard_error_mm": row.std(ddof=1) / np.sqrt(len(row))}
             for size, row in zip(sizes, errors, strict=True)
         ],
-        fit=fit,
+        fit=dict(zip(("floor_mm", "factor_mm", "exponent"), fit, strict=True)),
         forecast=forecast,
-        advice=f"{forecast.presses - sizes[-1]} more training presses, twice as many, would bring the error from "
-        f"{errors[-1].mean():.2f} mm to about {forecast.mean_mm:.2f} mm "
-        f"({forecast.low_mm:.2f} to {forecast.high_mm:.2f} mm)",
+        advice=f"{forecast['presses'] - sizes[-1]} more training presses, twice as many, would bring the error from "
+        f"{errors[-1].mean():.2f} mm to about {forecast['mean_mm']:.2f} mm "
+        f"({forecast['low_mm']:.2f} to {forecast['high_mm']:.2f} mm)",
         settings=options.model_dump(),
         provenance=origin,
     )
@@ -169,7 +143,7 @@ def _predict(
     return [predictions[number] for number in range(len(steps))]
 
 
-def fit_power_law(presses: Array, errors: Array) -> PowerLaw:
+def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:
     """Fit c + a n^-b to errors (P,) by numbers of presses (P,): least squares of relative errors, c and a >= 0."""
 
     def solve(exponent: float) -> tuple[Array, float]:
@@ -178,21 +152,24 @@ def fit_power_law(presses: Array, errors: Array) -> PowerLaw:
 
     exponent = min(EXPONENTS.tolist(), key=lambda b: solve(b)[1])
     (floor, last), _ = solve(exponent)
-    return PowerLaw(float(floor), float(last * presses[-1] ** exponent), float(exponent))
+    return float(floor), float(last * presses[-1] ** exponent), float(exponent)
 
 
-def power_law(presses: Array, fit: PowerLaw) -> Array:
+def power_law(presses: Array, fit: tuple[float, float, float]) -> Array:
     """Evaluate a fitted power law at numbers of presses."""
-    return fit.floor_mm + fit.factor_mm * presses**-fit.exponent
+    floor, factor, exponent = fit
+    return floor + factor * presses**-exponent
 
 
-def _forecast(presses: Array, errors: Array, fit: PowerLaw, rng: np.random.Generator) -> Forecast:
+def _forecast(
+    presses: Array, errors: Array, fit: tuple[float, float, float], rng: np.random.Generator
+) -> dict[str, Any]:
     """Extrapolate errors (P, Q) of the test presses to twice as many training presses."""
     residual = np.log(errors.mean(axis=1) / power_law(presses, fit))
     scatter = np.sqrt((residual**2).sum() / max(1, len(residual) - 3))
     target = 2 * presses[-1:]
 
-    def ratio(fit: PowerLaw) -> float:
+    def ratio(fit: tuple[float, float, float]) -> float:
         return (power_law(target, fit) / power_law(presses[-1:], fit))[0]
 
     ratios = []
@@ -201,28 +178,29 @@ def _forecast(presses: Array, errors: Array, fit: PowerLaw, rng: np.random.Gener
         ratios.append(ratio(fit_power_law(presses, means * np.exp(scatter * rng.standard_normal(len(means))))))
     low, high = np.quantile(ratios, [0.1, 0.9])
     expected, error = ratio(fit), errors[-1].mean()
-    return Forecast(
-        presses=int(target[0]),
-        mean_mm=float(error * expected),
-        low_mm=float(error * min(low, expected)),
-        high_mm=float(error * max(high, expected)),
-    )
+    return {
+        "presses": int(target[0]),
+        "mean_mm": float(error * expected),
+        "low_mm": float(error * min(low, expected)),
+        "high_mm": float(error * max(high, expected)),
+    }
 
 
 def draw_learning_curve(curve: LearningCurve, path: Path) -> None:
     """Draw the errors, the fit, and the forecast for twice as many presses."""
     figure, axes = new_figure(6.4, 4.4)
-    presses, means, standard_errors = np.array(curve.points).T
-    forecast = curve.forecast
-    x = np.geomspace(presses[0], forecast.presses, 200)
-    axes.plot(x, power_law(x, curve.fit), color=FAINT, linewidth=1.6)
-    bars = 2 * standard_errors
+    presses = np.array([point["presses"] for point in curve.points], dtype=float)
+    means = [point["mean_mm"] for point in curve.points]
+    forecast, fit = curve.forecast, curve.fit
+    x = np.geomspace(presses[0], forecast["presses"], 200)
+    axes.plot(x, power_law(x, (fit["floor_mm"], fit["factor_mm"], fit["exponent"])), color=FAINT, linewidth=1.6)
+    bars = [2 * point["standard_error_mm"] for point in curve.points]
     axes.errorbar(presses, means, bars, fmt="o", color=INK, markersize=5, linewidth=1.2, label="measured")
-    interval = [[forecast.mean_mm - forecast.low_mm], [forecast.high_mm - forecast.mean_mm]]
+    interval = [[forecast["mean_mm"] - forecast["low_mm"]], [forecast["high_mm"] - forecast["mean_mm"]]]
     style = {"fmt": "D", "color": ALARM, "markersize": 6, "linewidth": 1.2, "label": "expected"}
-    axes.errorbar([forecast.presses], [forecast.mean_mm], interval, **style)
+    axes.errorbar([forecast["presses"]], [forecast["mean_mm"]], interval, **style)
     axes.set_xscale("log")
-    ticks = [*presses.astype(int).tolist(), forecast.presses]
+    ticks = [*presses.astype(int).tolist(), forecast["presses"]]
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
     axes.set(ylim=(0, None), xlabel="training presses", ylabel="mean error (mm)")
@@ -240,7 +218,7 @@ def learning_curve_lines(curve: LearningCurve) -> list[str]:
     return [
         f"error in mm on {curve.test_presses} presses never trained on",
         "presses   mean  standard error",
-        *(f"{row.presses:7d} {row.mean_mm:6.2f}  {row.standard_error_mm:14.2f}" for row in curve.points),
-        f"fit: {fit.floor_mm:.2f} mm + {fit.factor_mm:.3g} mm / presses^{fit.exponent:.2f}",
+        *(f"{row['presses']:7d} {row['mean_mm']:6.2f}  {row['standard_error_mm']:14.2f}" for row in curve.points),
+        f"fit: {fit['floor_mm']:.2f} mm + {fit['factor_mm']:.3g} mm / presses^{fit['exponent']:.2f}",
         curve.advice,
     ]

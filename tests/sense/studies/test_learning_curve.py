@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.settings import LocalizerSettings as Options
-from padforge.sense.studies.learning_curve import LearningCurve, PowerLaw, fit_power_law, learning_curve, power_law
+from padforge.sense.studies.learning_curve import LearningCurve, fit_power_law, learning_curve, power_law
 from tests.helpers.door import called
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
@@ -23,7 +23,7 @@ QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
 @given(floor=st.floats(0, 2), factor=st.floats(0.5, 100), exponent=st.sampled_from([0.2, 0.4, 0.5, 0.75, 1.0]))
 def test_fit_power_law_recovers_power_laws(floor: float, factor: float, exponent: float) -> None:
     presses = np.array([50.0, 100, 200, 400, 800])
-    target, true = np.array([1600.0]), PowerLaw(floor, factor, exponent)
+    target, true = np.array([1600.0]), (floor, factor, exponent)
     forecast = power_law(target, fit_power_law(presses, power_law(presses, true)))
     np.testing.assert_allclose(forecast, power_law(target, true), rtol=1e-3)
 
@@ -52,12 +52,12 @@ def curve(recording: Recording) -> LearningCurve:
 
 
 def test_learning_curve_forecasts_twice_as_many_presses(curve: LearningCurve) -> None:
-    assert [point.presses for point in curve.points] == [16, 32, 64, 128, 255]
-    assert all(0.02 < point.standard_error_mm / point.mean_mm < 0.2 for point in curve.points)
+    assert [point["presses"] for point in curve.points] == [16, 32, 64, 128, 255]
+    assert all(0.02 < point["standard_error_mm"] / point["mean_mm"] < 0.2 for point in curve.points)
     forecast = curve.forecast
-    assert forecast.presses == 510
-    assert 0 < forecast.low_mm <= forecast.mean_mm <= forecast.high_mm
-    assert forecast.high_mm <= curve.points[-1].mean_mm + 1e-9
+    assert forecast["presses"] == 510
+    assert 0 < forecast["low_mm"] <= forecast["mean_mm"] <= forecast["high_mm"]
+    assert forecast["high_mm"] <= curve.points[-1]["mean_mm"] + 1e-9
     assert "255 more training presses" in curve.advice
     assert (curve.settings["members"], curve.test_presses) == (1, 45)
     json.dumps(curve.to_dict(), allow_nan=False)
