@@ -2,6 +2,7 @@ from .cad.model import build_mould as build_mould
 from .checks import Finding as Finding
 from .checks.mesh_checks import check_mesh as check_mesh
 from .checks.plan_checks import check as check
+from .export import Build as Build
 from .export import build as build
 from .materials import FibreSettings as FibreSettings
 from .materials import SiliconeSettings as SiliconeSettings

@@ -92,7 +92,8 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     folder = out or pad_folder(morphology)
     with locked_folder(folder):
         inputs = [path for path in (morphology, spec) if path]
-        document = build_files(pad, folder, split_formats(formats), settings, inputs, warn=_warn)
+        result = build_files(pad, folder, split_formats(formats), settings, inputs, warn=_warn)
+    document = result.to_dict()
     show_result(document, mould_lines(document, folder), as_json)
 
 
@@ -158,6 +159,6 @@ def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, floa
     from .settings import FabricationSettings
 
     settings = FabricationSettings.from_spec(spec)
-    document = build_files(pad, folder, ("stl",), settings, warn=_warn)
-    failed = sum(finding["status"] == "fail" for finding in document["findings"])
-    return {"mould_ml": document["mould_volume_ml"], "silicone_ml": document["silicone_volume_ml"], "failed": failed}
+    result = build_files(pad, folder, ("stl",), settings, warn=_warn)
+    failed = sum(finding.status == "fail" for finding in result.findings)
+    return {"mould_ml": result.mould_volume_ml, "silicone_ml": result.silicone_volume_ml, "failed": failed}

@@ -6,7 +6,7 @@ appear together or not at all. A new export format is a line in `FORMATS`, and i
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
@@ -95,6 +95,35 @@ class Fabrication:
             return build_models(self.plan, {body.name: body.body for body in self.bodies})
 
 
+@dataclass(frozen=True, kw_only=True)
+class Build:
+    """A mould that was written: all that a lab needs to print, cast, cut and place fibres."""
+
+    files: list[str]  # names of the exported files
+    size_mm: list[float]  # of the mould
+    sizes: dict[str, Any]  # of tray, cavity and pad, mm
+    mould_volume_ml: float  # of plastic
+    silicone_volume_ml: float  # to fill the mould
+    findings: list[Finding]  # of all checks
+    silicone: dict[str, Any]  # to mix
+    adhesive: dict[str, Any]  # volume of the tracks that it seals, by step of laying
+    fibre: dict[str, Any]  # material of the fibres
+    fibres: list[dict[str, Any]]  # one entry per fibre, in the order of their numbers
+    laying_order: list[list[int]]  # numbers of the fibres laid in each step
+    crossings: dict[str, Any]  # all of them, with the thickness of silicone between the fibres
+    common_tracks: list[dict[str, Any]]  # stretches of tracks over deeper ones
+    exits: list[int] | None = None  # fibres along the side of their leads; None unless all leave the pad there
+    frame: dict[str, Any] | None  # of the pad on the bed; None without a holder
+    settings: dict[str, Any]  # that the files depend on
+    provenance: dict[str, Any]  # of the files
+    sha256: dict[str, str]  # digests of the files
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fabrication document, as in `fabrication.json`."""
+        document = {"format": FORMAT} | {name: value for name, value in vars(self).items() if value is not None}
+        return document | {"findings": [finding.to_dict() for finding in self.findings]}
+
+
 def _write_utf8(path: Path, text: str) -> None:
     path.write_bytes(text.encode("utf-8"))  # line ends as they are: the bytes do not depend on the system
 
@@ -173,7 +202,7 @@ def build(
     inputs: Sequence[Path] = (),
     *,
     warn: Callable[[str], None] = lambda line: None,
-) -> dict[str, Any]:
+) -> Build:
     """Build the mould of a pad and write it, with the further bodies that the settings ask for.
 
     Files of an earlier mould in `out` that are not overwritten are deleted, unless they were changed since.
@@ -187,7 +216,7 @@ def build(
         warn: called with a line for every file of an earlier mould that was deleted or that remains.
 
     Returns:
-        The fabrication document, as written to `fabrication.json`; "sha256" has the digests of the other files.
+        What `fabrication.json` holds of the mould.
 
     Raises:
         InputError: an unknown format, an input that is no file, settings that contradict each other or refuse this
@@ -212,11 +241,10 @@ def build(
             fabrication.findings.extend(check_toolpath(plan, fabrication.toolpath))
         if "mould.step" in writers:
             fabrication.findings.extend(_check_cad(fabrication))
-    document = _compile_document(fabrication, list(writers), origin)
+    result = _compile_build(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
-    writers["laying.md"] = partial(_write_utf8, text=laying_page(document))
-    _write_files(out, writers, document, warn)
-    return document
+    writers["laying.md"] = partial(_write_utf8, text=laying_page(result.to_dict()))
+    return _write_files(out, writers, result, warn)
 
 
 def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
@@ -252,23 +280,22 @@ def _choose_writers(
     return writers
 
 
-def _compile_document(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> dict[str, Any]:
-    """Compile the fabrication document: all that a lab needs to print, cast, cut and place fibres."""
+def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> Build:
+    """Compile all that is said of a mould, but for the digests of its files."""
     plan, settings, mould = fabrication.plan, fabrication.plan.settings, fabrication.bodies[0]
     rim = settings.mould.floor_mm + plan.shrinkage_compensated.silicone_mm
     pins_mm3 = mould.mesh.trim_by_plane((0, 0, 1), rim).volume()
     laying = laying_document(plan, mould.mesh.volume() - pins_mm3)
-    return {
-        "format": FORMAT,
-        "files": files,
-        "size_mm": [round(side, 6) for side in np.ptp(mould.vertices.astype(float), axis=0).tolist()],
-        "sizes": sizes(plan),
-        "mould_volume_ml": round(mould.mesh.volume() / 1000, 4),
-        "silicone_volume_ml": laying["silicone"]["volume_ml"],
-        "findings": [finding.to_dict() for finding in fabrication.findings],
+    return Build(
+        files=files,
+        size_mm=[round(side, 6) for side in np.ptp(mould.vertices.astype(float), axis=0).tolist()],
+        sizes=sizes(plan),
+        mould_volume_ml=round(mould.mesh.volume() / 1000, 4),
+        silicone_volume_ml=laying["silicone"]["volume_ml"],
+        findings=fabrication.findings,
         **laying,
-        **({"frame": bed_frame(plan)} if settings.mould.holder else {}),
-        "settings": {
+        frame=bed_frame(plan) if settings.mould.holder else None,
+        settings={
             "pitch_mm": plan.pad.pitch_mm,
             "mould": settings.mould.model_dump(),
             "printer": settings.printer.model_dump(),
@@ -278,13 +305,14 @@ def _compile_document(fabrication: Fabrication, files: list[str], origin: Mappin
             "fibre": settings.fibre.model_dump(),
             **({"dispenser": settings.dispenser.model_dump(mode="json")} if "toolpath.svg" in files else {}),
         },
-        "provenance": dict(origin),
-    }
+        provenance=dict(origin),
+        sha256={},
+    )
 
 
 def _write_files(
-    out: Path, writers: Mapping[str, Callable[[Path], None]], document: dict[str, Any], warn: Callable[[str], None]
-) -> None:
+    out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build, warn: Callable[[str], None]
+) -> Build:
     """Write the files of a mould and their digests at once, and delete those of an earlier one."""
     try:
         earlier = read_json(out / "fabrication.json", FORMAT).get("sha256")
@@ -296,10 +324,11 @@ def _write_files(
         for name, write in writers.items():
             with profiling.stage(f"write {name}"), reraise_write_error(out / name):
                 write(folder / name)
-        document["sha256"] = {name: sha256(folder / name) for name in writers}
-        write_json(folder / "fabrication.json", document)
+        result = replace(result, sha256={name: sha256(folder / name) for name in writers})
+        write_json(folder / "fabrication.json", result.to_dict())
     for name in sorted(deleted):
         warn(f"{out / name} is gone: it was of the mould before this one")
     for file in sorted(out.iterdir()):
         if file.name in earlier.keys() - writers.keys():
             warn(f"{file} is left from the mould before this one: it is not as it was written")
+    return result

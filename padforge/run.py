@@ -256,10 +256,11 @@ def run_stages(
     if not design.stopped:
         Checkpoints(out / "search", {}).clear()  # a kill leaves them just after the results are written
     pad, source, digest = design.morphology, [out / PAD], sha256(out / PAD)
+    settings = FabricationSettings.from_spec(spec)
     mould = cache.get(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
-        lambda note: build(pad, out, run.formats, FabricationSettings.from_spec(spec), source, warn=on_message),
+        lambda note: build(pad, out, run.formats, settings, source, warn=on_message).to_dict(),
         pad=digest,
         formats=sorted(run.formats),
     )

@@ -13,10 +13,12 @@ from .health.fault_detector import FibreFault as FibreFault
 from .health.health_model import HealthModel as HealthModel
 from .live.pipeline import Live as Live
 from .localizer.calibration import calibrate as calibrate
+from .localizer.evaluation import Evaluation as Evaluation
 from .localizer.evaluation import evaluate as evaluate
 from .localizer.localizer import Localizer as Localizer
 from .localizer.model import Localization as Localization
 from .localizer.model import LocalizerModel as LocalizerModel
+from .localizer.recalibration import Recalibration as Recalibration
 from .localizer.recalibration import recalibrate as recalibrate
 from .recording.recording import Recording as Recording
 from .recording.run_directory import Recorder as Recorder
@@ -30,6 +32,8 @@ from .signals.filters import total_variation as total_variation
 from .signals.press_detection import PressDetector as PressDetector
 from .signals.press_detection import detect_presses as detect_presses
 from .simulation.simulated_recording import simulate as simulate
+from .studies.fibre_loss import FibreLoss as FibreLoss
 from .studies.fibre_loss import fibre_loss_study as fibre_loss_study
+from .studies.learning_curve import LearningCurve as LearningCurve
 from .studies.learning_curve import learning_curve as learning_curve
 from .twin.identification import identify as identify

@@ -56,10 +56,10 @@ def covered(number: int, seed: int) -> Covered:
     presses = round(math.exp(rng.uniform(*np.log(PRESSES))))
     recording = simulate(pad, RigSettings(presses=presses, seed=int(rng.integers(2**32))))
     split = SPLITS[number % 2]
-    _, document = calibrate(recording, LEARNT.model_copy(update={"split": split, "seed": int(rng.integers(2**32))}))
-    within = np.array([[row["within_r50"], row["within_r90"]] for row in document["errors"]])
+    _, evaluation = calibrate(recording, LEARNT.model_copy(update={"split": split, "seed": int(rng.integers(2**32))}))
+    within = np.array([[row["within_r50"], row["within_r90"]] for row in evaluation.errors])
     name = f"grid {grid}, {'straight' if straight else f'random, {knots} knots'}"
-    return Covered(name, presses, document["test_presses"], split, within)
+    return Covered(name, presses, evaluation.test_presses, split, within)
 
 
 def summary(found: Sequence[Covered]) -> list[str]:

@@ -82,7 +82,7 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 
     localizer = LocalizerModel.load(model)
     levels = range(min(max_failures, localizer.fibres - 1) + 1)
-    document = evaluation.evaluate(localizer, read_recording(recording), levels)
+    document = evaluation.evaluate(localizer, read_recording(recording), levels).to_dict()
     common.show_result(document, evaluation.calibration_lines(document), as_json)
 
 
@@ -238,15 +238,15 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     old, opened = LocalizerModel.load(model), open_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
     with progress_bar("recalibrating") as report:
-        localizer, document = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
+        localizer, result = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
     with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"
         check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *HEALTH_FILES], force)
-        write_json(folder / "recalibration.json", document)
+        write_json(folder / "recalibration.json", result.to_dict())
         if detector:  # it does not depend on positions
             detector.save(folder)
-    common.show_result(document, recalibration.recalibration_lines(document), as_json)
+    common.show_result(result.to_dict(), recalibration.recalibration_lines(result), as_json)
 
 
 @click.command("fibre-loss")
@@ -289,20 +289,20 @@ def fibre_loss(
     opened = open_recording(recording)
     options |= {"failed": fibre_indices(failed, opened.fibres), "checkpoints": unfinished}
     with progress_bar("networks") as show:
-        document = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
-    _write_study(target / "fibre_loss", document, draw_fibre_loss)
+        result = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
+    _write_study(target / "fibre_loss", result.to_dict(), partial(draw_fibre_loss, result))
     if retrain:
         Checkpoints(unfinished, {}).clear()
-    common.show_result(document, fibre_loss_lines(document), as_json)
+    common.show_result(result.to_dict(), fibre_loss_lines(result), as_json)
 
 
-def _write_study(path: Path, document: dict[str, Any], draw: Callable[[dict[str, Any], Path], None]) -> None:
+def _write_study(path: Path, document: dict[str, Any], draw: Callable[[Path], None]) -> None:
     """Write a document and its figure, as `path` with .json and .png."""
     from padforge.design.common.files import atomic_files, write_json
 
     with atomic_files(path.parent) as folder:
         write_json(folder / f"{path.name}.json", document)
-        draw(document, folder / f"{path.name}.png")
+        draw(folder / f"{path.name}.png")
 
 
 @click.command("learning-curve")
@@ -328,9 +328,9 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     check_writable(target)
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
     with progress_bar("training") as show:
-        document = study.learning_curve(opened, options, on_progress=show)
-    _write_study(target / "learning_curve", document, study.draw_learning_curve)
-    common.show_result(document, study.learning_curve_lines(document), as_json)
+        result = study.learning_curve(opened, options, on_progress=show)
+    _write_study(target / "learning_curve", result.to_dict(), partial(study.draw_learning_curve, result))
+    common.show_result(result.to_dict(), study.learning_curve_lines(result), as_json)
 
 
 @click.command()

@@ -6,7 +6,6 @@ whose error ends the training.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from padforge.design.common.validation import InputError, check_float, check_typ
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
-from padforge.sense.localizer.evaluation import conformal, evaluate, held_back_presses
+from padforge.sense.localizer.evaluation import Evaluation, conformal, evaluate, held_back_presses
 from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights, check_weights, predict_members
@@ -57,7 +56,7 @@ def calibrate(
     *,
     time_budget: float | None = None,
     on_progress: OnProgress = lambda done, total: None,
-) -> tuple[LocalizerModel, dict[str, Any]]:
+) -> tuple[LocalizerModel, Evaluation]:
     """Train a localizer on a part of the presses and test it on the others.
 
     Test presses enter nothing but the test, which looks at them once. Presses of unknown position are left out.
@@ -70,7 +69,7 @@ def calibrate(
         on_progress: called with (steps done, steps in all); with a time budget, with seconds.
 
     Returns:
-        The localizer, and the document of `calibration.json`.
+        The localizer, and its evaluation on the test presses.
 
     Raises:
         InputError: an option out of range, a time budget for the published method, too few presses, or a training
@@ -92,9 +91,9 @@ def calibrate(
         model = fit_recording(recording, training, options, rng, on_progress, time_budget)
     model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     with stage("evaluate"):
-        document = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
-    document |= {"training_presses": len(training), "settings": options.model_dump()}
-    return replace(model, errors=document["errors"]), document
+        evaluation = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
+    evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())
+    return replace(model, errors=evaluation.errors), evaluation
 
 
 def fit_recording(

@@ -1,6 +1,7 @@
 """Evaluation of a localizer: errors for every set of failed fibres and by position, and coverage of its radii."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from math import ceil, isnan
 from typing import Any
 
@@ -19,7 +20,40 @@ ACTIVE = 0.02  # share of its range that a fibre must change by to be active in 
 Measures = Mapping[str, Array]
 
 
-def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors of a localizer on test presses.
+
+    Attributes:
+        errors: rows of `error_row`, one a number of failed fibres.
+        split: how the test presses were held back; "none" in another recording than that of the training.
+        test_presses: their number.
+        by_subset: mean error of each set of failed fibres.
+        by_position: rows of `errors_by_position`.
+        idle_share: of each fibre, see `idle_share`.
+        test: true and predicted positions, depths and forces, with all fibres.
+        provenance: of the localizer, and the kind of the recording.
+        training_presses: their number, after a calibration.
+        settings: of the training, after a calibration.
+    """
+
+    errors: list[dict[str, Any]]
+    split: str
+    test_presses: int
+    by_subset: list[dict[str, Any]]
+    by_position: list[dict[str, Any]]
+    idle_share: list[float]
+    test: dict[str, Any]
+    provenance: dict[str, Any]
+    training_presses: int | None = None
+    settings: dict[str, Any] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of `calibration.json`."""
+        return {"format": FORMAT} | {name: value for name, value in vars(self).items() if value is not None}
+
+
+def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> Evaluation:
     """Evaluate a localizer for every set of failed fibres of some sizes.
 
     Of the recording of the training, only the presses that were held back count; of any other, all of known position.
@@ -28,12 +62,6 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         model: to evaluate.
         recording: of a pad with the fibres and the rate of the training.
         levels: numbers of failed fibres.
-
-    Returns:
-        The document of `calibration.json`: "errors", rows of `error_row`; "by_subset", the mean error of each set of
-        failed fibres; "by_position", see `errors_by_position`; "idle_share" of each fibre; "split", "none" for another
-        recording; "test_presses", their number; and "test", true and predicted positions, depths and forces with all
-        fibres.
 
     Raises:
         InputError: no level, one that leaves no fibre, no press of known position, or a recording that does not suit
@@ -56,15 +84,14 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         model.fibres, levels, lambda failed: model.predict_features(features, failed), positions_mm, measures
     )
     prediction = model.predict_features(features)
-    return {
-        "format": FORMAT,
-        "errors": rows,
-        "split": "none" if held_back is None else model.split,
-        "test_presses": len(test),
-        "by_subset": by_subset,
-        "by_position": errors_by_position(prediction.positions_mm, positions_mm),
-        "idle_share": idle_share(recording).tolist(),
-        "test": {
+    return Evaluation(
+        errors=rows,
+        split="none" if held_back is None else model.split,
+        test_presses=len(test),
+        by_subset=by_subset,
+        by_position=errors_by_position(prediction.positions_mm, positions_mm),
+        idle_share=idle_share(recording).tolist(),
+        test={
             "press": test.tolist(),
             "pressed_mm": positions_mm.tolist(),
             "predicted_mm": prediction.positions_mm.tolist(),
@@ -78,8 +105,8 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
                 for name, estimate in prediction.measures.items()
             },
         },
-        "provenance": {**model.provenance, "recording_kind": recording.source.get("kind")},
-    }
+        provenance={**model.provenance, "recording_kind": recording.source.get("kind")},
+    )
 
 
 def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices | None:
@@ -104,7 +131,7 @@ def errors_by_loss(
     positions_mm: Array,
     measures: Measures | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return "errors" and "by_subset" of `evaluate`; `predict` predicts the presses without the fibres of its indices.
+    """Return `errors` and `by_subset` of an evaluation; `predict` predicts presses without the fibres of its indices.
 
     True positions are (Q, 2), and depths and forces (Q,), NaN where unknown.
     """

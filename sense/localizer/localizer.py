@@ -13,7 +13,7 @@ from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model
-from padforge.sense.localizer.evaluation import distances, evaluate
+from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
@@ -32,14 +32,14 @@ class Localizer:
 
     Attributes:
         model_: the trained `LocalizerModel`, after `fit` or `load`.
-        calibration_: the document of `calibration.json`, after `fit` to a recording.
+        calibration_: the `Evaluation` on the test presses, after `fit` to a recording.
 
     Raises:
         InputError: an option that `LocalizerSettings` has not.
     """
 
     model_: LocalizerModel
-    calibration_: dict[str, Any]
+    calibration_: Evaluation
 
     def __init__(self, max_failures: int = 3, random_state: int = 0, **options: Any) -> None:
         for name in options.keys() - set(OPTIONS):
@@ -171,7 +171,7 @@ class Localizer:
         """
         model = self._fitted
         most = len(model.interval_factors) - 1 if max_failures is None else max_failures
-        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))["errors"]
+        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1)).errors
 
     def save(self, folder: str | Path) -> None:
         """Write `localizer.json` and `localizer.safetensors`.

@@ -5,8 +5,8 @@ scale of the pad, which folds into the scaling of features and the last layer of
 fine tuning suffices. Cross-validation over the new presses decides whether either is worth it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 from types import MappingProxyType
 from typing import Any
@@ -41,13 +41,42 @@ Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
 
 
+@dataclass(frozen=True)
+class Recalibration:
+    """What a recalibration changed and gained.
+
+    Attributes:
+        presses: number of new presses.
+        changes: that were kept, of "corrected" and "fine_tuned".
+        before: rows of `evaluation.error_row` on the new presses, by the old localizer.
+        after: the same by the new one, each press left out of what predicts it.
+        gain_mm: decrease of the error, averaged over numbers of failed fibres.
+        standard_error_mm: of the gain.
+        widened: factors on the intervals.
+        provenance: of the new localizer.
+    """
+
+    presses: int
+    changes: list[str]
+    before: list[dict[str, Any]]
+    after: list[dict[str, Any]]
+    gain_mm: float
+    standard_error_mm: float
+    widened: list[list[float]]
+    provenance: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of `recalibration.json`."""
+        return {"format": FORMAT} | vars(self)
+
+
 def recalibrate(
     model: LocalizerModel,
     recording: Recording,
     *,
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[LocalizerModel, dict[str, Any]]:
+) -> tuple[LocalizerModel, Recalibration]:
     """Adapt a localizer to a pad that has changed since its training.
 
     Radii only ever grow: they are widened where presses left out lie outside more often than they should. The `errors`
@@ -60,10 +89,7 @@ def recalibrate(
         on_progress: called with (steps done, steps in all).
 
     Returns:
-        The localizer from now on, which predicts as the old one if nothing was gained, and the document of
-        `recalibration.json`: "changes" that were kept; "before" and "after", rows of `evaluation.error_row` on the new
-        presses, each left out; "gain_mm", the decrease of the error averaged over numbers of failed fibres, and its
-        "standard_error_mm"; "widened", factors on the intervals.
+        The localizer from now on, which predicts as the old one if nothing was gained, and what changed.
 
     Raises:
         InputError: too few presses of known position, or a recording that does not suit the localizer.
@@ -85,24 +111,23 @@ def recalibrate(
     made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
     inputs = {"recording": recording.digest, "localizer": dict(model.provenance)}
     made_by |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
-    document = {
-        "format": FORMAT,
-        "presses": len(rows),
-        "changes": changes,
-        "before": validation.error_rows(before),
-        "after": validation.error_rows(after),
-        "gain_mm": gain,
-        "standard_error_mm": standard_error,
-        "widened": widened.tolist(),
-        "provenance": made_by,
-    }
+    result = Recalibration(
+        presses=len(rows),
+        changes=changes,
+        before=validation.error_rows(before),
+        after=validation.error_rows(after),
+        gain_mm=gain,
+        standard_error_mm=standard_error,
+        widened=widened.tolist(),
+        provenance=made_by,
+    )
     changed = replace(
         changed,
         interval_factors=np.minimum(changed.interval_factors * widened, 1e6),
         recalibrated_by=(*model.recalibrated_by, recording.digest),
         provenance=made_by,
     )
-    return changed, document
+    return changed, result
 
 
 def _select_changes(
@@ -272,20 +297,20 @@ class CrossValidation:
         return np.maximum([conformal(level, *self.presses[1:]) for level in predictions], 1.0)
 
 
-def recalibration_lines(document: Mapping[str, Any]) -> list[str]:
-    """Format the document of a recalibration as a table and a conclusion."""
+def recalibration_lines(result: Recalibration) -> list[str]:
+    """Format a recalibration as a table and a conclusion."""
     conclusion = "nothing gained: positions are predicted as before"
-    if document["changes"]:
-        gain, standard_error = document["gain_mm"], document["standard_error_mm"]
-        names = " and ".join(document["changes"]).replace("_", "-")
-        conclusion = f"{names}: errors shrink by {gain:.3f} mm (standard error {standard_error:.3f} mm)"
+    if result.changes:
+        names = " and ".join(result.changes).replace("_", "-")
+        gain = f"{result.gain_mm:.3f} mm (standard error {result.standard_error_mm:.3f} mm)"
+        conclusion = f"{names}: errors shrink by {gain}"
     return [
-        f"{document['presses']} new presses, each predicted by what was changed without it",
+        f"{result.presses} new presses, each predicted by what was changed without it",
         "failed  sets  before mm  after mm  in r90 before  in r90 after",
         *(
             f"{old['n_failed']:6d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
             f"{old['within_r90']:13.1%}  {new['within_r90']:12.1%}"
-            for old, new in zip(document["before"], document["after"], strict=True)
+            for old, new in zip(result.before, result.after, strict=True)
         ),
         conclusion,
     ]

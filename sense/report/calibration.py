@@ -1,6 +1,6 @@
 """What a calibration leaves in a folder: localizer, health models, document and figures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from padforge.design.common.profiling import stage
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import unlearnt_lines
+from padforge.sense.localizer.evaluation import Evaluation
 from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
@@ -56,7 +57,7 @@ def calibrate_into(
     path, origin = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
     check_replaceable(path, origin, FILES, force)
     localizer = Localizer.from_settings(options).fit(recording, time_budget=time_budget, on_progress=on_progress)
-    model, document = localizer.model_, localizer.calibration_
+    model, evaluation = localizer.model_, localizer.calibration_
     for line in unlearnt_lines(recording, model):
         on_message(line)
     on_progress(0, 0)
@@ -71,19 +72,18 @@ def calibrate_into(
         check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone
         if detector:
             detector.save(folder)
-        write_json(folder / "calibration.json", document)
+        write_json(folder / "calibration.json", evaluation.to_dict())
         with stage("figures"):
-            draw_error_map(document, folder / "error_map.png")
+            draw_error_map(evaluation, folder / "error_map.png")
             figure, axes = new_figure(6.0, 4.4)
-            draw_errors_by_loss(axes, {"": document}, f"One network, {document['test_presses']}")
+            draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
             save_figure(figure, folder / "error_by_loss.png")
-    return document
+    return evaluation.to_dict()
 
 
-def draw_error_map(document: Mapping[str, Any], path: Path) -> None:
+def draw_error_map(evaluation: Evaluation, path: Path) -> None:
     """Draw the test presses of a calibration, true and predicted."""
-    test = document["test"]
-    pressed, predicted = np.array(test["pressed_mm"]), np.array(test["predicted_mm"])
+    pressed, predicted = (np.array(evaluation.test[name]) for name in ("pressed_mm", "predicted_mm"))
     errors = np.hypot(*(predicted - pressed).T)
     figure, axes = new_figure(6.4, 5.6)
     lines = list(np.stack([pressed, predicted], axis=1))

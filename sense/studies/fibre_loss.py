@@ -5,7 +5,7 @@ fibres will fail, and trains on the others alone: 42 networks for 6 fibres of wh
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_unseen
-from padforge.sense.localizer.evaluation import errors_by_loss, errors_by_position
+from padforge.sense.localizer.evaluation import Evaluation, errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 from padforge.sense.studies.study import Task, compute_states, draw_error_map, failed_label
@@ -33,6 +33,40 @@ ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document 
 BAR_WIDTH = 0.36
 
 Failed = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class MethodErrors:
+    """Errors of one method."""
+
+    errors: list[dict[str, Any]]  # rows of `evaluation.error_row`, one a number of failed fibres
+    by_subset: list[dict[str, Any]]  # mean error of each set of failed fibres
+    maps: list[
+        dict[str, Any]
+    ]  # errors by position without the worst set of each size and, at the end, without the chosen fibres
+
+
+@dataclass(frozen=True)
+class FibreLoss:
+    """Errors of one or both methods for every set of failed fibres.
+
+    Attributes:
+        split: how the test presses were held back.
+        training_presses: their number.
+        test_presses: their number, the same for both methods.
+        methods: errors by name of the method, `ONE` or `RETRAINED`.
+        provenance: of the study.
+    """
+
+    split: str
+    training_presses: int
+    test_presses: int
+    methods: dict[str, MethodErrors]
+    provenance: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of `fibre_loss.json`."""
+        return {"format": FORMAT} | asdict(self)
 
 
 def fibre_loss_study(
@@ -45,7 +79,7 @@ def fibre_loss_study(
     failed: Sequence[int] = (),
     checkpoints: Path | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> dict[str, Any]:
+) -> FibreLoss:
     """Evaluate every set of failed fibres, by one localizer, by networks retrained for each set, or by both.
 
     Args:
@@ -57,12 +91,8 @@ def fibre_loss_study(
         max_failures: most fibres that fail at once; at least one is left.
         failed: indices of fibres without which errors are mapped too, however many; none if empty.
         checkpoints: folder for finished networks, from which an interrupted run resumes; `Checkpoints.clear` removes
-            them once the document is written.
+            them once the result is written.
         on_progress: called with (networks done, total).
-
-    Returns:
-        A document with "methods": for each, "errors" and "by_subset" as of `evaluate`, and "maps", errors by position
-        without the worst set of each size and, at the end, without `failed`; and "test_presses".
 
     Raises:
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
@@ -85,7 +115,7 @@ def fibre_loss_study(
     levels = range(most + 1)
     positions_mm = recording.presses_mm[test]
     evaluate = partial(_evaluate, fibres, levels, chosen, positions_mm)
-    methods: dict[str, Any] = {}
+    methods = {}
     if localizer is not None:
         methods[ONE] = evaluate(partial(localizer.predict_features, localizer.scaled_features(recording)[test]))
     if retrain:
@@ -95,19 +125,13 @@ def fibre_loss_study(
         methods[RETRAINED] = evaluate(predictions.__getitem__)
     origin = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     origin["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
-    return {
-        "format": FORMAT,
-        "split": options.split if localizer is None else localizer.split,
-        "training_presses": len(training),
-        "test_presses": len(test),
-        "methods": methods,
-        "provenance": origin,
-    }
+    split = options.split if localizer is None else localizer.split
+    return FibreLoss(split, len(training), len(test), methods, origin)
 
 
 def _evaluate(
     fibres: int, levels: range, chosen: Failed, positions_mm: Array, predict: Callable[[Failed], Localization]
-) -> dict[str, Any]:
+) -> MethodErrors:
     """Return errors by number and by set of failed fibres, and maps without the worst and the chosen ones."""
     rows, by_subset = errors_by_loss(fibres, levels, predict, positions_mm)
     worst = [
@@ -118,7 +142,7 @@ def _evaluate(
         {"failed": list(failed), "by_position": errors_by_position(predict(tuple(failed)).positions_mm, positions_mm)}
         for failed in (*worst, *([chosen] if chosen else []))
     ]
-    return {"errors": rows, "by_subset": by_subset, "maps": maps}
+    return MethodErrors(rows, by_subset, maps)
 
 
 def _retrain(
@@ -160,7 +184,7 @@ def _bit_mask(failed: Failed) -> int:
     return sum(1 << fibre for fibre in failed)
 
 
-def fibre_loss_lines(document: dict[str, Any]) -> list[str]:
+def fibre_loss_lines(result: FibreLoss) -> list[str]:
     """Format the errors of both methods as a table."""
     cells = [
         [
@@ -169,23 +193,23 @@ def fibre_loss_lines(document: dict[str, Any]) -> list[str]:
             f"{row['subsets']}",
             *(f"{row[f'{key}_mm']:.2f}" for key in ("mean", "std", "max")),
         ]
-        for name, method in document["methods"].items()
-        for row in method["errors"]
+        for name, method in result.methods.items()
+        for row in method.errors
     ]
-    head = f"error in mm on {document['test_presses']} presses (split: {document['split']})"
+    head = f"error in mm on {result.test_presses} presses (split: {result.split})"
     return [head, *text_table([["", "failed", "sets", "mean", "std", "max"], *cells])]
 
 
-def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
+def draw_fibre_loss(result: FibreLoss, path: Path) -> None:
     """Draw errors by number of failed fibres; below, maps of each method's errors."""
-    methods = document["methods"]
-    columns = len(next(iter(methods.values()))["maps"])
+    methods = result.methods
+    columns = len(next(iter(methods.values())).maps)
     figure = Figure(figsize=(max(6.4, 1.9 * columns), 4.4 + 1.9 * len(methods)), layout="constrained")
     grid = figure.add_gridspec(1 + len(methods), columns, height_ratios=[4.4] + [1.9] * len(methods))
     axes = figure.add_subplot(grid[0, :])
-    draw_errors_by_loss(axes, methods, f"Fibre loss, {document['test_presses']}")
+    draw_errors_by_loss(axes, methods, f"Fibre loss, {result.test_presses}")
     axes.legend(frameon=False, loc="upper left")
-    panels = [panel for method in methods.values() for panel in method["maps"]]
+    panels = [panel for method in methods.values() for panel in method.maps]
     highest = max(cell["mean_mm"] for panel in panels for cell in panel["by_position"])
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
@@ -196,14 +220,14 @@ def draw_fibre_loss(document: Mapping[str, Any], path: Path) -> None:
     save_figure(figure, path)
 
 
-def draw_errors_by_loss(axes: Any, methods: Mapping[str, Mapping[str, Any]], title: str) -> None:
+def draw_errors_by_loss(axes: Any, methods: Mapping[str, Evaluation | MethodErrors], title: str) -> None:
     """Draw the errors of one or two methods by number of failed fibres, every set of them as a dot."""
     style_axes(axes)
-    levels = next(iter(methods.values()))["errors"]
+    levels = next(iter(methods.values())).errors
     for number, ((name, method), colour) in enumerate(zip(methods.items(), (VERTICAL, HORIZONTAL), strict=False)):
-        for level, row in enumerate(method["errors"]):
+        for level, row in enumerate(method.errors):
             x = level + BAR_WIDTH * (number - (len(methods) - 1) / 2)
-            means = sorted(each["mean_mm"] for each in method["by_subset"] if len(each["failed"]) == row["n_failed"])
+            means = sorted(each["mean_mm"] for each in method.by_subset if len(each["failed"]) == row["n_failed"])
             # side by side, so that no dot hides another
             offsets = 0.3 * BAR_WIDTH * np.linspace(-1, 1, len(means)) if len(means) > 1 else np.zeros(1)
             axes.bar(x, row["mean_mm"], 0.9 * BAR_WIDTH, color=colour, alpha=0.35, label=None if level else name)

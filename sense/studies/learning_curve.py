@@ -5,7 +5,8 @@ floor, e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learni
 2017) and is extrapolated to twice as many presses.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,40 @@ EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried
 RESAMPLINGS = 400
 
 
+@dataclass(frozen=True)
+class LearningCurve:
+    """Error against the number of training presses.
+
+    Attributes:
+        test_presses: their number, the same for all points.
+        points: "presses", "mean_mm" and "standard_error_mm", by number of training presses.
+        fit: "floor_mm", "factor_mm" and "exponent" of the power law.
+        forecast: "presses", twice as many, "mean_mm", and the interval "low_mm" to "high_mm" of 80 % of resamplings of
+            the test presses and the residuals.
+        advice: in words.
+        settings: of the training.
+        provenance: of the study.
+    """
+
+    test_presses: int
+    points: list[dict[str, Any]]
+    fit: dict[str, float]
+    forecast: dict[str, Any]
+    advice: str
+    settings: dict[str, Any]
+    provenance: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of `learning_curve.json`."""
+        return {"format": FORMAT} | vars(self)
+
+
 def learning_curve(
     recording: Recording,
     options: settings.LocalizerSettings | None = None,
     *,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> dict[str, Any]:
+) -> LearningCurve:
     """Train localizers on more and more presses, and extrapolate their error.
 
     Args:
@@ -44,11 +73,6 @@ def learning_curve(
         options: how to train; a single member is, so errors are somewhat above those of a calibration. The defaults if
             None.
         on_progress: called with (steps done, total).
-
-    Returns:
-        A document with "points" ("presses", "mean_mm", "standard_error_mm" on the test presses), "fit" ("floor_mm",
-        "factor_mm", "exponent"), "forecast" ("presses", "mean_mm", and the interval "low_mm" to "high_mm" of 80 % of
-        resamplings of the test presses and the residuals), "advice" in words, and "settings".
 
     Raises:
         InputError: too few presses for a curve.
@@ -73,21 +97,20 @@ def learning_curve(
     forecast = _forecast(counts, errors, fit, rng)
     origin = provenance("padforge sense learning-curve", options.seed, packages=("torch",))
     origin["inputs"] = {"recording": recording.digest}
-    return {
-        "format": FORMAT,
-        "test_presses": len(test),
-        "points": [
+    return LearningCurve(
+        test_presses=len(test),
+        points=[
             {"presses": size, "mean_mm": row.mean(), "standard_error_mm": row.std(ddof=1) / np.sqrt(len(row))}
             for size, row in zip(sizes, errors, strict=True)
         ],
-        "fit": dict(zip(("floor_mm", "factor_mm", "exponent"), fit, strict=True)),
-        "forecast": forecast,
-        "advice": f"{forecast['presses'] - sizes[-1]} more training presses, twice as many, would bring the error from "
+        fit=dict(zip(("floor_mm", "factor_mm", "exponent"), fit, strict=True)),
+        forecast=forecast,
+        advice=f"{forecast['presses'] - sizes[-1]} more training presses, twice as many, would bring the error from "
         f"{errors[-1].mean():.2f} mm to about {forecast['mean_mm']:.2f} mm "
         f"({forecast['low_mm']:.2f} to {forecast['high_mm']:.2f} mm)",
-        "settings": options.model_dump(),
-        "provenance": origin,
-    }
+        settings=options.model_dump(),
+        provenance=origin,
+    )
 
 
 def _predict(
@@ -163,15 +186,15 @@ def _forecast(
     }
 
 
-def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
+def draw_learning_curve(curve: LearningCurve, path: Path) -> None:
     """Draw the errors, the fit, and the forecast for twice as many presses."""
     figure, axes = new_figure(6.4, 4.4)
-    presses = np.array([point["presses"] for point in document["points"]], dtype=float)
-    means = [point["mean_mm"] for point in document["points"]]
-    forecast, fit = document["forecast"], document["fit"]
+    presses = np.array([point["presses"] for point in curve.points], dtype=float)
+    means = [point["mean_mm"] for point in curve.points]
+    forecast, fit = curve.forecast, curve.fit
     x = np.geomspace(presses[0], forecast["presses"], 200)
     axes.plot(x, power_law(x, (fit["floor_mm"], fit["factor_mm"], fit["exponent"])), color=FAINT, linewidth=1.6)
-    bars = [2 * point["standard_error_mm"] for point in document["points"]]
+    bars = [2 * point["standard_error_mm"] for point in curve.points]
     axes.errorbar(presses, means, bars, fmt="o", color=INK, markersize=5, linewidth=1.2, label="measured")
     interval = [[forecast["mean_mm"] - forecast["low_mm"]], [forecast["high_mm"] - forecast["mean_mm"]]]
     style = {"fmt": "D", "color": ALARM, "markersize": 6, "linewidth": 1.2, "label": "expected"}
@@ -183,19 +206,19 @@ def draw_learning_curve(document: Mapping[str, Any], path: Path) -> None:
     axes.set(ylim=(0, None), xlabel="training presses", ylabel="mean error (mm)")
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.legend(frameon=False)
-    title = f"Error by number of presses, on the same {document['test_presses']}\n"
+    title = f"Error by number of presses, on the same {curve.test_presses}\n"
     axes.set_title(title, loc="left", color=INK, fontsize=11)
     add_caption(axes, "bars: two standard errors; expected: 80 % of resamplings")
     save_figure(figure, path)
 
 
-def learning_curve_lines(document: dict[str, Any]) -> list[str]:
+def learning_curve_lines(curve: LearningCurve) -> list[str]:
     """Format a learning curve as a table, the fit and the advice."""
-    fit = document["fit"]
+    fit = curve.fit
     return [
-        f"error in mm on {document['test_presses']} presses never trained on",
+        f"error in mm on {curve.test_presses} presses never trained on",
         "presses   mean  standard error",
-        *(f"{row['presses']:7d} {row['mean_mm']:6.2f}  {row['standard_error_mm']:14.2f}" for row in document["points"]),
+        *(f"{row['presses']:7d} {row['mean_mm']:6.2f}  {row['standard_error_mm']:14.2f}" for row in curve.points),
         f"fit: {fit['floor_mm']:.2f} mm + {fit['factor_mm']:.3g} mm / presses^{fit['exponent']:.2f}",
-        document["advice"],
+        curve.advice,
     ]

@@ -19,7 +19,7 @@ from padforge.design.morphology import Morphology
 from padforge.fabricate import export, mould
 from padforge.fabricate.cad import model, step_file
 from padforge.fabricate.cad.step_file import CadPart
-from padforge.fabricate.export import FORMATS, build
+from padforge.fabricate.export import FORMATS, Build, build
 from padforge.fabricate.mesh import BODY_COLOURS
 from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
@@ -36,17 +36,17 @@ SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory) -> tuple[Path, dict]:
+def built(tmp_path_factory) -> tuple[Path, Build]:
     out = tmp_path_factory.mktemp("mould")
     return out, build(PAD, out, tuple(FORMATS), SETTINGS)
 
 
 def test_build_writes_all_files_with_their_digests_and_no_others(built):
-    out, document = built
+    out, result = built
     assert {path.name for path in out.iterdir()} == FILES
-    assert {*document["files"]} == FILES - {"fabrication.json", "laying.md", "orientation.svg"}
-    assert json.loads((out / "fabrication.json").read_text()) == document
-    assert document["sha256"] == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
+    assert {*result.files} == FILES - {"fabrication.json", "laying.md", "orientation.svg"}
+    assert json.loads((out / "fabrication.json").read_text()) == result.to_dict()
+    assert result.sha256 == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
 
 
 @pytest.mark.slow
@@ -61,13 +61,13 @@ def test_build_is_reproducible_to_the_byte(built, tmp_path):
 def test_meshes_read_back_closed(built, name):
     if name.endswith("3mf"):
         pytest.importorskip("lxml")
-    out, document = built
+    out, result = built
     mesh = trimesh.load_mesh(out / name)
     assert isinstance(mesh, trimesh.Trimesh)
     assert mesh.is_watertight
     assert mesh.body_count == 1
-    assert mesh.extents == pytest.approx(document["size_mm"], abs=1e-4)
-    assert mesh.volume / 1000 == pytest.approx(document["mould_volume_ml"], abs=1e-3)
+    assert mesh.extents == pytest.approx(result.size_mm, abs=1e-4)
+    assert mesh.volume / 1000 == pytest.approx(result.mould_volume_ml, abs=1e-3)
 
 
 def test_stl_normals_point_out(built):
@@ -84,7 +84,7 @@ def test_stl_normals_point_out(built):
 @pytest.mark.parametrize("body", ["mould", "lid", "holder"])
 def test_3mf_is_one_named_object_of_one_material_in_strict_mode(built, body):
     lib3mf = pytest.importorskip("lib3mf")
-    out, document = built
+    out, result = built
     model = lib3mf.get_wrapper().CreateModel()
     reader = model.QueryReader("3mf")
     reader.SetStrictModeActive(True)
@@ -104,7 +104,7 @@ def test_3mf_is_one_named_object_of_one_material_in_strict_mode(built, body):
     assert f"#{colour.Red:02X}{colour.Green:02X}{colour.Blue:02X}" == BODY_COLOURS[body]
     assert found.GetObjectLevelProperty() == (group.GetUniqueResourceID(), material, True)
     told = [model.GetMetaDataGroup().GetMetaData(k) for k in range(model.GetMetaDataGroup().GetMetaDataCount())]
-    version = document["provenance"]["versions"]["padforge"]
+    version = result.provenance["versions"]["padforge"]
     assert {each.GetName(): each.GetValue() for each in told} == {
         "Title": f"{body}, for a pad of 1 + 1 fibres 11.25 mm apart",
         "Application": f"padforge {version}",
@@ -120,7 +120,7 @@ def listed(iterator, current: str) -> list:
 
 
 def test_step_reads_back_as_a_valid_solid_of_the_meshes_volume(built):
-    out, document = built
+    out, result = built
     whole = import_step(out / "mould.step")
     assert whole.is_valid
     assert {part.label: [each.label for each in part.children] for part in whole.children} == {
@@ -130,32 +130,32 @@ def test_step_reads_back_as_a_valid_solid_of_the_meshes_volume(built):
         "holder": [],
     }
     volume = {part.label: part.volume for part in whole.children}
-    assert volume["mould"] / 1000 == pytest.approx(document["mould_volume_ml"], rel=1e-4)
+    assert volume["mould"] / 1000 == pytest.approx(result.mould_volume_ml, rel=1e-4)
     for name in ("lid", "conductive", "holder"):  # the mesh has polygons for circles
         assert volume[name] == pytest.approx(trimesh.load_mesh(out / f"{name}.stl").volume, rel=1e-4)
-    (found,) = (finding for finding in document["findings"] if finding["name"] == "cad_solid")
-    assert found["status"] == "pass"
-    assert all(0 < share < 2e-4 < most for share, most in zip(found["measured"], found["limit"], strict=True))
-    assert found["message"].endswith("curves within 2 µm")
+    (found,) = (finding for finding in result.findings if finding.name == "cad_solid")
+    assert found.status == "pass"
+    assert all(0 < share < 2e-4 < most for share, most in zip(found.measured, found.limit, strict=True))
+    assert found.message.endswith("curves within 2 µm")
 
 
 def test_document_has_sizes_frame_findings_and_crossings(built, tmp_path):
-    _, document = built
-    assert document["format"] == "padforge-fabrication/2"
+    _, result = built
+    assert result.to_dict()["format"] == "padforge-fabrication/2"
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
-    assert document["size_mm"] == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
-    assert document["sizes"]["tray_mm"] == pytest.approx(side)
-    assert document["frame"]["centre_mm"] == [110, 110]
-    assert document["frame"]["mirrored"] is True
-    assert {finding["name"] for finding in document["findings"]} >= {"watertight", "bed", "layers", "tray_wall"}
-    assert set(document["provenance"]) == {"command", "seed", "versions", "inputs"}
-    assert len(document["crossings"]["table"]) == document["crossings"]["total"] >= PAD.grid**2
-    first, second, x, y, *_ = document["crossings"]["table"][0]
+    assert result.size_mm == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
+    assert result.sizes["tray_mm"] == pytest.approx(side)
+    assert result.frame["centre_mm"] == [110, 110]
+    assert result.frame["mirrored"] is True
+    assert {finding.name for finding in result.findings} >= {"watertight", "bed", "layers", "tray_wall"}
+    assert set(result.provenance) == {"command", "seed", "versions", "inputs"}
+    assert len(result.crossings["table"]) == result.crossings["total"] >= PAD.grid**2
+    first, second, x, y, *_ = result.crossings["table"][0]
     assert {first.split()[0], second.split()[0]} <= {"horizontal", "vertical"}
     assert max(abs(x), abs(y)) < 22.5 / 2
     other = build(level_pad(1.8, 1.2), tmp_path, [])
-    assert other["crossings"]["same_family"] == 2
-    assert "frame" not in other  # without a holder nobody knows where the pad lies
+    assert other.crossings["same_family"] == 2
+    assert other.frame is None  # without a holder nobody knows where the pad lies
 
 
 def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
@@ -168,31 +168,33 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
         assert isinstance(mesh, trimesh.Trimesh)
         floors.append(mesh.vertices[np.isclose(mesh.vertices[:, 2], 2.0)][:, :2].max())
     assert floors == pytest.approx([18.0, 18.0 / 0.96], abs=1e-5)
-    sizes = grown["sizes"]
-    assert sizes["cavity_mm"] * 0.96 == pytest.approx(sizes["pad_mm"]) == pytest.approx(kept["sizes"]["pad_mm"])
+    sizes = grown.sizes
+    assert sizes["cavity_mm"] * 0.96 == pytest.approx(sizes["pad_mm"]) == pytest.approx(kept.sizes["pad_mm"])
     assert sizes["cavity_depth_mm"] == 6.2  # 6.25 mm in whole layers
     assert sizes["pad_thickness_mm"] == pytest.approx(6.2 * 0.96)
-    assert grown["frame"]["surface_mm"] == pytest.approx(2 + 6.2 * 0.96)
-    assert grown["frame"]["pad_mm"] == kept["frame"]["pad_mm"]
+    assert grown.frame is not None
+    assert kept.frame is not None
+    assert grown.frame["surface_mm"] == pytest.approx(2 + 6.2 * 0.96)
+    assert grown.frame["pad_mm"] == kept.frame["pad_mm"]
     assert (tmp_path / "kept" / "holder.stl").read_bytes() == (tmp_path / "grown" / "holder.stl").read_bytes()
     for key in ("in_pad_mm", "cut_mm"):
-        assert [fibre[key] for fibre in grown["fibres"]] == [fibre[key] for fibre in kept["fibres"]]
-    assert [row[2:4] for row in grown["crossings"]["table"]] == [row[2:4] for row in kept["crossings"]["table"]]
-    assert [fibre["ridge_mm"] * 0.96 for fibre in grown["fibres"]] == pytest.approx(
-        [fibre["depth_mm"] for fibre in grown["fibres"]]
+        assert [fibre[key] for fibre in grown.fibres] == [fibre[key] for fibre in kept.fibres]
+    assert [row[2:4] for row in grown.crossings["table"]] == [row[2:4] for row in kept.crossings["table"]]
+    assert [fibre["ridge_mm"] * 0.96 for fibre in grown.fibres] == pytest.approx(
+        [fibre["depth_mm"] for fibre in grown.fibres]
     )
-    assert {finding["status"] for finding in grown["findings"]} == {"pass"}
+    assert {finding.status for finding in grown.findings} == {"pass"}
 
 
 def test_toolpath_findings_only_with_a_program(tmp_path):
     settings = replace(DEFAULTS, dispenser=DispenserSettings(origin_mm=(10.0, 110.0)))
     by_hand, by_machine = build(PAD, tmp_path, [], settings), build(PAD, tmp_path, ["urscript"], settings)
-    found = {finding["name"]: finding["status"] for finding in by_machine["findings"]}
+    found = {finding.name: finding.status for finding in by_machine.findings}
     assert (found.pop("dispenser_box"), found.pop("dispenser_tip")) == ("fail", "pass")
-    assert [*found] == [finding["name"] for finding in by_hand["findings"]]
-    assert "dispenser" not in by_hand["settings"]
-    assert by_machine["settings"]["dispenser"]["origin_mm"] == [10.0, 110.0]
-    assert by_machine["files"] == ["laying.script", "toolpath.svg"]
+    assert [*found] == [finding.name for finding in by_hand.findings]
+    assert "dispenser" not in by_hand.settings
+    assert by_machine.settings["dispenser"]["origin_mm"] == [10.0, 110.0]
+    assert by_machine.files == ["laying.script", "toolpath.svg"]
 
 
 def other_solid(monkeypatch, body: str) -> None:
@@ -282,10 +284,10 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path):
     for name in ("mine.stl", "mould.step"):
         (tmp_path / name).write_text("somebody's own")
     told: list[str] = []
-    document = build(Morphology.straight(2), tmp_path, ["stl"], warn=told.append)
+    result = build(Morphology.straight(2), tmp_path, ["stl"], warn=told.append)
     left = {"mine.stl", "mould.step", "tracks.dxf"}
-    assert {path.name for path in tmp_path.iterdir()} == {*document["sha256"], "fabrication.json"} | left
-    assert document["sha256"].keys() == {"mould.stl", "laying.md", "orientation.svg"}
+    assert {path.name for path in tmp_path.iterdir()} == {*result.sha256, "fabrication.json"} | left
+    assert result.sha256.keys() == {"mould.stl", "laying.md", "orientation.svg"}
     gone = "is gone: it was of the mould before this one"
     assert told == [
         *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
@@ -312,4 +314,4 @@ def test_provenance_is_of_the_input_at_the_start(tmp_path, monkeypatch):
         return check(*arguments)
 
     monkeypatch.setattr(export, "check_plan", meanwhile)
-    assert build(PAD, tmp_path, [], inputs=[pad])["provenance"]["inputs"] == {"morphology.json": read}
+    assert build(PAD, tmp_path, [], inputs=[pad]).provenance["inputs"] == {"morphology.json": read}

@@ -161,19 +161,19 @@ def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
     pad, hole = Morphology.straight((2, 3), (8.0, 15.0)), ((-7.0, -5.0), (-1.0, -5.0), (-1.0, 5.0), (-7.0, 5.0))
     own = settings(pad, leads="one side", keep_out_mm=(hole,), bent_radius_mm=30.0)
     own = replace(own, fibre=FibreSettings(ohm_per_mm=10.0))
-    document = build(pad, tmp_path, [], own)
+    result = build(pad, tmp_path, [], own)
     page = (tmp_path / "laying.md").read_text(encoding="utf-8")
     assert "Horizontal fibres are 1 to 2, vertical ones 3 to 5." in page
     assert "around every pillar" in page
     assert "bent to 30 mm, fibres are stretched by up to" in page
     assert "from left to right as the pad lies for laying, these fibres end: 5, 2, 1, 5, 4, 3, 1, 2, 3, 4." in page
-    assert document["settings"]["pad"]["horizontals"] == 2
+    assert result.settings["pad"]["horizontals"] == 2
     plan = Plan(pad, own)
-    for entry, line in zip(document["fibres"], plan.lines, strict=True):
+    for entry, line in zip(result.fibres, plan.lines, strict=True):
         assert entry["in_pad_mm"] == pytest.approx(line.length - 1.0, abs=0.01)  # less what runs into the walls
         assert entry["resistance_ohm"] == pytest.approx(10 * entry["cut_mm"], rel=1e-3)
     whole = build(pad, tmp_path, [], settings(pad, leads="one side"))
-    less = whole["silicone_volume_ml"] - document["silicone_volume_ml"]
+    less = whole.silicone_volume_ml - result.silicone_volume_ml
     assert less == pytest.approx(6 * 10 * 6 / 1000, abs=1e-3)
     left, low, right, high = plan.tray.bounds
     heights, shown = mould_relief(plan, round(10 * (right - left)), round(10 * (high - low)))
@@ -188,6 +188,6 @@ def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
 
 
 def test_laying_page_of_a_pad_without_crossings(tmp_path):
-    document = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
-    assert document["crossings"]["gap_mm"] is None
+    result = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
+    assert result.crossings["gap_mm"] is None
     assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from padforge.design import Morphology
-from padforge.sense import Recording, calibrate
+from padforge.sense import Evaluation, Recording, calibrate
 from padforge.sense import settings as sense_settings
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.arms.ur5 import UR5
@@ -43,12 +43,12 @@ def brief(recording: Recording) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def calibrated(once: Once, recording: Recording) -> tuple[LocalizerModel, dict]:
+def calibrated(once: Once, recording: Recording) -> tuple[LocalizerModel, Evaluation]:
     return once("calibrated", lambda folder: calibrate(recording, QUICK))
 
 
 @pytest.fixture(scope="session")
-def localizer(calibrated: tuple[LocalizerModel, dict]) -> LocalizerModel:
+def localizer(calibrated: tuple[LocalizerModel, Evaluation]) -> LocalizerModel:
     return calibrated[0]
 
 
@@ -62,13 +62,13 @@ def deep_recording(once: Once) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[LocalizerModel, dict]:
+def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[LocalizerModel, Evaluation]:
     options = QUICK.model_copy(update={"members": 1, "epochs": 40})
     return once("deeply-calibrated", lambda folder: calibrate(deep_recording, options))
 
 
 @pytest.fixture(scope="session")
-def deep_localizer(deeply_calibrated: tuple[LocalizerModel, dict]) -> LocalizerModel:
+def deep_localizer(deeply_calibrated: tuple[LocalizerModel, Evaluation]) -> LocalizerModel:
     """It has learnt depth and force."""
     return deeply_calibrated[0]
 

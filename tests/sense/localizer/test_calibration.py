@@ -14,7 +14,7 @@ from sklearn.base import clone
 from sklearn.model_selection import cross_val_score
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Localizer, Recording, calibrate, evaluate, import_mat
+from padforge.sense import Evaluation, Localizer, Recording, calibrate, evaluate, import_mat
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer.calibration import calibrate_scales, known_measures, split_presses, unlearnt_lines
 from padforge.sense.localizer.features import compute_features
@@ -70,10 +70,10 @@ def test_calibrate_is_blind_to_test_presses(recording: Recording, short: Localiz
 def test_calibrate_repeats_by_seed(recording: Recording, short: LocalizerModel) -> None:
     places = np.array(recording.presses_mm)
     places[sorted(set(range(len(places))) - set(short.test))[:50]] *= 0.5
-    changed, document = calibrate(replace(recording, presses_mm=places), SHORT)
+    changed, evaluation = calibrate(replace(recording, presses_mm=places), SHORT)
     assert not np.array_equal(changed.weights["last.w"], short.weights["last.w"])
     again, same = calibrate(replace(recording, presses_mm=places), SHORT)
-    assert document == same
+    assert evaluation == same
     assert all(np.array_equal(again.weights[name], weight) for name, weight in changed.weights.items())
     other, _ = calibrate(recording, SHORT.model_copy(update={"seed": 7}))
     assert short.test != other.test
@@ -81,38 +81,38 @@ def test_calibrate_repeats_by_seed(recording: Recording, short: LocalizerModel) 
     assert short.scaler.measures == ()
 
 
-def test_calibrate_documents_its_errors(calibrated: tuple[LocalizerModel, dict], recording: Recording) -> None:
-    localizer, document = calibrated
-    about = ("format", "split", "test_presses", "training_presses")
-    assert [document[key] for key in about] == ["padforge-calibration/2", "random", 45, 255]
-    assert [(row["n_failed"], row["subsets"]) for row in document["errors"]] == [(0, 1), (1, 4), (2, 6), (3, 4)]
-    assert localizer.errors == document["errors"]
+def test_calibrate_documents_its_errors(calibrated: tuple[LocalizerModel, Evaluation], recording: Recording) -> None:
+    localizer, evaluation = calibrated
+    assert evaluation.to_dict()["format"] == "padforge-calibration/2"
+    assert (evaluation.split, evaluation.test_presses, evaluation.training_presses) == ("random", 45, 255)
+    assert [(row["n_failed"], row["subsets"]) for row in evaluation.errors] == [(0, 1), (1, 4), (2, 6), (3, 4)]
+    assert localizer.errors == evaluation.errors
     test = np.array(localizer.test)
     found = [localizer.predict(recording, [fibre]).positions_mm[test] for fibre in range(4)]
     means = [np.hypot(*(places - recording.presses_mm[test]).T).mean() for places in found]
-    row = [document["errors"][1][key] for key in ("mean_mm", "std_mm", "max_mm")]
+    row = [evaluation.errors[1][key] for key in ("mean_mm", "std_mm", "max_mm")]
     assert row == pytest.approx([np.mean(means), np.std(means), np.max(means)])
-    assert document["errors"][0]["std_mm"] == 0
-    assert len(document["idle_share"]) == 4
-    cells = document["by_position"]
-    mean = sum(cell["presses"] * cell["mean_mm"] for cell in cells) / document["test_presses"]
-    assert mean == pytest.approx(document["errors"][0]["mean_mm"])
+    assert evaluation.errors[0]["std_mm"] == 0
+    assert len(evaluation.idle_share) == 4
+    cells = evaluation.by_position
+    mean = sum(cell["presses"] * cell["mean_mm"] for cell in cells) / evaluation.test_presses
+    assert mean == pytest.approx(evaluation.errors[0]["mean_mm"])
     assert localizer.scaler.mean_v.shape == (4, 9 + 8 + 3)  # windows, and gains of the phases
     guess = np.median(np.delete(recording.presses_mm, test, axis=0), axis=0)
     trivial = np.hypot(*(recording.presses_mm[test] - guess).T).mean()
-    assert document["errors"][0]["mean_mm"] < 0.5 * trivial
-    assert document["errors"][1]["mean_mm"] < 0.8 * trivial
+    assert evaluation.errors[0]["mean_mm"] < 0.5 * trivial
+    assert evaluation.errors[1]["mean_mm"] < 0.8 * trivial
     # 45 test presses, radii from 20: their shares are right within three standard errors of so few
-    assert 0.5 - 0.4 < document["errors"][0]["within_r50"] < 0.5 + 0.4
-    assert document["errors"][0]["within_r90"] > 0.9 - 0.25
+    assert 0.5 - 0.4 < evaluation.errors[0]["within_r50"] < 0.5 + 0.4
+    assert evaluation.errors[0]["within_r90"] > 0.9 - 0.25
 
 
-def test_evaluate_counts_presses_held_back(calibrated: tuple[LocalizerModel, dict], recording: Recording) -> None:
-    localizer, document = calibrated
+def test_evaluate_counts_presses_held_back(calibrated: tuple[LocalizerModel, Evaluation], recording: Recording) -> None:
+    localizer, evaluation = calibrated
     own = evaluate(localizer, recording, [0, 2])
-    assert own["errors"] == [document["errors"][0], document["errors"][2]]
+    assert own.errors == [evaluation.errors[0], evaluation.errors[2]]
     other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
-    assert (own["split"], other["split"], other["test_presses"]) == ("random", "none", 300)
+    assert (own.split, other.split, other.test_presses) == ("random", "none", 300)
     for lost, said in (([4], "n_failed is 4, allowed is a whole number from 0 to 3"), ([], "levels name no number")):
         with pytest.raises(InputError, match=said):
             evaluate(localizer, recording, lost)
@@ -128,10 +128,10 @@ def test_calibrate_refuses_options_out_of_range(recording: Recording) -> None:
 
 
 def test_calibrate_published_takes_no_failures(recording: Recording, tmp_path: Path) -> None:
-    localizer, document = calibrate(recording, Options(method="published"))
+    localizer, evaluation = calibrate(recording, Options(method="published"))
     guess = np.hypot(*(recording.presses_mm - np.median(recording.presses_mm, axis=0)).T).mean()
-    assert [row["n_failed"] for row in document["errors"]] == [0]
-    assert document["errors"][0]["mean_mm"] < 0.75 * guess
+    assert [row["n_failed"] for row in evaluation.errors] == [0]
+    assert evaluation.errors[0]["mean_mm"] < 0.75 * guess
     assert localizer.features == "published"
     localizer.save(tmp_path)
     again = LocalizerModel.load(tmp_path).predict(recording)
@@ -144,18 +144,18 @@ def test_calibrate_leaves_out_unknown_positions(recording: Recording) -> None:
     places = np.array(recording.presses_mm)
     places[::3] = np.nan
     part = replace(recording, presses_mm=places)
-    localizer, document = calibrate(part, SHORT)
+    localizer, evaluation = calibrate(part, SHORT)
     assert all(press % 3 for press in localizer.test)
-    assert document["training_presses"] + document["test_presses"] == 200
+    assert evaluation.training_presses == 200 - evaluation.test_presses
     assert np.isfinite(localizer.predict(part).positions_mm).all()
 
 
 @pytest.mark.slow
 def test_calibrate_short_on_the_published_recording(published: Path) -> None:
     recording = import_mat(published / "para5_long_first4500.mat")
-    _, document = calibrate(recording, Options(members=1, hidden=64, epochs=8, max_failures=1))
-    assert document["test_presses"] == 675
-    assert document["errors"][0]["mean_mm"] < 2.4
+    _, evaluation = calibrate(recording, Options(members=1, hidden=64, epochs=8, max_failures=1))
+    assert evaluation.test_presses == 675
+    assert evaluation.errors[0]["mean_mm"] < 2.4
 
 
 def test_calibrate_reports_divergence(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,19 +182,19 @@ def test_predict_masks_a_fault_from_its_first_press(localizer: LocalizerModel, r
 
 
 def test_calibrate_learns_depth_and_force(deep_recording: Recording, deeply_calibrated: tuple) -> None:
-    localizer, document = deeply_calibrated
-    row = document["errors"][0]
+    localizer, evaluation = deeply_calibrated
+    row = evaluation.errors[0]
     assert row["depth_mean_mm"] < 0.3
     assert row["force_mean_n"] < 0.9
     assert 0.75 <= row["depth_within_r90"] <= 1
     assert 0.75 <= row["force_within_r90"] <= 1
     assert localizer.interval_factors.shape[1] == 5
-    test, found = np.array(document["test"]["press"]), document["test"]["depth_mm"]
+    test, found = np.array(evaluation.test["press"]), evaluation.test["depth_mm"]
     off = np.abs(np.array(found["predicted"]) - deep_recording.depths_mm[test])
     assert off.mean() == pytest.approx(row["depth_mean_mm"])
     assert found["pressed"] == deep_recording.depths_mm[test].tolist()
     # of light presses errors of places grow as the answers shrink, not more: so do the radii
-    test = document["test"]
+    test = evaluation.test
     errors = np.hypot(*(np.array(test["predicted_mm"]) - test["pressed_mm"]).T)
     depths, radii = np.array(test["depth_mm"]["pressed"]), np.array(test["r90_mm"])
     light, deep = depths < 2, depths > 3.5
@@ -252,14 +252,14 @@ def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
     seen: list[tuple[int, int]] = []
     begin = time.monotonic()
     options = SHORT.model_copy(update={"epochs": 10**5})
-    localizer, document = calibrate(recording, options, time_budget=2, on_progress=lambda *step: seen.append(step))
+    localizer, evaluation = calibrate(recording, options, time_budget=2, on_progress=lambda *step: seen.append(step))
     assert time.monotonic() - begin < 60  # with what is done before and after, on a machine that does other things
     assert localizer.bayes is not None
     networks = len(localizer.weights["first.w"]) + len(localizer.residual_network["first.w"])
     assert networks % (os.cpu_count() or 1) == 0
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
     assert seen[-1][0] == seen[-1][1] <= 2 * networks
-    assert document["errors"][0]["mean_mm"] < 9
+    assert evaluation.errors[0]["mean_mm"] < 9
 
 
 def test_calibrate_takes_a_step_without_time(recording: Recording) -> None:
@@ -297,7 +297,7 @@ def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarr
 def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_path: Path) -> None:
     localizer = Localizer(2, features="causal", split="chronological", **TINY).fit(brief)
     rows = localizer.evaluate(brief)
-    assert rows == localizer.calibration_["errors"]
+    assert rows == localizer.calibration_.errors
     assert [row["n_failed"] for row in rows] == [0, 1, 2]
     assert localizer.evaluate(brief, max_failures=0) == rows[:1]
     assert localizer.score(brief) < 0

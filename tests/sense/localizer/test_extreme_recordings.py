@@ -58,17 +58,17 @@ def require_finite(localizer: LocalizerModel, recording: Recording, document: An
 @pytest.mark.parametrize("seed", range(10))
 def test_predict_and_evaluate_stay_finite(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
     one = worst(seed, brief)
-    require_finite(localizer, one, evaluate(localizer, one, (0, 3)) if one.has_position.any() else ())
+    require_finite(localizer, one, evaluate(localizer, one, (0, 3)).to_dict() if one.has_position.any() else ())
 
 
 @pytest.mark.parametrize(("seed", "features"), enumerate([*FEATURES, *FEATURES]))
 def test_calibrate_learns_or_refuses(brief: Recording, seed: int, features: str) -> None:
     one = worst(seed, brief)
     try:
-        localizer, document = calibrate(one, TINY.model_copy(update={"features": features}))
+        localizer, evaluation = calibrate(one, TINY.model_copy(update={"features": features}))
     except InputError:
         return
-    require_finite(localizer, one, document)
+    require_finite(localizer, one, evaluation.to_dict())
 
 
 @pytest.mark.slow
@@ -78,10 +78,10 @@ def test_recalibrate_follows_or_refuses(localizer: LocalizerModel, brief: Record
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(training, "FINE_TUNING_STEPS", 15)
         try:
-            now, document = recalibrate(localizer, one)
+            now, result = recalibrate(localizer, one)
         except InputError:
             return
-    require_finite(now, one, document)
+    require_finite(now, one, result.to_dict())
     assert (now.interval_factors >= localizer.interval_factors).all()
 
 

@@ -83,38 +83,38 @@ def test_cross_validation_compares_presses_left_out() -> None:
 
 
 def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: Recording) -> None:
-    now, document = recalibrate(localizer, known_only(remade(recording), NEW))
+    now, result = recalibrate(localizer, known_only(remade(recording), NEW))
     pad = remade(recording)
     for lost in ((), (0,), (2,), (1, 3)):
         pairs = ((localizer, pad), (now, pad), (localizer, recording))
         before, after, usual = (error(one, presses, LATER, lost) for one, presses in pairs)
         # Of the error with fibres lost, little is the change's: most of it no recalibration can take away.
         assert after - usual < (1.0 if lost else 0.3) * (before - usual)
-    assert "corrected" in document["changes"]
-    assert document["gain_mm"] > 2 * document["standard_error_mm"] > 0
-    shrunk = [old["mean_mm"] - new["mean_mm"] for old, new in zip(document["before"], document["after"], strict=True)]
+    assert "corrected" in result.changes
+    assert result.gain_mm > 2 * result.standard_error_mm > 0
+    shrunk = [old["mean_mm"] - new["mean_mm"] for old, new in zip(result.before, result.after, strict=True)]
     assert min(shrunk) > 0
-    assert document["gain_mm"] == pytest.approx(np.mean(shrunk))  # every number of lost fibres counts alike
+    assert result.gain_mm == pytest.approx(np.mean(shrunk))  # every number of lost fibres counts alike
     # Radii only grow, and hold for the new presses.
     assert (now.interval_factors >= localizer.interval_factors).all()
-    assert np.allclose(now.interval_factors, localizer.interval_factors * document["widened"])
+    assert np.allclose(now.interval_factors, localizer.interval_factors * result.widened)
     found = now.predict_features(now.scaled_features(pad)[LATER])
     assert (distances(found.positions_mm, pad.presses_mm[LATER]) <= found.r90_mm).mean() > 0.8
     # it has seen its presses, and they decide with the seed
     assert now.recalibrated_by == (known_only(pad, NEW).digest,)
     same, repeated = recalibrate(replace(localizer, recalibrated_by=("of before",)), known_only(pad, NEW))
     assert same.recalibrated_by == ("of before", *now.recalibrated_by)
-    assert repeated == document
+    assert repeated == result
     assert all(np.array_equal(same.weights[name], now.weights[name]) for name in now.weights)
     with pytest.raises(InputError, match="recalibrated by"):
         evaluate(now, known_only(pad, NEW))
 
 
 def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording: Recording) -> None:
-    now, document = recalibrate(localizer, known_only(recording, NEW))
-    assert "corrected" not in document["changes"]
+    now, result = recalibrate(localizer, known_only(recording, NEW))
+    assert "corrected" not in result.changes
     # adapting is kept unless new presses speak against it by a standard error
-    assert document["gain_mm"] >= -document["standard_error_mm"]
+    assert result.gain_mm >= -result.standard_error_mm
     assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
     with pytest.raises(InputError, match="has 9 presses of known position, expected at least 10"):
         recalibrate(localizer, known_only(recording, slice(0, 9)))
@@ -177,11 +177,11 @@ def test_recalibrate_follows_depths_known_or_not(deep_localizer: LocalizerModel,
     names = ("presses_mm", "down_command", "up_command", "depths_mm", "forces_n")
     few = {name: getattr(deep_recording, name)[:40] for name in names}
     later = replace(deep_recording, **few, reached_mm=np.empty(0))
-    now, document = recalibrate(deep_localizer, later)
+    now, result = recalibrate(deep_localizer, later)
     assert now.interval_factors.shape == deep_localizer.interval_factors.shape
     assert (now.interval_factors >= deep_localizer.interval_factors).all()
-    assert document["after"][0]["depth_mean_mm"] < 0.5
-    unknown, document = recalibrate(deep_localizer, replace(later, depths_mm=np.empty(0), forces_n=np.empty(0)))
-    assert "depth_mean_mm" not in document["after"][0]
+    assert result.after[0]["depth_mean_mm"] < 0.5
+    unknown, result = recalibrate(deep_localizer, replace(later, depths_mm=np.empty(0), forces_n=np.empty(0)))
+    assert "depth_mean_mm" not in result.after[0]
     depths = unknown.predict_features(unknown.scaled_features(deep_recording)).measures["depth_mm"].values
     assert np.abs(depths - deep_recording.depths_mm).mean() < 0.5

@@ -466,6 +466,6 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
 @pytest.mark.slow
 def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
     hand, recording = clumsy
-    _, document = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
+    _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
-    assert document["errors"][0]["mean_mm"] < 0.55 * scale_mm
+    assert evaluation.errors[0]["mean_mm"] < 0.55 * scale_mm

@@ -8,7 +8,7 @@ import pytest
 
 from padforge.design import Morphology
 from padforge.design.settings import PadSettings
-from padforge.sense import Recording, calibrate, evaluate
+from padforge.sense import Evaluation, Recording, calibrate, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import pad_source
 from padforge.sense.settings import LocalizerSettings, RigSettings
@@ -30,7 +30,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def calibrated(recording: Recording) -> tuple[LocalizerModel, dict]:
+def calibrated(recording: Recording) -> tuple[LocalizerModel, Evaluation]:
     return calibrate(recording, QUICK)
 
 
@@ -44,15 +44,15 @@ def test_recording_describes_its_pad(recording: Recording, tmp_path: Path) -> No
 
 
 def test_localization_of_a_rectangular_pad_is_in_mm(
-    recording: Recording, calibrated: tuple[LocalizerModel, dict]
+    recording: Recording, calibrated: tuple[LocalizerModel, Evaluation]
 ) -> None:
-    localizer, document = calibrated
+    localizer, evaluation = calibrated
     localization = localizer.predict(recording)
     errors = np.linalg.norm(localization.positions_mm - recording.presses_mm, axis=1)
     assert errors.mean() < 3.0  # of a pad of 24 by 60 mm
-    test = np.array(document["test"]["pressed_mm"]) - document["test"]["predicted_mm"]
-    assert document["errors"][0]["mean_mm"] == pytest.approx(np.linalg.norm(test, axis=1).mean(), rel=1e-6)
-    rows = evaluate(localizer, recording, levels=(0, 1))["errors"]
+    test = np.array(evaluation.test["pressed_mm"]) - evaluation.test["predicted_mm"]
+    assert evaluation.errors[0]["mean_mm"] == pytest.approx(np.linalg.norm(test, axis=1).mean(), rel=1e-6)
+    rows = evaluate(localizer, recording, levels=(0, 1)).errors
     assert [row["n_failed"] for row in rows] == [0, 1]
     within = [np.mean(errors <= radius) for radius in (localization.r50_mm, localization.r90_mm)]
     assert within == pytest.approx([0.5, 0.9], abs=0.2)
@@ -63,10 +63,10 @@ def test_localization_on_strips_of_parallel_fibres(counts: tuple[int, int]) -> N
     """Straight parallel fibres give no position along them; across, they do where two respond."""
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 8.0))
     recording = simulate(Morphology.straight(size.layout), RigSettings(presses=200, seed=1), size=size)
-    localizer, document = calibrate(recording, QUICK)
+    localizer, evaluation = calibrate(recording, QUICK)
     errors = np.abs(localizer.predict(recording).positions_mm - recording.presses_mm).mean(axis=0) / 4.0
     along, across = errors if counts[0] else errors[::-1]
     assert along > 0.15  # 4 mm are pressed, whose middle is off by a quarter of them
     assert sum(counts) == 1 or across < 0.25
     # a single fibre cannot fail
-    assert [row["n_failed"] for row in document["errors"]] == ([0, 1] if sum(counts) > 1 else [0])
+    assert [row["n_failed"] for row in evaluation.errors] == ([0, 1] if sum(counts) > 1 else [0])

@@ -14,7 +14,7 @@ from padforge.sense import Recording, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings as Options
 from padforge.sense.studies import fibre_loss
-from padforge.sense.studies.fibre_loss import ONE, RETRAINED, fibre_loss_study
+from padforge.sense.studies.fibre_loss import ONE, RETRAINED, FibreLoss, MethodErrors, fibre_loss_study
 from tests.helpers.door import Ended, call
 
 
@@ -27,25 +27,25 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_study_compares_both_methods_and_maps_a_chosen_set(localizer: LocalizerModel, recording: Recording) -> None:
     expected = evaluate(localizer, recording, (0, 1, 2))
-    document = fibre_loss_study(recording, localizer, retrain=True, max_failures=1, failed=(3, 1, 3))
-    assert list(document["methods"]) == [ONE, RETRAINED]
-    for method in document["methods"].values():
-        assert [row["subsets"] for row in method["errors"]] == [1, 4]
-        assert [row["failed"] for row in method["by_subset"]] == [[], [0], [1], [2], [3]]
-        intact, worst, chosen = method["maps"]
+    result = fibre_loss_study(recording, localizer, retrain=True, max_failures=1, failed=(3, 1, 3))
+    assert list(result.methods) == [ONE, RETRAINED]
+    for method in result.methods.values():
+        assert [row["subsets"] for row in method.errors] == [1, 4]
+        assert [row["failed"] for row in method.by_subset] == [[], [0], [1], [2], [3]]
+        intact, worst, chosen = method.maps
         assert (intact["failed"], chosen["failed"]) == ([], [1, 3])
-        assert worst["failed"] == max(method["by_subset"][1:], key=lambda row: row["mean_mm"])["failed"]
-    assert document["test_presses"] == expected["test_presses"] == len(localizer.test)
-    assert document["training_presses"] == 300 - len(localizer.test)
-    one = document["methods"][ONE]
-    assert one["errors"] == expected["errors"][:2]
-    assert one["by_subset"] == expected["by_subset"][:5]
-    assert one["maps"][0]["by_position"] == expected["by_position"]
-    (mean_mm,) = (row["mean_mm"] for row in expected["by_subset"] if row["failed"] == [1, 3])
-    cells = one["maps"][-1]["by_position"]
+        assert worst["failed"] == max(method.by_subset[1:], key=lambda row: row["mean_mm"])["failed"]
+    assert result.test_presses == expected.test_presses == len(localizer.test)
+    assert result.training_presses == 300 - len(localizer.test)
+    one = result.methods[ONE]
+    assert one.errors == expected.errors[:2]
+    assert one.by_subset == expected.by_subset[:5]
+    assert one.maps[0]["by_position"] == expected.by_position
+    (mean_mm,) = (row["mean_mm"] for row in expected.by_subset if row["failed"] == [1, 3])
+    cells = one.maps[-1]["by_position"]
     mean_of_map_mm = np.average([cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells])
     assert mean_of_map_mm == pytest.approx(mean_mm)
-    assert len(fibre_loss.fibre_loss_lines(document)) == 6
+    assert len(fibre_loss.fibre_loss_lines(result)) == 6
 
 
 def test_study_rejects_fibres_that_cannot_fail(localizer: LocalizerModel, recording: Recording) -> None:
@@ -56,21 +56,21 @@ def test_study_rejects_fibres_that_cannot_fail(localizer: LocalizerModel, record
 
 
 def test_retraining_ignores_failed_fibres_and_test_positions(recording: Recording) -> None:
-    def retrain(changed: Recording) -> dict:
-        return fibre_loss_study(changed, retrain=True, max_failures=1)["methods"][RETRAINED]
+    def retrain(changed: Recording) -> MethodErrors:
+        return fibre_loss_study(changed, retrain=True, max_failures=1).methods[RETRAINED]
 
     plain = retrain(recording)
     readings = recording.readings.copy()
     readings[:, 2] = np.random.default_rng(1).uniform(0, 3, len(readings))
     noisy = retrain(replace(recording, readings=readings))
-    for each, other in zip(plain["by_subset"], noisy["by_subset"], strict=True):
+    for each, other in zip(plain.by_subset, noisy.by_subset, strict=True):
         assert (each["mean_mm"] == other["mean_mm"]) == (each["failed"] == [2])
     test = np.sort(np.random.default_rng(0).permutation(300)[-45:])
     far = recording.presses_mm.copy()
     far[test] = 2e4  # a network trained on one of them would predict far positions
     moved = retrain(replace(recording, presses_mm=far))
     centre = np.hypot(*(2e4 - recording.presses_mm[test]).T).mean()
-    assert moved["errors"][0]["mean_mm"] == pytest.approx(centre, abs=30)
+    assert moved.errors[0]["mean_mm"] == pytest.approx(centre, abs=30)
 
 
 def interrupt(done: int, total: int) -> None:
@@ -150,10 +150,10 @@ def test_fibre_loss_command_keeps_networks_until_the_result_is_written(
 def test_draw_fibre_loss_has_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
     figures: list[Figure] = []
     monkeypatch.setattr(fibre_loss, "save_figure", lambda figure, path: figures.append(figure))
-    errors = {"errors": [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}], "by_subset": [{"failed": [], "mean_mm": 1.0}]}
+    errors, by_subset = [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}], [{"failed": [], "mean_mm": 1.0}]
     cells = [{"x_mm": 0.0, "y_mm": y_mm, "mean_mm": mean_mm} for y_mm, mean_mm in ((-5.0, 1.0), (5.0, 9.0))]
-    methods = {"one network": errors | {"maps": [{"failed": [], "by_position": cells}]}}
-    fibre_loss.draw_fibre_loss({"methods": methods, "test_presses": 2}, Path("none.png"))
+    methods = {"one network": MethodErrors(errors, by_subset, [{"failed": [], "by_position": cells}])}
+    fibre_loss.draw_fibre_loss(FibreLoss("random", 2, 2, methods, {}), Path("none.png"))
     (image,) = (image for axes in figures[0].axes for image in axes.images)
     assert image.origin == "lower"
     assert np.asarray(image.get_array())[-1, 0] == 9.0

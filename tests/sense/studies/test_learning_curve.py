@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.settings import LocalizerSettings as Options
-from padforge.sense.studies.learning_curve import fit_power_law, learning_curve, power_law
+from padforge.sense.studies.learning_curve import LearningCurve, fit_power_law, learning_curve, power_law
 from tests.helpers.door import called
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
@@ -48,31 +47,31 @@ def quick() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def document(recording: Recording) -> dict[str, Any]:
+def curve(recording: Recording) -> LearningCurve:
     return learning_curve(recording, QUICK)
 
 
-def test_learning_curve_forecasts_twice_as_many_presses(document: dict[str, Any]) -> None:
-    assert [point["presses"] for point in document["points"]] == [16, 32, 64, 128, 255]
-    assert all(0.02 < point["standard_error_mm"] / point["mean_mm"] < 0.2 for point in document["points"])
-    forecast = document["forecast"]
+def test_learning_curve_forecasts_twice_as_many_presses(curve: LearningCurve) -> None:
+    assert [point["presses"] for point in curve.points] == [16, 32, 64, 128, 255]
+    assert all(0.02 < point["standard_error_mm"] / point["mean_mm"] < 0.2 for point in curve.points)
+    forecast = curve.forecast
     assert forecast["presses"] == 510
     assert 0 < forecast["low_mm"] <= forecast["mean_mm"] <= forecast["high_mm"]
-    assert forecast["high_mm"] <= document["points"][-1]["mean_mm"] + 1e-9
-    assert "255 more training presses" in document["advice"]
-    assert (document["settings"]["members"], document["test_presses"]) == (1, 45)
-    json.dumps(document, allow_nan=False)
+    assert forecast["high_mm"] <= curve.points[-1]["mean_mm"] + 1e-9
+    assert "255 more training presses" in curve.advice
+    assert (curve.settings["members"], curve.test_presses) == (1, 45)
+    json.dumps(curve.to_dict(), allow_nan=False)
 
 
 def test_learning_curve_command_writes_document_and_figure(
-    document: dict[str, Any], recording: Recording, tmp_path: Path
+    curve: LearningCurve, recording: Recording, tmp_path: Path
 ) -> None:
     recording.save(tmp_path / "rec", {})
     (tmp_path / "pad.toml").write_text("[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\n")
     ended = called("sense", "learning-curve", "rec", "--out", "out", "--json", cwd=tmp_path)
     written = json.loads(ended.out)
     assert (ended.code, written) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))
-    assert written | {"provenance": None} == json.loads(json.dumps(document)) | {"provenance": None}
+    assert written | {"provenance": None} == json.loads(json.dumps(curve.to_dict())) | {"provenance": None}
     assert (tmp_path / "out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"
 
 
