@@ -4,6 +4,7 @@ The same inputs give the same bytes. Everything is built and checked before the 
 appear together or not at all. A new export format is a line in `FORMATS`, and its writer.
 """
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
     from padforge.fabricate.cad.model import CadModel
+
+_log = logging.getLogger(__name__)
 
 FORMAT = "padforge-fabrication/2"
 _CAD_VOLUME, _CAD_SURFACE, _CAD_TOLERANCE_MM = 5e-4, 5e-3, 0.01
@@ -171,8 +174,6 @@ def build(
     formats: Sequence[str] = ("stl", "step", "svg", "png"),
     settings: FabricationSettings = DEFAULTS,
     inputs: Sequence[Path] = (),
-    *,
-    warn: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Build the mould of a pad and write it, with the further bodies that the settings ask for.
 
@@ -184,7 +185,6 @@ def build(
         formats: which of `FORMATS` to write; `fabrication.json` and `laying.md` always are.
         settings: tray, ridges, printer, fibre, rules and dispenser.
         inputs: files the work came from, for the provenance.
-        warn: called with a line for every file of an earlier mould that was deleted or that remains.
 
     Returns:
         The fabrication document, as written to `fabrication.json`; "sha256" has the digests of the other files.
@@ -215,7 +215,7 @@ def build(
     document = _compile_document(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
     writers["laying.md"] = partial(_write_utf8, text=laying_page(document))
-    _write_files(out, writers, document, warn)
+    _write_files(out, writers, document)
     return document
 
 
@@ -282,9 +282,7 @@ def _compile_document(fabrication: Fabrication, files: list[str], origin: Mappin
     }
 
 
-def _write_files(
-    out: Path, writers: Mapping[str, Callable[[Path], None]], document: dict[str, Any], warn: Callable[[str], None]
-) -> None:
+def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], document: dict[str, Any]) -> None:
     """Write the files of a mould and their digests at once, and delete those of an earlier one."""
     try:
         earlier = read_json(out / "fabrication.json", FORMAT).get("sha256")
@@ -299,7 +297,7 @@ def _write_files(
         document["sha256"] = {name: sha256(folder / name) for name in writers}
         write_json(folder / "fabrication.json", document)
     for name in sorted(deleted):
-        warn(f"{out / name} is gone: it was of the mould before this one")
+        _log.info("%s is gone: it was of the mould before this one", out / name)
     for file in sorted(out.iterdir()):
         if file.name in earlier.keys() - writers.keys():
-            warn(f"{file} is left from the mould before this one: it is not as it was written")
+            _log.warning("%s is left from the mould before this one: it is not as it was written", file)

@@ -146,8 +146,7 @@ def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **o
     run = Run(common.load_spec(spec), out, formats=split_formats(formats), **options)
     check_run(run)
     with locked_folder(out):
-        warn, training_progress = partial(click.echo, err=True), partial(progress_bar, "training")
-        code = run_stages(run, click.echo, warn, search_progress, training_progress)
+        code = run_stages(run, click.echo, search_progress, partial(progress_bar, "training"))
         if code != common.INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")

@@ -6,6 +6,7 @@ is resumed where it ended.
 
 import hashlib
 import json
+import logging
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
@@ -21,6 +22,8 @@ from padforge.design.common.validation import InputError
 if TYPE_CHECKING:
     from padforge.design.common.settings import Settings, Spec
     from padforge.design.optimize.search import OnProgress, SearchResult
+
+_log = logging.getLogger(__name__)
 
 SECTIONS = {
     "pad": "padforge.design.settings:PadSettings",
@@ -201,7 +204,6 @@ def _regenerated_files() -> set[str]:
 def run_stages(
     run: Run,
     on_result: Callable[[str], None],
-    on_message: Callable[[str], None],
     search_progress: "Callable[[], AbstractContextManager[OnProgress]]",
     training_progress: Callable[[], AbstractContextManager[Callable[[int, int], None]]],
 ) -> int:
@@ -210,7 +212,6 @@ def run_stages(
     Args:
         run: the request.
         on_result: receives the summary of every stage.
-        on_message: receives warnings and notes.
         search_progress: opens a display that receives the progress of the search.
         training_progress: opens a display that receives the steps of the training, done and in all.
 
@@ -240,9 +241,7 @@ def run_stages(
     def calibrate(note: object) -> dict[str, Any]:
         options, budget = spec.section(LocalizerSettings, **seed), run.remaining_s(reserve_s=RESERVE_S)
         with training_progress() as report:
-            return calibrate_into(
-                recording, out, options, time_budget=budget, on_progress=report, on_message=on_message, force=True
-            )
+            return calibrate_into(recording, out, options, time_budget=budget, on_progress=report, force=True)
 
     design = cache.get(
         "design",
@@ -259,7 +258,7 @@ def run_stages(
     mould = cache.get(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
-        lambda note: build(pad, out, run.formats, FabricationSettings.from_spec(spec), source, warn=on_message),
+        lambda note: build(pad, out, run.formats, FabricationSettings.from_spec(spec), source),
         pad=digest,
         formats=sorted(run.formats),
     )
@@ -286,5 +285,5 @@ def run_stages(
     on_result("\n".join(f"  {line}" for line in calibration_lines(calibration)))
     on_result(contact_line(contacts))
     if cache.reused:
-        on_message(f"{out}: reused from an earlier run: {', '.join(cache.reused)}")
+        _log.info("%s: reused from an earlier run: %s", out, ", ".join(cache.reused))
     return int(bool(design.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))

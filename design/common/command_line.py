@@ -3,6 +3,7 @@
 import atexit
 import functools
 import json
+import logging
 import os
 import signal
 import sys
@@ -110,6 +111,28 @@ def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0
     return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
+class _EchoHandler(logging.Handler):
+    """Prints log records on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # Not by click.echo, which writes past the sys.stderr of a progress bar, and so into the bar.
+        print(self.format(record), file=sys.stderr)
+
+
+@contextmanager
+def _logged_on_stderr() -> Iterator[None]:
+    """Print what padforge logs, notes and warnings."""
+    logger, handler = logging.getLogger("padforge"), _EchoHandler()
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
 INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 
 
@@ -142,7 +165,8 @@ def _end_with_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        return command.main(standalone_mode=False, prog_name=name) or 0
+        with _logged_on_stderr():
+            return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         return 2

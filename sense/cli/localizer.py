@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +53,12 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
     from padforge.sense.report.calibration import calibrate_into
     from padforge.sense.settings import LocalizerSettings
 
-    folder, warn = out or common.pad_folder(recording), partial(click.echo, err=True)
+    folder = out or common.pad_folder(recording)
     run = {name: options.pop(name) for name in ("time_budget", "force")}
     with locked_folder(folder):
         settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
         with progress_bar("training") as show:
-            document = calibrate_into(presses, folder, settings, on_progress=show, on_message=warn, **run)
+            document = calibrate_into(presses, folder, settings, on_progress=show, **run)
     common.show_result(document, calibration_lines(document), as_json)
 
 

@@ -138,9 +138,7 @@ def _record_with(
         return _record_by_hand(config, resume, virtual_hardware)
     opened = _opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)), virtual_hardware)
     with progress_bar("presses") as show:
-        return operation.record(
-            config, opened, model=model, dry=dry_run, resume=resume, on_progress=show, on_message=_warn
-        )
+        return operation.record(config, opened, model=model, dry=dry_run, resume=resume, on_progress=show)
 
 
 def _opened_rig(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "OpenedRig":

@@ -1,5 +1,6 @@
 """What a calibration leaves in a folder: localizer, health models, document and figures."""
 
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import draw_errors_by_loss
 
+_log = logging.getLogger(__name__)
+
 FILES = (
     *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
     *sorted(HEALTH_FILES),
@@ -32,10 +35,11 @@ def calibrate_into(
     *,
     time_budget: float | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    on_message: Callable[[str], None] = lambda line: None,
     force: bool = False,
 ) -> dict[str, Any]:
     """Calibrate, and write all FILES; nothing changes before all are done.
+
+    What the recording does not suffice for (depth, force, health) is logged as a warning.
 
     Args:
         recording: with presses of known position.
@@ -43,7 +47,6 @@ def calibrate_into(
         options: of the localizer.
         time_budget: seconds to train for, see `calibrate`.
         on_progress: called with (training steps done, total), and with (0, 0) when the health is learnt.
-        on_message: called with a line on what the recording does not suffice for: depth, force or health.
         force: whether a localizer is replaced that other files in `out` were made from.
 
     Returns:
@@ -58,14 +61,14 @@ def calibrate_into(
     localizer = Localizer.from_settings(options).fit(recording, time_budget=time_budget, on_progress=on_progress)
     model, document = localizer.model_, localizer.calibration_
     for line in unlearnt_lines(recording, model):
-        on_message(line)
+        _log.warning(line)
     on_progress(0, 0)
     with stage("health"):
         try:
             detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)
         except InputError as error:
             detector = None
-            on_message(f"the health of the fibres is not monitored: {error}")
+            _log.warning("the health of the fibres is not monitored: %s", error)
     with atomic_files(out, without=HEALTH_FILES) as folder:  # those of an earlier calibration must not stay
         localizer.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone
