@@ -20,8 +20,9 @@ from padforge.design.common.files import read_json, reraise_as_input_error, sha2
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
+    from padforge.design.common.progress import OnProgress
     from padforge.design.common.settings import Settings, Spec
-    from padforge.design.optimize.search import OnProgress, SearchResult
+    from padforge.design.optimize.search import SearchResult
 
 _log = logging.getLogger(__name__)
 
@@ -205,7 +206,7 @@ def run_stages(
     run: Run,
     on_result: Callable[[str], None],
     search_progress: "Callable[[], AbstractContextManager[OnProgress]]",
-    training_progress: Callable[[], AbstractContextManager[Callable[[int, int], None]]],
+    training_progress: "Callable[[], AbstractContextManager[OnProgress]]",
 ) -> int:
     """Run all stages into `run.out`.
 
@@ -213,7 +214,7 @@ def run_stages(
         run: the request.
         on_result: receives the summary of every stage.
         search_progress: opens a display that receives the progress of the search.
-        training_progress: opens a display that receives the steps of the training, done and in all.
+        training_progress: opens a display that receives the progress of the training.
 
     Returns:
         The exit code: 0, 1 if a rule or a check of the mould fails, or 130 if the search was interrupted.

@@ -21,6 +21,7 @@ from padforge.design.common.validation import Fault, InputError, missing_extra
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from .progress import OnProgress
     from .settings import Spec
 
 spec_option = click.option(
@@ -95,6 +96,19 @@ def progress() -> Iterator["Progress"]:
     name, note = TextColumn("{task.description:<12}"), TextColumn("{task.fields[note]}")
     with Progress(name, BarColumn(), note, TimeElapsedColumn(), console=err, disable=not err.is_terminal) as bar:
         yield bar
+
+
+@contextmanager
+def progress_bar(name: str) -> Iterator["OnProgress"]:
+    """Yield a function that shows progress on stderr."""
+    with progress() as bar:
+        task = bar.add_task(name, total=None, note="")
+
+        def show(done: int, total: int, what: str) -> None:
+            count = f"{done} of {total}  " if total else ""
+            bar.update(task, completed=done, total=total or None, note=count + what)
+
+        yield show
 
 
 def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> None:

@@ -1,7 +1,7 @@
 """What a calibration leaves in a folder: localizer, health models, document and figures."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
 from padforge.design.common.plotting import INK, add_caption, new_figure, save_figure
 from padforge.design.common.profiling import stage
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import unlearnt_lines
@@ -34,7 +35,7 @@ def calibrate_into(
     options: LocalizerSettings,
     *,
     time_budget: float | None = None,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
     force: bool = False,
 ) -> dict[str, Any]:
     """Calibrate, and write all FILES; nothing changes before all are done.
@@ -46,7 +47,7 @@ def calibrate_into(
         out: folder.
         options: of the localizer.
         time_budget: seconds to train for, see `calibrate`.
-        on_progress: called with (training steps done, total), and with (0, 0) when the health is learnt.
+        on_progress: called with (training steps done, total, ""), and with (0, 0, "health") when that is learnt.
         force: whether a localizer is replaced that other files in `out` were made from.
 
     Returns:
@@ -62,7 +63,7 @@ def calibrate_into(
     model, document = localizer.model_, localizer.calibration_
     for line in unlearnt_lines(recording, model):
         _log.warning(line)
-    on_progress(0, 0)
+    on_progress(0, 0, "health")
     with stage("health"):
         try:
             detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)

@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from padforge.design.common.files import provenance, temporary_folder
 from padforge.design.common.profiling import stage
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
@@ -35,7 +36,7 @@ from padforge.sense.recording.run_directory import check_new_folder, check_new_r
 from padforge.sense.rig.config import RigConfig, load_or_make_plan, locate_on_bed, open_recorder, plan_notice
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
-from padforge.sense.rig.press_loop import Interrupts, OnProgress, PressLoop, check_plan
+from padforge.sense.rig.press_loop import Interrupts, PressLoop, check_plan
 from padforge.sense.rig.safety import Limits, check_start_state, check_tcp
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
@@ -138,7 +139,7 @@ def record(
     model: Path | None = None,
     dry: bool = False,
     resume: bool = False,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> Recording | None:
     """Record with a rig, of `opened_rig` or `opened_virtual_rig`; what is done is on the disk whatever happens.
 
@@ -164,7 +165,7 @@ def record(
         folder = temporary_folder(Path(tempfile.gettempdir()), "padforge-dry-") if dry else nullcontext(config.out)
         with folder as out:
             with open_recorder(config, rig, plan.to_rows(), out, resume, identities) as recorder:
-                on_progress(len(recorder.done), len(plan))
+                on_progress(len(recorder.done), len(plan), "")
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)
 

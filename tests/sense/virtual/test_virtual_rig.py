@@ -16,6 +16,7 @@ import pytest
 
 from padforge.cli import main
 from padforge.design import Morphology
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
@@ -23,7 +24,7 @@ from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig.boards import board_reader
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.rig.press_loop import OnProgress, PressLoop
+from padforge.sense.rig.press_loop import PressLoop
 from padforge.sense.rig.safety import RETREAT_MM
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import LivePad
@@ -64,13 +65,13 @@ class Rig:
     def plan(self, presses: int) -> PressPlan:
         return make_plan(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
 
-    def record(self, run: Path, plan: PressPlan, report: OnProgress = lambda done, of: None) -> float:
+    def record(self, run: Path, plan: PressPlan, report: OnProgress = ignore_progress) -> float:
         """Record into `run`, or resume it; return the time of the start."""
         with Recorder.resume(run) if run.exists() else Recorder(run, len(PAD.knots), {}, {}) as recorder:
             self.board_driver.connect()
             self.arm.connect()
             start_s = time.monotonic()
-            report(0, len(plan))
+            report(0, len(plan), "")
             PressLoop(self.arm, self.board_driver, recorder, self.settings).run(plan, report)
         return start_s
 
@@ -78,7 +79,7 @@ class Rig:
         """Record, disturbed after one more press; return the fault, and how long it took to be raised."""
         moment, at = 0.0, 1 + (len(read_journal(run / "journal.ndjson")) if run.exists() else 0)
 
-        def report(done: int, of: int) -> None:
+        def report(done: int, of: int, what: str) -> None:
             nonlocal moment
             if done == at:
                 moment = time.monotonic()
