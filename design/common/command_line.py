@@ -125,7 +125,7 @@ def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0
     return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
-class _EchoHandler(logging.Handler):
+class _StderrHandler(logging.Handler):
     """Prints log records on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -133,20 +133,7 @@ class _EchoHandler(logging.Handler):
         print(self.format(record), file=sys.stderr)
 
 
-@contextmanager
-def _logged_on_stderr() -> Iterator[None]:
-    """Print what padforge logs, notes and warnings."""
-    logger, handler = logging.getLogger("padforge"), _EchoHandler()
-    level = logger.level
-    logger.setLevel(logging.INFO)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
-
-
+_HANDLER = _StderrHandler()
 INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 
 
@@ -162,6 +149,9 @@ def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> 
         number = getattr(signal, name_of_signal)
         if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
             signal.signal(number, signal.default_int_handler)  # cleans up as Ctrl-C does
+    logger = logging.getLogger("padforge")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(_HANDLER)  # once, however often it is added
     code = _run(command, name, extras)
     atexit.register(_end_with_tasks, code)
     return code
@@ -179,8 +169,7 @@ def _end_with_tasks(code: int) -> None:
 
 def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     try:
-        with _logged_on_stderr():
-            return command.main(standalone_mode=False, prog_name=name) or 0
+        return command.main(standalone_mode=False, prog_name=name) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         return 2
