@@ -140,7 +140,7 @@ def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     bench.recorded.cache_clear()
     measured = harness.BenchRounds()
-    harness.measure_round(bench.BENCH, measured, lambda step: None, lambda key: False)
+    harness.measure_round(bench.BENCH, measured, ignore_progress, lambda key: False)
     bench.recorded.cache_clear()
     errors = {key[:3]: row["error"] for key, row in measured.results.items() if row}
     assert len(errors) == 2 + 4 + 4 + 2 - 2  # LM learns from published inputs alone; two only find one press

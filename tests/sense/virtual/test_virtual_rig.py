@@ -165,7 +165,7 @@ def test_readings_show_presses_when_tip_goes_down(rig: Rig, tmp_path: Path, monk
 @pytest.mark.parametrize("rig", ["printer"], indirect=True)
 def test_printer_presses_as_planned_despite_noise(rig: Rig, tmp_path: Path) -> None:
     plan = rig.plan(2)
-    rig.record(tmp_path / "run", plan, lambda done, of: rig.robot.garble(1e-3))
+    rig.record(tmp_path / "run", plan, lambda done, of, what: rig.robot.garble(1e-3))
     rig.robot.garble(0)
     assert_complete(tmp_path / "run", plan, 0.06)
     moves = rig.robot.firmware.moves
@@ -219,7 +219,7 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
-    rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
+    rig.record(run, plan, lambda done, of, what: rig.board.garble(1e-3))
     assert_complete(run, plan)
     readings = Recording.open(run).readings
     assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong reading would be an outlier
