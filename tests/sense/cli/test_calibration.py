@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-import padforge.design.common.command_line
 from padforge.sense.localizer import training
 
 
@@ -49,7 +48,7 @@ def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPat
 
         yield interrupt
 
-    monkeypatch.setattr(padforge.design.common.command_line, "progress_bar", progress_bar)
+    monkeypatch.setattr("padforge.design.common.command_line.progress_bar", progress_bar)
     code, _, err = few("calibrate", "rec", "--out", "new")
     assert code == 130
     assert "interrupted" in err
