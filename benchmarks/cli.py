@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from padforge.design.common.command_line import json_option, out_option, progress, show_result
+from padforge.design.common.command_line import json_option, out_option, progress_bar, show_result
 from padforge.design.common.validation import InputError
 
 BENCHES = {
@@ -46,10 +46,9 @@ def bench(context: click.Context, names: tuple[str, ...], against: Path | None, 
     names = tuple(dict.fromkeys(names)) or tuple(name for name in BENCHES if not earlier or name in earlier)
     if not names:
         raise InputError(f"{against}: has none of the benchmarks {', '.join(BENCHES)}")
-    with progress() as bar:
-        task = bar.add_task("bench", total=None, note="")
+    with progress_bar("bench") as show:
         benches = [resolve_name(f"padforge.benchmarks.{BENCHES[name]}") for name in names]
-        summary, changes = run_benches(benches, out, lambda step: bar.update(task, note=step), earlier)
+        summary, changes = run_benches(benches, out, show, earlier)
     lines = [line for document in summary["benches"].values() for line in [*bench_lines(document), ""]]
     lines += summary_lines(summary["summary"])
     if against:

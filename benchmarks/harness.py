@@ -21,6 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from padforge.design.common.command_line import text_table
 from padforge.design.common.files import check_writable, provenance, read_json, write_json
 from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, save_figure, style_axes
+from padforge.design.common.progress import OnProgress
 from padforge.design.common.validation import InputError
 
 ROUNDS = 3
@@ -116,7 +117,7 @@ class Worsening:
 
 
 def measure_round(
-    bench: Bench, rounds: BenchRounds, on_progress: Callable[[str], None], repeat: Callable[[TrialKey], bool]
+    bench: Bench, rounds: BenchRounds, on_progress: OnProgress, repeat: Callable[[TrialKey], bool]
 ) -> int:
     """Add a round to the measurements: new trials, and those to `repeat` but slow baselines; return their number."""
     if not rounds.seconds:
@@ -127,7 +128,7 @@ def measure_round(
         is_slow_baseline = earlier and trial.way in bench.baselines and min(earlier) * trial.items > MAX_BASELINE_S
         if earlier and (is_slow_baseline or not repeat(trial.key)):
             continue
-        on_progress(f"{trial.case}, {trial.way}" + (f" {trial.size:g}" if trial.size else ""))
+        on_progress(0, 0, f"{trial.case}, {trial.way}" + (f" {trial.size:g}" if trial.size else ""))
         paces = _measure_pace()
         result, seconds, is_long = _measure(trial.work)
         paces += _measure_pace()
@@ -178,7 +179,7 @@ def _measure_pace() -> list[float]:
 
 
 def run_benches(
-    benches: Sequence[Bench], out: Path, on_progress: Callable[[str], None], earlier: Documents
+    benches: Sequence[Bench], out: Path, on_progress: OnProgress, earlier: Documents
 ) -> tuple[dict[str, Any], list[Worsening]]:
     """Measure benchmarks, and write `bench.json` and a figure of each.
 
@@ -191,7 +192,8 @@ def run_benches(
 
     def measure(bench: Bench, label: str, repeat: Callable[[TrialKey], bool]) -> None:
         measured = rounds[bench.name]
-        if measure_round(bench, measured, lambda step: on_progress(f"{bench.name}, {label}, {step}"), repeat):
+        report = lambda done, total, step: on_progress(done, total, f"{bench.name}, {label}, {step}")  # noqa: E731
+        if measure_round(bench, measured, report, repeat):
             measured.pace_s = min(other.pace_s for other in rounds.values())
             documents[bench.name] = _to_document(bench, measured)
             figure = _draw(bench.name, _medians(documents[bench.name]["rows"]), bench.error_label)

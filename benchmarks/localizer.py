@@ -14,6 +14,7 @@ import torch
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design import Morphology
 from padforge.design.common.parallel import one_torch_thread
+from padforge.design.common.progress import ignore_progress
 from padforge.design.networks import fit_batch, initial_weights
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats
@@ -142,7 +143,7 @@ def _train_masked(inputs: Floats, targets: Floats, table: Floats, steps: int) ->
     presses = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
     batches = max(MIN_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
     options = settings.LocalizerSettings(epochs=-(-steps // batches))
-    trained = train_members(presses, table, options, np.random.default_rng(0), lambda done, total: None)
+    trained = train_members(presses, table, options, np.random.default_rng(0), ignore_progress)
 
     def predict(x: Array) -> Array:
         features = x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)

@@ -14,10 +14,10 @@ from padforge.design.common import command_line as common
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from padforge.design.common.progress import OnProgress
     from padforge.design.common.settings import Spec
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import Violation
-    from padforge.design.optimize.search import OnProgress
     from padforge.design.settings import PadSettings
 
 EDIT_PORT = 8322
@@ -40,15 +40,13 @@ def time_budget_option(text: str) -> Callable[..., Any]:
 def search_progress() -> "Iterator[OnProgress]":
     """Show a progress bar for every start of a search on stderr."""
     tasks: dict[str, TaskID] = {}
-    best: dict[str, float] = {}
     with common.progress() as bar:
 
-        def report(run: str, done: int, total: int, objective: float) -> None:
-            if run not in tasks:
-                tasks[run] = bar.add_task(run, total=total, note="")
-            search = run.rpartition(", ")[0]  # "usual, start 2" is a start of the search "usual"
-            best[search] = min(objective, best.get(search, objective))
-            bar.update(tasks[run], completed=done, note=f"objective {objective:.4f}, best {best[search]:.4f}")
+        def report(done: int, total: int, what: str) -> None:
+            start, _, note = what.rpartition(": ")
+            if start not in tasks:
+                tasks[start] = bar.add_task(start, total=total, note="")
+            bar.update(tasks[start], completed=done, note=note)
 
         yield report
 

@@ -117,8 +117,8 @@ def compare(
         folder, pad = out / variant.folder, variant.pad
         if pad is None:
 
-            def report(run: str, *step: Any, name: str = variant.name) -> None:
-                options.on_progress(f"{name}, {run}", *step)
+            def report(done: int, total: int, what: str, name: str = variant.name) -> None:
+                options.on_progress(done, total, f"{name}, {what}")
 
             _, result = run_design(variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=report))
             if result.stopped == "interrupted":

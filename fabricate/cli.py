@@ -1,6 +1,5 @@
 """`padforge fabricate`: build the mould of a morphology, or check one."""
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
     from padforge.design.morphology import Morphology
 
-_warn = partial(click.echo, err=True)
 _MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
 
@@ -92,7 +90,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     folder = out or pad_folder(morphology)
     with locked_folder(folder):
         inputs = [path for path in (morphology, spec) if path]
-        result = build_files(pad, folder, split_formats(formats), settings, inputs, warn=_warn)
+        result = build_files(pad, folder, split_formats(formats), settings, inputs)
     document = result.to_dict()
     show_result(document, mould_lines(document, folder), as_json)
 
@@ -159,6 +157,6 @@ def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, floa
     from .settings import FabricationSettings
 
     settings = FabricationSettings.from_spec(spec)
-    result = build_files(pad, folder, ("stl",), settings, warn=_warn)
+    result = build_files(pad, folder, ("stl",), settings)
     failed = sum(finding.status == "fail" for finding in result.findings)
     return {"mould_ml": result.mould_volume_ml, "silicone_ml": result.silicone_volume_ml, "failed": failed}

@@ -4,6 +4,7 @@ The same inputs give the same bytes. Everything is built and checked before the 
 appear together or not at all. A new export format is a line in `FORMATS`, and its writer.
 """
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
     from padforge.fabricate.cad.model import CadModel
+
+_log = logging.getLogger(__name__)
 
 FORMAT = "padforge-fabrication/2"
 _CAD_VOLUME, _CAD_SURFACE, _CAD_TOLERANCE_MM = 5e-4, 5e-3, 0.01
@@ -200,8 +203,6 @@ def build(
     formats: Sequence[str] = ("stl", "step", "svg", "png"),
     settings: FabricationSettings = DEFAULTS,
     inputs: Sequence[Path] = (),
-    *,
-    warn: Callable[[str], None] = lambda line: None,
 ) -> Build:
     """Build the mould of a pad and write it, with the further bodies that the settings ask for.
 
@@ -213,7 +214,6 @@ def build(
         formats: which of `FORMATS` to write; `fabrication.json` and `laying.md` always are.
         settings: tray, ridges, printer, fibre, rules and dispenser.
         inputs: files the work came from, for the provenance.
-        warn: called with a line for every file of an earlier mould that was deleted or that remains.
 
     Returns:
         What `fabrication.json` holds of the mould.
@@ -244,7 +244,7 @@ def build(
     result = _compile_build(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
     writers["laying.md"] = partial(_write_utf8, text=laying_page(result.to_dict()))
-    return _write_files(out, writers, result, warn)
+    return _write_files(out, writers, result)
 
 
 def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
@@ -310,9 +310,7 @@ def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[s
     )
 
 
-def _write_files(
-    out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build, warn: Callable[[str], None]
-) -> Build:
+def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build) -> Build:
     """Write the files of a mould and their digests at once, and delete those of an earlier one."""
     try:
         earlier = read_json(out / "fabrication.json", FORMAT).get("sha256")
@@ -327,8 +325,8 @@ def _write_files(
         result = replace(result, sha256={name: sha256(folder / name) for name in writers})
         write_json(folder / "fabrication.json", result.to_dict())
     for name in sorted(deleted):
-        warn(f"{out / name} is gone: it was of the mould before this one")
+        _log.info("%s is gone: it was of the mould before this one", out / name)
     for file in sorted(out.iterdir()):
         if file.name in earlier.keys() - writers.keys():
-            warn(f"{file} is left from the mould before this one: it is not as it was written")
+            _log.warning("%s is left from the mould before this one: it is not as it was written", file)
     return result

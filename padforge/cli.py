@@ -15,7 +15,6 @@ from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs, split_formats
 from padforge.sense.cli.main import sense as sense_group
-from padforge.sense.cli.options import progress_bar
 from padforge.sense.cli.studies import study as study_group
 
 from .report import write_report
@@ -146,8 +145,7 @@ def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **o
     run = Run(common.load_spec(spec), out, formats=split_formats(formats), **options)
     check_run(run)
     with locked_folder(out):
-        warn, training_progress = partial(click.echo, err=True), partial(progress_bar, "training")
-        code = run_stages(run, click.echo, warn, search_progress, training_progress)
+        code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
         if code != common.INTERRUPTED:
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")

@@ -6,6 +6,7 @@ is resumed where it ended.
 
 import hashlib
 import json
+import logging
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
@@ -19,8 +20,11 @@ from padforge.design.common.files import read_json, reraise_as_input_error, sha2
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
+    from padforge.design.common.progress import OnProgress
     from padforge.design.common.settings import Settings, Spec
-    from padforge.design.optimize.search import OnProgress, SearchResult
+    from padforge.design.optimize.search import SearchResult
+
+_log = logging.getLogger(__name__)
 
 SECTIONS = {
     "pad": "padforge.design.settings:PadSettings",
@@ -201,18 +205,16 @@ def _regenerated_files() -> set[str]:
 def run_stages(
     run: Run,
     on_result: Callable[[str], None],
-    on_message: Callable[[str], None],
     search_progress: "Callable[[], AbstractContextManager[OnProgress]]",
-    training_progress: Callable[[], AbstractContextManager[Callable[[int, int], None]]],
+    training_progress: "Callable[[], AbstractContextManager[OnProgress]]",
 ) -> int:
     """Run all stages into `run.out`.
 
     Args:
         run: the request.
         on_result: receives the summary of every stage.
-        on_message: receives warnings and notes.
         search_progress: opens a display that receives the progress of the search.
-        training_progress: opens a display that receives the steps of the training, done and in all.
+        training_progress: opens a display that receives the progress of the training.
 
     Returns:
         The exit code: 0, 1 if a rule or a check of the mould fails, or 130 if the search was interrupted.
@@ -240,9 +242,7 @@ def run_stages(
     def calibrate(note: object) -> dict[str, Any]:
         options, budget = spec.section(LocalizerSettings, **seed), run.remaining_s(reserve_s=RESERVE_S)
         with training_progress() as report:
-            return calibrate_into(
-                recording, out, options, time_budget=budget, on_progress=report, on_message=on_message, force=True
-            )
+            return calibrate_into(recording, out, options, time_budget=budget, on_progress=report, force=True)
 
     design = cache.get(
         "design",
@@ -260,7 +260,7 @@ def run_stages(
     mould = cache.get(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
-        lambda note: build(pad, out, run.formats, settings, source, warn=on_message).to_dict(),
+        lambda note: build(pad, out, run.formats, settings, source).to_dict(),
         pad=digest,
         formats=sorted(run.formats),
     )
@@ -287,5 +287,5 @@ def run_stages(
     on_result("\n".join(f"  {line}" for line in calibration_lines(calibration)))
     on_result(contact_line(contacts))
     if cache.reused:
-        on_message(f"{out}: reused from an earlier run: {', '.join(cache.reused)}")
+        _log.info("%s: reused from an earlier run: %s", out, ", ".join(cache.reused))
     return int(bool(design.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))

@@ -3,6 +3,7 @@
 import atexit
 import functools
 import json
+import logging
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ from padforge.design.common.validation import Fault, InputError, missing_extra
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from .progress import OnProgress
     from .settings import Spec
 
 spec_option = click.option(
@@ -96,6 +98,19 @@ def progress() -> Iterator["Progress"]:
         yield bar
 
 
+@contextmanager
+def progress_bar(name: str) -> Iterator["OnProgress"]:
+    """Yield a function that shows progress on stderr."""
+    with progress() as bar:
+        task = bar.add_task(name, total=None, note="")
+
+        def show(done: int, total: int, what: str) -> None:
+            count = f"{done} of {total}  " if total else ""
+            bar.update(task, completed=done, total=total or None, note=count + what)
+
+        yield show
+
+
 def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> None:
     """Print the machine-readable result or its summary for people, both on stdout."""
     click.echo(json.dumps(document, indent=1) if as_json else "\n".join(lines))
@@ -110,6 +125,15 @@ def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0
     return ["  ".join(row) for row in zip(*columns, strict=True)]
 
 
+class _StderrHandler(logging.Handler):
+    """Prints log records on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # Not by click.echo, which writes past the sys.stderr of a progress bar, and so into the bar.
+        print(self.format(record), file=sys.stderr)
+
+
+_HANDLER = _StderrHandler()
 INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 
 
@@ -125,6 +149,9 @@ def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> 
         number = getattr(signal, name_of_signal)
         if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
             signal.signal(number, signal.default_int_handler)  # cleans up as Ctrl-C does
+    logger = logging.getLogger("padforge")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(_HANDLER)  # once, however often it is added
     code = _run(command, name, extras)
     atexit.register(_end_with_tasks, code)
     return code

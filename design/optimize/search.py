@@ -21,6 +21,7 @@ import numpy as np
 
 from padforge.design.common import profiling
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_float, check_path, check_type, short_repr
 from padforge.design.contact_comparison import errors_by_contact
@@ -60,23 +61,21 @@ SUBSETS = 8
 BUDGET_SHARES = {"default": 0.35, "twin": 0.4, "from default": 0.2}
 """Of a time budget, by search for the next pad of a twin."""
 
-OnProgress = Callable[[str, int, int, float], None]
-"""Callback of a search: what runs ("start 2"), steps done, steps in all, and its objective at that step."""
-
 
 @dataclass(frozen=True)
 class SearchOptions:
     """How a search is run; the result does not depend on it, unless it is cut short.
 
     Attributes:
-        on_progress: called with each start's progress, in the caller's thread.
+        on_progress: called with each start's progress, in the caller's thread: steps done, in all, and in words its
+            objective and the best of all so far, such as "start 2: objective 0.1234, best 0.1111".
         keep_in: folder for the states of the starts; `Checkpoints.clear` removes them once the result is saved.
         resume: whether to go on from the states in `keep_in`.
         time_budget: seconds after which the search ends with the best so far; None for no end.
         executor: of the `concurrent.futures` kind, for slices of the starts; the threads of this machine if None.
     """
 
-    on_progress: OnProgress = lambda run, done, total, objective: None
+    on_progress: OnProgress = ignore_progress
     keep_in: Path | None = None
     resume: bool = False
     time_budget: float | None = None
@@ -285,6 +284,7 @@ def _advance(
         for start in problem.starts
         if not stop and (start not in states or not states[start]["done"])
     )
+    best = math.inf
     abandoned = partial(stop.abandoned, is_remote=run.executor is not None)
     for start, (state, step, objective) in run_tasks(
         slices, run.executor, follow_up=next_slice, is_abandoned=abandoned
@@ -292,7 +292,9 @@ def _advance(
         states[start] = state
         if checkpoints:
             checkpoints.save(start, state)
-        run.on_progress(_name(problem, start), min(step, problem.steps), problem.steps, objective)
+        best = min(best, objective)
+        words = f"{_name(problem, start)}: objective {objective:.4f}, best {best:.4f}"
+        run.on_progress(min(step, problem.steps), problem.steps, words)
 
 
 def _finish_starts(problem: SearchProblem, states: dict[int, State], stop: Stop) -> list[tuple[str, Morphology]]:
@@ -421,5 +423,5 @@ def _part_options(run: SearchOptions, name: str) -> SearchOptions:
     """Return the options of one of the searches for a twin."""
     keep_in = None if run.keep_in is None else state_folders(run.keep_in)[name]
     budget = None if run.time_budget is None else BUDGET_SHARES[name] * run.time_budget
-    report = lambda start, *progress: run.on_progress(f"{name}, {start}", *progress)  # noqa: E731
+    report = lambda done, total, what: run.on_progress(done, total, f"{name}, {what}")  # noqa: E731
     return replace(run, keep_in=keep_in, time_budget=budget, on_progress=report)

@@ -21,7 +21,6 @@ from padforge.sense.cli.options import (
     max_failures_option,
     model_option,
     predict_despite_faults,
-    progress_bar,
     read_recording,
     recording_argument,
 )
@@ -54,12 +53,12 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
     from padforge.sense.report.calibration import calibrate_into
     from padforge.sense.settings import LocalizerSettings
 
-    folder, warn = out or common.pad_folder(recording), partial(click.echo, err=True)
+    folder = out or common.pad_folder(recording)
     run = {name: options.pop(name) for name in ("time_budget", "force")}
     with locked_folder(folder):
         settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
-        with progress_bar("training") as show:
-            document = calibrate_into(presses, folder, settings, on_progress=show, on_message=warn, **run)
+        with common.progress_bar("training") as show:
+            document = calibrate_into(presses, folder, settings, on_progress=show, **run)
     common.show_result(document, calibration_lines(document), as_json)
 
 
@@ -204,7 +203,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
         raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
     budget, options = MemoryBudget(flash, ram, quantize == "int8"), common.load_spec(spec).section(LocalizerSettings)
     opened = read_recording(recording)
-    with progress_bar("training") as report:
+    with common.progress_bar("training") as report:
         header = export_header(localizer, digest, path, opened, budget, options, report)
     click.echo("\n".join([*header.lines(budget), f"localizer -> {path}"]))
 
@@ -237,7 +236,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     check_writable(target)
     old, opened = LocalizerModel.load(model), open_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
-    with progress_bar("recalibrating") as report:
+    with common.progress_bar("recalibrating") as report:
         localizer, result = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
     with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
@@ -288,7 +287,7 @@ def fibre_loss(
     settings = common.load_spec(options.pop("spec")).section(LocalizerSettings, seed=options.pop("seed"))
     opened = open_recording(recording)
     options |= {"failed": fibre_indices(failed, opened.fibres), "checkpoints": unfinished}
-    with progress_bar("networks") as show:
+    with common.progress_bar("networks") as show:
         result = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
     _write_study(target / "fibre_loss", result.to_dict(), partial(draw_fibre_loss, result))
     if retrain:
@@ -327,7 +326,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     target = out or common.pad_folder(recording)
     check_writable(target)
     options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
-    with progress_bar("training") as show:
+    with common.progress_bar("training") as show:
         result = study.learning_curve(opened, options, on_progress=show)
     _write_study(target / "learning_curve", result.to_dict(), partial(study.draw_learning_curve, result))
     common.show_result(result.to_dict(), study.learning_curve_lines(result), as_json)
@@ -356,11 +355,7 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
 
     folder, pad = out or common.pad_folder(recording), Morphology.load(morphology)
     inputs = [path for path in (recording, morphology) if not path.is_dir()]
-    with locked_folder(folder), progress_bar("identify") as bar:
-
-        def show(what: str, done: int, total: int) -> None:
-            bar(done, total, what)
-
+    with locked_folder(folder), common.progress_bar("identify") as show:
         opened = read_recording(recording)
         document = identify_into(opened, pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force)
     common.show_result(document, identification_lines(document, folder), as_json)

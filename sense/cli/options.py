@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import progress
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
@@ -83,19 +82,6 @@ def recording_line(recording: "Recording", out: Path) -> str:
         f"{len(recording.readings)} readings of {recording.fibres} fibres"
         f"{f', {missing} values missing,' * (missing > 0)} at {rate} Hz -> {out}"
     )
-
-
-@contextmanager
-def progress_bar(name: str) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows (done, total, note) on stderr; (0, 0) shows work without an end in sight."""
-    with progress() as bar:
-        task = bar.add_task(name, total=None, note="")
-
-        def show(done: int, total: int, note: str = "") -> None:
-            count = f"{done} of {total}  " if total else ""
-            bar.update(task, completed=done, total=total or None, note=count + note)
-
-        yield show
 
 
 def predict_despite_faults(

@@ -10,7 +10,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import FILE, FOLDER, progress_bar, recording_line, redrawn_lines, typed_keys
+from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lines, typed_keys
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -137,10 +137,8 @@ def _record_with(
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
         return _record_by_hand(config, resume, virtual_hardware)
     opened = _opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)), virtual_hardware)
-    with progress_bar("presses") as show:
-        return operation.record(
-            config, opened, model=model, dry=dry_run, resume=resume, on_progress=show, on_message=_warn
-        )
+    with common.progress_bar("presses") as show:
+        return operation.record(config, opened, model=model, dry=dry_run, resume=resume, on_progress=show)
 
 
 def _opened_rig(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "OpenedRig":

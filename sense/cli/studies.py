@@ -11,7 +11,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import max_failures_option, progress_bar
+from padforge.sense.cli.options import max_failures_option
 
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
@@ -57,7 +57,7 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
 
             check_writable(out)
             try:
-                with progress_bar(name) as show:
+                with common.progress_bar(name) as show:
                     show(0, 0, "pads")
                     study = make(names, seed=seed or 0, **options)
                     with cluster(scheduler) as executor:

@@ -5,7 +5,7 @@ Knowledge distillation (Hinton et al. 2015, "Distilling the knowledge in a neura
 between the true positions and those that the localizer, the teacher, predicts.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from padforge.design.common.files import write_text
 from padforge.design.common.parallel import one_torch_thread
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.deploy import streaming
 from padforge.sense.deploy.streaming import CODE_BYTES, N_LAYERS, MemoryBudget, ThresholdDetector
@@ -45,9 +46,6 @@ EPOCHS_FACTOR = 4  # by which its training is longer than a localizer's: it has 
 MAX_INT8 = 127
 WRAP_AT, WRAP_BY = 2**30, 2**29  # readings at which the 32-bit counter goes back, and by how many
 LINE = 118  # characters
-
-OnProgress = Callable[[int, int], None]
-"""Called with steps done and steps in all."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def distill(
     training: Indices,
     budget: MemoryBudget,
     options: LocalizerSettings,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> StudentNetwork:
     """Train a student as large as the budget allows, on presses of known position.
 
@@ -234,7 +232,7 @@ def export_header(
     recording: Recording,
     budget: MemoryBudget,
     options: LocalizerSettings,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> HeaderReport:
     """Distill a localizer, whose `localizer.json` has the SHA-256 `digest`, into a student, and write that as C header.
 

@@ -4,7 +4,7 @@ Presses are split three ways: training, calibration of the uncertainty, and test
 whose error ends the training.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.profiling import stage
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -34,7 +35,6 @@ MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one 
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
 INTERVAL_SUBSETS = 32  # sets of failed fibres of a size that intervals are calibrated on, at most
-OnProgress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def calibrate(
     options: LocalizerSettings | None = None,
     *,
     time_budget: float | None = None,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> tuple[LocalizerModel, Evaluation]:
     """Train a localizer on a part of the presses and test it on the others.
 
@@ -66,7 +66,7 @@ def calibrate(
         options: how to train; the defaults if None.
         time_budget: seconds to train for, with as many members as that is good for; the result then depends on the
             pace of the machine. None for the length and the members of `options`.
-        on_progress: called with (steps done, steps in all); with a time budget, with seconds.
+        on_progress: called with (steps done, steps in all, ""); with a time budget, with seconds.
 
     Returns:
         The localizer, and its evaluation on the test presses.
@@ -101,7 +101,7 @@ def fit_recording(
     training: Indices,
     options: LocalizerSettings,
     rng: np.random.Generator,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
     time_budget: float | None = None,
 ) -> LocalizerModel:
     """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
@@ -124,7 +124,7 @@ def fit_model(
     training: Indices,
     options: LocalizerSettings,
     rng: np.random.Generator,
-    on_progress: OnProgress = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
     time_budget: float | None = None,
 ) -> LocalizerModel:
     """Train a localizer and calibrate its uncertainty.

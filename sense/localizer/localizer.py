@@ -1,7 +1,6 @@
 """The estimator: a localizer with `fit`, `predict`, `score`, `evaluate`, `save` and `load`, as in scikit-learn."""
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError, check_float, check_type
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
@@ -91,7 +91,7 @@ class Localizer:
         y: ArrayLike | None = None,
         *,
         time_budget: float | None = None,
-        on_progress: Callable[[int, int], None] = lambda done, total: None,
+        on_progress: OnProgress = ignore_progress,
     ) -> "Localizer":
         """Train on a recording, a share of whose presses is held back for a test; or on arrays, without a test.
 
@@ -99,7 +99,7 @@ class Localizer:
             X: a recording; or (Q, C, F) features of presses, V, NaN where a fibre gave none.
             y: (Q, 2) positions, mm, with arrays.
             time_budget: seconds to train for, with as many members as that is good for.
-            on_progress: called with (steps done, steps in all); with a time budget, with seconds.
+            on_progress: called with (steps done, steps in all, ""); with a time budget, with seconds.
 
         Raises:
             InputError: an option or array out of range, too few presses, or a training that diverged.

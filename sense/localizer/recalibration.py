@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.files import provenance
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices
@@ -75,7 +76,7 @@ def recalibrate(
     recording: Recording,
     *,
     seed: int = 0,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> tuple[LocalizerModel, Recalibration]:
     """Adapt a localizer to a pad that has changed since its training.
 
@@ -86,7 +87,7 @@ def recalibrate(
         model: the localizer so far.
         recording: of the pad as it is now, with some 20 to 500 presses of known position; others are not looked at.
         seed: of the folds and of fine tuning.
-        on_progress: called with (steps done, steps in all).
+        on_progress: called with (steps done, steps in all, "").
 
     Returns:
         The localizer from now on, which predicts as the old one if nothing was gained, and what changed.
@@ -135,14 +136,14 @@ def _select_changes(
     validation: "CrossValidation",
     before: Predictions,
     seed: int,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> tuple[LocalizerModel, Predictions, list[str]]:
     """The model with the changes that are worth it, predictions of presses left out, and the names of the changes."""
     steps, total = count(1), 2 + FOLDS + 1 if model.method == "ensemble" else 1
 
     def tune(old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures) -> LocalizerModel:
         tuned = _fine_tuned(old, features, positions_mm, measures, np.random.default_rng([seed, len(features)]))
-        on_progress(next(steps), total)
+        on_progress(next(steps), total, "")
         return tuned
 
     candidates: list[tuple[str, Change, float]] = [("corrected", fit_correction, CORRECT_FROM)]
@@ -152,12 +153,12 @@ def _select_changes(
     for name, change, threshold in candidates:
         changed = validation.change(folds, change)
         predictions = validation.predict(changed)
-        on_progress(next(steps), total)
+        on_progress(next(steps), total, "")
         gain, standard_error = validation.gain(after, predictions)
         if gain > threshold * standard_error:
             model, folds, after = change(model, *validation.presses), changed, predictions
             changes.append(name)
-    on_progress(total, total)
+    on_progress(total, total, "")
     return model, after, changes
 
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.networks import fit_batch
 from padforge.sense.arrays import Floats
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
@@ -49,13 +50,12 @@ def fit_network(
     seconds: float | None = None,
     weight_decay: float = 1e-2,
     averaged: bool = True,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> dict[str, Floats]:
     """Minimize a loss by AdamW with a one-cycle learning rate; return the moving average of the weights, or the last.
 
     Weights by name require gradients and are changed in place. `loss_of_batch` draws a batch and returns its loss,
-    `seconds` limit the training in place of `steps`, and `on_progress` is called up to `REPORTS` times with the share
-    that is done.
+    `seconds` limit the training in place of `steps`, and `on_progress` is called with (n, `REPORTS`, "").
     """
     begin = time.monotonic()
     average = [weight.detach().clone() for weight in parameters.values()]
@@ -74,7 +74,7 @@ def fit_network(
             mean.lerp_(weight.detach(), 1 - decay)
         if share * REPORTS >= reports + 1:
             reports = int(share * REPORTS)
-            on_progress(share)
+            on_progress(reports, REPORTS, "")
     return {name: mean.cpu().numpy() for name, mean in zip(parameters, average, strict=True)}
 
 
@@ -83,22 +83,22 @@ class StoppedError(Exception):
 
 
 class JointProgress:
-    """Progress of trainings in threads, of `totals` steps: `on_progress` is called with (steps done, steps in all).
+    """Progress of trainings in threads, of `totals` steps, reported together.
 
     Those still at work when the `with` block ends stop at their next report.
     """
 
-    def __init__(self, totals: Sequence[int], on_progress: Callable[[int, int], None]) -> None:
-        self._done, self._total, self._on_progress = [0] * len(totals), sum(totals), on_progress
+    def __init__(self, totals: Sequence[int], on_progress: OnProgress) -> None:
+        self._done, self._totals, self._on_progress = [0] * len(totals), totals, on_progress
         self._lock, self._stopped = Lock(), Event()
 
-    def update(self, number: int, done: int) -> None:
-        """Set the steps done of one training; raise StoppedError if the `with` block has ended."""
+    def update(self, number: int, done: int, total: int, what: str) -> None:
+        """Report the progress of one training, in its own steps; raise StoppedError if the `with` block has ended."""
         if self._stopped.is_set():
             raise StoppedError
         with self._lock:
-            self._done[number] = done
-            self._on_progress(sum(self._done), self._total)
+            self._done[number] = round(done / total * self._totals[number])
+            self._on_progress(sum(self._done), sum(self._totals), what)
 
     def __enter__(self) -> None:
         pass
@@ -139,14 +139,14 @@ def train_members(
     table: Floats,
     options: LocalizerSettings,
     rng: np.random.Generator,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
     time_budget: float | None = None,
 ) -> TrainedNetworks:
     """Train the members of the localizer; the last of several is a Bayesian localizer with its residual network.
 
     Where depths vary there is no Bayesian localizer. Networks are trained in threads. `table` is the (S, S, C, F + G)
     scaled response by position, over [-1, 1] in x and y. `time_budget` is in seconds, for as many members as these are
-    good for, and `on_progress` is called with seconds then, else with (steps done, steps in all) of all networks.
+    good for, and the progress is in seconds then, else in steps of all networks.
     """
     begin = time.monotonic()
     presses = leave_one_out_residuals(presses, table)
@@ -177,7 +177,7 @@ def train_members(
             steps,
             options.learning_rate,
             seconds=seconds,
-            on_progress=lambda share: joint.update(number, round(share * total)),
+            on_progress=partial(joint.update, number),
         )
 
     with one_torch_thread(), joint:

@@ -1,6 +1,6 @@
 """What a calibration leaves in a folder: localizer, health models, document and figures."""
 
-from collections.abc import Callable
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from matplotlib.collections import LineCollection
 from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
 from padforge.design.common.plotting import INK, add_caption, new_figure, save_figure
 from padforge.design.common.profiling import stage
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import unlearnt_lines
@@ -18,6 +19,8 @@ from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import draw_errors_by_loss
+
+_log = logging.getLogger(__name__)
 
 FILES = (
     *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
@@ -32,19 +35,19 @@ def calibrate_into(
     options: LocalizerSettings,
     *,
     time_budget: float | None = None,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-    on_message: Callable[[str], None] = lambda line: None,
+    on_progress: OnProgress = ignore_progress,
     force: bool = False,
 ) -> dict[str, Any]:
     """Calibrate, and write all FILES; nothing changes before all are done.
+
+    What the recording does not suffice for (depth, force, health) is logged as a warning.
 
     Args:
         recording: with presses of known position.
         out: folder.
         options: of the localizer.
         time_budget: seconds to train for, see `calibrate`.
-        on_progress: called with (training steps done, total), and with (0, 0) when the health is learnt.
-        on_message: called with a line on what the recording does not suffice for: depth, force or health.
+        on_progress: called with (training steps done, total, ""), and with (0, 0, "health") when that is learnt.
         force: whether a localizer is replaced that other files in `out` were made from.
 
     Returns:
@@ -59,14 +62,14 @@ def calibrate_into(
     localizer = Localizer.from_settings(options).fit(recording, time_budget=time_budget, on_progress=on_progress)
     model, evaluation = localizer.model_, localizer.calibration_
     for line in unlearnt_lines(recording, model):
-        on_message(line)
-    on_progress(0, 0)
+        _log.warning(line)
+    on_progress(0, 0, "health")
     with stage("health"):
         try:
             detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)
         except InputError as error:
             detector = None
-            on_message(f"the health of the fibres is not monitored: {error}")
+            _log.warning("the health of the fibres is not monitored: %s", error)
     with atomic_files(out, without=HEALTH_FILES) as folder:  # those of an earlier calibration must not stay
         localizer.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone

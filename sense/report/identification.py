@@ -1,6 +1,6 @@
 """What an identification leaves in a folder (twin, document, figures), its lines and its section of the report."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from padforge.design.common.files import atomic_files, check_replaceable, check_
 from padforge.design.common.page import PageSection, figures, paragraph, table
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, add_title, save_figure, style_axes
 from padforge.design.common.profiling import stage
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.sense.recording.recording import Recording
@@ -33,7 +34,7 @@ def identify_into(
     seed: int = 0,
     *,
     inputs: list[Path] | None = None,
-    on_progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    on_progress: OnProgress = ignore_progress,
     force: bool = False,
 ) -> dict[str, Any]:
     """Identify a pad, and write twin.json, identification.json and two figures; nothing changes before all are done.
@@ -44,7 +45,7 @@ def identify_into(
         out: folder.
         seed: of what is drawn.
         inputs: files whose digests become part of the provenance.
-        on_progress: called with (what is being done, steps done, total).
+        on_progress: called with (steps done, total, what is being done).
         force: whether a twin is replaced that other files in `out` were made from.
 
     Returns:

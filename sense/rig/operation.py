@@ -3,6 +3,7 @@
 An adaptive plan moves its presses, as the recording goes on, to where a localizer errs most.
 """
 
+import logging
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from scipy.spatial import KDTree
 
 from padforge.design.common.files import provenance, temporary_folder
 from padforge.design.common.profiling import stage
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
@@ -34,10 +36,12 @@ from padforge.sense.recording.run_directory import check_new_folder, check_new_r
 from padforge.sense.rig.config import RigConfig, load_or_make_plan, locate_on_bed, open_recorder, plan_notice
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
-from padforge.sense.rig.press_loop import Interrupts, OnProgress, PressLoop, check_plan
+from padforge.sense.rig.press_loop import Interrupts, PressLoop, check_plan
 from padforge.sense.rig.safety import Limits, check_start_state, check_tcp
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+
+_log = logging.getLogger(__name__)
 
 ADAPT_EVERY = 20  # presses between two evaluations of the localizer by an adaptive plan
 _N_CANDIDATES = 500
@@ -135,14 +139,12 @@ def record(
     model: Path | None = None,
     dry: bool = False,
     resume: bool = False,
-    on_progress: OnProgress = lambda done, total: None,
-    on_message: Callable[[str], None] = lambda line: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> Recording | None:
     """Record with a rig, of `opened_rig` or `opened_virtual_rig`; what is done is on the disk whatever happens.
 
     An adaptive plan needs the folder of a localizer, `model`. If `dry`, the pad is not touched, nothing is kept, and
-    None is returned. `on_message` receives what a person should know before the arm moves. Raises RigFault if the rig
-    failed, or the plan is not safe.
+    None is returned. Raises RigFault if the rig failed, or the plan is not safe.
     """
     with opened as (arm, board, rig):
         with Interrupts() as interrupts:
@@ -150,7 +152,7 @@ def record(
             planner = _make_planner(config, rig, model)
             check_plan(plan, rig)
             if resume and (notice := plan_notice(config)):
-                on_message(notice)
+                _log.warning(notice)
             if not (resume or dry):
                 check_new_recording(config.out)
             identities = {"board": board.connect(), "arm": arm.connect()}
@@ -159,11 +161,11 @@ def record(
             check_start_state(arm.state(), Limits.from_settings(rig))
             interrupts.check()
         if rig.max_force_n is None:
-            on_message('[rig] max_force_n is "unwatched": no force stops the arm')
+            _log.warning('[rig] max_force_n is "unwatched": no force stops the arm')
         folder = temporary_folder(Path(tempfile.gettempdir()), "padforge-dry-") if dry else nullcontext(config.out)
         with folder as out:
             with open_recorder(config, rig, plan.to_rows(), out, resume, identities) as recorder:
-                on_progress(len(recorder.done), len(plan))
+                on_progress(len(recorder.done), len(plan), "")
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)
 

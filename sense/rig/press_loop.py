@@ -18,6 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder
@@ -34,9 +35,6 @@ from padforge.sense.rig.safety import (
 )
 from padforge.sense.rig.streams import Averager
 from padforge.sense.settings import RigSettings
-
-OnProgress = Callable[[int, int], None]
-"""Called after every press, once it is on the disk, with the number of presses done and of all."""
 
 _READING_DEADLINE_S = 3.0
 _DISK_DEADLINE_S = 30.0
@@ -143,13 +141,14 @@ class PressLoop:
     def run(
         self,
         plan: PressPlan,
-        on_progress: OnProgress = lambda done, total: None,
+        on_progress: OnProgress = ignore_progress,
         planner: Callable[[PressPlan, int], PressPlan] = lambda plan, press: plan,
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
-        The planner may move the presses from the next one on. Raises RigFault if the plan is not safe, or the rig
-        failed; the arm stands still then, and what is done is on the disk.
+        The planner may move the presses from the next one on. Progress is reported after every press, once it is on the
+        disk. Raises RigFault if the plan is not safe, or the rig failed; the arm stands still then, and what is done is
+        on the disk.
         """
         check_plan(plan, self._rig)
         check_start_state(self._arm.state(), self._limits)
@@ -163,7 +162,7 @@ class PressLoop:
                         plan = changed
                     self._press(press, plan.positions_mm[press], float(plan.depths_mm[press]))
                     self._await_disk()
-                    on_progress(len(self._recorder.done), len(plan))
+                    on_progress(len(self._recorder.done), len(plan), "")
             self._record_until(self._clock() + self._half_s)  # the release after the last press
             self._disk.submit(self._recorder.sync)
             self._await_disk()

@@ -17,6 +17,7 @@ from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import Checkpoints, State
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -78,7 +79,7 @@ def fibre_loss_study(
     max_failures: int = 3,
     failed: Sequence[int] = (),
     checkpoints: Path | None = None,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> FibreLoss:
     """Evaluate every set of failed fibres, by one localizer, by networks retrained for each set, or by both.
 
@@ -92,7 +93,7 @@ def fibre_loss_study(
         failed: indices of fibres without which errors are mapped too, however many; none if empty.
         checkpoints: folder for finished networks, from which an interrupted run resumes; `Checkpoints.clear` removes
             them once the result is written.
-        on_progress: called with (networks done, total).
+        on_progress: called with (networks done, total, "").
 
     Raises:
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
@@ -152,7 +153,7 @@ def _retrain(
     options: settings.LocalizerSettings,
     subsets: Sequence[Failed],
     folder: Path | None,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> dict[Failed, Localization]:
     """Predict the test presses by a network of each set of failed fibres; finished ones are not trained again."""
     about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
@@ -162,9 +163,7 @@ def _retrain(
         for failed in subsets
     }
     checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
-    states: Mapping[int, Mapping[str, Any]] = compute_states(
-        tasks, checkpoints, lambda done, total, _: on_progress(done, total)
-    )
+    states: Mapping[int, Mapping[str, Any]] = compute_states(tasks, checkpoints, on_progress)
     return {failed: Localization(**states[_bit_mask(failed)]) for failed in subsets}
 
 

@@ -5,7 +5,7 @@ floor, e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learni
 2017) and is extrapolated to twice as many presses.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from scipy.optimize import nnls
 from padforge.design.common.files import provenance
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_type
 from padforge.sense import settings
@@ -64,7 +65,7 @@ def learning_curve(
     recording: Recording,
     options: settings.LocalizerSettings | None = None,
     *,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> LearningCurve:
     """Train localizers on more and more presses, and extrapolate their error.
 
@@ -72,7 +73,7 @@ def learning_curve(
         recording: with presses of known position.
         options: how to train; a single member is, so errors are somewhat above those of a calibration. The defaults if
             None.
-        on_progress: called with (steps done, total).
+        on_progress: called with (steps done, total, "").
 
     Raises:
         InputError: too few presses for a curve.
@@ -118,7 +119,7 @@ def _predict(
     trainings: Sequence[Indices],
     test: Indices,
     options: settings.LocalizerSettings,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> list[Array]:
     """Return the test positions (Q, 2) that a localizer predicts after each training."""
     from padforge.sense.localizer.training import JointProgress, training_steps
@@ -129,12 +130,9 @@ def _predict(
     joint = JointProgress(steps, on_progress)
 
     def train(number: int) -> Array:
-        def report(step: int, total: int) -> None:
-            joint.update(number, round(step / total * steps[number]))
-
         training = trainings[number]
         rng = np.random.default_rng([options.seed, len(training)])
-        localizer = fit_recording(recording, training, options, rng, report)
+        localizer = fit_recording(recording, training, options, rng, partial(joint.update, number))
         return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
 
     longest_first = reversed(range(len(steps)))

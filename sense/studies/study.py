@@ -18,6 +18,7 @@ from padforge.design.common import files, plotting
 from padforge.design.common.command_line import text_table
 from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
 from padforge.design.common.plotting import FAINT, INK, save_figure, style_axes
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
@@ -81,7 +82,7 @@ def run(
     jobs: int | None = None,
     executor: Executor | None = None,
     resume: bool = False,
-    on_progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> dict[str, Any]:
     """Run a study, and write NAME.json, NAME.csv, NAME.png and NAME.md; results of tasks are kept until all are done.
 
@@ -154,7 +155,7 @@ def _locked(out: Path, name: str) -> Iterator[None]:
 def compute_states(
     tasks: Mapping[int, Task],
     checkpoints: Checkpoints | None,
-    on_progress: Callable[[int, int, str], None],
+    on_progress: OnProgress,
     *,
     resume: bool = True,
     jobs: int | None = None,

@@ -6,7 +6,6 @@
 4. It is fitted to all presses, with an angular term if held-out presses ask for one.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -15,6 +14,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from threadpoolctl import threadpool_limits
 
 from padforge.design import Morphology
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import sensed_rectangle
@@ -50,8 +50,6 @@ N_REFINED = 24  # transforms of the grid that are refined
 FIRST_STEPS = np.array([0.06, 0.25, 0.25, 0.03, 0.15])
 """First steps of the refinement: turn (rad), shift (grid units), scale, and logarithm of the profile's width."""
 STEP_COST = 0.002  # cost of a change by one such step in all, in shares of the variance explained
-
-OnProgress = Callable[[str, int, int], None]  # called with (what is being done, steps done, total)
 
 
 @dataclass(frozen=True)
@@ -116,12 +114,12 @@ def find_wirings(
     plan: PadPlan,
     responses: Responses,
     rng: np.random.Generator,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = ignore_progress,
 ) -> list[Wiring]:
     """Search for wirings of the channels of `responses`, best first, each with its best transform.
 
     Transforms on a grid are tried, and the best refined by Nelder-Mead; there is no first guess.
-    `rng` draws presses where there are many, and `on_progress` is called with (refined, total).
+    `rng` draws presses where there are many, and `on_progress` is called with (refined, total, "wiring").
     """
     scorer, unit_mm = _Scorer(plan, responses, rng), plan.layout.unit_mm
     middle_mm = responses.positions_mm.min(axis=0) / 2 + responses.positions_mm.max(axis=0) / 2
@@ -136,7 +134,7 @@ def find_wirings(
     tried.sort(key=lambda wiring: -wiring.match)
     best: dict[tuple[bool, tuple[int, ...]], Wiring] = {}
     for number, wiring in enumerate(tried[:N_REFINED]):
-        on_progress(number, N_REFINED)
+        on_progress(number, N_REFINED, "wiring")
         refined = _refine(scorer, wiring, unit_mm)
         key = refined.transform.mirrored, refined.fibres
         if key not in best or best[key].match < refined.match:
@@ -243,16 +241,14 @@ def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array]:
     return distance, weight, angular_weight
 
 
-def identify(
-    recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = lambda what, done, total: None
-) -> Twin:
+def identify(recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = ignore_progress) -> Twin:
     """Identify the twin of a printed pad: its wiring, pose, fibres as built and sensitivity profile.
 
     Args:
         recording: presses at known positions over most of the pad; of several depths, the most common one is used.
         pad: as planned.
         seed: of what is drawn.
-        on_progress: called with (what is being done, steps done, total).
+        on_progress: called with (steps done, total, what is being done).
 
     Returns:
         The twin, without provenance.
@@ -266,7 +262,7 @@ def identify(
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def identify_pad(
-    recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = lambda what, done, total: None
+    recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = ignore_progress
 ) -> Identification:
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
     rng = np.random.default_rng(check_int("seed", seed, 0, 2**64 - 1))
@@ -276,7 +272,7 @@ def identify_pad(
     _check_positions(positions_mm, pad)
 
     # 1. Responses
-    on_progress("responses", 0, 1)
+    on_progress(0, 1, "responses")
     held_out_mask = np.zeros(len(positions_mm), bool)
     held_out_mask[rng.permutation(len(positions_mm))[: max(round(HELD_OUT * len(positions_mm)), 2)]] = True
     responses = compute_responses(recording, ~held_out_mask)
@@ -311,7 +307,7 @@ def identify_pad(
         explained_by_straight = _explained_on_plan([fit for _, fit in straight], training, held_out)
 
     # 4. All presses
-    on_progress("paths", 0, 3)
+    on_progress(0, 3, "paths")
     fit = _fit_all(best.pad, training, on_progress)
     noise_v = np.nan_to_num(noise_v)
     noise_v[live] = fit_gp(fit.pad.residuals(training), pad.unit_mm)[0]
@@ -355,7 +351,7 @@ def _fit_candidates(
     plan: PadPlan, training: Responses, compared: Responses, rng: np.random.Generator, on_progress: OnProgress
 ) -> list[tuple[Wiring, AsBuiltFit]]:
     """Return the best wirings on a plan, best first, each with a fit in which fibres lie as planned."""
-    wirings = find_wirings(plan, training, rng, lambda done, total: on_progress("wiring", done, total))[:N_CANDIDATES]
+    wirings = find_wirings(plan, training, rng, on_progress)[:N_CANDIDATES]
     starts = [AsBuiltPad.from_plan(plan, wiring.fibres, wiring.transform, wiring.width) for wiring in wirings]
     fits = [fit_as_built(start.fit_gains(compared), compared, Priors()) for start in starts]
     return list(zip(wirings, fits, strict=True))
@@ -386,11 +382,11 @@ def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> A
     rows = np.arange(len(training))
     part, validation = training.select(rows[rows % 6 != 0]), training.select(rows[rows % 6 == 0])
     rough = fit_as_built(pad, part, FIRST_PRIORS, _noise_inflation(pad, part))
-    on_progress("paths", 1, 3)
+    on_progress(1, 3, "paths")
     plain = fit_as_built(rough.pad.align_transform(), part, FIRST_PRIORS, _noise_inflation(rough.pad, part))
     noise_inflation = _noise_inflation(plain.pad, part)
     angular = fit_as_built(plain.pad, part, replace(FIRST_PRIORS, angular=True), noise_inflation)
-    on_progress("paths", 2, 3)
+    on_progress(2, 3, "paths")
     explained, explained_plain = (
         validation.explained_variance(fit.pad.predict(validation.positions_mm)) for fit in (angular, plain)
     )

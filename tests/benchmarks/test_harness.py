@@ -16,6 +16,7 @@ from padforge.benchmarks.harness import (
     read_earlier,
     run_benches,
 )
+from padforge.design.common.progress import ignore_progress
 from padforge.design.common.validation import InputError
 
 
@@ -48,14 +49,14 @@ def test_measure_round_repeats_requested_trials_and_evaluates_once(monkeypatch):
     monkeypatch.setattr(harness.time, "perf_counter", lambda: next(now))
     monkeypatch.setattr(harness, "_waited_s", lambda: 0.0)
     for repeat, n_measured in ((False, 1), (False, 0), (True, 1)):
-        assert measure_round(one, rounds, lambda step: None, lambda key, repeat=repeat: repeat) == n_measured
+        assert measure_round(one, rounds, ignore_progress, lambda key, repeat=repeat: repeat) == n_measured
     assert evaluated == [42]
     assert rounds.seconds[trial.key] == pytest.approx([0.005] * 2)
 
 
 def test_run_benches_writes_measurements(tmp_path):
     steps = []
-    summary, changes = run_benches([bench()], tmp_path, steps.append, {})
+    summary, changes = run_benches([bench()], tmp_path, lambda *step: steps.append(step[2]), {})
     assert steps
     assert not changes
     assert {path.name for path in tmp_path.iterdir()} == {"x.png", "bench.json"}
@@ -75,7 +76,7 @@ def test_run_benches_writes_measurements(tmp_path):
 def test_run_benches_refuses_an_unwritable_folder_before_measuring(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file/out: cannot be written"):
-        run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", lambda step: None, {})
+        run_benches([bench(work=lambda: pytest.fail("measured"))], tmp_path / "file" / "out", ignore_progress, {})
 
 
 @pytest.mark.parametrize(

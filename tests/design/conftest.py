@@ -3,6 +3,7 @@
 import pytest
 
 from padforge.benchmarks import harness
+from padforge.design.common.progress import ignore_progress
 
 
 @pytest.fixture
@@ -12,7 +13,7 @@ def taken(monkeypatch):
 
     def found(bench):
         rounds = harness.BenchRounds()
-        harness.measure_round(bench, rounds, lambda step: None, lambda key: False)
+        harness.measure_round(bench, rounds, ignore_progress, lambda key: False)
         return rounds.results
 
     return found

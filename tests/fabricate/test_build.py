@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 import math
 from dataclasses import replace
 from functools import partial
@@ -278,28 +279,30 @@ def test_build_keeps_the_old_mould_if_a_folder_is_in_the_way(tmp_path):
     assert (tmp_path / "mould.stl").read_bytes() == before
 
 
-def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path):
+def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
+    caplog.set_level(logging.INFO, "padforge")
     build(PAD, tmp_path, ["3mf", "stl", "svg", "dxf"])
     (tmp_path / "tracks.dxf").write_text("drawn upon")
     for name in ("mine.stl", "mould.step"):
         (tmp_path / name).write_text("somebody's own")
-    told: list[str] = []
-    result = build(Morphology.straight(2), tmp_path, ["stl"], warn=told.append)
+    result = build(Morphology.straight(2), tmp_path, ["stl"])
     left = {"mine.stl", "mould.step", "tracks.dxf"}
     assert {path.name for path in tmp_path.iterdir()} == {*result.sha256, "fabrication.json"} | left
     assert result.sha256.keys() == {"mould.stl", "laying.md", "orientation.svg"}
     gone = "is gone: it was of the mould before this one"
-    assert told == [
+    assert caplog.messages == [
         *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
         f"{tmp_path / 'tracks.dxf'} is left from the mould before this one: it is not as it was written",
     ]
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"format": "padforge-fabrication/2", "sha256": ["mould.step"]}'])
-def test_build_deletes_nothing_without_digests(tmp_path, text):
+def test_build_deletes_nothing_without_digests(tmp_path, caplog, text):
+    caplog.set_level(logging.INFO, "padforge")
     (tmp_path / "fabrication.json").write_text(text)
     (tmp_path / "mould.step").write_text("somebody's own")
-    build(PAD, tmp_path, [], warn=pytest.fail)
+    build(PAD, tmp_path, [])
+    assert not caplog.messages
     assert (tmp_path / "mould.step").exists()
 
 

@@ -14,10 +14,9 @@ import pytest
 import trimesh
 from safetensors.numpy import load_file
 
-import padforge.design.design_run
-import padforge.sense.report.calibration
 from padforge.design.common.files import sha256
 from padforge.design.common.parallel import Checkpoints
+from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
 
@@ -95,7 +94,7 @@ def test_resume_reuses_finished_run(folder: Path) -> None:
 
 def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing of an earlier run counts as finished once it has begun."""
-    monkeypatch.setattr(padforge.design.design_run, "run_design", breaks)
+    monkeypatch.setattr("padforge.design.design_run.run_design", breaks)
     assert called("run", cwd=folder).code == 130
     assert not (folder / "out" / "pad" / "run.json").exists()
 
@@ -135,7 +134,7 @@ def test_resume_repeats_interrupted_calibration_only(
     """And two runs give the same files."""
     (tmp_path / "pad.toml").write_text(SMALL)
     with monkeypatch.context() as patch:
-        patch.setattr(padforge.sense.report.calibration, "calibrate_into", breaks)
+        patch.setattr("padforge.sense.report.calibration.calibrate_into", breaks)
         assert called("run", cwd=tmp_path).code == 130
     assert resumed(tmp_path) == "design, mould, recording, contacts"
     assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
@@ -221,13 +220,13 @@ def test_time_budget_covers_all_stages(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "pad.toml").write_text(
         SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
     )
-    run, given = padforge.sense.report.calibration.calibrate_into, []
+    run, given = calibrate_into, []
 
     def noted(*arguments, **more):
         given.append(more["time_budget"])
         return run(*arguments, **more)
 
-    monkeypatch.setattr(padforge.sense.report.calibration, "calibrate_into", noted)
+    monkeypatch.setattr("padforge.sense.report.calibration.calibrate_into", noted)
     begin = time.monotonic()
     words = ("run", "--time-budget", "16", "--formats", "stl,svg")
     ended = called(*words, cwd=tmp_path)

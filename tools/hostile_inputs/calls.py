@@ -20,7 +20,7 @@ from padforge.sense.health.health_model import DETECTED
 from .texts import Rng, pick
 from .values import ODD, spoiled
 
-CALLBACKS = {"progress", "on_progress", "on_message", "executor", "checkpoints"}
+CALLBACKS = {"progress", "on_progress", "executor", "checkpoints"}
 """Parameters that are left alone: what is called back may raise what it likes."""
 
 

@@ -49,7 +49,7 @@ def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_buil
     quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
     pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []
-    run = SearchOptions(on_progress=lambda name, done, total, objective: steps.append(name))
+    run = SearchOptions(on_progress=lambda done, total, what: steps.append(what))
     found = search_for_twin(pad, contact, quick, RulesSettings(**rules), quick, run=run)
     assert found.candidate == expected
     assert bool(found.violations) == (expected == "twin")

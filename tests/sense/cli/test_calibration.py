@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-import padforge.sense.cli.localizer
 from padforge.sense.localizer import training
 
 
@@ -43,13 +42,13 @@ def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
 def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextmanager
     def progress_bar(name: str) -> Iterator[object]:
-        def interrupt(done: int, total: int) -> None:
+        def interrupt(done: int, total: int, what: str) -> None:
             assert name == "training"
             raise KeyboardInterrupt
 
         yield interrupt
 
-    monkeypatch.setattr(padforge.sense.cli.localizer, "progress_bar", progress_bar)
+    monkeypatch.setattr("padforge.design.common.command_line.progress_bar", progress_bar)
     code, _, err = few("calibrate", "rec", "--out", "new")
     assert code == 130
     assert "interrupted" in err

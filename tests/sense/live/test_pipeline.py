@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import padforge.sense.live.pipeline
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate
 from padforge.sense.health.fault_detector import FibreFault
@@ -26,8 +25,8 @@ from tests.sense.live.conftest import first_presses
 def no_delays() -> Iterator[None]:
     """Scripted presses begin as they are commanded."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(padforge.sense.live.pipeline, "TOUCH_DELAY_S", 0.0)
-        monkeypatch.setattr(padforge.sense.live.pipeline, "RELEASE_DELAY_S", 0.0)
+        monkeypatch.setattr("padforge.sense.live.pipeline.TOUCH_DELAY_S", 0.0)
+        monkeypatch.setattr("padforge.sense.live.pipeline.RELEASE_DELAY_S", 0.0)
         yield
 
 
@@ -80,7 +79,7 @@ def replay(
     recording: Recording, models: Sequence[LocalizerModel], delays: tuple[int, int] = (2, 1), cuts: Sequence[int] = ()
 ) -> tuple[Live, list[Any]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(padforge.sense.live.pipeline, "PressDetector", ScriptedDetector(recording, delays))
+        monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(recording, delays))
         live = Live(models, None, recording.fibres, recording.rate_hz)
     events = []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
@@ -154,8 +153,8 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, trained, mo
     down_command, up_command = part.down_command.copy(), part.up_command.copy()
     down_command[8], up_command[8] = up_command[7] + 4, up_command[7] + 20  # soon after the one before
     part = replace(part, down_command=down_command, up_command=up_command)
-    monkeypatch.setattr(padforge.sense.live.pipeline, "FaultMonitor", lambda model: monitor)
-    monkeypatch.setattr(padforge.sense.live.pipeline, "PressDetector", ScriptedDetector(part))
+    monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
+    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live = Live([localizer], localizer, part.fibres, part.rate_hz)  # a stand-in for health, of the same pad
     events = live.feed(part.times_s, part.readings)
     fault = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
@@ -187,7 +186,7 @@ def test_live_without_readings_says_anywhere(recording, trained) -> None:
 
 def test_view_follows_the_pad(recording, trained, monkeypatch) -> None:
     part = first_presses(recording, 3)
-    monkeypatch.setattr(padforge.sense.live.pipeline, "PressDetector", ScriptedDetector(part))
+    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live = Live([trained("press_and_release")], None, part.fibres, part.rate_hz)
     missing = [{"swing": None, "state": "missing"}] * 4
     assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "faults": []}

@@ -249,7 +249,7 @@ def test_calibrate_scales_corrects_overconfidence(recording: Recording, localize
 
 @pytest.mark.slow
 def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
-    seen: list[tuple[int, int]] = []
+    seen: list[tuple[int, int, str]] = []
     begin = time.monotonic()
     options = SHORT.model_copy(update={"epochs": 10**5})
     localizer, evaluation = calibrate(recording, options, time_budget=2, on_progress=lambda *step: seen.append(step))
@@ -257,7 +257,7 @@ def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
     assert localizer.bayes is not None
     networks = len(localizer.weights["first.w"]) + len(localizer.residual_network["first.w"])
     assert networks % (os.cpu_count() or 1) == 0
-    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert [done for done, *_ in seen] == sorted(done for done, *_ in seen)
     assert seen[-1][0] == seen[-1][1] <= 2 * networks
     assert evaluation.errors[0]["mean_mm"] < 9
 

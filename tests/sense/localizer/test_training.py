@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from padforge.benchmarks import harness
 from padforge.benchmarks import localizer as bench
+from padforge.design.common.progress import ignore_progress
 from padforge.sense.localizer import network, torch_network, training
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import TrainingPresses
@@ -48,7 +49,7 @@ def test_combine_members_weighs_by_variance_and_adds_disagreement() -> None:
 def test_fit_network_returns_the_average_of_the_last_weights() -> None:
     """Of a quadratic with noisy gradients, the average is nearer to the minimum than single weights are."""
     torch.manual_seed(0)
-    reports: list[float] = []
+    reports: list[int] = []
 
     def fit(averaged: bool) -> float:
         w = torch.zeros(200, requires_grad=True)
@@ -59,13 +60,13 @@ def test_fit_network_returns_the_average_of_the_last_weights() -> None:
             0.05,
             weight_decay=0.0,
             averaged=averaged,
-            on_progress=reports.append,
+            on_progress=lambda done, total, what: reports.append(done),
         )
         return float(np.square(weights["w"] - 1).mean())
 
     assert fit(averaged=True) < 0.05
     assert reports == sorted(reports)
-    assert (len(reports), reports[-1]) == (training.REPORTS, 1.0)
+    assert (len(reports), reports[-1]) == (training.REPORTS, training.REPORTS)
     assert fit(averaged=False) < 0.05
     assert [training.one_cycle(share) for share in (0.0, 0.1, 0.2, 0.6, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
@@ -96,7 +97,7 @@ def test_train_members_reflects_augmented_positions_at_the_edge(monkeypatch: pyt
     monkeypatch.setattr(training, "AUGMENTATION", 0.1)
     options = Options(members=1, hidden=8, layers=1, max_failures=0, batch=256, epochs=1)
     table = np.zeros((3, 3, 1, 1), np.float32)
-    training.train_members(presses, table, options, np.random.default_rng(0), lambda done, total: None)
+    training.train_members(presses, table, options, np.random.default_rng(0), ignore_progress)
     inwards = np.abs(corners[0]) - torch.cat(augmented[1:]).abs().cpu().numpy()
     assert inwards.min() >= -1e-6
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
@@ -110,7 +111,7 @@ def test_train_members_takes_longer_without_the_release(features: Features, long
     presses = TrainingPresses(np.zeros((40, 2, 3), np.float32), np.ones((40, 2), bool), positions)
     options = Options(features=features, hidden=8, layers=1, epochs=3, batch=16)
     totals: set[int] = set()
-    training.train_members(presses, table, options, rng, lambda done, total: totals.add(total))
+    training.train_members(presses, table, options, rng, lambda done, total, what: totals.add(total))
     assert totals == {longer * options.members * 3 * training.MIN_BATCHES}
 
 
@@ -139,7 +140,7 @@ def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     bench.recorded.cache_clear()
     measured = harness.BenchRounds()
-    harness.measure_round(bench.BENCH, measured, lambda step: None, lambda key: False)
+    harness.measure_round(bench.BENCH, measured, ignore_progress, lambda key: False)
     bench.recorded.cache_clear()
     errors = {key[:3]: row["error"] for key, row in measured.results.items() if row}
     assert len(errors) == 2 + 4 + 4 + 2 - 2  # LM learns from published inputs alone; two only find one press

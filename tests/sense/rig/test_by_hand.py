@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-import padforge.sense.rig.streams
 from padforge.design import Contact, Morphology
 from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
@@ -192,7 +191,7 @@ class Hands:
             watch(view)
 
         with pytest.MonkeyPatch.context() as patch:  # nobody else sleeps meanwhile
-            patch.setattr(padforge.sense.rig.streams.time, "sleep", self.clock.sleep)
+            patch.setattr("padforge.sense.rig.streams.time.sleep", self.clock.sleep)
             board = FingerBoard(self.finger, self.clock)
             return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.commands()], resume)
 

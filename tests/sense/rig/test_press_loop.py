@@ -246,7 +246,7 @@ def test_run_begins_no_press_before_the_last_one_is_on_the_disk(tmp_path):
 
         recorder.sync = slow
         loop(arm, board, recorder, options).run(
-            FOUR, lambda done, total: progress.append((done, n_done(tmp_path / "run"), len(arm.moves)))
+            FOUR, lambda done, total, what: progress.append((done, n_done(tmp_path / "run"), len(arm.moves)))
         )
     assert progress == [(done, done, 3 * done) for done in range(1, 5)]
 

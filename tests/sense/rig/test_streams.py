@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import padforge.sense.rig.streams
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START
@@ -20,8 +19,8 @@ from tests.sense.rig.fakes import Time
 def still(monkeypatch: pytest.MonkeyPatch) -> Time:
     """A clock that goes on only in `sleep`."""
     time = Time(least_s=0)
-    monkeypatch.setattr(padforge.sense.rig.streams.time, "monotonic", time)
-    monkeypatch.setattr(padforge.sense.rig.streams.time, "sleep", time.sleep)
+    monkeypatch.setattr("padforge.sense.rig.streams.time.monotonic", time)
+    monkeypatch.setattr("padforge.sense.rig.streams.time.sleep", time.sleep)
     return time
 
 

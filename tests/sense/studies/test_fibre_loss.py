@@ -73,7 +73,7 @@ def test_retraining_ignores_failed_fibres_and_test_positions(recording: Recordin
     assert moved.errors[0]["mean_mm"] == pytest.approx(centre, abs=30)
 
 
-def interrupt(done: int, total: int) -> None:
+def interrupt(done: int, total: int, what: str) -> None:
     if done == 2:
         raise KeyboardInterrupt
 

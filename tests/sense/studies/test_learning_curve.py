@@ -85,7 +85,7 @@ def test_learning_curve_rejects_too_few_presses(recording: Recording) -> None:
 def test_interrupt_ends_a_learning_curve_at_once(recording: Recording) -> None:
     long, shares = QUICK.model_copy(update={"epochs": 1000}), []
 
-    def interrupt(done: int, total: int) -> None:
+    def interrupt(done: int, total: int, what: str) -> None:
         shares.append(done / total)
         raise KeyboardInterrupt
 

@@ -11,6 +11,7 @@ from padforge.benchmarks import harness
 from padforge.benchmarks import twin as bench
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import InputError, Morphology
+from padforge.design.common.progress import ignore_progress
 from padforge.design.settings import PadSettings
 from padforge.design.twin import Twin
 from padforge.sense import identify
@@ -158,7 +159,7 @@ def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch) ->
     for cached in (bench.printed, bench.recorded):
         cached.cache_clear()
     measured = harness.BenchRounds()
-    harness.measure_round(bench.BENCH, measured, lambda step: None, lambda key: False)
+    harness.measure_round(bench.BENCH, measured, ignore_progress, lambda key: False)
     results = {key[1]: row for key, row in measured.results.items()}
     for cached in (bench.printed, bench.recorded):
         cached.cache_clear()

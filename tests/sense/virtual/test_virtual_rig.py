@@ -16,6 +16,7 @@ import pytest
 
 from padforge.cli import main
 from padforge.design import Morphology
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
@@ -23,7 +24,7 @@ from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig.boards import board_reader
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.rig.press_loop import OnProgress, PressLoop
+from padforge.sense.rig.press_loop import PressLoop
 from padforge.sense.rig.safety import RETREAT_MM
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import LivePad
@@ -64,13 +65,13 @@ class Rig:
     def plan(self, presses: int) -> PressPlan:
         return make_plan(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
 
-    def record(self, run: Path, plan: PressPlan, report: OnProgress = lambda done, of: None) -> float:
+    def record(self, run: Path, plan: PressPlan, report: OnProgress = ignore_progress) -> float:
         """Record into `run`, or resume it; return the time of the start."""
         with Recorder.resume(run) if run.exists() else Recorder(run, len(PAD.knots), {}, {}) as recorder:
             self.board_driver.connect()
             self.arm.connect()
             start_s = time.monotonic()
-            report(0, len(plan))
+            report(0, len(plan), "")
             PressLoop(self.arm, self.board_driver, recorder, self.settings).run(plan, report)
         return start_s
 
@@ -78,7 +79,7 @@ class Rig:
         """Record, disturbed after one more press; return the fault, and how long it took to be raised."""
         moment, at = 0.0, 1 + (len(read_journal(run / "journal.ndjson")) if run.exists() else 0)
 
-        def report(done: int, of: int) -> None:
+        def report(done: int, of: int, what: str) -> None:
             nonlocal moment
             if done == at:
                 moment = time.monotonic()
@@ -164,7 +165,7 @@ def test_readings_show_presses_when_tip_goes_down(rig: Rig, tmp_path: Path, monk
 @pytest.mark.parametrize("rig", ["printer"], indirect=True)
 def test_printer_presses_as_planned_despite_noise(rig: Rig, tmp_path: Path) -> None:
     plan = rig.plan(2)
-    rig.record(tmp_path / "run", plan, lambda done, of: rig.robot.garble(1e-3))
+    rig.record(tmp_path / "run", plan, lambda done, of, what: rig.robot.garble(1e-3))
     rig.robot.garble(0)
     assert_complete(tmp_path / "run", plan, 0.06)
     moves = rig.robot.firmware.moves
@@ -218,7 +219,7 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
-    rig.record(run, plan, lambda done, of: rig.board.garble(1e-3))
+    rig.record(run, plan, lambda done, of, what: rig.board.garble(1e-3))
     assert_complete(run, plan)
     readings = Recording.open(run).readings
     assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong reading would be an outlier

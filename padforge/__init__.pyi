@@ -1,0 +1,16 @@
+from . import design as design
+from . import fabricate as fabricate
+from . import sense as sense
+from .design import InputError as InputError
+from .design import Morphology as Morphology
+from .design import Spec as Spec
+from .design import Twin as Twin
+from .design import check_rules as check_rules
+from .design import score as score
+from .design import search as search
+from .fabricate import build as build
+from .sense import FaultDetector as FaultDetector
+from .sense import Localizer as Localizer
+from .sense import Recording as Recording
+from .sense import identify as identify
+from .sense import simulate as simulate

@@ -1,0 +1,1 @@
+../../padforge/__init__.pyi
