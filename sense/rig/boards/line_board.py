@@ -1,4 +1,4 @@
-"""A board that sends lines of text, so plain that any board can be programmed to: docs/howto-boards.md describes them."""
+"""A board that sends lines of text, so plain that any board can be programmed to; see docs/howto-boards.md."""
 
 import time
 from binascii import crc32
