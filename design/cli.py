@@ -27,7 +27,7 @@ morphology_argument = click.argument("morphology", type=click.Path(path_type=Pat
 twin_option = click.option(
     "--twin",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="twin.json of a printed pad: design for its sensitivity profile, noise and sensed area.",
+    help="twin.json of a printed pad, whose sensitivity profile, noise and sensed area are used.",
 )
 
 
@@ -53,7 +53,11 @@ def search_progress() -> "Iterator[OnProgress]":
 
 @click.group(invoke_without_command=True)
 @common.spec_option
-@click.option("--method", type=click.Choice(["descent", "genetic"]), help="As [search] method.")
+@click.option(
+    "--method",
+    type=click.Choice(["descent", "genetic"]),
+    help="descent (by gradients), or genetic (as published, with the published objective).",
+)
 @click.option("--knots", type=int, help="Inner knots per fibre.")
 @click.option("--starts", type=int, help="Random starts of the gradient search.")
 @click.option("--start-from", metavar="random|straight|FILE", help="Initial fibres (default: random).")

@@ -197,11 +197,11 @@ class Twin:
 
     def ignored_effects(self) -> str | None:
         """Describe effects measured on this pad that are ignored for any other pad; None if there are none."""
-        effects = ["that the angle between fibre and press counts"] if self.angular_weight is not None else []
+        effects = ["the dependence on the angle between fibre and press"] if self.angular_weight is not None else []
         stds = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
         if stds and max(stds) > UNIFORM_SENSITIVITY_STD:
-            effects.append(f"that fibres respond unevenly along themselves (by {np.mean(stds):.0%})")
-        return f"left out of another pad than the one measured: {' and '.join(effects)}" if effects else None
+            effects.append(f"the uneven response along fibres ({np.mean(stds):.0%})")
+        return f"ignored for other pads than the measured one: {' and '.join(effects)}" if effects else None
 
     def as_built_stretch(self, positions_mm: ArrayLike) -> Array:
         """Compute the relative stretch of the as-built fibres: signal over planned length.

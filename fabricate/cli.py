@@ -104,7 +104,7 @@ def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
         f"mould: {size} mm, {document['silicone_volume_ml']:.1f} ml of silicone -> {out / document['files'][0]}"
         if document["files"]
         else f"mould: {size} mm -> {out / 'fabrication.json'}",
-        f"  {passed} checks pass" + ("" if remarks else ", none to look at"),
+        f"  {passed} checks passed" + ("" if remarks else ", no warnings"),
         *(f"  {_line(finding)}" for finding in remarks),
     ]
 

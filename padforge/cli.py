@@ -28,7 +28,7 @@ except ModuleNotFoundError as error:
 
     @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
     def bench() -> None:
-        """Measure run time against error, in a checkout of the repository."""
+        """Compare run time and error with published and plain methods, in a checkout of the repository."""
         raise InputError("bench runs in a checkout of the repository only, whose benchmarks are not installed")
 
 
@@ -133,9 +133,8 @@ def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **o
     padforge run --resume
 
     The search uses at most half of a time budget, the calibration what remains after all other stages. --resume reuses
-    the stages whose settings and input files are unchanged, and continues an interrupted search. A localizer that was
-    not trained on simulated presses, and a pad from which files were made that a run does not make, are replaced with
-    --force only.
+    the stages whose settings and input files are unchanged, and continues an interrupted search. Without --force, a run
+    does not replace a localizer that was trained on real presses, or a pad of which you have made other files.
 
     Exit code 1 if the pad breaks a design rule or its mould fails a check; all files are written nevertheless.
     """

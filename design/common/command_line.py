@@ -30,14 +30,16 @@ spec_option = click.option(
     help="Settings file (default: pad.toml in the current folder, if there is one).",
 )
 scheduler_option = click.option(
-    "--scheduler", metavar="ADDRESS", help="Work on a Dask cluster, trusted wholly: what it sends runs here."
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler to run on. Trust it: it can execute code on this machine."
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice (default: that of the settings, 0)."
 )
 
-force_option = click.option("--force", is_flag=True, help="Replace files that others in the folder were made from.")
+force_option = click.option(
+    "--force", is_flag=True, help="Replace files even if others in the folder were made from them."
+)
 
 
 def out_option(default: str = "", what: str = "Folder for the results", file: bool = False) -> Callable[..., Any]:
@@ -62,7 +64,7 @@ def pad_folder(source: Path | None = None) -> Path:
 def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add `--profile` to a command: at its end, print to stderr where time went and what was skipped."""
 
-    @click.option("--profile", is_flag=True, help="Say on stderr where time went and what was skipped.")
+    @click.option("--profile", is_flag=True, help="Print to stderr where time went and what was skipped.")
     @functools.wraps(command)
     def with_profile(*arguments: Any, profile: bool, **options: Any) -> Any:
         if not profile:

@@ -102,11 +102,11 @@ def check_solid(mesh: TriangleMesh, genus: int | None = None) -> list[Finding]:
     """Run the SOLID_CHECKS alone, in a fraction of the time of all; `genus` is the required number of through holes."""
     status, volume = mesh.solid.status().name, float(mesh.signed_volumes.sum())
     findings = [
-        check_result("manifold", status == "NoError", int(status == "NoError"), 1, f"manifold3d says {status}"),
+        check_result("manifold", status == "NoError", int(status == "NoError"), 1, f"status of manifold3d: {status}"),
         _check_edges(mesh),
         _check_self_intersection(mesh),
         _check_bodies(mesh),
-        check_result("volume", volume > 0, volume, 0, f"the solid holds {volume:.1f} mm³"),
+        check_result("volume", volume > 0, volume, 0, f"the volume is {volume:.1f} mm³"),
     ]
     return findings if genus is None else [*findings, _check_genus(mesh, genus)]
 
@@ -122,7 +122,7 @@ def _check_edges(mesh: TriangleMesh) -> Finding:
     count = np.bincount(edge, minlength=len(first))
     forward = np.bincount(edge, half_edges[:, 0] < half_edges[:, 1], len(first))
     loose, flipped = count != 2, (count == 2) & (forward != 1)
-    message = "every edge has two faces that turn one way"
+    message = "every edge has two consistently oriented faces"
     if loose.any():
         message = f"{loose.sum()} edges without exactly two faces"
     elif flipped.any():
@@ -139,7 +139,7 @@ def _check_self_intersection(mesh: TriangleMesh) -> Finding:
     positions = _deduplicate(shapely.get_coordinates(shapely.centroid(shared)))
     count = len(pairs)
     number = f"{count} pairs of triangles" + (" and more" if count == _MAX_PAIRS else "")
-    message = f"{number} cut through each other" if count else "no triangles cut through each other"
+    message = f"{number} intersect each other" if count else "no triangles intersect each other"
     return check_result("self_intersection", count == 0, count, 0, message, positions)
 
 
@@ -189,7 +189,7 @@ def _check_bed(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
     size, bed = np.ptp(mesh.bounds, axis=0).tolist(), printer.bed_mm
     fits = all(a <= b for a, b in zip([*sorted(size[:2]), size[2]], [*sorted(bed[:2]), bed[2]], strict=True))
     body, room = (" x ".join(f"{math.ceil(x * 100 - 1e-3) / 100:g}" for x in sizes) for sizes in (size, bed))
-    return check_result("bed", fits, size, bed, f"{body} mm to print on a bed of {room} mm")
+    return check_result("bed", fits, size, bed, f"{body} mm, the bed is {room} mm")
 
 
 MIN_FLOOR_MM = 0.4  # thinner floors bend when the casting is pulled out
@@ -304,7 +304,7 @@ def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
     high = mesh.corners[:, :, 2].max(axis=1) > mesh.bounds[0, 2] + printer.layer_mm
     leaning = _leaning(mesh, MAX_OVERHANG_DEG + _SPARE_DEG) & high
     lean = _max_lean_deg(mesh, high)
-    message = f"faces lean over by up to {lean:.0f}°, and print without support up to {MAX_OVERHANG_DEG:g}°"
+    message = f"overhangs of up to {lean:.0f}°, {MAX_OVERHANG_DEG:g}° print without support"
     positions = _deduplicate(mesh.patch_positions(leaning))
     return check_result("overhang", not leaning.any(), lean, MAX_OVERHANG_DEG, message, positions)
 
@@ -313,7 +313,9 @@ def _check_undercut(mesh: TriangleMesh, lowest: Slab) -> Finding:
     """Check that no face leans over the casting, which could then not be pulled out upwards."""
     holding = _before_void(mesh, _leaning(mesh, _UPRIGHT_DEG), lowest)
     lean = _max_lean_deg(mesh, holding)
-    message = f"faces lean over the casting by up to {lean:.1f}°" if holding.any() else "the casting comes out"
+    message = (
+        f"faces lean over the casting by up to {lean:.1f}°" if holding.any() else "none, the casting can be demoulded"
+    )
     positions = _deduplicate(mesh.patch_positions(holding))
     return check_result("undercut", not holding.any(), lean, 0.0, message, positions)
 
@@ -361,7 +363,7 @@ def _check_leaks(slabs: Sequence[Slab]) -> Finding:
     leaks = [leak.representative_point() for leak in leaks if leak.area > SPECK_MM2]
     positions = dict.fromkeys((round(leak.x, 3), round(leak.y, 3)) for leak in leaks)  # one for several slabs
     count = len(leaks)
-    message = f"silicone runs out at {count} places" if count else "no opening lets silicone out"
+    message = f"silicone leaks at {count} positions" if count else "no leaks"
     return check_result("tight", not count, count, 0, message, positions)
 
 

@@ -434,7 +434,7 @@ def _depths(first_mm: float, second_mm: float) -> str:
 
 def _check_lines(findings: Sequence[Document]) -> Iterator[str]:
     remarks = sorted((f for f in findings if f["status"] != "pass"), key=lambda finding: finding["status"])
-    passed = f"{len(findings) - len(remarks)} of {len(findings)} checks pass."
+    passed = f"{len(findings) - len(remarks)} of {len(findings)} checks passed."
     yield from (passed + " Look at the others:", "") if remarks else (passed,)
     for finding in remarks:
         count = len(finding["positions_mm"])

@@ -28,8 +28,8 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
 
 @click.command()
 @rig_option
-@click.option("--replay", metavar="RECORDING", type=click.Path(path_type=Path), help="Show a recording, not a rig.")
-@click.option("--speed", type=click.FloatRange(min=0.01), default=1.0, show_default=True, help="Of the replay.")
+@click.option("--replay", metavar="RECORDING", type=click.Path(path_type=Path), help="Replay a recording.")
+@click.option("--speed", type=click.FloatRange(min=0.01), default=1.0, show_default=True, help="Speed of --replay.")
 @click.option(
     "--model",
     "models",
@@ -37,14 +37,21 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
     multiple=True,
     default=("out/pad",),
     show_default=True,
-    help="Folder that calibrate wrote; may be given again for one that answers earlier, or better.",
+    help="Folder that calibrate wrote; repeat the option for a second model that answers earlier, or better.",
 )
-@click.option("--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Of the page; 0: any.")
+@click.option(
+    "--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Port of the page; 0: any."
+)
 @click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any.")
 @click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address.")
 @click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name.")
-@click.option("--host", default=HOST, show_default=True, help="Of page and --tcp; for others with a --token.")
-@click.option("--token", default="", envvar="PADFORGE_TOKEN", help="What must be known to listen.")
+@click.option(
+    "--host",
+    default=HOST,
+    show_default=True,
+    help="Address of page and --tcp; others than this machine's need --token.",
+)
+@click.option("--token", default="", envvar="PADFORGE_TOKEN", help="Secret that clients have to send.")
 @spec_option
 @json_option
 def live(
@@ -57,24 +64,24 @@ def live(
     as_json: bool,
     **output: Any,
 ) -> None:
-    """Show where a pad is pressed, as it is pressed: here, and on a page for the browsers of this machine.
+    """Show touches as they happen, in the terminal and on a page for the browsers of this machine.
 
     \b
     padforge sense live --model out/pad
 
     \b
     --rig simulated      the simulated pad that the model was trained on, pressed at random
-    --rig ur5            the board, as [rig] says; the arm is not used
-    --replay RECORDING   what was recorded
+    --rig ur5            the board of [rig]; no arm is used or moved
+    --replay RECORDING   a recording
 
     \b
     padforge sense live --tcp 9000                                for programs here: docs/live-protocol.md
     padforge sense live --osc 127.0.0.1:9001 --lsl pad            for music, for labs
     padforge sense live --tcp 9000 --host 0.0.0.0 --token WORD    for other machines
 
-    Anyone who knows the token sees page and lines from anywhere in the network, and nothing is encrypted.
+    Anyone in the network who knows the token can watch, and nothing is encrypted.
 
-    A faulty fibre is masked from then on, if health was learnt into the folder of the first model. Ctrl-C ends it.
+    A faulty fibre is masked from then on, if the folder of the first model has a health model. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
     from padforge.sense.formats.import_export import open_recording

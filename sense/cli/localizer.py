@@ -28,9 +28,18 @@ from padforge.sense.cli.options import (
 
 @click.command()
 @recording_argument
-@click.option("--method", type=click.Choice(METHODS), help="ensemble: one localizer for all failures; or as published.")
-@click.option("--features", type=click.Choice(FEATURES), help="Windows of press and release, to its end, of its onset.")
-@click.option("--test-split", "split", type=click.Choice(SPLITS), help="Presses held out for the test.")
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
+)
+@click.option(
+    "--features",
+    type=click.Choice(FEATURES),
+    help="Part of a press that is used: press_and_release (most accurate), causal (to the end of the press), onset "
+    "(earliest), or as published.",
+)
+@click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
@@ -69,7 +78,7 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
 @common.json_option
 @common.profile_option
 def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
-    """Errors on RECORDING for every set of failed fibres.
+    """Evaluate a model on RECORDING for every set of failed fibres.
 
     \b
     padforge sense evaluate --model out/pad out/later/recording --max-failures 1
@@ -88,11 +97,11 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 @click.command()
 @model_option
 @recording_argument
-@fibres_option("--exclude-fibres", "Fibres to leave out, by number, the first is 1.")
+@fibres_option("--exclude-fibres", "Fibres to mask, numbered from 1.")
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option
 def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
-    """Localize every press of RECORDING, with its uncertainty; no true position is needed.
+    """Predict the position of every press of RECORDING and its uncertainty; true positions are not needed.
 
     \b
     padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
@@ -107,7 +116,7 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
     file = out or common.pad_folder(recording) / "places.csv"
     localization, faults, _ = predict_despite_faults(model, read_recording(recording), exclude_fibres)
     for fault in faults:
-        click.echo(f"{fault.text}; left out from there on", err=True)
+        click.echo(f"{fault.text}; masked from press {fault.since} on", err=True)
     write_localization(localization, file)
     click.echo(f"{len(localization.r50_mm)} positions -> {file}")
 
@@ -167,13 +176,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
     padforge sense deploy --model out/pad localizer.onnx
     padforge sense deploy --model out/pad out/pad/recording localizer.h --flash 256k --ram 64k
 
-    An .onnx takes the readings and times of a press, and returns position and radii. It is compared with the localizer
-    by onnxruntime, on the presses of RECORDING or on simulated ones, and not written if they differ.
+    An .onnx takes all readings so far, the rows at which presses start and end, and a mask of the fibres, and returns
+    positions, standard deviations and radii. It is compared with the localizer in ONNX Runtime, on the presses of
+    RECORDING or on synthetic ones, and not written if they differ.
 
     A .h is one C99 file that takes reading after reading. Its student network, as large as --flash and --ram allow, is
-    trained on RECORDING to localize a press by its end. Its error on presses that the model was not trained on is shown
-    beside those of the model and, where that uses the release, of one trained without it. [localizer] sets how long
-    they are trained.
+    trained on RECORDING to predict positions at the end of a press. Its error on held-out presses is printed beside
+    those of the model and, if it uses the release, of one trained without it. [localizer] sets the training.
     """
     from padforge.design.common.files import check_writable, sha256
     from padforge.sense.localizer.model import LocalizerModel
@@ -216,13 +225,13 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 @common.force_option
 @common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Adapt a model to a pad that has drifted or was re-made, by 20 to 500 presses of known position in RECORDING.
+    """Adapt a model to a pad that has drifted or was cast again, by 20 to 500 presses at known positions in RECORDING.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
 
-    Writes a whole model and recalibration.json. Whether it is better is decided by cross-validation; if it is not,
-    predictions stay as they were. The old model is replaced only if --out names its folder.
+    Writes a model and recalibration.json. Changes are kept only if they reduce the error in cross-validation. The old
+    model is replaced only if --out names its folder.
     """
     from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.formats.import_export import open_recording
@@ -251,9 +260,9 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 @click.command("fibre-loss")
 @recording_argument
 @click.option("--model", type=FOLDER, help="Folder that calibrate wrote: one network for all failures.")
-@click.option("--retrain", is_flag=True, help="As published: another network for every set of failed fibres.")
+@click.option("--retrain", is_flag=True, help="As in the paper: a network for every set of failed fibres.")
 @max_failures_option
-@fibres_option("--failed", "Map errors without these fibres too, from 1: as 2,5.")
+@fibres_option("--failed", "Also map errors without these fibres, numbered from 1, such as 2,5.")
 @common.seed_option
 @common.spec_option
 @common.out_option()
@@ -261,7 +270,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 def fibre_loss(
     recording: Path, model: Path | None, failed: tuple[int, ...], out: Path | None, as_json: bool, **options: Any
 ) -> None:
-    """Errors on RECORDING for every set of failed fibres, by one network, by networks retrained for each, or by both.
+    """Compare one localizer for all failures with networks retrained for every set, and map errors on RECORDING.
 
     \b
     padforge sense fibre-loss out/pad/recording --model out/pad
@@ -311,7 +320,7 @@ def _write_study(path: Path, document: dict[str, Any], draw: Callable[[Path], No
 @common.out_option()
 @common.json_option
 def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Path | None, as_json: bool) -> None:
-    """Errors by number of training presses, and what recording more of them would bring.
+    """Errors by number of training presses, and the error to expect with more of them.
 
     \b
     padforge sense learning-curve out/pad/recording

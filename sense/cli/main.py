@@ -27,11 +27,11 @@ _PATH = click.Path(path_type=Path)
 
 @click.command("import")
 @click.argument("file", type=_PATH)
-@click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="What columns, datasets or topics hold.")
+@click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="Content of columns, datasets or topics.")
 @out_option(what="Folder of the recording; must be new or empty")
 def import_(file: Path, columns: str, out: Path | None) -> None:
-    """Make a recording of FILE, a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a bag of ROS 2: an .mcap, a .db3
-    or a folder with metadata.yaml. Of NAME.csv it makes out/NAME/recording.
+    """Import a recording from FILE: .csv, .tsv, .txt, .h5, .hdf5, .mat, or a ROS 2 bag (.mcap, .db3 or a
+    folder with metadata.yaml). The default folder for NAME.csv is out/NAME/recording.
 
     \b
     padforge sense import readings.csv
@@ -41,13 +41,13 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     padforge sense import lab.mcap --columns 'fibres=/skin/readings,positions=/probe,force=/wrench'
 
     \b
-    Without --columns a CSV has the columns time_s, one of volts per fibre, x_mm, y_mm; the last two
-    hold the position pressed while the probe is down and are empty on all other lines. An .h5 or a bag
-    is one that export wrote, a .mat one of the published study.
+    Without --columns a CSV has the columns time_s, fibre_0_v, fibre_1_v, ..., x_mm, y_mm, and optionally
+    depth_mm, reached_mm, force_n; positions are filled while the probe is down and empty elsewhere. An .h5
+    or a bag is one that export wrote, a .mat one of the published study.
 
     \b
-    With it, columns, datasets, variables or topics are named, with commas between them; * stands for
-    any characters, ? for one. A unit or a factor follows a colon; without it they are s, V, mm, N.
+    --columns lists columns, datasets, variables or topics, separated by commas; * stands for any
+    characters, ? for one. A unit or a factor follows a colon; without it they are s, V, mm, N.
       time, fibres    of each reading, needed
       x, y, positions of each reading, or of each press; positions are both in one dataset
       depth, reached, force
@@ -86,10 +86,10 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
 @recording_argument
 @click.argument("file", type=_PATH)
 @click.option("--format", "kind", type=click.Choice(["lerobot"]), help="Write a folder FILE: a LeRobot dataset v3.0.")
-@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: add the positions it predicts, and health.")
+@click.option("--model", type=FOLDER, help="Folder that calibrate wrote: adds predicted positions and health.")
 def export(recording: Path, file: Path, kind: str | None, model: Path | None) -> None:
-    """Write RECORDING to FILE for other programs: CSV (.csv), HDF5 (.h5) or ROS 2 (.mcap), by the end of
-    its name, or a LeRobot dataset.
+    """Export RECORDING to FILE for other programs: CSV (.csv), HDF5 (.h5) or ROS 2 (.mcap), by its
+    extension, or a LeRobot dataset.
 
     \b
     padforge sense export out/pad/recording recording.h5
@@ -97,18 +97,18 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
     padforge sense export out/pad/recording dataset --format lerobot
 
     \b
-    An .mcap has these topics, in V, m and N, with the stamps of the readings; the frame pad has its
-    origin in the middle of the pad, and z points away from it (into one that lay mirrored):
-      /pad/readings   Float64MultiArray, a value for each fibre
-      /pad/pressed    Bool, as a press begins and ends
-      /pad/place      PoseWithCovarianceStamped, where a press was commanded; z is minus its depth
+    An .mcap has these topics, in V, m and N, with the stamps of the readings; the origin of the frame pad
+    is the centre of the pad, and z points out of its surface (into it if the tracks were up):
+      /pad/readings   Float64MultiArray, a value per fibre
+      /pad/pressed    Bool, at the start and end of a press
+      /pad/place      PoseWithCovarianceStamped, commanded position; z is minus the depth
       /pad/reached, /pad/force
-                      PointStamped, the depth measured, and WrenchStamped, where they are known
-      /pad/recording  String, latched: JSON of what messages round off, for an exact import
+                      PointStamped, measured depth, and WrenchStamped, if they are known
+      /pad/recording  String, latched: JSON of what messages round, for an exact import
       /pad/touches, /pad/health
-                      of --model: PoseWithCovarianceStamped as a press ends, and DiagnosticArray
+                      with --model: PoseWithCovarianceStamped at the end of a press, and DiagnosticArray
       /arm/pose       PoseStamped, of a recording made by an arm
-    It needs rosbags (pip install 'padforge[ros]'), LeRobot needs pyarrow (padforge[lerobot]).
+    An .mcap needs the extra ros (pip install '.[ros]'), a LeRobot dataset the extra lerobot.
     """
     from padforge.sense.formats.import_export import arm_states, export_file
 

@@ -25,7 +25,7 @@ _RIGS = "simulated, ur5, printer, hand, or an installed arm."
 rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
 _warn = partial(click.echo, err=True)
 virtual_hardware_option = click.option(
-    "--virtual-hardware", is_flag=True, help="Emulated devices in real time, behind the drivers of the real ones."
+    "--virtual-hardware", is_flag=True, help="Run the drivers of the rig on emulated devices, in real time."
 )
 
 
@@ -36,12 +36,12 @@ virtual_hardware_option = click.option(
     type=FILE,
     help="morphology.json or published .mat (default: the twin's, or straight fibres; with a real rig, beside --out).",
 )
-@click.option("--twin", type=FILE, help="twin.json of a measured pad, which the simulated pad responds like.")
+@click.option("--twin", type=FILE, help="twin.json of a measured pad; the simulated pad responds like it.")
 @click.option("--presses", type=int, help="Presses to record.")
-@click.option("--plan", help="As [rig] plan: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
-@click.option("--model", type=FOLDER, help="Localizer of an adaptive plan.")
-@click.option("--dry-run", is_flag=True, help="Go through the whole plan above the pad, touching nothing.")
-@click.option("--resume", is_flag=True, help="Go on with an unfinished recording.")
+@click.option("--plan", help="Positions: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
+@click.option("--model", type=FOLDER, help="Localizer of an adaptive plan, which presses where it is least certain.")
+@click.option("--dry-run", is_flag=True, help="Move through the whole plan above the pad without touching it.")
+@click.option("--resume", is_flag=True, help="Continue an unfinished recording.")
 @virtual_hardware_option
 @common.seed_option
 @common.spec_option
@@ -68,14 +68,15 @@ def record(
 
     \b
     --rig simulated                     a simulated pad, at once
-    --virtual-hardware                  any of them in real time, through emulated devices
-    --rig ur5, --rig printer            a UR robot or a 3D printer, and the board, as [rig] says
+    --virtual-hardware                  any rig on emulated devices, in real time
+    --rig ur5, --rig printer            a UR robot or a 3D printer, and the board, as set in [rig]
     --rig hand                          you and the board: a page and the terminal show where to press
 
-    --twin twin.json, that identify wrote, makes the simulated pad the one that was measured: laid, wired, turned and
-    noisy as that was. With --morphology as well it is that pad as planned, with the reach, gain and noise of the twin.
+    --twin twin.json, which identify writes, makes the simulated pad respond like the measured one: paths of the fibres,
+    wiring, pose, gain and noise. With --morphology as well, the fibres are those of that plan, and only the sensitivity
+    profile, gain and noise are the twin's.
 
-    A recording that broke off keeps every finished press; --resume makes the others.
+    An interrupted recording keeps every finished press; --resume records the others.
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from padforge.design.settings import Contact, PadSettings

@@ -46,14 +46,14 @@ FLOATING = 30.0  # noise, as a multiple of the median, that only an open input p
 
 TEXTS = {
     "stuck": "reads one value",
-    "open": "is open: it reads a level that it never rests at, or noise alone",
-    "no_response": "responds to no press",
+    "open": "has an open circuit: its readings are at an impossible level, or noise alone",
+    "no_response": "does not respond to presses",
     "reduced_gain": "responds with about half its gain",
     "inconsistent": "responds as if another position were pressed",
     "swapped": "are swapped",
     "noisy": "is noisy",
-    "offset": "rests at another level",
-    "drifting": "rests ever further from its level",
+    "offset": "has another baseline",
+    "drifting": "has a drifting baseline",
     "missing": "gives no readings",
 }
 """Kinds of faults, in words."""
@@ -75,7 +75,7 @@ class FibreFault:
         numbers = " and ".join(str(fibre + 1) for fibre in self.fibres)
         return (
             f"fibre{'s' * (len(self.fibres) > 1)} {numbers} {TEXTS[self.kind]} ({self.kind}) since press {self.since}, "
-            f"found at press {self.press}; by chance once in 1e{self.score:.0f} presses"
+            f"detected at press {self.press}; false alarm probability 1e-{self.score:.0f} per press"
         )
 
 

@@ -30,7 +30,7 @@ BASES = {
     "tutorial-fabricate": "tutorial-design",
     "tutorial-sense": "tutorial-design",
     "tutorial-study": "tutorial-design",
-    "tutorial-twin": "tutorial-design",
+    "tutorial-twin": "tutorial-sense",
     "howto-ros": "tutorial-sense",
     "howto-microcontroller": "tutorial-sense",
 }

@@ -89,7 +89,7 @@ def test_check_of_a_mesh_with_the_printer_of_a_spec(morphology, tmp_path):
     assert invoke("check", tmp_path / "mould.stl").exit_code == 0
     result = invoke("check", tmp_path / "mould.stl", "--spec", tmp_path / "pad.toml")
     assert result.exit_code == 1
-    assert "FAIL bed: 42.17 x 42.17 x 8 mm to print on a bed of 30 x 30 x 100 mm" in result.stdout
+    assert "FAIL bed: 42.17 x 42.17 x 8 mm, the bed is 30 x 30 x 100 mm" in result.stdout
 
 
 def test_the_spec_shapes_the_mould(morphology, tmp_path):

@@ -205,4 +205,4 @@ def test_check_solid_of_many_intersections_stops_early():
     found = check_solid(TriangleMesh(corners, np.arange(30_000).reshape(-1, 3)))
     failed = {finding.name: finding for finding in found if finding.status == "fail"}
     assert {"watertight", "self_intersection"} <= failed.keys()
-    assert failed["self_intersection"].message.endswith("pairs of triangles and more cut through each other")
+    assert failed["self_intersection"].message.endswith("pairs of triangles and more intersect each other")

@@ -72,7 +72,7 @@ class TestSolid:
         findings = check_body(self.box, genus=0)
         assert findings["volume"].measured == pytest.approx(1000)
         assert findings["bed"].measured == pytest.approx([10, 20, 5])
-        assert findings["bed"].message == "10 x 20 x 5 mm to print on a bed of 220 x 220 x 250 mm"
+        assert findings["bed"].message == "10 x 20 x 5 mm, the bed is 220 x 220 x 250 mm"
         assert findings["genus"].measured == 0
         assert check_body(block(10.002, 20.01, 5))["bed"].message.startswith("10.01 x 20.01 x 5 mm")  # never less
 

@@ -29,7 +29,7 @@ def count_intersections(*parts: np.ndarray) -> int:
 
 def positions(*parts: np.ndarray) -> np.ndarray:
     (finding,) = (finding for finding in check_solid(mesh_of(*parts)) if finding.name == "self_intersection")
-    assert finding.message.endswith("pairs of triangles cut through each other")
+    assert finding.message.endswith("pairs of triangles intersect each other")
     return np.array(finding.positions_mm)
 
 

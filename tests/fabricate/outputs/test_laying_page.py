@@ -236,7 +236,7 @@ def test_page_lists_failed_checks_and_follows_settings():
         {"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True, "nozzle_mm": 0.05, "layer_mm": 0.05}
     )
     page = laying_page(fabrication_document(Plan(Morphology.straight(2), lid), findings))
-    assert "1 of 3 checks pass" in page
+    assert "1 of 3 checks passed" in page
     assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 position,")
     assert "pour through its spout" in page
     for text in ("of resin", "in layers of 0.05 mm", "A ridge is 8 pixels wide", "the floor is 2 mm, 40 layers"):
@@ -245,7 +245,7 @@ def test_page_lists_failed_checks_and_follows_settings():
     assert page.index("- Slice it") < page.index("- Turn anti-aliasing") < page.index("- Wash and cure")
     assert "read the right way" not in page
     plain = laying_page(fabrication_document(Plan(Morphology.straight(2)), findings[:1]))
-    assert "1 of 1 checks pass.\n" in plain
+    assert "1 of 1 checks passed.\n" in plain
 
 
 def print_setting(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:

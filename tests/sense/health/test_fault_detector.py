@@ -124,8 +124,8 @@ def test_fault_lines() -> None:
     dead, swapped, reduced, sound = fault_lines(faults, 6, dead=(5,))
     assert dead == "fibre 6 was dead in the recording that health was learnt from"
     assert (
-        swapped
-        == "fibres 2 and 5 are swapped (swapped) since press 21, found at press 30; by chance once in 1e7 presses"
+        swapped == "fibres 2 and 5 are swapped (swapped) since press 21, detected at press 30; "
+        "false alarm probability 1e-7 per press"
     )
     assert reduced.startswith("fibre 1 responds with about half its gain (reduced_gain) since press 41")
     assert sound == "sound fibres: 3, 4"
