@@ -23,7 +23,7 @@ from padforge.sense.twin.identification import Identification, identify_pad
 FORMAT = "padforge-identification/3"
 MIN_ADVANTAGE = 0.02
 """Share of the variance by which a plan must explain more than straight fibres, else it may be of another pad."""
-CHANNEL_HEAD = ["channel", "fibre", "or", "gain (mV a %)", "noise (mV)", "explained", "lateral offset (mm)"]
+CHANNEL_HEAD = ["channel", "fibre", "or", "gain (mV/%)", "noise (mV)", "explained", "lateral offset (mm)"]
 COMMAND, TWIN = "padforge sense identify", "twin.json"
 
 
