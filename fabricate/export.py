@@ -100,26 +100,47 @@ class Fabrication:
 
 @dataclass(frozen=True, kw_only=True)
 class Build:
-    """A mould that was written: all that a lab needs to print, cast, cut and place fibres."""
+    """A mould that was written: all that a lab needs to print, cast, cut and place fibres.
 
-    files: list[str]  # names of the exported files
-    size_mm: list[float]  # of the mould
-    sizes: dict[str, Any]  # of tray, cavity and pad, mm
-    mould_volume_ml: float  # of plastic
-    silicone_volume_ml: float  # to fill the mould
-    findings: list[Finding]  # of all checks
-    silicone: dict[str, Any]  # to mix
-    adhesive: dict[str, Any]  # volume of the tracks that it seals, by step of laying
-    fibre: dict[str, Any]  # material of the fibres
-    fibres: list[dict[str, Any]]  # one entry per fibre, in the order of their numbers
-    laying_order: list[list[int]]  # numbers of the fibres laid in each step
-    crossings: dict[str, Any]  # all of them, with the thickness of silicone between the fibres
-    common_tracks: list[dict[str, Any]]  # stretches of tracks over deeper ones
-    exits: list[int] | None = None  # fibres along the side of their leads; None unless all leave the pad there
-    frame: dict[str, Any] | None  # of the pad on the bed; None without a holder
-    settings: dict[str, Any]  # that the files depend on
-    provenance: dict[str, Any]  # of the files
-    sha256: dict[str, str]  # digests of the files
+    Attributes:
+        files: names of the exported files.
+        size_mm: of the mould.
+        sizes: of tray, cavity and pad, mm.
+        mould_volume_ml: of plastic.
+        silicone_volume_ml: to fill the mould.
+        findings: of all checks.
+        silicone: to mix.
+        adhesive: volume of the tracks that it seals, by step of laying.
+        fibre: material of the fibres.
+        fibres: one entry per fibre, in the order of their numbers.
+        laying_order: numbers of the fibres laid in each step.
+        crossings: all of them, with the thickness of silicone between the fibres.
+        common_tracks: stretches of tracks over deeper ones.
+        exits: fibres along the side of their leads; None unless all leave the pad there.
+        frame: of the pad on the bed; None without a holder.
+        settings: that the files depend on.
+        provenance: of the files.
+        sha256: digests of the files.
+    """
+
+    files: list[str]
+    size_mm: list[float]
+    sizes: dict[str, Any]
+    mould_volume_ml: float
+    silicone_volume_ml: float
+    findings: list[Finding]
+    silicone: dict[str, Any]
+    adhesive: dict[str, Any]
+    fibre: dict[str, Any]
+    fibres: list[dict[str, Any]]
+    laying_order: list[list[int]]
+    crossings: dict[str, Any]
+    common_tracks: list[dict[str, Any]]
+    exits: list[int] | None = None
+    frame: dict[str, Any] | None
+    settings: dict[str, Any]
+    provenance: dict[str, Any]
+    sha256: dict[str, str]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fabrication document, as in `fabrication.json`."""

@@ -38,13 +38,17 @@ Failed = tuple[int, ...]
 
 @dataclass(frozen=True)
 class MethodErrors:
-    """Errors of one method."""
+    """Errors of one method.
 
-    errors: list[dict[str, Any]]  # rows of `evaluation.error_row`, one a number of failed fibres
-    by_subset: list[dict[str, Any]]  # mean error of each set of failed fibres
-    maps: list[
-        dict[str, Any]
-    ]  # errors by position without the worst set of each size and, at the end, without the chosen fibres
+    Attributes:
+        errors: rows of `evaluation.error_row`, one a number of failed fibres.
+        by_subset: mean error of each set of failed fibres.
+        maps: errors by position without the worst set of each size and, at the end, without the chosen fibres.
+    """
+
+    errors: list[dict[str, Any]]
+    by_subset: list[dict[str, Any]]
+    maps: list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
