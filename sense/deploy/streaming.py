@@ -47,63 +47,72 @@ kernel = njit(cache=True, error_model="numpy", nogil=True)
 
 
 @kernel
-def _run_stream(readings: Any, pressed: Any, fibre_mask: Any, inverse_noise: Any, threshold: Any, delay: int) -> Any:
-    """Return down_command, estimated and ended (Q, 3), features (Q, C, K + J) and valid (Q, C) of Q presses.
+def _run_stream(
+    readings: Any,
+    pressed: Any,
+    fibre_mask: Any,
+    rates: Any,
+    inverse_noise: Any,
+    detector: Any,
+    windows: Any,
+    edges: Any,
+    features: Any,
+    valid: Any,
+) -> int:
+    """Fill `edges` (R, 3), `features` (R, C, K + J) and `valid` (R, C) of every press, and return how many there are.
 
-    `pressed` is empty for the detector to decide.
+    `pressed` is empty for the detector to decide; `detector` holds its threshold and delay, and `windows` (1 + K, 2)
+    the rest before a press and the windows of it.
     """
     n_readings, n_fibres = readings.shape
-    edges = np.empty((n_readings, 3), np.int64)
-    features = np.empty((n_readings, n_fibres, N_WINDOWS + N_HISTORY), np.float32)
-    valid = np.empty((n_readings, n_fibres), np.bool_)
     ring = np.zeros((RING, n_fibres), np.float32)
-    averages = np.zeros((2, n_fibres, N_HISTORY), np.float32)  # now, and when the press began
+    averages = np.zeros((2, n_fibres, len(rates)), np.float32)  # now, and when the press began
     levels = np.zeros((2, n_fibres), np.float32)  # baseline, and the largest deviation of the press
     max_square = np.zeros(1, np.float32)
     missing = np.zeros(n_fibres, np.int64)
     pad = np.zeros(7, np.int64)
     n_presses = 0
     for n in range(n_readings):
-        _ingest(n, readings[n], ring, averages[0], levels[0], missing)
+        _ingest(n, readings[n], ring, averages[0], levels[0], missing, rates)
         if len(pressed):
             change = _follow(n, pressed[n], pad)
         else:
-            deviation = np.where(fibre_mask, (ring[n % RING] - levels[0]) * inverse_noise, np.float32(0))
-            change = _detect(n, ring[n % RING], deviation, threshold, delay, levels, max_square, pad)
+            change = _detect(n, ring[n % RING], fibre_mask, inverse_noise, detector, levels, max_square, pad)
         if change > 0:
             missing[:] = 0
             pad[ESTIMATED], pad[TOUCHED] = 0, n
-            _store_history(n, ring, averages, pad)
+            _store_history(n, ring, averages, rates, pad)
         ended = change < 0
-        if pad[ESTIMATED] == 0 and (ended or (pad[PRESSED] == 1 and n >= pad[DOWN_COMMAND] + PRESS - 1)):
+        if pad[ESTIMATED] == 0 and (ended or (pad[PRESSED] == 1 and n >= pad[DOWN_COMMAND] + windows[-1, 1] - 1)):
             pad[ESTIMATED] = 1
             edges[n_presses, 0], edges[n_presses, 1], edges[n_presses, 2] = pad[DOWN_COMMAND], n, n_readings
-            valid[n_presses] = 4 * missing <= n - pad[TOUCHED]
-            _compute_features(n if ended else n + 1, ring, averages[1], pad, features[n_presses])
+            end = n if ended else n + 1
+            for c in range(n_fibres):
+                valid[n_presses, c] = 4 * missing[c] <= n - pad[TOUCHED]
+                _compute_features(c, end, ring, averages[1, c], pad, windows, features[n_presses, c])
             n_presses += 1
         if ended and n_presses > 0:
             edges[n_presses - 1, 2] = pad[UP_COMMAND]
-    return edges[:n_presses], features[:n_presses], valid[:n_presses]
+    return n_presses
 
 
 @kernel
-def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: Any) -> None:
+def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: Any, rates: Any) -> None:
     """Store a reading; what is missing or beyond MAX_VOLTS repeats the reading before."""
     for c in range(len(row)):
-        is_missing = not abs(row[c]) <= np.float32(MAX_VOLTS)
-        missing[c] += is_missing
-        ring[n % RING, c] = ring[(n - 1) % RING, c] if is_missing else row[c]
+        x = row[c]
+        if not abs(x) <= np.float32(MAX_VOLTS):
+            missing[c] += 1
+            x = ring[(n - 1) % RING, c]
+        lagged = ring[(n - LAG) % RING, c]
+        ring[n % RING, c] = x
         if n == 0:
-            baseline[c] = ring[0, c]
-            averages[c] = ring[0, c]
-        elif n >= LAG:
-            _follow_level(ring[(n - LAG) % RING, c], averages[c])
-
-
-@kernel
-def _follow_level(x: Any, averages: Any) -> None:
-    for j in range(len(averages)):
-        averages[j] += RATES[j] * (x - averages[j])
+            baseline[c] = x
+        for j in range(len(rates)):
+            if n == 0:
+                averages[c, j] = x
+            elif n >= LAG:
+                averages[c, j] += rates[j] * (lagged - averages[c, j])
 
 
 @kernel
@@ -121,60 +130,71 @@ def _follow(n: int, pressed: bool, pad: Any) -> int:
 
 @kernel
 def _detect(
-    n: int, row: Any, deviation: Any, threshold: Any, delay: int, levels: Any, max_square: Any, pad: Any
+    n: int, row: Any, fibre_mask: Any, inverse_noise: Any, detector: Any, levels: Any, max_square: Any, pad: Any
 ) -> int:
-    """Return the same as decided by the detector, from the deviations of a reading in units of the noise."""
+    """Return the same as decided by the detector."""
     baseline, peak = levels[0], levels[1]
     square, along_peak = np.float32(0), np.float32(0)
     for c in range(len(row)):
-        square += deviation[c] * deviation[c]
-        along_peak += deviation[c] * peak[c]
+        if fibre_mask[c]:
+            deviation = (row[c] - baseline[c]) * inverse_noise[c]
+            square += deviation * deviation
+            along_peak += deviation * peak[c]
     change = 0
     if pad[PRESSED] == 1:
         if square > max_square[0]:
             max_square[0] = square
-            peak[:] = deviation
+            for c in range(len(row)):
+                peak[c] = (row[c] - baseline[c]) * inverse_noise[c]
         elif along_peak < np.float32(RELEASE_SHARE) * max_square[0] or n - pad[DOWN_COMMAND] > MAX_PRESS:
-            change = _follow(n, False, pad)
+            pad[PRESSED], pad[UP_COMMAND] = 0, n
+            change = -1
             baseline[:] = row
     elif n < pad[UP_COMMAND] + SETTLING:
         baseline[:] = row
-    elif square <= threshold:
-        pad[SUSPECTED] = 0
-        baseline += np.float32(BASELINE_RATE) * (row - baseline)
-    elif pad[SUSPECTED] == 0:
-        pad[SUSPECTED] = 1
+    elif square > detector[0]:
+        if pad[SUSPECTED] == 1:
+            pad[PRESSED], pad[SUSPECTED], pad[PREVIOUS_END] = 1, 0, pad[UP_COMMAND]
+            pad[DOWN_COMMAND] = max(n - 1 - int(detector[1]), pad[PREVIOUS_END] + 1)
+            max_square[0] = np.float32(0)
+            change = 1
+        else:
+            pad[SUSPECTED] = 1
     else:
         pad[SUSPECTED] = 0
-        max_square[0] = 0
-        change = _follow(n - 1 - delay, True, pad)
+        for c in range(len(row)):
+            baseline[c] += np.float32(BASELINE_RATE) * (row[c] - baseline[c])
     return change
 
 
 @kernel
-def _store_history(n: int, ring: Any, averages: Any, pad: Any) -> None:
+def _store_history(n: int, ring: Any, averages: Any, rates: Any, pad: Any) -> None:
     """Bring the averages up to the begin of the press, and store them."""
-    averages[1] = averages[0]
-    for i in range(max(n - LAG + 1, 0), pad[DOWN_COMMAND]):
-        for c in range(averages.shape[1]):
-            _follow_level(ring[i % RING, c], averages[1, c])
+    for c in range(averages.shape[1]):
+        for j in range(len(rates)):
+            level = averages[0, c, j]
+            for i in range(max(n - LAG + 1, 0), pad[DOWN_COMMAND]):
+                level += rates[j] * (ring[i % RING, c] - level)
+            averages[1, c, j] = level
 
 
 @kernel
-def _compute_features(end: int, ring: Any, history: Any, pad: Any, out: Any) -> None:
-    """Compute the windows of each fibre from the readings of the press before `end`, and its history."""
-    down_command = pad[DOWN_COMMAND]
-    first = max(down_command - N_REST, pad[PREVIOUS_END])
-    rest = np.zeros(len(out), np.float32)
+def _compute_features(c: int, end: int, ring: Any, history: Any, pad: Any, windows: Any, out: Any) -> None:
+    """Compute the windows of a fibre from the readings of the press before `end`, and its history."""
+    down_command, n_windows = pad[DOWN_COMMAND], len(windows) - 1
+    first = max(down_command + windows[0, 0], pad[PREVIOUS_END])
+    total = np.float32(0)
     for i in range(first, down_command):
-        rest += ring[i % RING]
-    rest /= np.float32(down_command - first)
-    for k in range(N_WINDOWS):
-        total = np.zeros(len(out), np.float32)
-        for i in range(down_command + DOWN[k][0], down_command + DOWN[k][1]):
-            total += ring[max(min(i, end - 1), down_command) % RING]
-        out[:, k] = total / np.float32(DOWN[k][1] - DOWN[k][0]) - rest
-    out[:, N_WINDOWS:] = history - np.expand_dims(rest, 1)
+        total += ring[i % RING, c]
+    rest = total / np.float32(down_command - first)
+    for k in range(n_windows):
+        low, high = windows[k + 1, 0], windows[k + 1, 1]
+        total = np.float32(0)
+        for i in range(down_command + low, down_command + high):
+            total += ring[max(min(i, end - 1), down_command) % RING, c]
+        out[k] = total / np.float32(high - low) - rest
+    for j in range(len(history)):
+        out[n_windows + j] = history[j] - rest
 
 
 @dataclass(frozen=True)
@@ -232,17 +252,24 @@ def stream_presses(
     readings: Array, detector: ThresholdDetector, pressed: Mask | None = None, fibre_mask: Mask | None = None
 ) -> StreamedPresses:
     """Process (R, C) readings as a microcontroller does; `pressed` (R,) is None for the detector to decide."""
-    edges, features, valid = _run_stream(
+    n_readings, n_fibres = readings.shape
+    edges = np.empty((n_readings, 3), np.int64)
+    features = np.empty((n_readings, n_fibres, N_WINDOWS + N_HISTORY), np.float32)
+    valid = np.empty((n_readings, n_fibres), bool)
+    n_presses = _run_stream(
         np.ascontiguousarray(readings, np.float32),
         np.zeros(0, bool) if pressed is None else pressed,
-        np.ones(readings.shape[1], bool) if fibre_mask is None else fibre_mask,
+        np.ones(n_fibres, bool) if fibre_mask is None else fibre_mask,
+        RATES,
         detector.inverse_noise,
-        np.float32(detector.threshold),
-        detector.delay,
+        np.array([detector.threshold, detector.delay], np.float32),
+        np.array([REST, *DOWN]),
+        edges,
+        features,
+        valid,
     )
-    windows, history = np.split(features.astype(np.float64), [N_WINDOWS], axis=2)
-    down_command, estimated, ended = edges.T.copy()
-    return StreamedPresses(down_command, estimated, ended, PressFeatures(windows, history, valid.copy()))
+    windows, history = np.split(features[:n_presses].astype(np.float64), [N_WINDOWS], axis=2)
+    return StreamedPresses(*edges[:n_presses].T.copy(), PressFeatures(windows, history, valid[:n_presses].copy()))
 
 
 def commanded_presses(recording: Recording) -> Mask:
