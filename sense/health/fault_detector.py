@@ -323,8 +323,7 @@ class FaultDetector:
         Raises:
             InputError: another number of fibres, or another rate, than trained on; or `fit` or `load` was not called.
         """
-        if not hasattr(self, "model_"):
-            raise InputError("fault detector: not fitted, expected fit or load before predict")
+        self._check_fitted()
         check_type("recording", recording, Recording)
         is_detected = PRESSES_DETECTED.items() <= recording.source.items()
         monitor = FaultMonitor(self.live_model_ if is_detected else self.model_)
@@ -343,8 +342,9 @@ class FaultDetector:
             folder: where to; its models are replaced.
 
         Raises:
-            InputError: the folder cannot be written.
+            InputError: `fit` or `load` was not called, or the folder cannot be written.
         """
+        self._check_fitted()
         self.model_.save(folder, COMMANDED)
         self.live_model_.save(folder, DETECTED)
 
@@ -362,6 +362,10 @@ class FaultDetector:
         detector = cls(model.false_alarm_rate)
         detector.model_, detector.live_model_ = model, live_model
         return detector
+
+    def _check_fitted(self) -> None:
+        if not hasattr(self, "model_"):
+            raise InputError("the fault detector is not fitted, expected fit or load before")
 
 
 def has_health(folder: Path) -> bool:

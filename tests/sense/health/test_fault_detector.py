@@ -98,7 +98,7 @@ def test_fibre_is_missing_after_twenty_successive_presses(pad: Recording, model:
     assert without(range(45)) == [(first + 19, first, "missing")]
 
 
-def test_predict_and_update_refuse_other_pads(pad: Recording, model: HealthModel) -> None:
+def test_predict_and_update_refuse_other_pads(pad: Recording, model: HealthModel, tmp_path: Path) -> None:
     presses = pad.presses_mm, pad.down_command, pad.up_command
     with pytest.raises(InputError, match="readings are of 5 fibres, health was learnt from 6"):
         detect(model, Recording(pad.readings[:, :5], pad.times_s, *presses))
@@ -108,6 +108,9 @@ def test_predict_and_update_refuse_other_pads(pad: Recording, model: HealthModel
         FaultMonitor(model).update(pad.readings[:60, :5], 10, 30)
     with pytest.raises(InputError, match="not fitted"):
         FaultDetector().predict(pad)
+    with pytest.raises(InputError, match="not fitted"):
+        FaultDetector().save(tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("seed", range(5))
