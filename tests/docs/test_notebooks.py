@@ -1,18 +1,11 @@
 """Notebooks are those of their pages, and run."""
 
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import nbformat
 import pytest
 
-from tests.docs.pages import ROOT
-
-_SPEC = spec_from_file_location("notebooks", ROOT / "docs" / "notebooks.py")
-assert _SPEC is not None
-assert _SPEC.loader is not None
-notebooks = module_from_spec(_SPEC)
-_SPEC.loader.exec_module(notebooks)
+from docs import notebooks
 
 
 @pytest.mark.parametrize("page", notebooks.PAGES)
