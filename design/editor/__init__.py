@@ -226,7 +226,7 @@ class EditSession:
             "title": self._title,
             "session": self._id,
             "ended": "",
-            "middle_mm": [0, 0],
+            "centre_mm": [0, 0],
             "half_mm": [side / 2 for side in self._layout.size_mm],
             "unit_mm": self._layout.unit_mm,
             "mirrored": False,

@@ -104,7 +104,7 @@ def live(
         draw = None if as_json else stack.enter_context(redrawn_lines())
         scaler, title = localizers[0].scaler, f"{replay or f'{rig} rig'}, {models[0]}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
-        pad = {"title": title, "origin_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
+        pad = {"title": title, "centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
 
         @stack.push
         def show_end(kind: object, error: BaseException | None, trace: object) -> None:

@@ -507,7 +507,7 @@ def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, A
     """Return the constant part of the view, as JSON; of a pad `mirrored`, with its tracks up, x runs to the left."""
     return {
         "title": title,
-        "origin_mm": [0.0, 0.0],
+        "centre_mm": [0.0, 0.0],
         "half_mm": [side / 2 for side in pad.layout.size_mm],
         "mirrored": mirrored,
         "paths": [np.round(pad.to_mm(path), 1).tolist() for path in flatten(pad, PATH_TOLERANCE)],

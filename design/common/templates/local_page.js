@@ -22,13 +22,13 @@ function frame(view) {
   const scale = (SIDE - 2 * MARGIN) / (2 * Math.max(...view.half_mm)), right = view.mirrored ? -scale : scale
   return {
     scale,
-    x: mm => SIDE / 2 + (mm - view.middle_mm[0]) * right,
-    y: mm => SIDE / 2 - (mm - view.middle_mm[1]) * scale,
+    x: mm => SIDE / 2 + (mm - view.centre_mm[0]) * right,
+    y: mm => SIDE / 2 - (mm - view.centre_mm[1]) * scale,
   }
 }
 
 function gridElements(view) {
-  const {scale, x, y} = frame(view), [cx, cy] = view.middle_mm, [halfWidth, halfHeight] = view.half_mm
+  const {scale, x, y} = frame(view), [cx, cy] = view.centre_mm, [halfWidth, halfHeight] = view.half_mm
   const left = x(cx) - halfWidth * scale, labelY = y(cy - halfHeight) + MARGIN - 14, elements = []
   const half = Math.max(halfWidth, halfHeight), decade = 10 ** Math.floor(Math.log10(half))
   const step = decade / (half / decade < 3 ? 2 : 1)

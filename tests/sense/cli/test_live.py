@@ -16,6 +16,7 @@ from padforge.sense.live.outputs import LivePage
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.virtual import virtual_pad
+from tests.helpers.page_names import names_in_view
 from tests.sense.live.conftest import first_presses
 
 
@@ -46,6 +47,7 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     assert 38 <= len(told) <= 40
     assert {view["mirrored"] for view in views} == {True}
     assert [view["ended"] for view in views][-2:] == ["", "ended"]
+    assert names_in_view("live.html") <= views[-1].keys()
     code, plain, _ = replay()
     assert code == 0, err
     first = told[0]

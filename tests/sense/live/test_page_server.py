@@ -19,7 +19,7 @@ from tests.helpers.chromium import CHROMIUM, Chromium
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
 VIEW = {
     "title": HOSTILE,
-    "origin_mm": [1.0, -2.0],
+    "centre_mm": [1.0, -2.0],
     "half_mm": [20.0, 20.0],
     "pressed": True,
     "ended": "",

@@ -40,6 +40,7 @@ from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
+from tests.helpers.page_names import names_in_view
 from tests.sense.conftest import QUICK
 from tests.sense.rig.fakes import Time
 
@@ -253,6 +254,7 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     held_s = (recording.up_command - recording.down_command)[recording.has_position] / HAND_RIG.rate_hz
     assert held_s.min() > 0.45
     assert hand.views[-1]["done"] == hand.views[-1]["total"] == 60
+    assert names_in_view("hand.html") <= (pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
 
 
 class Inverted(PressDetector):
