@@ -64,7 +64,7 @@ def test_search_from_an_origin_improves_on_it_and_on_straight_fibres():
 
 
 def test_search_returns_an_origin_that_it_cannot_improve():
-    settings = SMALL.model_copy(update={"steps": 60, "starts": 1})
+    settings = SMALL.model_copy(update={"steps": 500, "starts": 1})  # at fewer, a step may still improve it
     origin = search(PAD, PUBLISHED_CONTACT, settings, FREE).morphology
     result = search(PAD, PUBLISHED_CONTACT, QUICK, FREE, origin=origin)
     assert (result.morphology, result.candidate) == (origin, "origin")
