@@ -3,7 +3,8 @@
 A block of shell commands after a comment `<!-- run -->` is run here, after all such blocks above it and those of the
 page that it continues. What it prints must be what the page shows below: text and whole numbers exactly, decimals
 exactly or within the share of a comment like `<!-- run: decimals within 20 % -->`; probabilities such as 1e8 may then
-differ as well. Times always may. With REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
+differ as well. Times always may. After `<!-- run: numbers vary -->` it prints the same kinds of lines, whatever their
+numbers and how many there are: a search on another processor rounds differently, and ends in another pad. With REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
 """
 
 import os
@@ -55,12 +56,13 @@ OUTPUT = re.compile(r"\s*```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 class Run(NamedTuple):
-    """A block that is run: its commands, what the page shows below and where, and by what share decimals may differ."""
+    """A block that is run: its commands, what the page shows below and where, and by what share decimals may differ, or all varies."""
 
     commands: str
     shown: str
     begin: int
     share: float
+    varies: bool
 
 
 def runs(text: str) -> Iterator[Run]:
@@ -72,7 +74,12 @@ def runs(text: str) -> Iterator[Run]:
         output = OUTPUT.match(text, block.end())
         share = re.search(r"decimals within (\d+) %", how)
         shown, begin = (output[1], output.start(1)) if output else ("", -1)
-        yield Run(block["body"], shown, begin, int(share[1]) / 100 if share else 0.0)
+        yield Run(block["body"], shown, begin, int(share[1]) / 100 if share else 0.0, "numbers vary" in how)
+
+
+def kinds(text: str) -> set[str]:
+    """Lines without their numbers and lists of numbers, each once."""
+    return {" ".join(re.sub(r"#(?:, #)*", "#", NUMBER.sub("#", line)).split()) for line in text.strip().splitlines()}
 
 
 def difference(shown: str, printed: str, share: float) -> str:
@@ -131,7 +138,11 @@ def follow(page: Path, folder: Path) -> str:
     moved = 0
     for block in blocks:
         printed = run(block.commands, folder)
-        wrong = difference(block.shown, printed, block.share)
+        if block.varies:
+            odd = kinds(block.shown) ^ kinds(printed)
+            wrong = f"{sorted(odd)} are lines of the page or printed, not both" if odd else ""
+        else:
+            wrong = difference(block.shown, printed, block.share)
         if wrong and not REWRITE:
             return f"{relative(page)}: {block.commands}printed {wrong}"
         if wrong and block.begin >= 0:
