@@ -4,7 +4,8 @@ A block of shell commands after a comment `<!-- run -->` is run here, after all 
 page that it continues. What it prints must be what the page shows below: text and whole numbers exactly, decimals
 exactly or within the share of a comment like `<!-- run: decimals within 20 % -->`; probabilities such as 1e8 may then
 differ as well. Times always may. After `<!-- run: numbers vary -->` it prints the same kinds of lines, whatever their
-numbers and how many there are: a search on another processor rounds differently, and ends in another pad. With REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
+numbers and how many there are: a search on another processor rounds differently, and ends in another pad. With
+REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
 """
 
 import os
@@ -56,13 +57,13 @@ OUTPUT = re.compile(r"\s*```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 class Run(NamedTuple):
-    """A block that is run: its commands, what the page shows below and where, and by what share decimals may differ, or all varies."""
+    """A block that is run: its commands, what the page shows below and where, and how that may differ."""
 
     commands: str
     shown: str
     begin: int
-    share: float
-    varies: bool
+    share: float  # by which decimals may differ
+    varies: bool  # whether all numbers may
 
 
 def runs(text: str) -> Iterator[Run]:
