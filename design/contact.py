@@ -1,9 +1,10 @@
 """The contact model: the signal of each fibre for a press (paper, section II-B).
 
-A fibre's signal is the line integral of a weight along it: the measured sensitivity profile of the distance to the
-press centre, or the published weight inside a regular polygon.
+A fibre's signal is the line integral of a weight along it: of the strains of the silicone under a tool, of a measured
+profile of the distance to the press centre, or of the published weight inside a regular polygon.
 """
 
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,10 +14,11 @@ from padforge.design.common import profiling
 from padforge.design.common.parallel import map_chunks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import MAX_VALUES, InputError, check_array, check_int, check_type
-from padforge.design.kernels import geometry
+from padforge.design.kernels import geometry, measured_signals
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.kernels.published import quantized_signals
+from padforge.design.layer import LayerPress, solve_press
 from padforge.design.morphology import (
     MAX_COORDINATE,
     MAX_SAMPLES,
@@ -38,6 +40,14 @@ _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUA
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
 _Sparse = tuple[Ints, Ints]
 _DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
+LAYER_REACH = {"bonded": 6.0, "slipping": 16.0}
+"""Distance beyond the contact at which strains of a layer end, thicknesses. What is left out is 0.5 % of a straight
+fibre's signal if the layer is bonded; strains of a slipping one fall only with the square of the distance."""
+FIBRE_BLUR_MM = 0.2
+"""Standard deviation of a Gaussian by which strains are averaged: a fibre has a width and is stiffer than silicone, so
+it does not follow the step of the strains at the edge of the contact, which signals, their integrals, hardly show."""
+NEAR_POINTS, FAR_POINTS = 300, 100
+"""Distances at which strains are computed, up to half a radius beyond the contact's edge and further out."""
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 """Chains, extents and weight law of a press."""
 
@@ -169,13 +179,85 @@ def grid_unit_mm(pad: Morphology | Array, layout: Layout | None = None) -> float
 
 def press_shape(contact: Contact, unit_mm: float) -> PressShape:
     """Convert a contact to grid units of `unit_mm`: chains and extents in the frame of each family, and weight law."""
-    length = _LENGTHS[contact.length]
-    if contact.sensitivity_profile:
-        points = contact.profile_points(unit_mm)
-        end, profile = points[-1][0], geometry.profile_coefficients(points)
-        return *geometry.frame_shape(end, None), geometry.WeightLaw(end, geometry.PROFILE, length, profile)
-    law = geometry.WeightLaw(contact.radius, _WEIGHTS[contact.weight], length)
-    return *geometry.frame_shape(contact.radius, contact.sides), law
+    if contact.model == "shape":
+        law = geometry.WeightLaw(contact.radius, _WEIGHTS[contact.weight], _LENGTHS[contact.length])
+        return *geometry.frame_shape(contact.radius, contact.sides), law
+    law = _profile_law(contact, unit_mm)
+    return *geometry.frame_shape(law.radius, None), law
+
+
+def element_spacing(contact: Contact, unit_mm: float) -> float:
+    """Return the spacing of elements of `measured_signals` for a contact with a profile, grid units of `unit_mm`."""
+    return _element_spacing(contact, unit_mm)
+
+
+@lru_cache(maxsize=64)
+def _element_spacing(contact: Contact, unit_mm: float) -> float:
+    return measured_signals.element_spacing(_profile_law(contact, unit_mm))
+
+
+@lru_cache(maxsize=64)
+def _profile_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
+    return geometry.profile_law(
+        _LENGTHS[contact.length],
+        tuple((distance / unit_mm, *weights) for distance, *weights in profile_weights(contact)),
+    )
+
+
+@lru_cache(maxsize=64)
+def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
+    """Return the weights of a contact that is no shape, once, or for the horizontal and for the vertical fibres.
+
+    An element at the distance d, at the angle phi between fibre and press, has the weight w + v cos^2 phi.
+
+    Args:
+        contact: a layer or a profile.
+
+    Returns:
+        Distances d, mm, ascending from 0 to where the weight ends; w and v there; all of shape (n,). Of a layer they
+        are strains: their integral over the length of a fibre is an elongation, or what responds like one.
+    """
+    if contact.model == "profile":
+        distance, weight = np.array(contact.sensitivity_profile).T
+        return ((distance, weight, np.zeros_like(weight)),)
+    press = solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
+    distance = _layer_distances(press.contact_radius_mm, contact)
+    fade = np.clip((distance[-1] - distance) / contact.thickness_mm, 0, 1)
+    fade = fade * fade * (3 - 2 * fade)
+    families = []
+    for depth_mm in contact.fibre_depths_mm:
+        strains = press.strains(distance, contact.thickness_mm - depth_mm, FIBRE_BLUR_MM)
+        plain = contact.squeeze * strains.compressive + contact.stretch * strains.hoop
+        directed = contact.stretch * (strains.radial - strains.hoop)
+        directed[0] = 0.0  # to rounding, by symmetry
+        families.append((distance, fade * plain, fade * directed))
+    return tuple(families)
+
+
+def half_width_mm(contact: Contact) -> float:
+    """Return the largest distance at which an element of a fibre has half of its greatest weight, mm.
+
+    It is the mean over the directions of the fibre, and of the horizontal and vertical fibres of a layer.
+
+    Args:
+        contact: a layer or a profile.
+    """
+    widths = []
+    for distance, plain, directed in profile_weights(contact):
+        weight = np.abs(plain + directed / 2)
+        half = weight.max() / 2
+        last = int(np.flatnonzero(weight >= half)[-1])  # never the last point, whose weight is 0
+        share = (weight[last] - half) / (weight[last] - weight[last + 1])
+        widths.append(distance[last] + share * (distance[last + 1] - distance[last]))
+    return float(np.mean(widths))
+
+
+def _layer_distances(contact_radius_mm: float, contact: Contact) -> Array:
+    """Return distances at which strains are computed, densest around the edge of the contact, where they bend."""
+    near = 1.5 * contact_radius_mm
+    end = contact_radius_mm + LAYER_REACH[contact.base] * contact.thickness_mm
+    near_points = near * np.sqrt(np.arange(NEAR_POINTS) / NEAR_POINTS)
+    return np.concatenate([near_points, np.linspace(near, max(end, 1.2 * near), FAR_POINTS)])
 
 
 def signals_quantized(

@@ -9,6 +9,7 @@ import numpy as np
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
 from padforge.design.common.validation import InputError, check_array, check_type
+from padforge.design.contact import half_width_mm
 from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings, sensed_rectangle
 
 if TYPE_CHECKING:
@@ -104,22 +105,13 @@ def _contact_patch(contact: Contact, unit_mm: float) -> "Circle | Polygon":
     from matplotlib.patches import Circle, Polygon
 
     style = {"color": INK, "alpha": 0.15, "linewidth": 0}
-    if contact.sensitivity_profile:
-        return Circle((0, 0), _half_width_mm(contact.sensitivity_profile), **style)
+    if contact.model != "shape":
+        return Circle((0, 0), half_width_mm(contact), **style)
     radius = contact.radius * unit_mm
     if contact.sides is None:
         return Circle((0, 0), radius, **style)
     angle = 2 * np.pi * np.arange(contact.sides) / contact.sides
     return Polygon(radius * np.column_stack([np.cos(angle), np.sin(angle)]), **style)
-
-
-def _half_width_mm(profile: Sequence[tuple[float, float]]) -> float:
-    """Return the largest distance at which a profile is half of its maximum, by linear interpolation, mm."""
-    distance, weight = np.abs(np.array(profile)).T
-    half = weight.max() / 2
-    last = int(np.flatnonzero(weight >= half)[-1])  # never the last point, whose weight is 0
-    share = (weight[last] - half) / (weight[last] - weight[last + 1])
-    return float(distance[last] + share * (distance[last + 1] - distance[last]))
 
 
 def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:

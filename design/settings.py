@@ -14,7 +14,7 @@ from padforge.design.common.validation import InputError, check_float, check_int
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
     from scipy.interpolate import CubicSpline
 
 DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
@@ -152,7 +152,21 @@ profiles stay far below; beyond it a signal would depend on weights that nobody 
 
 Point = tuple[Annotated[float, Field(ge=0, le=1e4)], Annotated[float, Field(ge=-1e3, le=1e3)]]
 Sides = Annotated[Annotated[int, Field(ge=3, le=4096)] | None, *null_as("circle")]
-_SHAPE = {"radius", "sides", "weight"}
+FibreDepths = tuple[Annotated[float, Field(gt=0, le=100)], Annotated[float, Field(gt=0, le=100)]]
+_KEYS = {
+    "layer": (
+        *("tool", "tool_radius_mm", "depth_mm", "thickness_mm", "base"),
+        *("fibre_depths_mm", "squeeze", "stretch"),
+    ),
+    "profile": ("sensitivity_profile",),
+    "shape": ("radius", "sides", "weight"),
+}
+"""Keys that count for each model of `[contact]`, besides those for all."""
+
+SILICONE_MM = 6.0  # default thickness of the cast pad
+FIBRE_MM = 0.3  # default diameter of a fibre
+TRACK_DEPTHS_MM = (1.2, 0.4)  # default depths of the tracks of the deep family and of the other one
+FIBRE_DEPTHS_MM = (TRACK_DEPTHS_MM[0] - FIBRE_MM / 2, TRACK_DEPTHS_MM[1] - FIBRE_MM / 2)  # centre lines, at the bottom
 
 
 def _as_tuples(value: object) -> object:
@@ -161,22 +175,46 @@ def _as_tuples(value: object) -> object:
 
 
 class Contact(Settings):
-    """`[contact]`: the contact model of a press: a measured sensitivity profile, or the published shape.
+    """`[contact]`: the contact model of a press, by which each fibre responds.
 
-    The signal of a fibre is the line integral of a weight along it. With a `sensitivity_profile` the weight is a
-    function of the distance d to the press centre. With an empty one it is `weight` inside a regular polygon or circle
-    (paper, formulas (1) and (2)); stating `radius`, `sides` or `weight` without a profile selects that as well. Shapes
-    are in grid units, as published; a measured press has the same width in mm on pads of any pitch.
+    The signal of a fibre is the line integral of a weight along it. The model "layer" computes the weight from the
+    press: the silicone is an elastic layer under a tool (`padforge.design.layer`), and an element of a fibre answers by
+
+        squeeze (-eps_zz) + stretch (cos^2 phi du/dr + sin^2 phi u/r),
+
+    the strain that presses it flat and the strain along it, with phi the angle between the fibre and the way to the
+    press. In "profile" the weight is a measured function of the distance d to the press centre. In "shape" it is
+    `weight` inside a regular polygon or circle (paper, formulas (1) and (2)), in grid units, as published: there, and
+    only there, the press grows with the pitch. Stating keys of one model selects it; `sensitivity_profile = []` is a
+    shape as well.
 
     Attributes:
+        model: "layer" if no key of another model is stated.
+        tool: "dome" is a paraboloid of that tip radius, "finger" one as soft as the pad, "flat" the end of a rod.
+        depth_mm: of the tool's tip, less than the thickness.
+        base: "bonded" where friction or glue holds the pad on what it lies on, "slipping" where nothing does.
+        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed; of
+            the default mould, pressed on the side of its tracks, if not stated.
         sides: number of sides D; None for a circle ("circle" in pad.toml).
         weight: "inverse" is 1 / max(d, K / 100), the paper's 1 / d kept finite within a hundredth of the radius.
-        length: "manhattan" is the default of shapes, "euclidean" that of a profile.
+        length: "manhattan" is the default of shapes, "euclidean" that of the others.
         sensitivity_profile: points from distance 0 to the distance from which the weight is 0, interpolated by a cubic
-            spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be negative. MEASURED_PROFILE if
-            nothing of the contact is stated.
+            spline over d^2, which may leave their range by MAX_OVERSHOOT. Weights may be negative.
     """
 
+    model: Literal["layer", "profile", "shape"] = Field(
+        default="layer", description="layer: from the press in mm; profile: as measured; shape: as published"
+    )
+    tool: Literal["dome", "ball", "flat", "finger"] = Field(default="dome", description="what presses, of a layer")
+    tool_radius_mm: float = Field(default=8.4, ge=0.1, le=1000, description="tip radius of the tool, mm")
+    depth_mm: float = Field(default=5.0, ge=0.01, le=100, description="depth of the press, of a layer, mm")
+    thickness_mm: float = Field(default=SILICONE_MM, ge=0.1, le=1000, description="thickness of the pad, mm")
+    base: Literal["bonded", "slipping"] = Field(default="bonded", description="what the pad does on what it lies on")
+    fibre_depths_mm: Annotated[FibreDepths, BeforeValidator(as_tuple)] = Field(
+        default=FIBRE_DEPTHS_MM, description="depth of the [horizontal, vertical] fibres below the pressed face, mm"
+    )
+    squeeze: float = Field(default=1.0, ge=0, le=100, description="response of a fibre to being pressed flat")
+    stretch: float = Field(default=1.0, ge=0, le=100, description="response of a fibre to being stretched")
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
     sides: Sides = Field(default=30, description='sides D of the object, or "circle", of a shape')
     weight: Literal["uniform", "inverse_square", "inverse"] = Field(
@@ -186,30 +224,48 @@ class Contact(Settings):
         default="euclidean", description="length of a fibre element: euclidean, or |dx| + |dy| as published"
     )
     sensitivity_profile: Annotated[tuple[Point, ...], BeforeValidator(_as_tuples), Field(max_length=64)] = Field(
-        default=MEASURED_PROFILE, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]]; [] for a shape"
+        default=MEASURED_PROFILE, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]], of a profile"
     )
 
     @model_validator(mode="before")
     @classmethod
-    def _infer_kind(cls, stated: object) -> object:
-        """Fill in profile and length from the keys that are stated."""
+    def _infer_model(cls, stated: object) -> object:
+        """Fill in the model and the length from the keys that are stated."""
         stated = to_builtins(stated)  # `Settings` does so later, and the truth value of an array is ambiguous
         if not isinstance(stated, Mapping):
             return stated
-        profile = stated.get("sensitivity_profile", () if _SHAPE & stated.keys() else MEASURED_PROFILE)
-        is_shape = isinstance(profile, list | tuple) and not profile
-        return {"sensitivity_profile": profile, "length": "manhattan" if is_shape else "euclidean", **stated}
+        profile = stated.get("sensitivity_profile")
+        if isinstance(profile, list | tuple) and not profile:
+            model, stated = "shape", {name: value for name, value in stated.items() if name != "sensitivity_profile"}
+        elif profile is not None:
+            model = "profile"
+        else:
+            model = "shape" if stated.keys() & set(_KEYS["shape"]) else "layer"
+        model = stated.get("model", model)
+        return {"model": model, "length": "manhattan" if model == "shape" else "euclidean", **stated}
+
+    @model_validator(mode="after")
+    def _check_model(self) -> "Contact":
+        for model, names in _KEYS.items():
+            for name in names if model != self.model else ():
+                value = getattr(self, name)
+                # else a radius set beside the layer that `padforge init` has written would have no effect
+                if value != type(self).model_fields[name].default:
+                    raise ValueError(f"{name} is {short_repr(value)}, which counts where model is {model}")
+        if self.model == "layer":
+            if self.length == "manhattan":
+                raise ValueError("length is manhattan, a layer stretches along the fibre: allowed is euclidean")
+            for name, depth in (("depth_mm", self.depth_mm), ("fibre_depths_mm", max(self.fibre_depths_mm))):
+                if depth >= self.thickness_mm:
+                    raise ValueError(f"{name} is {depth:g}, the pad is {self.thickness_mm:g} mm thick")
+            if self.squeeze + self.stretch == 0:
+                raise ValueError("squeeze and stretch are both 0, one of them must be above")
+        return self
 
     @field_validator("sensitivity_profile")
     @classmethod
-    def _check_profile(cls, profile: tuple[Point, ...], info: ValidationInfo) -> tuple[Point, ...]:
-        if not profile:
-            return profile
-        for name, value in info.data.items():
-            # else a radius set beside the profile that `padforge init` has written would have no effect
-            if name in _SHAPE and value != cls.model_fields[name].default:
-                raise ValueError(f"{name} is {value}, which counts where sensitivity_profile is []")
-        distances, weights = zip(*profile, strict=True)
+    def _check_profile(cls, profile: tuple[Point, ...]) -> tuple[Point, ...]:
+        distances, weights = zip(*profile, strict=True) if profile else ((), ())
         if len(profile) < 3 or distances[0] != 0 or any(a >= b for a, b in pairwise(distances)):
             raise ValueError("it must be of 3 points or more, whose distances ascend from 0")
         if weights[-1] != 0 or not any(weights):
@@ -218,30 +274,22 @@ class Contact(Settings):
             _check_overshoot(profile)
         return profile
 
-    def profile_points(self, unit_mm: float) -> tuple[Point, ...]:
-        """Convert the sensitivity profile to points (distance in grid units, weight).
 
-        Args:
-            unit_mm: grid unit of the pad, mm.
-        """
-        return tuple((distance_mm / unit_mm, weight) for distance_mm, weight in self.sensitivity_profile)
-
-
-def profile_spline(points: tuple[Point, ...]) -> "CubicSpline":
-    """Fit a cubic spline to points (distance, weight) over the squared distance, which makes it smooth at the centre.
+def profile_spline(distances: "ArrayLike", weights: "ArrayLike") -> "CubicSpline":
+    """Fit a cubic spline to weights at distances (n,) over the squared distance, which makes it smooth at the centre.
 
     It ends at weight 0, that of the last point, without a kink.
     """
     import numpy as np
     from scipy.interpolate import CubicSpline
 
-    distance, weight = np.array(points).T
-    return CubicSpline(distance**2, weight, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
+    squares = np.asarray(distances, dtype=float) ** 2
+    return CubicSpline(squares, weights, bc_type=((2, 0.0), (1, 0.0)))  # pyright: ignore[reportArgumentType]
 
 
 def _check_overshoot(points: tuple[Point, ...]) -> None:
     """Refuse points between which their spline leaves their range by more than MAX_OVERSHOOT."""
-    spline = profile_spline(points)
+    spline = profile_spline(*zip(*points, strict=True))
     slack = MAX_OVERSHOOT * max(abs(weight) for _, weight in points)
     extremes = [square for square in spline.derivative().roots(extrapolate=False).tolist() if math.isfinite(square)]
     for (begin, first), (end, second) in pairwise(points):
@@ -255,6 +303,9 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
 
 
 PUBLISHED_CONTACT = Contact(radius=0.6)  # of the paper: a polygon of 30 sides, Manhattan lengths
+# the authors' pad: a dome of 0.75 pitches, pressed 5 mm by their code; which family lies deeper, and that the pad slips
+# on its table, is what their readings say
+BUILT_CONTACT = Contact(base="slipping", fibre_depths_mm=FIBRE_DEPTHS_MM[::-1])
 TRACK_WIDTH_MM = 0.4  # default width of a track
 MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM  # two straight tracks at a right angle have two widths in common
 

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from padforge.design.common import profiling
-from padforge.design.contact import press_shape, record_visits
+from padforge.design.contact import element_spacing, press_shape, record_visits
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.geometry import Ends
 from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
-from padforge.design.kernels.measured_signals import element_signals, element_spacing, elements_gradient, fibre_elements
+from padforge.design.kernels.measured_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.morphology import Array
 from padforge.design.settings import Contact
 
@@ -87,7 +87,7 @@ def press_signals(
 ) -> Tensor:
     """Compute the signals (F, Q) of one pad, grid units for weights without unit, with their analytic gradient.
 
-    They are exact for a shape, and within PRECISION of `measured_signals` for a sensitivity profile. Slopes at the
+    They are exact for a shape, and within PRECISION of `measured_signals` for a layer or a profile. Slopes at the
     knots are independent of them, all (F, n) in float64; `presses` are (Q, 2).
     """
     return _PressSignals.apply(along, across, slope, presses, contact, ends, unit_mm)  # pyright: ignore[reportReturnType]
@@ -102,8 +102,8 @@ class _PressSignals(torch.autograd.Function):
         presses, contact, ends, unit_mm = inputs[3:]
         shape, max_offsets = press_shape(contact, unit_mm), compute_max_offsets(v[None], ends)
         out = np.zeros((len(presses), len(t)))
-        if contact.sensitivity_profile:  # elements are cut once for both directions
-            law, spacing = shape[2], element_spacing(contact.profile_points(unit_mm))
+        if contact.model != "shape":  # elements are cut once for both directions
+            law, spacing = shape[2], element_spacing(contact, unit_mm)
             elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacing)
             visited = element_signals(t, v, elements, presses, law, out)
             ctx.gradient = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law)

@@ -16,7 +16,8 @@ from padforge.design.common.files import read_json, write_json
 from padforge.design.common.validation import InputError, check_array, check_float, check_int, check_mapping, check_type
 from padforge.design.common.validation import check_path as as_path
 from padforge.design.contact import check_presses
-from padforge.design.kernels.geometry import profile_coefficients, profile_weights
+from padforge.design.kernels.geometry import EUCLIDEAN, profile_law
+from padforge.design.kernels.measured_signals import sum_elements
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact
@@ -218,27 +219,15 @@ class Twin:
         if pressed_mm.shape[1:] != (2,):
             raise InputError(f"positions_mm have shape {pressed_mm.shape}, expected (Q, 2)")
         presses, _ = check_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
-        points = self.contact().profile_points(self.morphology.unit_mm)
-        distances, end = [distance for distance, _ in points], points[-1][0]
-        profile, angular = profile_coefficients(points), None
-        if self.angular_weight is not None:
-            angular = profile_coefficients(tuple(zip(distances, self.angular_weight.tolist(), strict=True)))
+        distance, weight, angular = self.distance_mm / self.morphology.unit_mm, self.weight, self.angular_weight
+        angular = np.zeros_like(weight) if angular is None else angular
+        # cos 2 phi = 2 cos^2 phi - 1
+        law = profile_law(EUCLIDEAN, ((distance, weight - angular, 2 * angular),))
         out = np.zeros((len(presses), len(self.as_built_mm)))
         for fibre, path in enumerate(self.as_built_mm):
-            if path is None:
-                continue
-            sensitivity = None if self.sensitivity is None else self.sensitivity[fibre]
-            middles, weighted_lengths, tangents = _cut(self.morphology.to_grid(path), sensitivity)
-            for press, centre in enumerate(presses):
-                offset = middles - centre
-                distance = np.hypot(*offset.T)
-                near = distance < end
-                weights = profile_weights(profile, end, distance[near])
-                if angular is not None:
-                    along = (offset[near] * tangents[near]).sum(axis=1)
-                    cos_2phi = 2 * along**2 / (distance[near] ** 2 + 1e-6) - 1  # regular at the press centre
-                    weights = weights + profile_weights(angular, end, distance[near]) * cos_2phi
-                out[press, fibre] = float(weights @ weighted_lengths[near])
+            if path is not None:
+                sensitivity = None if self.sensitivity is None else self.sensitivity[fibre]
+                out[:, fibre] = sum_elements(*_cut(self.morphology.to_grid(path), sensitivity), presses, law)
         return out / lengths(self.morphology)
 
     @classmethod

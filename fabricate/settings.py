@@ -8,7 +8,14 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from padforge.design.common.settings import Settings, Spec, as_tuple, null_as
 from padforge.design.common.validation import InputError, check_type
-from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
+from padforge.design.settings import (
+    SILICONE_MM,
+    TRACK_DEPTHS_MM,
+    TRACK_WIDTH_MM,
+    Layout,
+    PadSettings,
+    RulesSettings,
+)
 
 from .materials import FibreSettings, SiliconeSettings
 
@@ -33,12 +40,16 @@ class MouldSettings(Settings):
     floor_mm: float = Field(default=2.0, ge=0.4, le=50, description="thickness of the tray's floor, mm")
     wall_mm: float = Field(default=2.0, ge=0.8, le=50, description="least thickness of the tray's walls, mm")
     wall_draft_deg: float = Field(default=2.0, ge=0, le=30, description="lean of the walls, for demoulding, degrees")
-    silicone_mm: float = Field(default=6.0, gt=0, le=100, description="thickness of the cast pad, mm")
+    silicone_mm: float = Field(default=SILICONE_MM, gt=0, le=100, description="thickness of the cast pad, mm")
     border_mm: float = Field(default=0.0, ge=0, le=100, description="silicone beyond the fibre ends, mm")
     ridge_width_mm: float = Field(default=TRACK_WIDTH_MM, ge=0.1, le=20, description="width of a ridge at its top, mm")
     ridge_draft_deg: float = Field(default=0.0, ge=0, le=20, description="taper of a ridge on either side, degrees")
-    deep_ridge_height_mm: float = Field(default=1.2, gt=0, le=50, description="ridge height of the deep family, mm")
-    shallow_ridge_height_mm: float = Field(default=0.4, gt=0, le=50, description="ridge height of the other family, mm")
+    deep_ridge_height_mm: float = Field(
+        default=TRACK_DEPTHS_MM[0], gt=0, le=50, description="ridge height of the deep family, mm"
+    )
+    shallow_ridge_height_mm: float = Field(
+        default=TRACK_DEPTHS_MM[1], gt=0, le=50, description="ridge height of the other family, mm"
+    )
     levels: Literal["as_needed", "two"] = Field(
         default="as_needed", description="more ridge heights where a family crosses itself, or refuse such a pad"
     )

@@ -26,7 +26,7 @@ from padforge.design.kernels.geometry import (
     find_unit_roots,
     select_frame,
     shell_sort,
-    weigh,
+    weigh_element,
 )
 from padforge.design.kernels.pchip import piece_of
 
@@ -74,7 +74,7 @@ def _density(span: Any, s: float, law: Any) -> float:
     if law.weight == UNIFORM:
         return run
     t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
-    return run * weigh(t * t + v * v, law)
+    return run * weigh_element(t, v, span[1], rise, law)
 
 
 @njit(cache=True, error_model="numpy")

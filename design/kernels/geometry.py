@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
-NO_PROFILE = np.empty((0, 5))
+NO_PROFILE, NO_BINS = np.empty((2, 0, 9)), np.empty(0, np.int64)
+MAX_BINS = 4096
 
 
 class Ends(NamedTuple):
@@ -31,46 +32,83 @@ class Ends(NamedTuple):
 class WeightLaw(NamedTuple):
     """Weight of a fibre element in a press.
 
-    A profile (B, 5) has rows of a squared distance and the coefficients of a cubic in the excess over it, up to the
-    next row's.
+    A profile is w(d) + v(d) cos^2 phi, with d the distance to the press centre and phi the angle between the fibre and
+    the way there; v is 0 at d = 0. It has a table for each family, whose fibres may lie at another depth: rows of a
+    squared distance, and the coefficients of the cubics w and v in the excess over it, up to the next row's.
     """
 
     radius: float  # circumradius of the shape, or the distance at which a profile ends
     weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
     length: int  # MANHATTAN or EUCLIDEAN
-    profile: Array = NO_PROFILE
+    profile: Array = NO_PROFILE  # shape (2, B, 9), or (B, 9) in the frame of a family
+    bins: NDArray[np.int64] = NO_BINS  # row of the profile at the begin of each of equal steps of the squared distance
+    bin_rate: float = 0.0  # steps per squared distance
+    directional: bool = False  # whether v counts
 
 
 @njit(cache=True, error_model="numpy")
 def weigh(square: float, law: Any) -> float:
-    """Return the weight of a fibre element at a squared distance from the press centre, by a `WeightLaw`."""
-    radius, weight, profile = law.radius, law.weight, law.profile
+    """Return the weight of a fibre element at a squared distance from the press centre, in a shape."""
+    radius, weight = law.radius, law.weight
     if weight == UNIFORM:
         return 1.0
     if weight == INVERSE_SQUARE:
         return 1 / (radius + square)
-    if weight == INVERSE:
-        return 1 / max(math.sqrt(square), radius / 100)
-    piece = profile[piece_of(square, profile[:, 0], len(profile))]
-    x = square - piece[0]
-    return piece[1] + x * (piece[2] + x * (piece[3] + x * piece[4]))
+    return 1 / max(math.sqrt(square), radius / 100)
 
 
-@lru_cache(maxsize=64)
-def profile_coefficients(points: tuple[tuple[float, float], ...]) -> Array:
-    """Return the `WeightLaw.profile` (B, 5) through points (distance, weight), by their `profile_spline`."""
-    spline = profile_spline(points)
-    # one memory order, so that kernels are compiled once
-    return np.ascontiguousarray(np.column_stack([spline.x[:-1], spline.c[::-1].T]))
+@njit(cache=True, error_model="numpy")
+def find_row(square: float, profile: Any, law: Any) -> int:
+    """Return the row of a family's profile that applies at a squared distance, below that of its end."""
+    row = law.bins[int(square * law.bin_rate)]
+    while row < len(profile) - 1 and square >= profile[row + 1, 0]:
+        row += 1
+    return row
 
 
-def profile_weights(profile: Array, end: float, distance: Array) -> Array:
-    """Evaluate a profile of `profile_coefficients` at distances of any shape; it is 0 from `end` on."""
-    square = distance**2
-    piece = np.searchsorted(profile[:, 0], square, side="right") - 1
-    x, c0, c1, c2, c3 = profile[piece].T
-    above = square - x.T
-    return np.where(distance < end, c0.T + above * (c1.T + above * (c2.T + above * c3.T)), 0.0)
+@njit(cache=True, error_model="numpy")
+def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
+    """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
+    square = dt * dt + dv * dv
+    if square >= law.radius * law.radius:
+        return 0.0
+    row = profile[find_row(square, profile, law)]
+    x = square - row[0]
+    weight = row[1] + x * (row[2] + x * (row[3] + x * row[4]))
+    if law.directional and square > 0:
+        along = dt * ut + dv * uv
+        weight += (row[5] + x * (row[6] + x * (row[7] + x * row[8]))) * (along * along / square)
+    return weight
+
+
+@njit(cache=True, error_model="numpy")
+def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> float:
+    """Return the weight of an element at (t, v) from the press centre that runs along (run, rise), by a framed law."""
+    if law.weight != PROFILE:
+        return weigh(t * t + v * v, law)
+    norm = math.sqrt(run * run + rise * rise)
+    return weigh_profile(t, v, run / norm, rise / norm, law.profile, law)
+
+
+def profile_law(length: int, families: tuple[tuple[Array, Array, Array], ...]) -> WeightLaw:
+    """Return the law of profiles by their (distances, weights w, weights v), once for both families or for each.
+
+    All have the same distances; both functions are a `profile_spline` through them.
+    """
+    tables = []
+    for distance, plain, directed in families:
+        splines = [profile_spline(distance, values) for values in (plain, directed)]
+        tables.append(np.column_stack([splines[0].x[:-1], *(spline.c[::-1].T for spline in splines)]))
+    profile = np.ascontiguousarray(np.stack([tables[0], tables[-1]]))
+    end, starts = float(families[0][0][-1]), profile[0, :, 0]
+    finest = float(np.diff(np.append(starts, end**2)).min())
+    steps = min(MAX_BINS, math.ceil(end**2 / finest))
+    rate = steps / end**2
+    # a step's begin is taken a little early, since rounding may go either way
+    edges = np.arange(steps + 1) / rate * (1 - 8 * EPS) - 8 * EPS * end**2
+    bins = np.clip(np.searchsorted(starts, edges, side="right") - 1, 0, None)
+    directional = any(bool(np.any(directed)) for _, _, directed in families)
+    return WeightLaw(end, PROFILE, length, profile, bins, rate, directional)
 
 
 @lru_cache(maxsize=64)
@@ -107,7 +145,9 @@ def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], 
 def select_frame(shape: Any, family: int) -> Any:
     """Return a shape (chains and extents in both frames, law) in the frame of one family."""
     chains, extents, law = shape
-    return (chains[0] if family == 0 else chains[1]), extents[family], law
+    profile = law.profile[family]
+    framed = WeightLaw(law.radius, law.weight, law.length, profile, law.bins, law.bin_rate, law.directional)
+    return (chains[0] if family == 0 else chains[1]), extents[family], framed
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

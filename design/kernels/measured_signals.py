@@ -6,7 +6,6 @@ position and length is accumulated over all presses first, then passed on to kno
 """
 
 import math
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,13 +13,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from padforge.design.kernels.exact_gradient import differentiate_cubic
-from padforge.design.kernels.geometry import MANHATTAN, profile_coefficients, profile_weights
+from padforge.design.kernels.geometry import MANHATTAN, WeightLaw, find_row, weigh_profile
 from padforge.design.kernels.pchip import extremes
 
 Array = NDArray[np.float64]
 
 PRECISION = 5e-5
 """Error of signals here, as a share of the largest one: far below that of measured profiles."""
+LAYER_PRECISION = 1e-3
+"""Root of the mean squared error of signals of a layer, as a share of the largest one: a tenth of the noise. Strains of
+a shallow fibre step at the edge of the contact, and to resolve the step everywhere would take five times as long."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 MAX_REFINEMENTS = 24
@@ -37,15 +39,20 @@ class Elements(NamedTuple):
     along: Array  # coordinate along the fibre's axis, grid units
     across: Array  # coordinate across it, grid units
     length: Array  # grid units
+    tangent_along: Array  # unit tangent, along the fibre's axis
+    tangent_across: Array  # and across it
     share: Array  # position on its span, 0..1
     weight: Array  # quadrature weight, as a share of the span
 
 
-@lru_cache(maxsize=64)
-def element_spacing(points: tuple[tuple[float, float], ...]) -> float:
-    """Return the largest spacing at which a straight fibre is within PRECISION, by (distance, weight) of a profile."""
-    profile, end = profile_coefficients(points), points[-1][0]
-    distances, shifts = end * np.arange(32)[:, None, None] / 32, np.arange(16)[:, None] / 16
+def element_spacing(law: WeightLaw) -> float:
+    """Return the largest spacing at which straight fibres of both families are within PRECISION, by their profiles."""
+    return min(_spacing(profile, law) for profile in law.profile[: 1 + int((law.profile[0] != law.profile[1]).any())])
+
+
+def _spacing(profile: Array, law: WeightLaw) -> float:
+    end = law.radius
+    distances, shifts = end * np.arange(32) / 32, np.arange(16)[:, None] / 16
 
     def straight_signals(spacing: float) -> Array:
         """Return signals (distances, shifts) by pieces of a span that begin at shifted positions."""
@@ -53,16 +60,26 @@ def element_spacing(points: tuple[tuple[float, float], ...]) -> float:
         begin = width * (np.arange(-math.ceil(end / width) - 1, math.ceil(end / width) + 1) + shifts)
         nodes = (begin[..., None] + width * _NODES).reshape(len(shifts), -1)
         lengths = np.tile(width * _WEIGHTS, begin.shape[-1])
-        return profile_weights(profile, end, np.hypot(nodes, distances)) @ lengths
+        return np.stack([straight_weights(nodes, distance, profile, law) @ lengths for distance in distances])
 
     spacing = end / 4
     for _ in range(MAX_REFINEMENTS):
         signals = straight_signals(spacing)
         reference = signals.mean(axis=1, keepdims=True)  # far more precise than any one of them
-        if np.abs(signals - reference).max() <= PRECISION * np.abs(reference).max():
+        error, largest = np.abs(signals - reference), np.abs(reference).max()
+        if math.sqrt((error**2).mean()) <= LAYER_PRECISION * largest if law.directional else error.max() <= PRECISION * largest:
             break
         spacing *= 0.8
     return spacing
+
+
+@njit(cache=True, error_model="numpy")
+def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any:
+    """Return the weights, of any shape, of elements of a straight fibre that passes the press at a distance."""
+    out = np.empty(along.shape)
+    for i, at in np.ndenumerate(along):
+        out[i] = weigh_profile(at, distance, 1.0, 0.0, profile, law)
+    return out
 
 
 @njit(cache=True, error_model="numpy")
@@ -95,22 +112,24 @@ def fibre_elements(
                 pieces[f, j] = _count_pieces(t1 - t0, v1 - v0, slope[f, j], slope[f, j + 1], spacing)
                 total += pieces[f, j] * len(_NODES)
         starts[f, n - 1] = total
-    out = np.empty((5, total))
+    out = np.empty((7, total))
     for f in range(fibres):
         for j in range(n - 1):
-            h, v0, rise = along[f, j + 1] - along[f, j], across[f, j], across[f, j + 1] - across[f, j]
+            h, v0, height = along[f, j + 1] - along[f, j], across[f, j], across[f, j + 1] - across[f, j]
             a1 = h * slope[f, j]
-            a2, a3 = 3 * rise - 2 * a1 - h * slope[f, j + 1], a1 + h * slope[f, j + 1] - 2 * rise
+            a2, a3 = 3 * height - 2 * a1 - h * slope[f, j + 1], a1 + h * slope[f, j + 1] - 2 * height
             k = starts[f, j]
             for piece in range(pieces[f, j]):
                 for i in range(len(_NODES)):
                     s, weight = (piece + _NODES[i]) / pieces[f, j], _WEIGHTS[i] / pieces[f, j]
-                    speed = abs(a1 + s * (2 * a2 + 3 * a3 * s))
-                    speed = h + speed if law.length == MANHATTAN else math.hypot(h, speed)
+                    rise = a1 + s * (2 * a2 + 3 * a3 * s)
+                    norm = math.hypot(h, rise)
+                    speed = h + abs(rise) if law.length == MANHATTAN else norm
                     out[0, k], out[1, k] = along[f, j] + h * s, v0 + s * (a1 + s * (a2 + s * a3))
-                    out[2, k], out[3, k], out[4, k] = weight * speed, s, weight
+                    out[2, k], out[3, k], out[4, k] = weight * speed, h / norm, rise / norm
+                    out[5, k], out[6, k] = s, weight
                     k += 1
-    return Elements(horizontals, starts, out[0], out[1], out[2], out[3], out[4])
+    return Elements(horizontals, starts, out[0], out[1], out[2], out[3], out[4], out[5], out[6])
 
 
 @njit(cache=True, error_model="numpy")
@@ -120,23 +139,13 @@ def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
     return is_beside and min(v[j], v[j + 1]) < cv + end and max(v[j], v[j + 1]) > cv - end
 
 
-@njit(cache=True, error_model="numpy")
-def _find_piece(square: float, profile: Any, piece: Any) -> int:
-    """Return the row of a profile that applies at a squared distance, searching from the row of a nearby element."""
-    while piece > 0 and square < profile[piece, 0]:
-        piece -= 1
-    while piece < len(profile) - 1 and square >= profile[piece + 1, 0]:
-        piece += 1
-    return piece
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, out: Any) -> int:
     """Compute signals of one pad from its elements into `out` (Q, F); return the number of spans visited."""
-    (fibres, n), (end, _, _, profile) = along.shape, law
-    visited, piece = 0, np.int64(0)
+    (fibres, n), end, visited = along.shape, law.radius, 0
     for f in range(fibres):
         t, v, first, axis = along[f], across[f], elements.starts[f], 0 if f < elements.horizontals else 1
+        profile = law.profile[axis]
         bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, total = presses[q, axis], presses[q, 1 - axis], 0.0
@@ -145,25 +154,36 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                     continue
                 visited += 1
                 for k in range(first[j], first[j + 1]):
-                    dt, dv = elements.along[k] - ct, elements.across[k] - cv
-                    square = dt * dt + dv * dv
-                    if square < end * end:
-                        piece = _find_piece(square, profile, piece)
-                        start, c0, c1, c2, c3 = profile[piece]
-                        x = square - start
-                        total += elements.length[k] * (c0 + x * (c1 + x * (c2 + x * c3)))
+                    ut, uv = elements.tangent_along[k], elements.tangent_across[k]
+                    weight = weigh_profile(elements.along[k] - ct, elements.across[k] - cv, ut, uv, profile, law)
+                    total += elements.length[k] * weight
             out[q, f] = total
     return visited
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any) -> Any:
+    """Sum the weights of E elements for each press (Q,), by their points (E, 2), lengths (E,) and tangents (E, 2)."""
+    out, profile = np.zeros(len(presses)), law.profile[0]
+    for q in range(len(presses)):
+        for k in range(len(length)):
+            dt, dv = points[k, 0] - presses[q, 0], points[k, 1] - presses[q, 1]
+            out[q] += length[k] * weigh_profile(dt, dv, tangents[k, 0], tangents[k, 1], profile, law)
+    return out
 
 
 @njit(cache=True, error_model="numpy")
 def _differentiate_elements(
     along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, out: Any
 ) -> None:
-    """Add the derivatives of sum(upstream * signals) by each element's along, across and length to out (3, E)."""
-    (fibres, n), (end, _, _, profile), piece = along.shape, law, np.int64(0)
+    """Add the derivatives of sum(upstream * signals) to out (5, E).
+
+    They are by each element's along, across and length, and by both parts of its unit tangent.
+    """
+    (fibres, n), end = along.shape, law.radius
     for f in range(fibres):
         t, v, first, axis = along[f], across[f], elements.starts[f], 0 if f < elements.horizontals else 1
+        profile = law.profile[axis]
         bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, up = presses[q, axis], presses[q, 1 - axis], upstream[q, f]
@@ -174,13 +194,26 @@ def _differentiate_elements(
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
                     if square < end * end:
-                        piece = _find_piece(square, profile, piece)
-                        start, c0, c1, c2, c3 = profile[piece]
-                        x = square - start
-                        radial_derivative = 2 * up * elements.length[k] * (c1 + x * (2 * c2 + 3 * x * c3))
+                        row = profile[find_row(square, profile, law)]
+                        x, up_length = square - row[0], up * elements.length[k]
+                        radial_derivative = 2 * up_length * (row[2] + x * (2 * row[3] + 3 * x * row[4]))
+                        weight = row[1] + x * (row[2] + x * (row[3] + x * row[4]))
+                        if law.directional and square > 0:
+                            ut, uv = elements.tangent_along[k], elements.tangent_across[k]
+                            directed = row[5] + x * (row[6] + x * (row[7] + x * row[8]))
+                            rate = row[6] + x * (2 * row[7] + 3 * x * row[8])
+                            way = (dt * ut + dv * uv) / square
+                            cosine_square = way * way * square
+                            weight += directed * cosine_square
+                            radial_derivative += 2 * up_length * cosine_square * (rate - directed / square)
+                            turn = 2 * up_length * directed * way
+                            out[0, k] += turn * ut
+                            out[1, k] += turn * uv
+                            out[3, k] += turn * dt
+                            out[4, k] += turn * dv
                         out[0, k] += radial_derivative * dt
                         out[1, k] += radial_derivative * dv
-                        out[2, k] += up * (c0 + x * (c1 + x * (c2 + x * c3)))
+                        out[2, k] += up * weight
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -190,7 +223,7 @@ def elements_gradient(along: Any, across: Any, slope: Any, elements: Any, presse
     Slopes are held independent of knots; the elements are from `fibre_elements` of the same arguments.
     """
     fibres, n = along.shape
-    out, element_gradient = np.zeros((3, fibres, n)), np.zeros((3, len(elements.length)))
+    out, element_gradient = np.zeros((3, fibres, n)), np.zeros((5, len(elements.length)))
     _differentiate_elements(along, across, elements, presses, upstream, law, element_gradient)
     d_point, d_tangent = np.empty((6, 2)), np.empty((6, 2))
     for f in range(fibres):
@@ -200,15 +233,18 @@ def elements_gradient(along: Any, across: Any, slope: Any, elements: Any, presse
             for k in range(elements.starts[f, j], elements.starts[f, j + 1]):
                 s = elements.share[k]
                 dv_ds = h * (d0 + s * (2 * (3 * m - 2 * d0 - d1) + 3 * s * (d0 + d1 - 2 * m)))
-                is_manhattan = law.length == MANHATTAN
-                speed = h + abs(dv_ds) if is_manhattan else math.hypot(h, dv_ds)
+                is_manhattan, norm = law.length == MANHATTAN, math.hypot(h, dv_ds)
+                speed = h + abs(dv_ds) if is_manhattan else norm
                 speed_t = 1.0 if is_manhattan else h / speed
                 speed_v = math.copysign(1.0, dv_ds) if is_manhattan else dv_ds / speed
                 longer = element_gradient[2, k] * elements.weight[k]
+                ut, uv = elements.tangent_along[k], elements.tangent_across[k]
+                # what turns the tangent is across it
+                turn = (element_gradient[4, k] * ut - element_gradient[3, k] * uv) / norm
                 differentiate_cubic(s, h, d0, d1, d_point, d_tangent)
                 for x in range(6):
                     moved = element_gradient[0, k] * d_point[x, 0] + element_gradient[1, k] * d_point[x, 1]
-                    out[x // 2, f, j + x % 2] += moved + longer * (
-                        speed_t * d_tangent[x, 0] + speed_v * d_tangent[x, 1]
-                    )
+                    stretched = longer * (speed_t * d_tangent[x, 0] + speed_v * d_tangent[x, 1])
+                    turned = turn * (ut * d_tangent[x, 1] - uv * d_tangent[x, 0])
+                    out[x // 2, f, j + x % 2] += moved + stretched + turned
     return out

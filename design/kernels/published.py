@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from padforge.design.kernels.geometry import MANHATTAN, UNIFORM, select_frame, shell_sort, weigh
+from padforge.design.kernels.geometry import MANHATTAN, UNIFORM, select_frame, shell_sort, weigh_element
 from padforge.design.kernels.pchip import extremes, pchip_sample, piece_of
 
 
@@ -91,7 +91,7 @@ def _sum_stretch(
         dt, dv = i * step - ct, curve[i] - cv
         square = dt * dt + dv * dv
         if square <= inner or (square <= outer and _is_between_chains(dt, dv, chains)):
-            total += segment_lengths[i] * weigh(square, law)
+            total += segment_lengths[i] * weigh_element(dt, dv, step, curve[i + 1] - curve[i], law)
     return total
 
 

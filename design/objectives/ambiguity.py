@@ -16,8 +16,8 @@ import numpy as np
 from numba import njit
 
 from padforge.design.common.validation import InputError
-from padforge.design.contact import fibre_axes, grid_positions, press_shape, relative_stretch, signals
-from padforge.design.kernels.measured_signals import element_signals, element_spacing, fibre_elements
+from padforge.design.contact import element_spacing, fibre_axes, grid_positions, press_shape, relative_stretch, signals
+from padforge.design.kernels.measured_signals import element_signals, fibre_elements
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares, failure_subsets
@@ -113,12 +113,12 @@ def ambiguity_map(
 
 def _fast_signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
     """Return signals (Q, F) as precise as a search needs them, without torch."""
-    if not contact.sensitivity_profile:
+    if contact.model == "shape":
         return signals(pad, presses, contact)
     along, across, ends, _ = fibre_axes(pad)
     slope = population_slopes(along, across)[0]
     law = press_shape(contact, pad.unit_mm)[2]
-    spacing = element_spacing(contact.profile_points(pad.unit_mm))
+    spacing = element_spacing(contact, pad.unit_mm)
     elements = fibre_elements(along[0], across[0], slope, ends.horizontals, presses, law, spacing)
     out = np.empty((len(presses), len(slope)))
     element_signals(along[0], across[0], elements, presses, law, out)

@@ -68,7 +68,7 @@ class ScoredPad:
     @property
     def published_contact(self) -> Contact:
         """The contact of the published terms, which have no sensitivity profile."""
-        return PUBLISHED_CONTACT if self.contact.sensitivity_profile else self.contact
+        return self.contact if self.contact.model == "shape" else PUBLISHED_CONTACT
 
     @cached_property
     def published(self) -> formula.PublishedTerms:

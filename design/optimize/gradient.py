@@ -177,7 +177,7 @@ class GradientSearch:
         pad, rules = problem.pad, problem.rules
         # full scale of straight fibres under each contact
         self.scales = [objective.straight_full_scale(pad.layout, c, pad.sensed_mm) for c in problem.contacts]
-        gentle = bool(problem.contacts[0].sensitivity_profile)
+        gentle = problem.contacts[0].model != "shape"
         paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng, gentle)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
         self._optimiser = self._adam()

@@ -1,0 +1,227 @@
+"""An elastic layer on a rigid base, pressed by a tool: contact radius, force, deflection and strains.
+
+The layer of thickness t is incompressible, linear, and bonded to its base or free to slip on it; the tool is a body of
+revolution that slides on the pressed face. Displacements are Hankel integrals over the wavenumber k of the pressure p
+on the face (Sneddon 1951, Fourier Transforms, ch. 10; Johnson 1985, Contact Mechanics, ch. 3 and 5). Down and outward,
+at the height z, with G the shear modulus and W, E the responses of `_transfer`:
+
+    w(r, z) = 1 / 2G  int p(k) W(k, z) J0(k r) dk,      u(r, z) = 1 / 2G  int p(k) E(k, z) J1(k r) dk,
+    -eps_zz = 1 / 2G  int k p(k) E(k, z) J0(k r) dk,    p(k) = 4 G / pi  int_0^a phi(s) cos(k s) ds.
+
+With p(k) so, there is no pressure beyond the contact radius a, and the face follows the tool inside it if (Lebedev and
+Ufliand 1958, Axisymmetric contact problem for an elastic layer)
+
+    (1 + c) phi(x) - 2 / pi  int_0^a phi(s) int (1 - W(k, t)) cos(k x) cos(k s) dk ds = d - f(x),    0 <= x <= a,
+
+    f(x) = x^2 / R  for a dome, a paraboloid of tip radius R,    x artanh(x / R)  for a ball,    0  for a flat end,
+
+which even Legendre polynomials solve. d is the depth; the contact of a smooth tool ends where phi(a) = 0, that of a
+flat end at its radius. c is the compliance of the tool's surface over that of the pad's: 0 if it is rigid, 1 for a
+finger, a dome as soft as the pad. On a thick layer these are Hertz's and Sneddon's closed forms.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Tool = Literal["dome", "ball", "flat", "finger"]
+Base = Literal["bonded", "slipping"]
+
+REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
+"""E* of EcoFlex 00-20, kPa: modulus 55 kPa at 100 % strain (manufacturer's data sheet), incompressible."""
+FINGER_COMPLIANCE = 1.0
+"""Compliance of a fingertip's pulp as a multiple of the pad's: both are tens of kPa soft."""
+TERMS = 16
+"""Legendre polynomials of phi: contact radii up to five thicknesses to 1e-6."""
+_FACE_WAVES = 20.0
+"""Wavenumber times thickness at which a layer is a half-space to 1e-15."""
+_DECAY = 25.0
+"""Wavenumber times depth below the face at which a field has decayed, to exp(-25)."""
+_MIN_DEPTH_SHARE = 0.01
+"""Least depth below the face, as a share of the thickness, at which strains are computed."""
+
+
+class Strains(NamedTuple):
+    """Strains of the silicone at a height, by the distance from the tool's axis; they sum to 0."""
+
+    compressive: Array  # -eps_zz, vertical
+    radial: Array  # du / dr
+    hoop: Array  # u / r
+
+
+@dataclass(frozen=True)
+class LayerPress:
+    """One press of a tool into a layer, all lengths in mm.
+
+    Attributes:
+        thickness_mm: thickness t of the layer.
+        base: "bonded" to what it lies on, or "slipping" without friction.
+        contact_radius_mm: radius a of the contact.
+        load: coefficients of phi by the Legendre polynomials P_0, P_2, ... of x / a; shape (TERMS,), mm.
+    """
+
+    thickness_mm: float
+    base: Base
+    contact_radius_mm: float
+    load: Array
+
+    def force_n(self, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> float:
+        """Return the force, N.
+
+        Args:
+            reduced_modulus_kpa: E* = E / (1 - nu^2) of the silicone, kPa.
+        """
+        return 2e-3 * reduced_modulus_kpa * self.contact_radius_mm * float(self.load[0])  # kPa mm^2 = 1e-3 N
+
+    def deflection(self, r_mm: ArrayLike) -> Array:
+        """Return how far the pressed face is down.
+
+        Args:
+            r_mm: distances from the axis; shape (n,).
+
+        Returns:
+            Deflections; shape (n,), mm.
+        """
+        r, a = np.asarray(r_mm, dtype=float), self.contact_radius_mm
+        nodes, weights = _gauss(200)
+        # int phi(s) / sqrt(r^2 - s^2) ds of the half-space, s = min(r, a) sin(angle)
+        inside, angle = np.minimum(r, a)[:, None], np.pi / 2 * nodes
+        series = np.polynomial.legendre.legval(inside / a * np.sin(angle), np.insert(self.load, range(1, TERMS), 0.0))
+        within = r[:, None] <= a
+        root = np.sqrt(np.maximum(r[:, None] ** 2 - (a * np.sin(angle)) ** 2, 1e-300))
+        half_space = np.where(within, series, series * a * np.cos(angle) / root) @ (np.pi / 2 * weights)
+        k = _FACE_WAVES / self.thickness_mm * nodes
+        softer = 1 - _transfer(self.base, k, self.thickness_mm, self.thickness_mm)[0]
+        layer = weights * _FACE_WAVES / self.thickness_mm * softer * (self.load @ _legendre_waves(k, a))
+        return 2 / np.pi * (half_space - _bessel(0, r, k) @ layer)
+
+    def strains(self, r_mm: ArrayLike, height_mm: float, blur_mm: float = 0.0) -> Strains:
+        """Return the strains at a height.
+
+        Args:
+            r_mm: distances from the axis; shape (n,).
+            height_mm: height above the base, mm; nearer to the pressed face than a hundredth of the thickness, the
+                strains are those there.
+            blur_mm: standard deviation of a Gaussian in the plane by which they are averaged.
+        """
+        r = np.asarray(r_mm, dtype=float)
+        height_mm = min(height_mm, (1 - _MIN_DEPTH_SHARE) * self.thickness_mm)
+        k, weight, load = self._waves(height_mm, r.max(initial=0.0), blur_mm)
+        _, outward = _transfer(self.base, k, height_mm, self.thickness_mm)
+        amplitude = weight * load * outward * np.exp(-((k * blur_mm) ** 2) / 2)
+        compressive = _bessel(0, r, k) @ (k * amplitude)
+        hoop = np.where(r > 0, _bessel(1, r, k) @ amplitude / np.where(r > 0, r, 1), compressive / 2)
+        return Strains(compressive, compressive - hoop, hoop)
+
+    def _waves(self, height_mm: float, farthest_mm: float, blur_mm: float) -> tuple[Array, Array, Array]:
+        """Return wavenumbers, their quadrature weights, and p(k) / 2G, for a field out to a distance."""
+        depth = max(self.thickness_mm - height_mm, _MIN_DEPTH_SHARE * self.thickness_mm)
+        # k depth + k^2 blur^2 / 2 = _DECAY
+        largest = 2 * _DECAY / (depth + math.sqrt(depth**2 + 2 * _DECAY * blur_mm**2))
+        # panels of ten radians of the fastest oscillation, and twenty of what the layer itself does
+        panels = 20 + math.ceil(largest * (self.contact_radius_mm + farthest_mm) / 10)
+        nodes, weights = _gauss(16)
+        k = (largest / panels * (np.arange(panels)[:, None] + nodes)).ravel()
+        weight = np.tile(largest / panels * weights, panels)
+        return k, weight, 2 / np.pi * (self.load @ _legendre_waves(k, self.contact_radius_mm))
+
+
+@lru_cache(maxsize=256)
+def solve_press(
+    tool: Tool, radius_mm: float, depth_mm: float, thickness_mm: float, base: Base = "bonded"
+) -> LayerPress:
+    """Solve the contact of a tool with a layer.
+
+    Args:
+        tool: "dome", a paraboloid of tip radius R; "ball", a sphere; "flat", the end of a rod; "finger", a soft dome.
+        radius_mm: R of the tool, > 0.
+        depth_mm: depth of the tool's tip below the undeformed face, > 0; of a finger, what tip and pad take up.
+        thickness_mm: thickness of the layer, above the depth.
+        base: what the layer does on its base.
+
+    Returns:
+        The press. A ball deeper than it can touch a plane with has the radius of contact of its equator.
+    """
+    from scipy.optimize import brentq
+
+    compliance = FINGER_COMPLIANCE if tool == "finger" else 0.0
+
+    def solve(a: float) -> tuple[Array, Array]:
+        return _solve_phi(tool, radius_mm, a, thickness_mm, base, compliance)
+
+    def excess(a: float) -> float:  # a smooth tool's contact ends where phi(a) = 0, and P_2n(1) = 1
+        unit, shape = solve(a)
+        return float(shape.sum() - depth_mm * unit.sum())
+
+    hertz = math.sqrt(radius_mm * depth_mm)
+    widest = radius_mm * (1 - 1e-6) if tool == "ball" else 3 * hertz
+    if tool == "flat" or (tool == "ball" and excess(widest) < 0):
+        a = radius_mm if tool == "flat" else widest
+    else:  # between Hertz's and twice it, the thin layer's
+        a = float(brentq(excess, min(0.5 * hertz, widest / 2), widest, xtol=1e-10 * hertz))  # pyright: ignore[reportArgumentType]
+    unit, shape = solve(a)
+    return LayerPress(thickness_mm, base, a, depth_mm * unit - shape)
+
+
+def _solve_phi(
+    tool: Tool, radius: float, a: float, thickness: float, base: Base, compliance: float
+) -> tuple[Array, Array]:
+    """Solve for phi on [0, a] with the right side 1 and with f(x), both by Legendre coefficients (TERMS,)."""
+    nodes, weights = _gauss(400)
+    k, x = _FACE_WAVES / thickness * nodes, a * nodes
+    softer = 1 - _transfer(base, k, thickness, thickness)[0]
+    waves = _legendre_waves(k, a)
+    order = np.arange(TERMS)
+    matrix = np.diag((1 + compliance) * a / (4 * order + 1))
+    matrix -= 2 / np.pi * (waves * (softer * weights * _FACE_WAVES / thickness)) @ waves.T
+    shape = x * np.arctanh(x / radius) if tool == "ball" else x**2 / radius * (tool != "flat")
+    polynomials = np.polynomial.legendre.legvander(nodes, 2 * TERMS - 2)[:, ::2].T
+    right = np.stack([polynomials @ (a * weights), polynomials @ (a * weights * shape)])
+    unit, shaped = np.linalg.solve(matrix, right.T).T
+    return unit, shaped
+
+
+def _transfer(base: Base, k: Array, height: float, thickness: float) -> tuple[Array, Array]:
+    """Return W and E at wavenumbers k > 0, at a height; 1 and 0 on the face of a half-space.
+
+    (d^2 / dz^2 - k^2)^2 w = 0 with p(k) and no shear on the face, and on the base w = 0 and u = 0 or no shear.
+    Everything is scaled by exp(-k t), so that nothing overflows.
+    """
+    x, y = k * thickness, k * height
+    decayed = np.exp(-2 * x)
+    cosh, sinh = (1 + decayed) / 2, (1 - decayed) / 2
+    cosh_y, sinh_y = (np.exp(y - x) + np.exp(-y - x)) / 2, (np.exp(y - x) - np.exp(-y - x)) / 2
+    if base == "slipping":
+        whole = sinh * cosh + x * decayed
+        down = ((sinh + x * cosh) * sinh_y - sinh * y * cosh_y) / whole
+        return down, (x * cosh * cosh_y - sinh * y * sinh_y) / whole
+    whole = cosh**2 + x**2 * decayed
+    first, second = (cosh + x * sinh) / whole, x * cosh / whole
+    return first * (sinh_y - y * cosh_y) + second * y * sinh_y, second * (sinh_y + y * cosh_y) - first * y * sinh_y
+
+
+def _legendre_waves(k: Array, a: float) -> Array:
+    """Return the integrals of P_2n(x / a) cos(k x) over [0, a]; shape (TERMS, n)."""
+    from scipy.special import spherical_jn
+
+    order = np.arange(TERMS)[:, None]
+    return a * (-1.0) ** order * spherical_jn(2 * order, a * k)
+
+
+def _bessel(order: int, r: Array, k: Array) -> Array:
+    """Return J_order(k r); shape (n, waves)."""
+    from scipy.special import j0, j1
+
+    return (j0 if order == 0 else j1)(np.multiply.outer(r, k))
+
+
+@cache
+def _gauss(count: int) -> tuple[Array, Array]:
+    """Return the nodes and weights of a Gauss-Legendre rule on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return (1 + nodes) / 2, weights / 2
