@@ -18,7 +18,7 @@ from padforge.design.kernels import geometry, measured_signals
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.kernels.published import quantized_signals
-from padforge.design.layer import LayerPress, solve_press
+from padforge.design.layer import solve_press
 from padforge.design.morphology import (
     MAX_COORDINATE,
     MAX_SAMPLES,
@@ -230,7 +230,7 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
         plain = contact.squeeze * strains.compressive + contact.stretch * strains.hoop
         directed = contact.stretch * (strains.radial - strains.hoop)
         directed[0] = 0.0  # to rounding, by symmetry
-        families.append((distance, fade * plain, fade * directed))
+        families.append((contact.scale * distance, fade * plain, fade * directed))
     return tuple(families)
 
 

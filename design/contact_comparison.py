@@ -48,14 +48,27 @@ class ContactErrors:
 
 
 def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
-    """Return the assumed contact, first, and others that a pad may really meet, by name; none twice."""
-    others = {
-        f"profile of {std:g} mm": Contact(
-            sensitivity_profile=tuple((std / MEASURED_STD_MM * d, weight) for d, weight in MEASURED_PROFILE)
-        )
-        for std in PROFILE_STD_MM
-    }
-    others["published disc, K = 0.6"] = PUBLISHED_CONTACT
+    """Return the assumed contact, first, and others that a pad may really meet, by name; none twice.
+
+    Beside a layer they are presses by a tool half as large or half as deep, and fibres that answer to being pressed
+    flat alone; beside another contact narrower and wider profiles, and the published disc.
+    """
+    if assumed.model == "layer":
+        tool_mm, depth_mm = assumed.tool_radius_mm / 2, assumed.depth_mm / 2
+        changes: dict[str, dict[str, float]] = {
+            f"tool of {tool_mm:g} mm": {"tool_radius_mm": tool_mm},
+            f"{depth_mm:g} mm deep": {"depth_mm": depth_mm},
+            "pressed flat alone": {"squeeze": 1.0, "stretch": 0.0},
+        }
+        others = {name: Contact(**assumed.model_dump() | change) for name, change in changes.items()}
+    else:
+        others = {
+            f"profile of {std:g} mm": Contact(
+                sensitivity_profile=tuple((std / MEASURED_STD_MM * d, weight) for d, weight in MEASURED_PROFILE)
+            )
+            for std in PROFILE_STD_MM
+        }
+        others["published disc, K = 0.6"] = PUBLISHED_CONTACT
     return {"as assumed": assumed} | {name: other for name, other in others.items() if other != assumed}
 
 

@@ -156,7 +156,7 @@ FibreDepths = tuple[Annotated[float, Field(gt=0, le=100)], Annotated[float, Fiel
 _KEYS = {
     "layer": (
         *("tool", "tool_radius_mm", "depth_mm", "thickness_mm", "base"),
-        *("fibre_depths_mm", "squeeze", "stretch"),
+        *("fibre_depths_mm", "squeeze", "stretch", "scale"),
     ),
     "profile": ("sensitivity_profile",),
     "shape": ("radius", "sides", "weight"),
@@ -215,6 +215,9 @@ class Contact(Settings):
     )
     squeeze: float = Field(default=1.0, ge=0, le=100, description="response of a fibre to being pressed flat")
     stretch: float = Field(default=1.0, ge=0, le=100, description="response of a fibre to being stretched")
+    scale: float = Field(
+        default=1.0, ge=0.1, le=10, description="width of the press, as measured, over that of the layer"
+    )
     radius: float = Field(default=0.6, ge=1e-9, le=1e4, description="object radius K, grid units, of a shape")
     sides: Sides = Field(default=30, description='sides D of the object, or "circle", of a shape')
     weight: Literal["uniform", "inverse_square", "inverse"] = Field(
@@ -579,3 +582,4 @@ PUBLISHED: Mapping[str, Settings] = {
     **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
+BUILT: Mapping[str, Settings] = {"contact": BUILT_CONTACT}  # settings of the pad that the authors built

@@ -32,7 +32,7 @@ except ModuleNotFoundError as error:
         raise InputError("bench runs in a checkout of the repository only, whose benchmarks are not installed")
 
 
-PRESETS = {"published": "padforge.design.settings:PUBLISHED"}
+PRESETS = {"published": "padforge.design.settings:PUBLISHED", "built": "padforge.design.settings:BUILT"}
 """Settings other than the defaults, by section, that `padforge init` can write."""
 
 EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
@@ -96,7 +96,11 @@ def _compare(
 
 @cli.command("init")
 @click.argument("path", type=click.Path(dir_okay=False, path_type=Path), default="pad.toml")
-@click.option("--preset", type=click.Choice(list(PRESETS)), help="published: contact, noise and area of the paper.")
+@click.option(
+    "--preset",
+    type=click.Choice(list(PRESETS)),
+    help="published: contact, noise and area of the paper; built: the press on its pad.",
+)
 def _init(path: Path, preset: str | None) -> None:
     """Write a settings file, pad.toml, with every default and a comment on each key.
 

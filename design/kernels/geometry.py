@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from padforge.design.kernels.pchip import piece_of
 from padforge.design.settings import profile_spline
 
 Array = NDArray[np.float64]

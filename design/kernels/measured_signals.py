@@ -67,7 +67,7 @@ def _spacing(profile: Array, law: WeightLaw) -> float:
         signals = straight_signals(spacing)
         reference = signals.mean(axis=1, keepdims=True)  # far more precise than any one of them
         error, largest = np.abs(signals - reference), np.abs(reference).max()
-        if math.sqrt((error**2).mean()) <= LAYER_PRECISION * largest if law.directional else error.max() <= PRECISION * largest:
+        if (math.sqrt((error**2).mean()) / LAYER_PRECISION if law.directional else error.max() / PRECISION) <= largest:
             break
         spacing *= 0.8
     return spacing

@@ -1,6 +1,6 @@
 """Physical model of a simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The strain of a fibre is its relative stretch by the contact model, times the relative depth of the probe. Effects of
+The response of a fibre is the change of its resistance by the contact model. Effects of
 the published recording, whose sizes are the defaults of `[rig]`, are added: the response scatters about that of the
 position, creeps, and has hysteresis (unloaded, a fibre overshoots its rest and comes back within seconds); the rest
 drifts over minutes. An ADC with white noise reads the middle of the fibre and a fixed resistor.
@@ -19,7 +19,8 @@ from padforge.sense.settings import RigSettings
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095
-GAUGE_FACTOR = 0.4  # relative change of a fibre's resistance per relative stretch at FULL_DEPTH_MM
+GAUGE_FACTOR = 0.65  # relative change of a fibre's resistance per strain in a layer
+WEIGHT_GAUGE_FACTOR = 0.4  # and per relative stretch of a contact with weights about 1, pressed FULL_DEPTH_MM deep
 FULL_DEPTH_MM = 5.0
 TRAVEL_S = 0.15  # time that the probe takes from the surface to its depth, and back
 DELAY_S = (0.08, 0.2)  # range of the time from the command to the touch, and to the start of the release
@@ -44,6 +45,22 @@ class Cycle:
     def held_index(self) -> int:
         """Reading of the cycle from which on the probe is at its depth, at the latest the last one."""
         return min(self.down_index + math.ceil((DELAY_S[1] + TRAVEL_S) * self.rate_hz), self.readings - 1)
+
+
+def resistance_changes(pad: Morphology, positions_mm: Array, depths_mm: Array, contact: Contact) -> Array:
+    """Compute the relative changes of resistance (Q, C) by presses (Q, 2) of depths (Q,).
+
+    A layer is pressed as deep, other contacts, which know no depth, respond in proportion to it.
+    """
+    presses = pad.to_grid(positions_mm)
+    if contact.model != "layer":
+        return WEIGHT_GAUGE_FACTOR / FULL_DEPTH_MM * depths_mm[:, None] * relative_stretch(pad, presses, contact)
+    changes = np.empty((len(presses), len(pad.knots)))
+    for depth_mm in np.unique(depths_mm).tolist():
+        rows = depths_mm == depth_mm
+        pressed = Contact(**contact.model_dump() | {"depth_mm": depth_mm})
+        changes[rows] = GAUGE_FACTOR * relative_stretch(pad, presses[rows], pressed)
+    return changes
 
 
 def relative_depths(cycle: Cycle, delays_s: Array) -> Array:
@@ -116,7 +133,7 @@ def quantize(volts: Array) -> Array:
 
 
 class Divider:
-    """Fibres in their dividers, read by an ADC; strain is relative, or in V if `linear`."""
+    """Fibres in their dividers, read by an ADC; strain is a relative change of resistance, or in V if `linear`."""
 
     def __init__(
         self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator, linear: bool = False
@@ -131,7 +148,7 @@ class Divider:
         if not len(strain):
             return strain
         visible = self._creep_hysteresis(strain)
-        volts = self._rest_v + visible if self._linear else divider_voltage(self._rest_v, GAUGE_FACTOR * visible)
+        volts = self._rest_v + visible if self._linear else divider_voltage(self._rest_v, visible)
         volts += self._rig.drift_mv * 1e-3 * self._drift(len(volts))
         volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
         return quantize(volts)
@@ -139,15 +156,14 @@ class Divider:
 
 def simulate_readings(
     responses: Array,
-    depths_mm: Array,
     cycle: Cycle,
     rig: RigSettings,
     rng: np.random.Generator,
     noise_v: Array | None = None,
 ) -> Array:
-    """Simulate the readings (Q readings, C), V, of presses; strain is proportional to the depth (Q,).
+    """Simulate the readings (Q readings, C), V, of presses.
 
-    Responses (Q, C) are relative stretches at full depth; or V, as measured (a held press minus the rest), with the
+    Responses (Q, C) are relative changes of resistance; or V, as measured (a held press minus the rest), with the
     standard deviation `noise_v` (C,) that does not depend on them.
     """
     presses, channels = responses.shape
@@ -158,7 +174,7 @@ def simulate_readings(
         press_noise_v = np.sqrt(np.maximum(noise_v**2 - _reading_noise_v(cycle, rig) ** 2, 0))
         responses = (responses + press_noise_v * rng.standard_normal(responses.shape)) / _held_share(cycle, rig)
     depths = relative_depths(cycle, rng.uniform(*DELAY_S, (presses, 2)))
-    return divider(superpose_strain(depths_mm[:, None] / FULL_DEPTH_MM * responses, depths))
+    return divider(superpose_strain(responses, depths))
 
 
 def _held_share(cycle: Cycle, rig: RigSettings) -> float:
@@ -188,6 +204,7 @@ class LivePad:
         self._pad, self._contact = pad, contact
         self._divider = Divider(len(pad.knots), rate_hz, rig, rng)
         self._rig, self._rng = rig, rng
+        self._depth_mm = max(rig.depths_mm, default=rig.depth_mm)
         self._cache: dict[tuple[float, float], Array] = {}
         self._gains = np.ones(len(pad.knots))
         self._is_touched = False
@@ -203,12 +220,13 @@ class LivePad:
                 self._gains = self._rig.response_scatter.sample_gains((1, len(self._gains)), self._rng)[0]
             self._is_touched = bool(is_touched)
             if is_touched:
-                strain[row] = depths_mm[row] / FULL_DEPTH_MM * self._gains * self._stretch(positions_mm[row])
+                strain[row] = depths_mm[row] / self._depth_mm * self._gains * self._response(positions_mm[row])
         return self._divider(strain)
 
-    def _stretch(self, position_mm: Array) -> Array:
-        """(C,) of a press at full depth; the tip of an arm at rest stays within hundredths of a millimetre."""
+    def _response(self, position_mm: Array) -> Array:
+        """(C,) of the deepest press; the tip of an arm at rest stays within hundredths of a millimetre."""
         x, y = np.round(position_mm, 2).tolist()
         if (x, y) not in self._cache:
-            self._cache = {(x, y): relative_stretch(self._pad, self._pad.to_grid([[x, y]]), self._contact)[0]}
+            position, depth = np.array([[x, y]]), np.array([self._depth_mm])
+            self._cache = {(x, y): resistance_changes(self._pad, position, depth, self._contact)[0]}
         return self._cache[x, y]

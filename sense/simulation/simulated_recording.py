@@ -30,7 +30,15 @@ from padforge.sense.recording.press_plan import (
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
-from padforge.sense.simulation.pad_model import DELAY_S, DRIFT_S, TRAVEL_S, Cycle, simulate_readings
+from padforge.sense.simulation.pad_model import (
+    DELAY_S,
+    DRIFT_S,
+    FULL_DEPTH_MM,
+    TRAVEL_S,
+    Cycle,
+    resistance_changes,
+    simulate_readings,
+)
 
 MIN_SINGULAR = 0.3  # relative; below it both sides of a pad, turned by more than some 28 degrees, count as equal
 JITTER = 0.1  # standard deviation of the interval between readings over its mean: the loop that records is no clock
@@ -45,7 +53,7 @@ class PadModel:
 
     corners_mm: Array  # low and high corner of where it is pressed, in the frame of the arm; shape (2, 2)
     free: PositionTest  # which positions (Q, 2) may be pressed
-    responses: Callable[[Array], Array]  # of positions (Q, 2), mm, at full depth: relative stretches, or V; (Q, C)
+    responses: Callable[[Array, Array], Array]  # (Q, C) of positions (Q, 2) and depths (Q,), mm; as `simulate_readings`
     source: dict[str, Any]  # description of the pad for the recording, JSON
     noise_v: Array | None = None  # deviation of responses that no position explains, shape (C,); None for stretches
     rig: dict[str, float] = field(default_factory=dict)  # measured settings of `[rig]`
@@ -58,8 +66,8 @@ def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = Non
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
     source |= size.model_dump(mode="json", include=keys)
 
-    def responses(positions_mm: Array) -> Array:
-        return relative_stretch(pad, pad.to_grid(positions_mm), contact)
+    def responses(positions_mm: Array, depths_mm: Array) -> Array:
+        return resistance_changes(pad, positions_mm, depths_mm, contact)
 
     return PadModel(pad.to_mm(size.sensed), pressable_test(pad, size), responses, source)
 
@@ -73,10 +81,10 @@ def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
     noise_v = np.zeros(len(twin.channels))
     noise_v[columns] = [channel.noise_v for channel in live]
 
-    def responses(positions_mm: Array) -> Array:
+    def responses(positions_mm: Array, depths_mm: Array) -> Array:
         out = np.zeros((len(positions_mm), len(twin.channels)))
         out[:, columns] = gains_v * twin.as_built_stretch(positions_mm)[:, fibres]
-        return out
+        return depths_mm[:, None] / FULL_DEPTH_MM * out
 
     # Sides along the axes of the arm that span `sensed_mm` along those of the plan.
     spans = np.abs(twin.frame.rotate(np.eye(2))).T
@@ -101,8 +109,13 @@ def model_like_twin(pad: Morphology, twin: Twin, size: PadSettings | None = None
     gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
     plan = model_plan(pad, twin.contact(), size)
     noise_v = np.full(len(pad.knots), np.median(noises_v))
-    measured = _measured(twin, noise_v, plan.source)
-    return replace(plan, responses=lambda positions_mm: gain_v * plan.responses(positions_mm), **measured)
+    contact = twin.contact()
+
+    def responses(positions_mm: Array, depths_mm: Array) -> Array:
+        stretch = relative_stretch(pad, pad.to_grid(positions_mm), contact)
+        return gain_v / FULL_DEPTH_MM * depths_mm[:, None] * stretch
+
+    return replace(plan, responses=responses, **_measured(twin, noise_v, plan.source))
 
 
 def _live_channels(twin: Twin) -> list[TwinChannel]:
@@ -171,7 +184,8 @@ def simulate(
     if values > MAX_VALUES:
         raise InputError(f"[rig] presses is {len(plan)}: they have {values} readings, allowed are {MAX_VALUES}")
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
-    readings = simulate_readings(model.responses(plan.positions_mm), plan.depths_mm, cycle, rig, rng, model.noise_v)
+    responses = model.responses(plan.positions_mm, plan.depths_mm)
+    readings = simulate_readings(responses, cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
     first = cycle.readings * np.arange(len(plan))
     return Recording(

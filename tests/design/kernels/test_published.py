@@ -34,14 +34,14 @@ def test_quantized_signals_are_the_published_samples(published, name, contact):
 @pytest.mark.parametrize("pitch_mm", [4.0, 11.25, 25.0, (100.0, 8.0), (8.0, 100.0)])
 def test_signals_are_as_wide_in_mm_at_any_pitch(pitch_mm):
     """A straight fibre right under it signals the integral of a Gaussian of 6.2 mm, one beside it the lesser."""
-    pad = Morphology.straight(9, pitch_mm)
+    pad, contact = Morphology.straight(9, pitch_mm), Contact(model="profile")
     for offset_mm in (0.0, 4.0):
         press = pad.to_grid([[offset_mm, offset_mm]])
         expected_mm = np.sqrt(2 * np.pi) * 6.2 * np.exp(-0.5 * (offset_mm / 6.2) ** 2)
         for found in (
-            signals(pad, press),
-            signals_sparse(pad, press).toarray(),
-            signals_quantized(pad, press, Contact(), 20_001),
+            signals(pad, press, contact),
+            signals_sparse(pad, press, contact).toarray(),
+            signals_quantized(pad, press, contact, 20_001),
         ):
             assert pad.unit_mm * found[0, [4, 13]] == pytest.approx(np.full(2, expected_mm), rel=0.02)
 

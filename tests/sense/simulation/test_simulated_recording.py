@@ -85,8 +85,10 @@ def test_simulate_twin_is_reproducible_and_its_dead_channel_has_noise_alone() ->
 def test_model_twin_follows_the_plan_transform() -> None:
     positions = np.array([[4.0, 3.0], [-7.0, 1.0], [2.0, -9.0]])
     plain, mirrored = (model_twin(twin_of(PlanTransform(mirrored=mirrored))) for mirrored in (False, True))
-    assert mirrored.responses(positions * [-1, 1]) == pytest.approx(plain.responses(positions))
-    assert np.abs(mirrored.responses(positions) - plain.responses(positions)).max() > 0.01
+    depths = np.full(3, 5.0)
+    straight = plain.responses(positions, depths)
+    assert mirrored.responses(positions * [-1, 1], depths) == pytest.approx(straight)
+    assert np.abs(mirrored.responses(positions, depths) - straight).max() > 0.01
     keep_out = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))  # of the plan, so on the other side if mirrored
     free = model_twin(twin_of(PlanTransform(mirrored=True)), PadSettings(keep_out_mm=(keep_out,))).free
     assert free(np.array([[5.0, 0.0], [-5.0, 0.0]])).tolist() == [True, False]
@@ -109,7 +111,9 @@ def test_simulate_twin_scatters_by_its_noise(information_gain: float, rig: dict)
     twin = twin_of(noise_v=0.012, readings=TwinReadings(**measured, information_gain=information_gain))
     recording = simulate(twin, RigSettings(presses=1500, creep=0))
     assert recording.source["rig"].items() >= (measured | {"creep": 0}).items()
-    scatter = responses(recording) - model_twin(twin).responses(recording.presses_mm)
+    scatter = responses(recording) - model_twin(twin).responses(
+        recording.presses_mm, np.full(len(recording.presses_mm), 5.0)
+    )
     assert scatter[:, [0, 2, 3]].std(axis=0) == pytest.approx(0.012 / information_gain**0.5, rel=0.08)
 
 
