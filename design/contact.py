@@ -4,6 +4,7 @@ A fibre's signal is the line integral of a weight along it: of the strains of th
 profile of the distance to the press centre, or of the published weight inside a regular polygon.
 """
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ from padforge.design.kernels import geometry, measured_signals
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.kernels.published import quantized_signals
-from padforge.design.layer import solve_press
+from padforge.design.layer import LayerPress, solve_press
 from padforge.design.morphology import (
     MAX_COORDINATE,
     MAX_SAMPLES,
@@ -198,10 +199,15 @@ def _element_spacing(contact: Contact, unit_mm: float) -> float:
 
 @lru_cache(maxsize=64)
 def _profile_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
-    return geometry.profile_law(
-        _LENGTHS[contact.length],
-        tuple((distance / unit_mm, *weights) for distance, *weights in profile_weights(contact)),
-    )
+    families = tuple((distance / unit_mm, *weights) for distance, *weights in profile_weights(contact))
+    near = math.inf
+    if contact.model == "layer":
+        near = contact.scale * (_press(contact).contact_radius_mm + contact.thickness_mm / 2) / unit_mm
+    return geometry.profile_law(_LENGTHS[contact.length], families, near)
+
+
+def _press(contact: Contact) -> LayerPress:
+    return solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
 
 
 @lru_cache(maxsize=64)
@@ -220,7 +226,7 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
         return ((distance, weight, np.zeros_like(weight)),)
-    press = solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
+    press = _press(contact)
     distance = _layer_distances(press.contact_radius_mm, contact)
     fade = np.clip((distance[-1] - distance) / contact.thickness_mm, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
@@ -253,11 +259,14 @@ def half_width_mm(contact: Contact) -> float:
 
 
 def _layer_distances(contact_radius_mm: float, contact: Contact) -> Array:
-    """Return distances at which strains are computed, densest around the edge of the contact, where they bend."""
+    """Return distances at which strains are computed, densest around the edge of the contact, where they bend.
+
+    Their squares are multiples of one step, so that the kernels find the row of a squared distance at once.
+    """
     near = 1.5 * contact_radius_mm
-    end = contact_radius_mm + LAYER_REACH[contact.base] * contact.thickness_mm
-    near_points = near * np.sqrt(np.arange(NEAR_POINTS) / NEAR_POINTS)
-    return np.concatenate([near_points, np.linspace(near, max(end, 1.2 * near), FAR_POINTS)])
+    end = max(contact_radius_mm + LAYER_REACH[contact.base] * contact.thickness_mm, 1.2 * near)
+    far = np.rint((np.linspace(near, end, FAR_POINTS) / near) ** 2 * NEAR_POINTS)
+    return near * np.sqrt(np.unique(np.append(np.arange(NEAR_POINTS), far)) / NEAR_POINTS)
 
 
 def signals_quantized(

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
-NO_PROFILE, NO_BINS = np.empty((2, 0, 9)), np.empty(0, np.int64)
-MAX_BINS = 4096
+NO_PROFILE, NO_BINS = np.empty((2, 0, 9)), np.empty(0, np.int32)
+MAX_BINS = 1 << 15
 
 
 class Ends(NamedTuple):
@@ -40,9 +40,10 @@ class WeightLaw(NamedTuple):
     weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
     length: int  # MANHATTAN or EUCLIDEAN
     profile: Array = NO_PROFILE  # shape (2, B, 9), or (B, 9) in the frame of a family
-    bins: NDArray[np.int64] = NO_BINS  # row of the profile at the begin of each of equal steps of the squared distance
+    bins: NDArray[np.int32] = NO_BINS  # row of the profile at the begin of each of equal steps of the squared distance
     bin_rate: float = 0.0  # steps per squared distance
     directional: bool = False  # whether v counts
+    near: float = math.inf  # distance beyond which the profile is so smooth that a coarse quadrature serves
 
 
 @njit(cache=True, error_model="numpy")
@@ -56,7 +57,7 @@ def weigh(square: float, law: Any) -> float:
     return 1 / max(math.sqrt(square), radius / 100)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
 def find_row(square: float, profile: Any, law: Any) -> int:
     """Return the row of a family's profile that applies at a squared distance, below that of its end."""
     row = law.bins[int(square * law.bin_rate)]
@@ -65,18 +66,20 @@ def find_row(square: float, profile: Any, law: Any) -> int:
     return row
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
 def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
     """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
     square = dt * dt + dv * dv
     if square >= law.radius * law.radius:
         return 0.0
-    row = profile[find_row(square, profile, law)]
-    x = square - row[0]
-    weight = row[1] + x * (row[2] + x * (row[3] + x * row[4]))
+    i = find_row(square, profile, law)
+    x = square - profile[i, 0]
+    weight = profile[i, 1] + x * (profile[i, 2] + x * (profile[i, 3] + x * profile[i, 4]))
     if law.directional and square > 0:
         along = dt * ut + dv * uv
-        weight += (row[5] + x * (row[6] + x * (row[7] + x * row[8]))) * (along * along / square)
+        weight += (profile[i, 5] + x * (profile[i, 6] + x * (profile[i, 7] + x * profile[i, 8]))) * (
+            along * along / square
+        )
     return weight
 
 
@@ -89,7 +92,7 @@ def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> floa
     return weigh_profile(t, v, run / norm, rise / norm, law.profile, law)
 
 
-def profile_law(length: int, families: tuple[tuple[Array, Array, Array], ...]) -> WeightLaw:
+def profile_law(length: int, families: tuple[tuple[Array, Array, Array], ...], near: float = math.inf) -> WeightLaw:
     """Return the law of profiles by their (distances, weights w, weights v), once for both families or for each.
 
     All have the same distances; both functions are a `profile_spline` through them.
@@ -101,13 +104,11 @@ def profile_law(length: int, families: tuple[tuple[Array, Array, Array], ...]) -
     profile = np.ascontiguousarray(np.stack([tables[0], tables[-1]]))
     end, starts = float(families[0][0][-1]), profile[0, :, 0]
     finest = float(np.diff(np.append(starts, end**2)).min())
-    steps = min(MAX_BINS, math.ceil(end**2 / finest))
-    rate = steps / end**2
-    # a step's begin is taken a little early, since rounding may go either way
-    edges = np.arange(steps + 1) / rate * (1 - 8 * EPS) - 8 * EPS * end**2
-    bins = np.clip(np.searchsorted(starts, edges, side="right") - 1, 0, None)
+    steps = min(MAX_BINS, math.ceil(end**2 / finest - 1e-6))
+    # a row that begins at a step's begin, to rounding, is its row
+    bins = np.searchsorted(starts, np.arange(steps + 1) * (end**2 / steps) * (1 + 1e-12), side="right") - 1
     directional = any(bool(np.any(directed)) for _, _, directed in families)
-    return WeightLaw(end, PROFILE, length, profile, bins, rate, directional)
+    return WeightLaw(end, PROFILE, length, profile, bins.astype(np.int32), steps / end**2, directional, near)
 
 
 @lru_cache(maxsize=64)
@@ -145,7 +146,7 @@ def select_frame(shape: Any, family: int) -> Any:
     """Return a shape (chains and extents in both frames, law) in the frame of one family."""
     chains, extents, law = shape
     profile = law.profile[family]
-    framed = WeightLaw(law.radius, law.weight, law.length, profile, law.bins, law.bin_rate, law.directional)
+    framed = WeightLaw(law.radius, law.weight, law.length, profile, law.bins, law.bin_rate, law.directional, law.near)
     return (chains[0] if family == 0 else chains[1]), extents[family], framed
 
 

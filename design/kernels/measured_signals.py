@@ -20,11 +20,17 @@ Array = NDArray[np.float64]
 
 PRECISION = 5e-5
 """Error of signals here, as a share of the largest one: far below that of measured profiles."""
-LAYER_PRECISION = 1e-3
+LAYER_PRECISION = 4e-3
 """Root of the mean squared error of signals of a layer, as a share of the largest one: a tenth of the noise. Strains of
 a shallow fibre step at the edge of the contact, and to resolve the step everywhere would take five times as long."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
+_LAYER_NODES, _LAYER_WEIGHTS = np.polynomial.legendre.leggauss(5)
+_LAYER_NODES, _LAYER_WEIGHTS = (1 + _LAYER_NODES) / 2, _LAYER_WEIGHTS / 2
+_FAR_NODES, _FAR_WEIGHTS = np.polynomial.legendre.leggauss(2)
+_FAR_NODES, _FAR_WEIGHTS = (1 + _FAR_NODES) / 2, _FAR_WEIGHTS / 2
+FAR_SPACING = 0.4
+"""Spacing of elements beyond `WeightLaw.near`, as a share of that distance."""
 MAX_REFINEMENTS = 24
 """Refinements of the spacing by a fifth, from a quarter of the profile on; a steep profile needs them."""
 MAX_PIECES = 512
@@ -32,10 +38,11 @@ MAX_PIECES = 512
 
 
 class Elements(NamedTuple):
-    """Fibres cut into E elements, in the order of fibres and along each of them; all but two of shape (E,)."""
+    """Fibres cut into E elements, twice where presses may be far; all but three fields of shape (E,)."""
 
     horizontals: int  # number of fibres, the first ones, that run along x
     starts: Any  # first element of each span, and in the last column of the next fibre; shape (F, n)
+    far_starts: Any  # the same of the coarser elements, all behind the others, for presses that are far from a span
     along: Array  # coordinate along the fibre's axis, grid units
     across: Array  # coordinate across it, grid units
     length: Array  # grid units
@@ -53,13 +60,14 @@ def element_spacing(law: WeightLaw) -> float:
 def _spacing(profile: Array, law: WeightLaw) -> float:
     end = law.radius
     distances, shifts = end * np.arange(32) / 32, np.arange(16)[:, None] / 16
+    rule, weights = (_LAYER_NODES, _LAYER_WEIGHTS) if law.directional else (_NODES, _WEIGHTS)
 
     def straight_signals(spacing: float) -> Array:
         """Return signals (distances, shifts) by pieces of a span that begin at shifted positions."""
-        width = len(_NODES) * spacing
+        width = len(rule) * spacing
         begin = width * (np.arange(-math.ceil(end / width) - 1, math.ceil(end / width) + 1) + shifts)
-        nodes = (begin[..., None] + width * _NODES).reshape(len(shifts), -1)
-        lengths = np.tile(width * _WEIGHTS, begin.shape[-1])
+        nodes = (begin[..., None] + width * rule).reshape(len(shifts), -1)
+        lengths = np.tile(width * weights, begin.shape[-1])
         return np.stack([straight_weights(nodes, distance, profile, law) @ lengths for distance in distances])
 
     spacing = end / 4
@@ -83,25 +91,23 @@ def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any
 
 
 @njit(cache=True, error_model="numpy")
-def _count_pieces(h: float, rise: float, d0: float, d1: float, spacing: float) -> int:
-    """Return the number of equal pieces of a span whose elements are at most `spacing` apart on average."""
+def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -> int:
+    """Return the number of equal pieces of a span, at most `longest` on average."""
     # the slope at which a span rises is a quadratic, which keeps within its Bezier points
     steepest = max(abs(h * d0), abs(h * d1), abs(3 * rise - h * (d0 + d1)))
-    return math.ceil(min(math.hypot(h, steepest) / (len(_NODES) * spacing), 1.0 * MAX_PIECES))
+    return math.ceil(min(math.hypot(h, steepest) / longest, 1.0 * MAX_PIECES))
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def fibre_elements(
-    along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacing: float
+@njit(cache=True, error_model="numpy")
+def _count_elements(
+    along: Any, across: Any, slope: Any, horizontals: int, low: Any, high: Any, nodes: int, spacing: float, total: int
 ) -> Any:
-    """Cut one pad's spans into `Elements` `spacing` apart, except spans beyond the profile of every press."""
+    """Return the pieces (F, n) of spans, none beyond `low` and `high` (2,), and where their elements start from total.
+
+    The last column of the starts is where the next fibre's do.
+    """
     fibres, n = along.shape
-    low, high = np.empty(2), np.empty(2)
-    for axis in range(2):
-        least, largest = extremes(presses[:, axis])
-        low[axis], high[axis] = least - law.radius, largest + law.radius
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
-    total = 0
     for f in range(fibres):
         axis = 0 if f < horizontals else 1
         for j in range(n - 1):
@@ -109,10 +115,18 @@ def fibre_elements(
             t0, t1, v0, v1 = along[f, j], along[f, j + 1], across[f, j], across[f, j + 1]
             is_near = t1 > low[axis] and t0 < high[axis]
             if is_near and max(v0, v1) > low[1 - axis] and min(v0, v1) < high[1 - axis]:
-                pieces[f, j] = _count_pieces(t1 - t0, v1 - v0, slope[f, j], slope[f, j + 1], spacing)
-                total += pieces[f, j] * len(_NODES)
+                pieces[f, j] = _count_pieces(t1 - t0, v1 - v0, slope[f, j], slope[f, j + 1], nodes * spacing)
+                total += pieces[f, j] * nodes
         starts[f, n - 1] = total
-    out = np.empty((7, total))
+    return pieces, starts
+
+
+@njit(cache=True, error_model="numpy")
+def _place_elements(
+    along: Any, across: Any, slope: Any, pieces: Any, starts: Any, nodes: Any, weights: Any, length: int, out: Any
+) -> None:
+    """Write the elements of a Gauss rule on all pieces into the fields out (7, E) of `Elements`."""
+    fibres, n = along.shape
     for f in range(fibres):
         for j in range(n - 1):
             h, v0, height = along[f, j + 1] - along[f, j], across[f, j], across[f, j + 1] - across[f, j]
@@ -120,16 +134,38 @@ def fibre_elements(
             a2, a3 = 3 * height - 2 * a1 - h * slope[f, j + 1], a1 + h * slope[f, j + 1] - 2 * height
             k = starts[f, j]
             for piece in range(pieces[f, j]):
-                for i in range(len(_NODES)):
-                    s, weight = (piece + _NODES[i]) / pieces[f, j], _WEIGHTS[i] / pieces[f, j]
+                for i in range(len(nodes)):
+                    s, weight = (piece + nodes[i]) / pieces[f, j], weights[i] / pieces[f, j]
                     rise = a1 + s * (2 * a2 + 3 * a3 * s)
                     norm = math.hypot(h, rise)
-                    speed = h + abs(rise) if law.length == MANHATTAN else norm
+                    speed = h + abs(rise) if length == MANHATTAN else norm
                     out[0, k], out[1, k] = along[f, j] + h * s, v0 + s * (a1 + s * (a2 + s * a3))
                     out[2, k], out[3, k], out[4, k] = weight * speed, h / norm, rise / norm
                     out[5, k], out[6, k] = s, weight
                     k += 1
-    return Elements(horizontals, starts, out[0], out[1], out[2], out[3], out[4], out[5], out[6])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def fibre_elements(
+    along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacing: float
+) -> Any:
+    """Cut one pad's spans into `Elements` `spacing` apart, except spans beyond the profile of every press."""
+    low, high = np.empty((2, 2)), np.empty((2, 2))  # of presses near a span, and of all
+    for axis in range(2):
+        least, largest = extremes(presses[:, axis])
+        for i, reach in enumerate((min(law.near, law.radius), law.radius)):
+            low[i, axis], high[i, axis] = least - reach, largest + reach
+    curves, far_spacing = (along, across, slope, horizontals), FAR_SPACING * law.near
+    nodes, weights = (_LAYER_NODES, _LAYER_WEIGHTS) if law.directional else (_NODES, _WEIGHTS)
+    pieces, starts = _count_elements(*curves, low[0], high[0], len(nodes), spacing, np.int64(0))
+    total = starts[-1, -1]
+    far_pieces, far_starts = np.zeros_like(pieces), np.full_like(starts, total)
+    if law.near < law.radius:
+        far_pieces, far_starts = _count_elements(*curves, low[1], high[1], len(_FAR_NODES), far_spacing, total)
+    out = np.empty((7, far_starts[-1, -1]))
+    _place_elements(along, across, slope, pieces, starts, nodes, weights, law.length, out)
+    _place_elements(along, across, slope, far_pieces, far_starts, _FAR_NODES, _FAR_WEIGHTS, law.length, out)
+    return Elements(horizontals, starts, far_starts, out[0], out[1], out[2], out[3], out[4], out[5], out[6])
 
 
 @njit(cache=True, error_model="numpy")
@@ -144,7 +180,7 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
     """Compute signals of one pad from its elements into `out` (Q, F); return the number of spans visited."""
     (fibres, n), end, visited = along.shape, law.radius, 0
     for f in range(fibres):
-        t, v, first, axis = along[f], across[f], elements.starts[f], 0 if f < elements.horizontals else 1
+        t, v, axis = along[f], across[f], 0 if f < elements.horizontals else 1
         profile = law.profile[axis]
         bottom, top = extremes(v)
         for q in range(len(presses)):
@@ -153,10 +189,19 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
                 visited += 1
-                for k in range(first[j], first[j + 1]):
-                    ut, uv = elements.tangent_along[k], elements.tangent_across[k]
-                    weight = weigh_profile(elements.along[k] - ct, elements.across[k] - cv, ut, uv, profile, law)
-                    total += elements.length[k] * weight
+                first = elements.starts if _is_near(t, v, j, ct, cv, law.near) else elements.far_starts
+                for k in range(first[f, j], first[f, j + 1]):
+                    dt, dv = elements.along[k] - ct, elements.across[k] - cv
+                    square = dt * dt + dv * dv
+                    if square < end * end:
+                        i = find_row(square, profile, law)
+                        x = square - profile[i, 0]
+                        weight = profile[i, 1] + x * (profile[i, 2] + x * (profile[i, 3] + x * profile[i, 4]))
+                        if law.directional and square > 0:
+                            way = dt * elements.tangent_along[k] + dv * elements.tangent_across[k]
+                            directed = profile[i, 5] + x * (profile[i, 6] + x * (profile[i, 7] + x * profile[i, 8]))
+                            weight += directed * (way * way / square)
+                        total += elements.length[k] * weight
             out[q, f] = total
     return visited
 
@@ -176,13 +221,13 @@ def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any
 def _differentiate_elements(
     along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, out: Any
 ) -> None:
-    """Add the derivatives of sum(upstream * signals) to out (5, E).
+    """Add the derivatives of sum(upstream * signals) to out (E, 5).
 
     They are by each element's along, across and length, and by both parts of its unit tangent.
     """
     (fibres, n), end = along.shape, law.radius
     for f in range(fibres):
-        t, v, first, axis = along[f], across[f], elements.starts[f], 0 if f < elements.horizontals else 1
+        t, v, axis = along[f], across[f], 0 if f < elements.horizontals else 1
         profile = law.profile[axis]
         bottom, top = extremes(v)
         for q in range(len(presses)):
@@ -190,30 +235,33 @@ def _differentiate_elements(
             for j in range(n - 1 if bottom - end < cv < top + end else 0):
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
-                for k in range(first[j], first[j + 1]):
+                first = elements.starts if _is_near(t, v, j, ct, cv, law.near) else elements.far_starts
+                for k in range(first[f, j], first[f, j + 1]):
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
                     if square < end * end:
-                        row = profile[find_row(square, profile, law)]
-                        x, up_length = square - row[0], up * elements.length[k]
-                        radial_derivative = 2 * up_length * (row[2] + x * (2 * row[3] + 3 * x * row[4]))
-                        weight = row[1] + x * (row[2] + x * (row[3] + x * row[4]))
+                        i = find_row(square, profile, law)
+                        x, up_length = square - profile[i, 0], up * elements.length[k]
+                        radial_derivative = (
+                            2 * up_length * (profile[i, 2] + x * (2 * profile[i, 3] + 3 * x * profile[i, 4]))
+                        )
+                        weight = profile[i, 1] + x * (profile[i, 2] + x * (profile[i, 3] + x * profile[i, 4]))
                         if law.directional and square > 0:
                             ut, uv = elements.tangent_along[k], elements.tangent_across[k]
-                            directed = row[5] + x * (row[6] + x * (row[7] + x * row[8]))
-                            rate = row[6] + x * (2 * row[7] + 3 * x * row[8])
+                            directed = profile[i, 5] + x * (profile[i, 6] + x * (profile[i, 7] + x * profile[i, 8]))
+                            rate = profile[i, 6] + x * (2 * profile[i, 7] + 3 * x * profile[i, 8])
                             way = (dt * ut + dv * uv) / square
                             cosine_square = way * way * square
                             weight += directed * cosine_square
                             radial_derivative += 2 * up_length * cosine_square * (rate - directed / square)
                             turn = 2 * up_length * directed * way
-                            out[0, k] += turn * ut
-                            out[1, k] += turn * uv
-                            out[3, k] += turn * dt
-                            out[4, k] += turn * dv
-                        out[0, k] += radial_derivative * dt
-                        out[1, k] += radial_derivative * dv
-                        out[2, k] += up * weight
+                            out[k, 0] += turn * ut
+                            out[k, 1] += turn * uv
+                            out[k, 3] += turn * dt
+                            out[k, 4] += turn * dv
+                        out[k, 0] += radial_derivative * dt
+                        out[k, 1] += radial_derivative * dv
+                        out[k, 2] += up * weight
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -223,28 +271,38 @@ def elements_gradient(along: Any, across: Any, slope: Any, elements: Any, presse
     Slopes are held independent of knots; the elements are from `fibre_elements` of the same arguments.
     """
     fibres, n = along.shape
-    out, element_gradient = np.zeros((3, fibres, n)), np.zeros((5, len(elements.length)))
+    out, element_gradient = np.zeros((3, fibres, n)), np.zeros((len(elements.length), 5))
     _differentiate_elements(along, across, elements, presses, upstream, law, element_gradient)
+    for starts in (elements.starts, elements.far_starts):
+        _pass_to_knots(along, across, slope, elements, starts, element_gradient, law, out)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _pass_to_knots(
+    along: Any, across: Any, slope: Any, elements: Any, starts: Any, element_gradient: Any, law: Any, out: Any
+) -> None:
+    """Add the gradient (E, 5) by the elements that begin at `starts` to that by along, across and slope (3, F, n)."""
+    fibres, n = along.shape
     d_point, d_tangent = np.empty((6, 2)), np.empty((6, 2))
     for f in range(fibres):
         for j in range(n - 1):
             h, d0, d1 = along[f, j + 1] - along[f, j], slope[f, j], slope[f, j + 1]
             m = (across[f, j + 1] - across[f, j]) / h
-            for k in range(elements.starts[f, j], elements.starts[f, j + 1]):
+            for k in range(starts[f, j], starts[f, j + 1]):
                 s = elements.share[k]
                 dv_ds = h * (d0 + s * (2 * (3 * m - 2 * d0 - d1) + 3 * s * (d0 + d1 - 2 * m)))
                 is_manhattan, norm = law.length == MANHATTAN, math.hypot(h, dv_ds)
                 speed = h + abs(dv_ds) if is_manhattan else norm
                 speed_t = 1.0 if is_manhattan else h / speed
                 speed_v = math.copysign(1.0, dv_ds) if is_manhattan else dv_ds / speed
-                longer = element_gradient[2, k] * elements.weight[k]
+                longer = element_gradient[k, 2] * elements.weight[k]
                 ut, uv = elements.tangent_along[k], elements.tangent_across[k]
                 # what turns the tangent is across it
-                turn = (element_gradient[4, k] * ut - element_gradient[3, k] * uv) / norm
+                turn = (element_gradient[k, 4] * ut - element_gradient[k, 3] * uv) / norm
                 differentiate_cubic(s, h, d0, d1, d_point, d_tangent)
                 for x in range(6):
-                    moved = element_gradient[0, k] * d_point[x, 0] + element_gradient[1, k] * d_point[x, 1]
+                    moved = element_gradient[k, 0] * d_point[x, 0] + element_gradient[k, 1] * d_point[x, 1]
                     stretched = longer * (speed_t * d_tangent[x, 0] + speed_v * d_tangent[x, 1])
                     turned = turn * (ut * d_tangent[x, 1] - uv * d_tangent[x, 0])
                     out[x // 2, f, j + x % 2] += moved + stretched + turned
-    return out
