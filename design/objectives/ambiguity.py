@@ -95,7 +95,7 @@ def ambiguity_map(
 ) -> Array:
     """Compute the ambiguity (K, Q), grid units, of every press with 0, 1, ... K - 1 fibres failed, fast enough to edit.
 
-    Each of the `presses` (Q, 2) may be taken for any other. Signals are exact, but for a sensitivity profile within the
+    Each of the `presses` (Q, 2) may be taken for any other. Signals are exact, but for a layer or a profile within the
     PRECISION of `measured_signals`; `noise` is a share of full scale.
     """
     stretch = _fast_signals(pad, presses, contact) / lengths(pad)

@@ -67,7 +67,7 @@ class ScoredPad:
 
     @property
     def published_contact(self) -> Contact:
-        """The contact of the published terms, which have no sensitivity profile."""
+        """The contact of the published terms, which are of a shape."""
         return self.contact if self.contact.model == "shape" else PUBLISHED_CONTACT
 
     @cached_property
@@ -181,11 +181,11 @@ def score(
     """Compute every term of a pad, by name; TERMS describes them.
 
     Presses are where `size` says; those of the information and of the published terms lie between the outermost fibres,
-    as published. The published terms are of the published contact where `contact` has a sensitivity profile.
+    as published. The published terms are of the published contact where `contact` is no shape.
 
     Args:
         pad: the fibres.
-        contact: what a press does to them; the measured one if None.
+        contact: what a press does to them; the default layer if None.
         max_failures: most failed fibres, or weights of 0, 1, ... failed.
         noise: of a signal in the ambiguity, share of full scale.
         rules: limits of the penalties; the default ones if None.

@@ -137,7 +137,7 @@ def search(
 
     Args:
         pad: settings of the pad.
-        contact: what a press does to a fibre; the measured one, or the published one by the published method, if None.
+        contact: what a press does to a fibre; the default layer, or the published one by the published method, if None.
         settings: how to search.
         rules: the limits.
         origin: morphology to start from, of the pad's layout, of at most `settings.knots` knots; random if None.
