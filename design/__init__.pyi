@@ -1,11 +1,11 @@
 from .common.settings import Spec as Spec
 from .common.validation import Fault as Fault
 from .common.validation import InputError as InputError
+from .contact import indented_signals as indented_signals
+from .contact import press_forces_n as press_forces_n
 from .contact import signals as signals
 from .contact import signals_quantized as signals_quantized
 from .contact import signals_sparse as signals_sparse
-from .indentation import Indenter as Indenter
-from .indentation import indented_signals as indented_signals
 from .morphology import Morphology as Morphology
 from .networks import FailureError as FailureError
 from .networks import localisation_error as localisation_error

@@ -160,20 +160,28 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     return drift_study(load_pads(pads, seed), load_recordings(recordings), seed=seed)
 
 
-def _add_study(name: str, module: str, text: str, example: str) -> None:
-    """Add the command of a study without further options; `example` are its pads in the help."""
+def _add_study(name: str, module: str, text: str, example: str, *, has_contact: bool = True) -> None:
+    """Add the command of a study without options of its own; `example` are its pads in the help."""
 
-    def make(names: tuple[str, ...], *, seed: int) -> "Study":
+    def make(names: tuple[str, ...], *, seed: int, spec: Path | None = None) -> "Study":
+        from padforge.design.settings import Contact
+
         make_study = getattr(import_module(f"padforge.sense.studies.{module}"), f"{name}_study")
-        return make_study(_pads(names, seed), seed=seed)
+        contact = {"contact": common.load_spec(spec).section(Contact)} if has_contact else {}
+        return make_study(_pads(names, seed), seed=seed, **contact)
 
     make.__doc__ = f"{text}\n\n\b\npadforge study {name} {example}"
-    _command(name)(make)
+    _command(name)(common.spec_option(make) if has_contact else make)
 
 
-_add_study("sensitivity", "sensitivity", "Objects of other sizes and shapes, trained with or not (figure 6).", "square")
-_force = "Depth and force of a press from the signals that localize it, by a model of indentation."
-_add_study("force", "indentation", _force, "square random-5")
-_add_study("shape", "indentation", "Which object was pressed, from the signals that localize it.", "random-5")
+_sensitivity = """Tools of other radii and other depths, trained with or not (figure 6).
+
+They have half to one and a half times the radius and the depth that [contact] states. If [contact] is a shape, as in
+the preset `published`, the objects are those of the paper, of sizes K and shapes D in grid units."""
+_force = "Depth and force of a press from the signals that localize it, as a tool presses the layer of [contact]."
+_shape = "Which object was pressed, from the signals that localize it: a dome, a ball, a finger or a flat end."
 _multicontact = "Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9)."
-_add_study("multicontact", "multicontact", _multicontact, "square")
+_add_study("sensitivity", "sensitivity", _sensitivity, "square")
+_add_study("force", "indentation", _force, "square random-5")
+_add_study("shape", "indentation", _shape, "random-5")
+_add_study("multicontact", "multicontact", _multicontact, "square", has_contact=False)

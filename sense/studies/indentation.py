@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, INK, add_title
-from padforge.design.contact import signals
-from padforge.design.indentation import REDUCED_MODULUS_KPA, Indenter, indented_signals
+from padforge.design.common.validation import InputError
+from padforge.design.contact import indented_signals, press_forces_n, signals
+from padforge.design.layer import REDUCED_MODULUS_KPA, solve_press
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fresh_presses
 from padforge.design.settings import Contact, between_fibres
@@ -34,138 +35,173 @@ from padforge.sense.studies.study import (
 LOG_SCALE = 4.0
 """Counts below which the logarithm of a reading becomes linear, since there it would be one of noise. To logarithms a
 deeper press adds, as it multiplies all signals."""
-DEPTHS = LOW, HIGH = 0.1, 0.45  # least and greatest, grid units
+DEPTHS = LOW, HIGH = 0.2, 1.0  # least and greatest, as a share of the contact's depth
 MIDDLE = (LOW + HIGH) / 2
 CASES = {"depth unknown": (DEPTHS, False), "depth known": (DEPTHS, True), "one depth": ((MIDDLE, MIDDLE), False)}
 """Range of depths, and whether the depth is an input, of the networks whose errors of the position are compared."""
-SPHERE, FORCE_SIZES = Indenter(), Sizes(2048, 1024)
+FORCE_SIZES = Sizes(2048, 1024)
 FORCE_NOISES = (1.0, 4.0)  # standard deviations of the readings' noise, counts of a 12-bit converter
 BINS = 7  # depths by which the error of the position is drawn
 COLUMNS = 4  # pads side by side in the figure of the force
-INDENTERS = {
-    "sphere": Indenter("sphere", radius=0.7),
-    "cone": Indenter("cone", angle_deg=22),
-    "flat punch": Indenter("flat", radius=0.44),
-}
-"""Of about the same contact radius at the middle depth, 0.44 grid units, so that they differ by profile alone."""
+TOOLS = ("dome", "ball", "flat", "finger")
 FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}  # sides of each polygon; None for a circle
 SIZES = np.linspace(0.5, 0.9, 17)
 """Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""
 SHAPE_NOISE_COUNTS, SHAPE_SIZES = 1.0, Sizes(4096, 2048)
-SETS = {"indenters": tuple(INDENTERS), "footprints": tuple(FOOTPRINTS)}
+SETS = {"tools": TOOLS, "footprints": tuple(FOOTPRINTS)}
 
 
-def force_study(pads: Mapping[str, Morphology], *, sizes: Sizes = FORCE_SIZES, seed: int = 0) -> Study:
-    """Estimate position, depth and force of presses of random depth, from the signals of the indentation model.
+def force_study(
+    pads: Mapping[str, Morphology], *, contact: Contact | None = None, sizes: Sizes = FORCE_SIZES, seed: int = 0
+) -> Study:
+    """Estimate position, depth and force of presses of random depth, from the signals of a pressed layer.
 
     An unknown depth is compared with one that is an input, and with presses of the middle depth alone.
+
+    Args:
+        pads: the pads, by label.
+        contact: a layer; presses are up to as deep, and at least a fifth as deep. `Contact()` if None.
+        sizes: of the networks and of their sets of presses.
+        seed: of every random choice.
+
+    Raises:
+        InputError: the contact is no layer.
     """
+    contact = _check_layer(contact)
     tasks = [
-        Task(f"{label}, noise of {_counts(noise)}, {name}", partial(_estimate_depth, pad, *case, noise, sizes, seed))
+        Task(
+            f"{label}, noise of {_counts(noise)}, {name}",
+            partial(_estimate_depth, pad, contact, *case, noise, sizes, seed),
+        )
         for label, pad in pads.items()
         for noise in FORCE_NOISES
         for name, case in CASES.items()
     ]
     settings = {
         "pads": describe_pads(pads),
-        "indenter": {"shape": SPHERE.shape, "radius": SPHERE.radius, "angle_deg": SPHERE.angle_deg},
-        "depths": list(DEPTHS),
+        "contact": contact.model_dump(mode="json"),
+        "depths_mm": [share * contact.depth_mm for share in DEPTHS],
         "noise_counts": list(FORCE_NOISES),
         "reduced_modulus_kpa": REDUCED_MODULUS_KPA,
         "seed": seed,
         **asdict(sizes),
     }
-    conclude = partial(_conclude_force, dict(pads), settings)
+    conclude = partial(_conclude_force, dict(pads), contact, settings)
     return Study("force", "Depth and force of a press, besides its position", settings, tasks, conclude, _draw_force)
 
 
+def _check_layer(contact: Contact | None) -> Contact:
+    """Return the contact, the default one if None, if it has a depth."""
+    contact = contact or Contact()
+    if contact.model != "layer":
+        raise InputError(f"[contact] model is {contact.model}, allowed is layer: nothing else is pressed to a depth")
+    return contact
+
+
 def _estimate_depth(
-    pad: Morphology, depths: tuple[float, float], is_known: bool, noise_counts: float, sizes: Sizes, seed: int
+    pad: Morphology,
+    contact: Contact,
+    depths: tuple[float, float],
+    is_known: bool,
+    noise_counts: float,
+    sizes: Sizes,
+    seed: int,
 ) -> State:
-    """Return x, y and depth of the test presses, "pressed" and "predicted", grid units; no depth where it is known."""
+    """Return the test presses, "pressed" and "predicted": x and y, grid units, and the depth, mm, unless it is known.
+
+    `depths` are the least and the greatest one, as shares of the contact's.
+    """
     rng, count = np.random.default_rng([3, seed]), sizes.presses + sizes.test
     positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
-    depth = rng.uniform(*depths, count)
-    responses = indented_signals(pad, positions, depth, SPHERE)
-    inputs = np.log1p(quantize(responses, sizes.presses, noise_counts, rng) / LOG_SCALE)
-    targets = np.column_stack([positions, depth])
+    depth_mm = contact.depth_mm * rng.uniform(*depths, count)
+    responses = indented_signals(pad, positions, depth_mm, contact)
+    inputs = signed_logarithm(quantize(responses, sizes.presses, noise_counts, rng))
+    targets = np.column_stack([positions, depth_mm])
     if is_known:
-        inputs, targets = np.column_stack([inputs, depth]), positions
+        inputs, targets = np.column_stack([inputs, depth_mm]), positions
     return {"pressed": targets[sizes.presses :], "predicted": fit_and_predict(inputs, targets, rng, sizes)}
+
+
+def signed_logarithm(counts: Array) -> Array:
+    """Return the logarithm of the magnitude of readings, with their sign, linear below LOG_SCALE."""
+    return np.sign(counts) * np.log1p(np.abs(counts) / LOG_SCALE)
 
 
 def _counts(number: float) -> str:
     return f"{number:g} count" if number == 1 else f"{number:g} counts"
 
 
-def _conclude_force(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
-    edges = np.linspace(LOW, HIGH, BINS + 1)
+def _conclude_force(
+    pads: Mapping[str, Morphology], contact: Contact, settings: Mapping[str, Any], states: list[State]
+) -> StudyResult:
+    low_mm, middle_mm, high_mm = (share * contact.depth_mm for share in (LOW, MIDDLE, HIGH))
+    edges = np.linspace(low_mm, high_mm, BINS + 1)
+    force_n = partial(press_forces_n, contact=contact)
+    range_n = float(force_n(high_mm) - force_n(low_mm))
     rows, curves = [], []
     results = iter(states)
     for label, pad in pads.items():
-        unit_mm, force_n = pad.unit_mm, partial(SPHERE.force_n, unit_mm=pad.unit_mm)
-        range_n = float(force_n(HIGH) - force_n(LOW))
         for noise in FORCE_NOISES:
             cases = [next(results) for _ in CASES]
-            depth, predicted = cases[0]["pressed"][:, 2], np.clip(cases[0]["predicted"][:, 2], LOW, HIGH)
+            depth, predicted = cases[0]["pressed"][:, 2], np.clip(cases[0]["predicted"][:, 2], low_mm, high_mm)
             errors, depth_known, one_depth = (
-                np.linalg.norm(case["predicted"][:, :2] - case["pressed"][:, :2], axis=1) for case in cases
+                pad.unit_mm * np.linalg.norm(case["predicted"][:, :2] - case["pressed"][:, :2], axis=1)
+                for case in cases
             )
-            depth_error = np.abs(predicted - depth).mean()
             force_error_n, force_guess_n = (
-                float(np.abs(force_n(guess) - force_n(depth)).mean()) for guess in (predicted, MIDDLE)
+                float(np.abs(force_n(guess) - force_n(depth)).mean()) for guess in (predicted, middle_mm)
             )
             row = {
                 "pad": label,
                 "noise_counts": noise,
-                "position_grid": float(errors.mean()),
-                "position_mm": float(errors.mean() * unit_mm),
-                "position_depth_known_mm": float(depth_known.mean() * unit_mm),
-                "position_one_depth_mm": float(one_depth.mean() * unit_mm),
-                "depth_grid": float(depth_error),
-                "depth_mm": float(depth_error * unit_mm),
-                "depth_guessed_mm": float(np.abs(depth - MIDDLE).mean() * unit_mm),
+                "position_mm": float(errors.mean()),
+                "position_depth_known_mm": float(depth_known.mean()),
+                "position_one_depth_mm": float(one_depth.mean()),
+                "depth_mm": float(np.abs(predicted - depth).mean()),
+                "depth_guessed_mm": float(np.abs(depth - middle_mm).mean()),
                 "force_n": force_error_n,
                 "force_percent": 100 * force_error_n / range_n,
                 "force_guessed_percent": 100 * force_guess_n / range_n,
             }
             rows.append(row)
             bins = np.digitize(depth, edges[1:-1])
-            means = [float(errors[bins == bin].mean() * unit_mm) if bin in bins else None for bin in range(BINS)]
+            means = [float(errors[bins == bin].mean()) if bin in bins else None for bin in range(BINS)]
             curve = {
                 "pad": label,
                 "noise_counts": noise,
-                "pressed_mm": np.round(depth * unit_mm, 4).tolist(),
-                "predicted_mm": np.round(predicted * unit_mm, 4).tolist(),
-                "bin_depth_mm": ((edges[1:] + edges[:-1]) / 2 * unit_mm).tolist(),
+                "pressed_mm": np.round(depth, 4).tolist(),
+                "predicted_mm": np.round(predicted, 4).tolist(),
+                "bin_depth_mm": ((edges[1:] + edges[:-1]) / 2).tolist(),
                 "bin_position_mm": means,
             }
             curves.append(curve)
-    return StudyResult(rows, _describe_force(settings, rows), {"curves": curves})
+    return StudyResult(rows, _describe_force(contact, settings, rows), {"curves": curves})
 
 
-def _describe_force(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe_force(contact: Contact, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+    low_mm, high_mm = settings["depths_mm"]
     noises = " or ".join(f"{noise:g}" for noise in FORCE_NOISES)
     model = (
-        f"A rigid {SPHERE.shape} of radius {SPHERE.radius:g} grid units is pressed {LOW:g} to {HIGH:g} grid units deep "
-        "at random positions. The signal of a fibre is its lengthening by the deflected surface, read by a 12-bit "
-        f"converter whose full scale is the fibre's largest signal, with noise of {noises} counts. Networks of "
-        f"{settings['hidden']} neurons, of which the mean of {settings['members']} is taken, estimate x, y and depth "
-        f"from the readings' logarithms; they were trained on {settings['presses']} presses and tested on "
+        f"A {contact.tool} of radius {contact.tool_radius_mm:g} mm is pressed {low_mm:g} to {high_mm:g} mm deep into a "
+        f"{contact.base} layer {contact.thickness_mm:g} mm thick at random positions. Fibres answer to its strains, "
+        f"read by a 12-bit converter whose full scale is the fibre's largest signal, with noise of {noises} counts. "
+        f"Networks of {settings['hidden']} neurons, of which the mean of {settings['members']} is taken, estimate x, y "
+        f"and depth from the readings' logarithms; they were trained on {settings['presses']} presses and tested on "
         f"{settings['test']} others."
     )
     result = (
         "{pad}, noise of {noise}: the error of the depth is {depth_mm:.2f} mm (guessing the middle depth: "
         "{depth_guessed_mm:.2f} mm), of the force {force_n:.3f} N or {force_percent:.1f} % of its range (guessing: "
         "{force_guessed_percent:.1f} %). That of the position is {position_mm:.2f} mm, {position_depth_known_mm:.2f} "
-        "mm where the depth is an input, and {position_one_depth_mm:.2f} mm where all presses are {middle:g} grid "
-        "units deep."
+        "mm where the depth is an input, and {position_one_depth_mm:.2f} mm where all presses are {middle:g} mm deep."
     )
-    results = [result.format(**row, noise=_counts(row["noise_counts"]), middle=MIDDLE) for row in rows]
+    results = [
+        result.format(**row, noise=_counts(row["noise_counts"]), middle=MIDDLE * contact.depth_mm) for row in rows
+    ]
     caution = (
-        "Depth and force are related by the contact mechanics of an elastic half-space of reduced modulus "
-        f"{REDUCED_MODULUS_KPA:.0f} kPa. A pad a few millimetres thick on a hard table is stiffer than that, and "
-        "silicone creeps: forces of a built pad need a calibration against a load cell."
+        f"Depth and force are related by the mechanics of a linear elastic layer of reduced modulus "
+        f"{REDUCED_MODULUS_KPA:.0f} kPa. Silicone stiffens where it is strained, and creeps: forces of a built pad "
+        "need a calibration against a load cell."
     )
     return [model, *results, caution]
 
@@ -202,50 +238,75 @@ def _draw_force(document: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def shape_study(pads: Mapping[str, Morphology], *, sizes: Sizes = SHAPE_SIZES, seed: int = 0) -> Study:
-    """Classify the object: indenters of unknown depth, and footprints of unknown size, the position unknown too.
+def shape_study(
+    pads: Mapping[str, Morphology], *, contact: Contact | None = None, sizes: Sizes = SHAPE_SIZES, seed: int = 0
+) -> Study:
+    """Classify the object: tools of unknown depth, and footprints of unknown size, the position unknown too.
 
-    Indenters follow the indentation model, footprints the published contact: polygons of one orientation.
+    Tools press the layer of the contact, footprints follow the published contact: polygons of one orientation.
+
+    Args:
+        pads: the pads, by label.
+        contact: a layer, whose tools have that tool's radius and are pressed up to as deep. `Contact()` if None.
+        sizes: of the networks and of their sets of presses.
+        seed: of every random choice.
+
+    Raises:
+        InputError: the contact is no layer.
     """
+    contact = _check_layer(contact)
     tasks = [
-        Task(f"{label}, {kind}, {name}", partial(work, pad, kind, sizes, seed))
+        Task(f"{label}, {kind}, {name}", partial(work, pad, contact, kind, sizes, seed))
         for label, pad in pads.items()
         for kind in SETS
         for name, work in (("shape", _classify_shapes), ("position", _localize))
     ]
     settings = {
         "pads": describe_pads(pads),
-        "depths": list(DEPTHS),
+        "contact": contact.model_dump(mode="json"),
+        "depths_mm": [share * contact.depth_mm for share in DEPTHS],
         "sizes": [float(SIZES[0]), float(SIZES[-1])],
         "noise_counts": SHAPE_NOISE_COUNTS,
         "seed": seed,
         **asdict(sizes),
     }
-    conclude = partial(_conclude_shape, dict(pads), settings)
+    conclude = partial(_conclude_shape, dict(pads), contact, settings)
     return Study("shape", "Shape of what is pressed", settings, tasks, conclude, _draw_shape)
 
 
+def tool_contacts(contact: Contact) -> dict[str, Contact]:
+    """Return the contact of each of TOOLS, by name.
+
+    All have the radius of the contact's tool except the flat end, which has the contact radius of the dome at the
+    middle depth: they differ by the profile of what presses more than by the size.
+    """
+    layer = contact.thickness_mm, contact.base
+    dome = solve_press("dome", contact.tool_radius_mm, MIDDLE * contact.depth_mm, *layer)
+    radii_mm = dict.fromkeys(TOOLS, contact.tool_radius_mm) | {"flat": dome.contact_radius_mm}
+    return {tool: contact.model_copy(update={"tool": tool, "tool_radius_mm": radii_mm[tool]}) for tool in TOOLS}
+
+
 def _simulate_shapes(
-    pad: Morphology, kind: str, sizes: Sizes, seed: int
+    pad: Morphology, contact: Contact, kind: str, sizes: Sizes, seed: int
 ) -> tuple[Array, Array, Indices, np.random.Generator]:
     """Return network inputs (Q, C), positions (Q, 2), indices of the shapes (Q,), and the generator to go on with."""
     rng, count = np.random.default_rng([4, seed, list(SETS).index(kind)]), sizes.presses + sizes.test
     positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
     shape = rng.integers(len(SETS[kind]), size=count)
     responses = np.empty((count, pad.layout.fibres))
-    if kind == "indenters":
-        depths = rng.uniform(*DEPTHS, count)
-        for index, indenter in enumerate(INDENTERS.values()):
+    if kind == "tools":
+        depths_mm = contact.depth_mm * rng.uniform(*DEPTHS, count)
+        for index, tool in enumerate(tool_contacts(contact).values()):
             rows = shape == index
-            responses[rows] = indented_signals(pad, positions[rows], depths[rows], indenter)
+            responses[rows] = indented_signals(pad, positions[rows], depths_mm[rows], tool)
     else:
         size = rng.integers(len(SIZES), size=count)
         for (index, sides), (size_index, radius) in product(enumerate(FOOTPRINTS.values()), enumerate(SIZES)):
             rows = (shape == index) & (size == size_index)
-            contact = Contact(radius=radius * circumradius(sides), sides=sides)
-            responses[rows] = signals(pad, positions[rows], contact)
+            footprint = Contact(radius=radius * circumradius(sides), sides=sides)
+            responses[rows] = signals(pad, positions[rows], footprint)
     counts = quantize(responses, sizes.presses, SHAPE_NOISE_COUNTS, rng)
-    return np.log1p(counts / LOG_SCALE) if kind == "indenters" else counts, positions, shape, rng
+    return signed_logarithm(counts) if kind == "tools" else counts, positions, shape, rng
 
 
 def circumradius(sides: int | None) -> float:
@@ -253,14 +314,14 @@ def circumradius(sides: int | None) -> float:
     return 1.0 if sides is None else float(np.sqrt(2 * np.pi / (sides * np.sin(2 * np.pi / sides))))
 
 
-def _classify_shapes(pad: Morphology, kind: str, sizes: Sizes, seed: int) -> State:
-    inputs, _, shape, rng = _simulate_shapes(pad, kind, sizes, seed)
+def _classify_shapes(pad: Morphology, contact: Contact, kind: str, sizes: Sizes, seed: int) -> State:
+    inputs, _, shape, rng = _simulate_shapes(pad, contact, kind, sizes, seed)
     return classify(inputs, shape, len(SETS[kind]), rng, sizes)
 
 
-def _localize(pad: Morphology, kind: str, sizes: Sizes, seed: int) -> State:
+def _localize(pad: Morphology, contact: Contact, kind: str, sizes: Sizes, seed: int) -> State:
     """Return mean errors of the position on the test presses, grid units: shape "unknown", or "known" as an input."""
-    inputs, positions, shape, rng = _simulate_shapes(pad, kind, sizes, seed)
+    inputs, positions, shape, rng = _simulate_shapes(pad, contact, kind, sizes, seed)
     with_shape = np.column_stack([inputs, np.eye(len(SETS[kind]))[shape]])
     errors = {}
     for name, features, member_rng in zip(("unknown", "known"), (inputs, with_shape), rng.spawn(2), strict=True):
@@ -269,7 +330,9 @@ def _localize(pad: Morphology, kind: str, sizes: Sizes, seed: int) -> State:
     return errors
 
 
-def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
+def _conclude_shape(
+    pads: Mapping[str, Morphology], contact: Contact, settings: Mapping[str, Any], states: list[State]
+) -> StudyResult:
     rows, confusions = [], []
     results = iter(states)
     for label, pad in pads.items():
@@ -288,16 +351,17 @@ def _conclude_shape(pads: Mapping[str, Morphology], settings: Mapping[str, Any],
             }
             rows.append(row)
             confusions.append({"pad": label, "shapes": kind, "names": list(shapes), "counts": counts.tolist()})
-    return StudyResult(rows, _describe_shape(settings, rows), {"confusions": confusions})
+    return StudyResult(rows, _describe_shape(contact, settings, rows), {"confusions": confusions})
 
 
-def _describe_shape(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
-    sphere, cone, flat = INDENTERS.values()
+def _describe_shape(contact: Contact, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+    low_mm, high_mm = settings["depths_mm"]
+    flat_mm = tool_contacts(contact)["flat"].tool_radius_mm
     model = (
-        f"Indenters: a sphere of radius {sphere.radius:g}, a cone whose flank makes {cone.angle_deg:g} degrees with "
-        f"the surface, and a flat punch of radius {flat.radius:g} grid units, pressed {LOW:g} to {HIGH:g} "
-        "deep into an elastic half-space. Footprints: circle, square and triangle of equal area, that of a circle of "
-        f"{SIZES[0]:g} to {SIZES[-1]:g} grid units radius, of one orientation, under the published contact model. "
+        f"Tools: a dome, a ball and a finger of radius {contact.tool_radius_mm:g} mm, and a flat end of radius "
+        f"{flat_mm:.1f} mm, pressed {low_mm:g} to {high_mm:g} mm deep into a {contact.base} layer "
+        f"{contact.thickness_mm:g} mm thick. Footprints: circle, square and triangle of equal area, that of a circle "
+        f"of {SIZES[0]:g} to {SIZES[-1]:g} grid units radius, of one orientation, under the published contact model. "
         f"Readings are whole counts of 12 bits with noise of {SHAPE_NOISE_COUNTS:g}. Position, depth and size are "
         f"drawn for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} "
         f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."

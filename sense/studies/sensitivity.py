@@ -1,41 +1,92 @@
-"""Sensitivity to the object: other objects than the pad was designed for, trained with or not (paper, figure 6)."""
+"""Sensitivity to what presses: other tools and depths than the pad was trained with (paper, figure 6).
+
+A layer is pressed by tools of half to one and a half times the radius, half to one and a half times as deep, in mm.
+Responses scatter as on a built pad, since exact ones would locate even a press that fibres hardly feel. For a shape the
+objects are the published ones, in grid units, and responses have no noise.
+"""
 
 import math
 from collections.abc import Mapping
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, INK
-from padforge.design.contact import signals
+from padforge.design.common.validation import InputError
+from padforge.design.contact import relative_stretch, signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
-from padforge.design.settings import Contact
+from padforge.design.objectives.expected_error import straight_full_scale
+from padforge.design.settings import Contact, SearchSettings
 from padforge.sense.arrays import Array
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
 
 MEMBERS = 6
 """Networks whose errors are averaged, since that of a single one depends on its first weights."""
 SIDE, TEST, HIDDEN = 32, 2000, 50
-RADII, SIDES = (0.6, 0.8, 1.0), (4, 30)  # sizes K, grid units, and shapes D of the object, which is a polygon
+FACTORS = (0.5, 1.0, 1.5)  # of the radius of the tool and of its depth in a layer
+RADII, SIDES = (0.6, 0.8, 1.0), (4, 30)  # published sizes K, grid units, and shapes D of the object, a polygon
+SCATTER = SearchSettings().response_scatter
+"""Scatter of the responses of a layer, as measured on a built pad."""
 
 
-def sensitivity_study(pads: Mapping[str, Morphology], *, seed: int = 0) -> Study:
-    """Compare errors for objects of several sizes and shapes, by networks trained with the same object or another."""
-    objects = [Contact(radius=radius, sides=shape) for shape, radius in product(SIDES, RADII)]
+class _Objects(NamedTuple):
+    """How the objects of a contact model differ, are named and judged."""
+
+    size: str  # field of `Contact` that is their size
+    other: str  # the other field that differs
+    error: str  # column of their errors
+    unit: str  # of the errors
+    names: tuple[str, str, str]  # of a size and of a value of the other field, formats; and of all these values
+    axes: tuple[str, str]  # labels of the size and of an object in the figure
+
+
+_OBJECTS = {
+    "layer": _Objects(
+        *("tool_radius_mm", "depth_mm", "mean_mm", "mm"),
+        ("a radius of {:g} mm", "{:g} mm deep", "depths"),
+        ("radius of the tool, trained and tested with (mm)", "radius/depth"),
+    ),
+    "shape": _Objects(
+        *("radius", "sides", "mean", "grid units"),
+        ("K {:g}", "D {}", "shapes"),
+        ("size K of the object, trained and tested with (grid units)", "K/D"),
+    ),
+}
+
+
+def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None = None, seed: int = 0) -> Study:
+    """Compare errors for what presses, by networks trained with the same or with something else.
+
+    Args:
+        pads: the pads, by label.
+        contact: a layer, about whose tool and depth others are tried; or a shape, which is replaced by the published
+            ones. `Contact()` if None.
+        seed: of every random choice.
+
+    Raises:
+        InputError: the contact is a profile.
+    """
+    contact = contact or Contact()
+    sizes, others = _values(contact)
+    kind = _OBJECTS[contact.model]
+    objects = [
+        contact.model_copy(update={kind.size: size, kind.other: other}) for other, size in product(others, sizes)
+    ]
     tasks = [
-        Task(f"{label}, trained with K {each.radius:g}, D {each.sides}", partial(_evaluate, pad, each, objects, seed))
+        Task(f"{label}, trained with {_name(each)}", partial(_evaluate, pad, contact, each, objects, seed))
         for label, pad in pads.items()
         for each in objects
     ]
     settings = {
         "pads": describe_pads(pads),
-        "radii": list(RADII),
-        "sides": list(SIDES),
+        "contact": contact.model_dump(mode="json"),
+        kind.size: sizes,
+        kind.other: others,
         "members": MEMBERS,
         "hidden": HIDDEN,
         "presses": SIDE**2,
@@ -46,12 +97,41 @@ def sensitivity_study(pads: Mapping[str, Morphology], *, seed: int = 0) -> Study
     return Study("sensitivity", "Sensitivity to the object that presses", settings, tasks, conclude, _draw)
 
 
-def _evaluate(pad: Morphology, trained: Contact, objects: list[Contact], seed: int) -> State:
-    """Compute mean errors (MEMBERS, objects), grid units, of networks trained with one object."""
-    presses = SimulatedPresses.simulate(pad, SIDE, TEST, seed, lambda positions: signals(pad, positions, trained))
-    rngs = np.random.default_rng([5, seed]).spawn(MEMBERS)
+def _values(contact: Contact) -> tuple[list[float], list[float]]:
+    """Return the sizes of the objects, and their depths or shapes."""
+    if contact.model == "shape":
+        return list(RADII), list(SIDES)
+    if contact.model != "layer":
+        raise InputError(f"[contact] model is {contact.model}, allowed are layer and shape: only they have a size")
+    depths_mm = [factor * contact.depth_mm for factor in FACTORS]
+    return [factor * contact.tool_radius_mm for factor in FACTORS], [d for d in depths_mm if d < contact.thickness_mm]
+
+
+def _name(contact: Contact) -> str:
+    kind = _OBJECTS[contact.model]
+    size, other, _ = kind.names
+    return f"{size.format(getattr(contact, kind.size))}, {other.format(getattr(contact, kind.other))}"
+
+
+def _evaluate(pad: Morphology, stated: Contact, trained: Contact, objects: list[Contact], seed: int) -> State:
+    """Compute mean errors (MEMBERS, objects), grid units, of networks trained with one object.
+
+    The noise of a layer's responses is a share of the full scale of the stated contact, whatever presses.
+    """
+    rng = np.random.default_rng([5, seed])
+    rngs, noise_rng = rng.spawn(MEMBERS), rng.spawn(1)[0]
+    full_scale = straight_full_scale(pad.layout, stated, "fibres")
+
+    def respond(positions: Array, contact: Contact) -> Array:
+        if contact.model == "shape":
+            return signals(pad, positions, contact)
+        stretch = relative_stretch(pad, positions, contact) / full_scale
+        noise = SCATTER.floor * noise_rng.standard_normal(stretch.shape)
+        return stretch * SCATTER.sample_gains(stretch.shape, noise_rng) + noise
+
+    presses = SimulatedPresses.simulate(pad, SIDE, TEST, seed, partial(respond, contact=trained))
     networks = fit_batch(presses.train_signals, presses.train_positions, rngs, HIDDEN)
-    tests = [signals(pad, presses.test_positions, contact) for contact in objects]
+    tests = [respond(presses.test_positions, contact) for contact in objects]
     errors = [
         [presses.position_errors(network, (), test, presses.test_positions).mean() for test in tests]
         for network in networks
@@ -62,17 +142,15 @@ def _evaluate(pad: Morphology, trained: Contact, objects: list[Contact], seed: i
 def _conclude(
     pads: Mapping[str, Morphology], objects: list[Contact], settings: Mapping[str, Any], states: list[State]
 ) -> StudyResult:
-    rows = []
+    kind, rows = _kind(settings), []
     results = iter(states)
     for label, pad in pads.items():
         for trained in objects:
             rows += [
                 {
                     "pad": label,
-                    "trained_radius": trained.radius,
-                    "trained_sides": trained.sides,
-                    "radius": tested.radius,
-                    "sides": tested.sides,
+                    **{f"trained_{name}": getattr(trained, name) for name in (kind.size, kind.other)},
+                    **{name: getattr(tested, name) for name in (kind.size, kind.other)},
                     "mean": float(errors.mean()),
                     "std": float(errors.std()),
                     "mean_mm": float(errors.mean() * pad.unit_mm),
@@ -82,61 +160,79 @@ def _conclude(
     return StudyResult(rows, _describe(settings, rows))
 
 
-def _error_matrix(rows: list[dict[str, Any]], label: str) -> Array:
-    """Return the mean errors of a pad by trained and tested object, each by shape, then size."""
-    means = [row["mean"] for row in rows if row["pad"] == label]
+def _kind(settings: Mapping[str, Any]) -> _Objects:
+    return _OBJECTS[settings["contact"]["model"]]
+
+
+def _error_matrix(settings: Mapping[str, Any], rows: list[dict[str, Any]], label: str) -> Array:
+    """Return the mean errors of a pad by trained and tested object, each by depth or shape, then size."""
+    means = [row[_kind(settings).error] for row in rows if row["pad"] == label]
     return np.reshape(means, (math.isqrt(len(means)), -1))
 
 
 def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
-    radii, sides = settings["radii"], settings["sides"]
+    kind = _kind(settings)
+    sizes, others = settings[kind.size], settings[kind.other]
+    if settings["contact"]["model"] == "layer":
+        what = (
+            f"Tools of {len(sizes)} radii press every pad to {len(others)} depths, less than its thickness. Responses "
+            f"scatter by {100 * SCATTER.share:.0f} % and have noise of {100 * SCATTER.floor:.0f} % of what straight "
+            "fibres answer to the stated tool and depth"
+        )
+    else:
+        what = (
+            f"Objects of {len(sizes)} sizes (radius K in grid units) and {len(others)} shapes (D sides) press every pad"
+        )
     text = [
-        f"Objects of {len(radii)} sizes (radius K in grid units) and {len(sides)} shapes (D sides) press every pad; "
-        f"{settings['members']} networks of {settings['hidden']} neurons were trained on {settings['presses']} presses "
-        f"with each object, and tested on {settings['test']} fresh presses with that one and with every other. "
-        "Errors are in grid units."
+        f"{what}; {settings['members']} networks of {settings['hidden']} neurons were trained on "
+        f"{settings['presses']} presses with each object, and tested on {settings['test']} fresh presses with that one "
+        f"and with every other. Errors are in {kind.unit}."
     ]
+    small_name, large_name = (kind.names[0].format(size) for size in (sizes[0], sizes[-1]))
     for label in settings["pads"]:
-        matrix = _error_matrix(rows, label)
-        trained = np.diag(matrix).reshape(len(sides), len(radii))
+        matrix = _error_matrix(settings, rows, label)
+        trained = np.diag(matrix).reshape(len(others), len(sizes))
         small, *_, large = trained.mean(axis=0)
-        shapes = trained.mean(axis=1)
-        other = matrix[~np.eye(len(matrix), dtype=bool)]
+        by_other = trained.mean(axis=1)
+        different = matrix[~np.eye(len(matrix), dtype=bool)]
         text.append(
-            f"{label}: {small:.3f} with K {radii[0]:g}, {large:.3f} with K {radii[-1]:g}; "
-            f"shapes differ by {100 * (shapes.max() / shapes.min() - 1):.0f} %. The mean error for an object that the "
-            f"networks were not trained with is {other.mean():.3f}, at worst {other.max():.3f}, instead of "
+            f"{label}: {small:.3f} with {small_name}, {large:.3f} with {large_name}; {kind.names[2]} differ by "
+            f"{100 * (by_other.max() / by_other.min() - 1):.0f} %. The mean error for an object that the networks were "
+            f"not trained with is {different.mean():.3f}, at worst {different.max():.3f}, instead of "
             f"{trained.mean():.3f}."
         )
     return text
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:
-    """Draw errors by size for every shape; and error matrices of trained by tested object."""
+    """Draw errors by size for every depth or shape; and error matrices of trained by tested object."""
     rows, settings = document["rows"], document["settings"]
-    labels, radii, sides = list(settings["pads"]), settings["radii"], settings["sides"]
+    kind, labels = _kind(settings), list(settings["pads"])
+    sizes, others = settings[kind.size], settings[kind.other]
     figure = Figure(figsize=(max(6.4, 2.6 * len(labels)), 6.4), layout="constrained")
     grid = figure.add_gridspec(2, len(labels), height_ratios=[1.0, 1.0])
     axes = figure.add_subplot(grid[0, :])
     for number, label in enumerate(labels):
-        colour, trained = CURVES[number % len(CURVES)], np.diag(_error_matrix(rows, label)).reshape(len(sides), -1)
-        for shape, style, errors in zip(sides, ("--", "-", ":", "-."), trained, strict=False):
-            axes.plot(radii, errors, style, color=colour, marker="o", markersize=4, label=f"{label}, D {shape}")
-    label_axes(axes, grid="y", xticks=radii, ylim=(0, None), ylabel="mean error (grid units)")
-    axes.set_xlabel("size K of the object, trained and tested with (grid units)")
+        colour = CURVES[number % len(CURVES)]
+        trained = np.diag(_error_matrix(settings, rows, label)).reshape(len(others), -1)
+        for other, style, errors in zip(others, ("--", "-", ":", "-."), trained, strict=False):
+            name = f"{label}, {kind.names[1].format(other)}"
+            axes.plot(sizes, errors, style, color=colour, marker="o", markersize=4, label=name)
+    label_axes(axes, grid="y", xticks=sizes, ylim=(0, None), ylabel=f"mean error ({kind.unit})")
+    axes.set_xlabel(kind.axes[0])
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    names = [f"{radius:g}/{shape}" for shape, radius in product(sides, radii)]
-    highest = max(row["mean"] for row in rows)
+    names = [f"{size:g}/{other:g}" for other, size in product(others, sizes)]
+    highest = max(row[kind.error] for row in rows)
     for number, label in enumerate(labels):
         axes = figure.add_subplot(grid[1, number], aspect="equal")
-        matrix = _error_matrix(rows, label)
+        matrix = _error_matrix(settings, rows, label)
         axes.imshow(matrix, cmap="magma_r", vmin=0, vmax=highest)
         for (trained, tested), value in np.ndenumerate(matrix):
             colour = "w" if value > 0.6 * highest else INK
             axes.text(tested, trained, f"{value:.2f}", ha="center", va="center", fontsize=6, color=colour)
         axes.set_xticks(range(len(names)), names, fontsize=7, rotation=90)
         axes.set_yticks(range(len(names)), names if number == 0 else [""] * len(names), fontsize=7)
-        axes.set_xlabel("tested with K/D", fontsize=8)
-        axes.set_ylabel("trained with K/D" if number == 0 else "", fontsize=8)
+        axes.set_xlabel(f"tested with {kind.axes[1]}", fontsize=8)
+        axes.set_ylabel(f"trained with {kind.axes[1]}" if number == 0 else "", fontsize=8)
         label_axes(axes, label)
     return figure

@@ -278,11 +278,12 @@ def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
 def quantize(signals: Array, training: int, noise_counts: float, rng: np.random.Generator) -> Array:
     """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a silent fibre reads its noise.
 
-    Full scale is the largest signal of a fibre in the first `training` presses.
+    Full scale is the largest magnitude of a fibre's signal in the first `training` presses. Readings begin at 0 unless
+    there are negative signals.
     """
-    full_scale = signals[:training].max(axis=0)
+    full_scale, lowest = np.abs(signals[:training]).max(axis=0), -ADC_COUNTS * int(signals.min() < 0)
     share = np.divide(signals, full_scale, out=np.zeros(signals.shape), where=full_scale > 0)
-    return np.clip(np.rint(ADC_COUNTS * share + rng.normal(0, noise_counts, signals.shape)), 0, ADC_COUNTS)
+    return np.clip(np.rint(ADC_COUNTS * share + rng.normal(0, noise_counts, signals.shape)), lowest, ADC_COUNTS)
 
 
 def fit_and_predict(inputs: Array, targets: Array, rng: np.random.Generator, sizes: Sizes) -> Array:

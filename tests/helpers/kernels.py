@@ -44,7 +44,6 @@ def use_kernels() -> None:
     design.signals_quantized(pad, presses)
     design.published_objective(pad)
     ambiguity_map(pad, presses, contacts[0], 1, 0.1)
-    design.indented_signals(pad, presses, 0.1, design.Indenter())
     design.check_rules(pad, design.RulesSettings())
     for contact in contacts[:2]:
         settings = design.SearchSettings(knots=1, starts=1, steps=2, max_failures=1)

@@ -56,7 +56,6 @@ def sound() -> dict[str, Any]:
         "up_command": recording.up_command,
         "presses_mm": recording.presses_mm,
         "rng": np.random.default_rng(0),
-        "indenter": design.Indenter(),
         "layout": pad.layout,
         "size": design.PadSettings(grid=2),
         "path": "new.json",
@@ -69,7 +68,7 @@ def sound() -> dict[str, Any]:
         "width": 5,
         "lam": 2.0,
         "times": 2,
-        "depths": np.array([0.1]),
+        "depths_mm": np.array([0.1, 4.0]),
         "tables": {"contact": {"radius": 0.5}},
         "held_back": (0, 1),
         "document": pad.to_dict(),
@@ -115,7 +114,7 @@ def _elsewhere(found: dict[str, Any]) -> dict[tuple[str, str], Any]:
 
 
 _OF_CLASS = {"Morphology": "pad", "Twin": "twin", "Recording": "recording", "LocalizerModel": "localizer"}
-_OF_CLASS |= {"Indenter": "indenter", "HealthModel": "health"}
+_OF_CLASS |= {"HealthModel": "health"}
 """Sound arguments that are of a class, whose methods are called as well."""
 
 

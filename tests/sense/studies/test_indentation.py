@@ -1,15 +1,15 @@
 """The studies of force and of shape, in small: estimates are better than guesses."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from padforge.design import Morphology
-from padforge.design.indentation import Indenter
+from padforge.design import Contact, InputError, Morphology, press_forces_n
 from padforge.sense.studies import indentation
-from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study
-from padforge.sense.studies.study import Sizes, run
+from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study, tool_contacts
+from padforge.sense.studies.study import Sizes, Study, run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
 UNIT_MM = 11.25
@@ -28,16 +28,27 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(
     for row in force["rows"]:
         assert 0 < row["depth_mm"] < 0.7 * row["depth_guessed_mm"]
         assert 0 < row["force_percent"] < 0.7 * row["force_guessed_percent"]
-        assert row["depth_mm"] == pytest.approx(UNIT_MM * row["depth_grid"])
         assert row["position_one_depth_mm"] < row["position_mm"] < MIDDLE_ERROR_MM
     for quiet, noisy in zip(force["rows"][::2], force["rows"][1::2], strict=True):
         assert quiet["depth_mm"] < noisy["depth_mm"]
         assert quiet["position_one_depth_mm"] < noisy["position_one_depth_mm"]
-    curve, row, indenter = force["curves"][0], force["rows"][0], Indenter()
-    pressed_n, predicted_n = (
-        indenter.force_n(np.array(curve[key]) / UNIT_MM, UNIT_MM) for key in ("pressed_mm", "predicted_mm")
-    )
+    curve, row = force["curves"][0], force["rows"][0]
+    pressed_n, predicted_n = (press_forces_n(curve[key]) for key in ("pressed_mm", "predicted_mm"))
     assert np.abs(predicted_n - pressed_n).mean() == pytest.approx(row["force_n"], rel=1e-3)
+
+
+def test_tools_have_one_size_and_the_layer_of_the_contact() -> None:
+    tools = tool_contacts(Contact(tool_radius_mm=6.0, thickness_mm=8.0))
+    assert [contact.tool for contact in tools.values()] == list(tools) == ["dome", "ball", "flat", "finger"]
+    assert {contact.thickness_mm for contact in tools.values()} == {8.0}
+    assert [tools[name].tool_radius_mm for name in ("dome", "ball", "finger")] == [6.0] * 3
+    assert 3.0 < tools["flat"].tool_radius_mm < 6.0
+
+
+@pytest.mark.parametrize("study", [force_study, shape_study])
+def test_contact_without_depth_is_refused(study: Callable[..., Study]) -> None:
+    with pytest.raises(InputError, match=r"\[contact\] model is shape, allowed is layer"):
+        study(PADS, contact=Contact(radius=0.6))
 
 
 @pytest.mark.parametrize("sides", FOOTPRINTS.values())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from padforge.design import InputError, Morphology, signals
+from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import scaling
 from padforge.sense.studies.scaling import family_shares, scaling_study, spread_presses, tile_inputs
 from padforge.sense.studies.study import run
@@ -27,10 +28,12 @@ def test_family_shares_divide_by_the_sum_of_each_family() -> None:
 
 
 def test_tile_inputs_are_the_same_in_every_tile() -> None:
+    """A published press ends within its tile; what a layer feels of fibres bent beyond its neighbours differs."""
     pad = Morphology.random(2, 3, 1).tiled(6)
     position = np.array([[5.2, 7.1]])
-    inputs, origin = tile_inputs(signals(pad, position), 2)
-    moved_inputs, moved_origin = tile_inputs(signals(pad, position + np.array([2.0, -4.0])), 2)
+    inputs, origin = tile_inputs(signals(pad, position, PUBLISHED_CONTACT), 2)
+    moved = signals(pad, position + np.array([2.0, -4.0]), PUBLISHED_CONTACT)
+    moved_inputs, moved_origin = tile_inputs(moved, 2)
     np.testing.assert_allclose(inputs, moved_inputs, atol=1e-9)
     np.testing.assert_array_equal(moved_origin - origin, [[2.0, -4.0]])
     assert inputs.shape == (1, 12)

@@ -4,17 +4,51 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design import Morphology
+from padforge.design import Contact, InputError, Morphology
+from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import sensitivity
 from padforge.sense.studies.sensitivity import sensitivity_study
 from padforge.sense.studies.study import run
 
 
-@pytest.mark.slow
-def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+PADS = {"square": Morphology.straight(3)}
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("SIDE", 16), ("TEST", 300), ("MEMBERS", 2), ("HIDDEN", 15), ("RADII", (0.6, 1.0))):
         monkeypatch.setattr(sensitivity, name, value)
-    document = run(sensitivity_study({"square": Morphology.straight(3)}), tmp_path)
+
+
+def test_tool_and_depth_of_half_size_err_more_between_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the paper's own probe of half the size did: 6.3 and 6.8 mm instead of about 2."""
+    monkeypatch.setattr(sensitivity, "FACTORS", (0.5, 1.0))
+    document = run(sensitivity_study(PADS), tmp_path)
+    keys = "trained_tool_radius_mm", "trained_depth_mm", "tool_radius_mm", "depth_mm"
+    means_mm = {tuple(row[key] for key in keys): row["mean_mm"] for row in document["rows"]}
+    assert len(means_mm) == 16
+    half, stated = (4.2, 2.5), (8.4, 5.0)
+    assert means_mm[half + half] > 3 * means_mm[stated + stated]
+    assert means_mm[stated + half] > means_mm[half + half]
+    assert means_mm[stated + stated] < means_mm[4.2, 5.0, 4.2, 5.0] < means_mm[half + half]
+    assert "Errors are in mm." in document["text"][0]
+
+
+def test_depths_beyond_the_thickness_are_left_out() -> None:
+    deep, shallow = (sensitivity_study(PADS, contact=Contact(depth_mm=depth_mm)) for depth_mm in (5.0, 3.0))
+    assert deep.settings["depth_mm"] == [2.5, 5.0]
+    assert shallow.settings["depth_mm"] == [1.5, 3.0, 4.5]
+    assert len(shallow.tasks) == 9
+
+
+def test_profile_has_no_size_to_vary() -> None:
+    with pytest.raises(InputError, match=r"\[contact\] model is profile, allowed are layer and shape"):
+        sensitivity_study(PADS, contact=Contact(model="profile"))
+
+
+@pytest.mark.slow
+def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path) -> None:
+    document = run(sensitivity_study(PADS, contact=PUBLISHED_CONTACT), tmp_path)
     assert len(document["rows"]) == 16
     keys = "trained_radius", "trained_sides", "radius", "sides"
     means = {tuple(row[key] for key in keys): row["mean"] for row in document["rows"]}

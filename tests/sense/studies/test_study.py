@@ -53,9 +53,9 @@ SMALLER: dict[object, dict[str, object]] = {
         **{"MEMBERS": 2, "HIDDEN": 4, "EPOCHS": 2, "RIG": RigSettings(drift_mv=300, presses=40)},
         "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
     },
-    indentation: {"FORCE_NOISES": (1.0,)},
+    indentation: {"FORCE_NOISES": (1.0,), "TOOLS": ("dome", "flat"), "SETS": {"tools": ("dome", "flat")}},
     scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
-    sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "RADII": (0.6, 1.0), "SIDES": (4,)},
+    sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "FACTORS": (0.5, 1.0)},
 }
 
 
@@ -223,5 +223,7 @@ def test_quantize_gives_whole_counts_up_to_full_scale_of_the_training() -> None:
     counts = quantize(signals, 3, 0.0, np.random.default_rng(0))
     full = [ADC_COUNTS, ADC_COUNTS, 0]
     np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, 2048, 0], full])
+    signed = quantize(np.array([[-0.5, -2.0], [1.0, 0.0]]), 2, 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(signed, [[-2048, -ADC_COUNTS], [ADC_COUNTS, 0]])
     noisy = quantize(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
     assert noisy[:-1].std() == pytest.approx(4, rel=0.1)

@@ -1,0 +1,89 @@
+"""Signals and forces of presses of known depth, against solved contacts and closed forms of the half-space."""
+
+import numpy as np
+import pytest
+
+from padforge.design import Contact, InputError, Morphology, indented_signals, press_forces_n, signals
+from padforge.design.layer import REDUCED_MODULUS_KPA, solve_press
+
+PAD = Morphology.random(2, 3, 1)
+
+
+def presses_on(pad: Morphology, count: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.3, pad.grid + 0.7, (count, 2))
+
+
+@pytest.mark.parametrize(
+    "contact",
+    [Contact(), pytest.param(Contact(tool="finger", base="slipping"), marks=pytest.mark.slow)],
+    ids=["dome", "finger"],
+)
+def test_indented_signals_are_those_of_solved_contacts(contact: Contact) -> None:
+    presses, full_scale = presses_on(PAD, 12), np.abs(signals(PAD, presses_on(PAD, 60), contact)).max()
+    depths_mm = (0.03, 1.1, 2.6, 4.7)
+    interpolated = indented_signals(PAD, np.tile(presses, (4, 1)), np.repeat(depths_mm, len(presses)), contact)
+    solved = [signals(PAD, presses, Contact(**contact.model_dump() | {"depth_mm": each})) for each in depths_mm]
+    np.testing.assert_allclose(interpolated, np.concatenate(solved), rtol=0, atol=0.005 * full_scale)
+    deepest = indented_signals(PAD, presses, contact.depth_mm, contact)
+    np.testing.assert_array_equal(deepest, signals(PAD, presses, contact))
+    assert not indented_signals(PAD, presses, 0.0, contact).any()
+
+
+def test_indented_signals_of_a_flat_end_grow_in_proportion_to_the_depth() -> None:
+    contact, presses = Contact(tool="flat", tool_radius_mm=5.0), presses_on(PAD, 5)
+    depths_mm = np.array([0.0, 0.02, 1.0, 3.3, 4.9])
+    expected = depths_mm[:, None] / 5.0 * signals(PAD, presses, contact)
+    np.testing.assert_allclose(indented_signals(PAD, presses, depths_mm, contact), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_indented_signals_do_not_depend_on_other_presses() -> None:
+    presses, depths_mm = presses_on(PAD, 20), np.linspace(0.1, 5, 20)
+    together = indented_signals(PAD, presses, depths_mm)
+    np.testing.assert_array_equal(indented_signals(PAD, presses[7:8], depths_mm[7:8]), together[7:8])
+    assert indented_signals(PAD, [], []).shape == (0, 4)
+
+
+@pytest.mark.parametrize("contact", [Contact(), Contact(tool="ball", tool_radius_mm=6.0, base="slipping")])
+def test_press_forces_are_those_of_solved_contacts(contact: Contact) -> None:
+    depths_mm = np.array([[0.0, 0.02], [1.3, 4.8]])
+    layer = contact.thickness_mm, contact.base
+    solved = [
+        solve_press(contact.tool, contact.tool_radius_mm, depth_mm, *layer).force_n() if depth_mm else 0.0
+        for depth_mm in depths_mm.ravel().tolist()
+    ]
+    deepest_n = float(press_forces_n(contact.depth_mm, contact))
+    np.testing.assert_allclose(press_forces_n(depths_mm, contact).ravel(), solved, rtol=0, atol=5e-4 * deepest_n)
+
+
+def test_press_forces_on_a_thick_layer_are_hertz_and_sneddon() -> None:
+    depths_mm, thick = np.linspace(0, 1, 7), {"thickness_mm": 1000.0, "depth_mm": 1.0, "tool_radius_mm": 8.0}
+    dome = press_forces_n(depths_mm, Contact(**thick))
+    hertz = 4 / 3 * REDUCED_MODULUS_KPA * np.sqrt(8.0) * depths_mm**1.5 * 1e-3
+    np.testing.assert_allclose(dome, hertz, rtol=0.01, atol=1e-6)
+    flat = press_forces_n(depths_mm, Contact(tool="flat", **thick), reduced_modulus_kpa=100.0)
+    np.testing.assert_allclose(flat, 2 * 100.0 * 8.0 * depths_mm * 1e-3, rtol=0.02)
+
+
+def test_layer_stiffness_is_twice_modulus_times_contact_radius() -> None:
+    """dF / dd = 2 E* a holds for a half-space; a bonded layer is stiffer than that."""
+    step = 1e-3
+    for thickness_mm, ratio in ((1000.0, 1.0), (6.0, 2.0)):
+        press = solve_press("dome", 8.4, 4.0, thickness_mm)
+        low, high = (solve_press("dome", 8.4, 4.0 + shift, thickness_mm).force_n() for shift in (-step, step))
+        stiffness = (high - low) / (2 * step) / (2e-3 * REDUCED_MODULUS_KPA * press.contact_radius_mm)
+        assert stiffness == pytest.approx(ratio, rel=0.02) if ratio == 1 else stiffness > ratio
+
+
+@pytest.mark.parametrize(
+    ("contact", "depths_mm", "message"),
+    [
+        (Contact(radius=0.6), 0.1, "contact is a shape, allowed is a layer"),
+        (Contact(model="profile"), 0.1, "contact is a profile, allowed is a layer"),
+        (Contact(), [0.1, 5.1], "depths_mm has 5.1, allowed is 0 to 5, the contact's depth"),
+        (Contact(), [0.1, -0.1], "depths_mm has -0.1, allowed is 0 to 5"),
+        (Contact(), [0.1], r"depths_mm have shape \(1,\), expected \(2,\)"),
+    ],
+)
+def test_indented_signals_refuse_other_contacts_and_depths(contact: Contact, depths_mm: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        indented_signals(PAD, [[1, 1], [2, 2]], depths_mm, contact)  # pyright: ignore[reportArgumentType]
