@@ -22,7 +22,7 @@ def test_indented_signals_are_those_of_solved_contacts(contact: Contact) -> None
     presses, full_scale = presses_on(PAD, 12), np.abs(signals(PAD, presses_on(PAD, 60), contact)).max()
     depths_mm = (0.03, 1.1, 2.6, 4.7)
     interpolated = indented_signals(PAD, np.tile(presses, (4, 1)), np.repeat(depths_mm, len(presses)), contact)
-    solved = [signals(PAD, presses, Contact(**contact.model_dump() | {"depth_mm": each})) for each in depths_mm]
+    solved = [signals(PAD, presses, contact.model_copy(update={"depth_mm": each})) for each in depths_mm]
     np.testing.assert_allclose(interpolated, np.concatenate(solved), rtol=0, atol=0.005 * full_scale)
     deepest = indented_signals(PAD, presses, contact.depth_mm, contact)
     np.testing.assert_array_equal(deepest, signals(PAD, presses, contact))
@@ -56,11 +56,11 @@ def test_press_forces_are_those_of_solved_contacts(contact: Contact) -> None:
 
 
 def test_press_forces_on_a_thick_layer_are_hertz_and_sneddon() -> None:
-    depths_mm, thick = np.linspace(0, 1, 7), {"thickness_mm": 1000.0, "depth_mm": 1.0, "tool_radius_mm": 8.0}
-    dome = press_forces_n(depths_mm, Contact(**thick))
+    depths_mm, thick = np.linspace(0, 1, 7), Contact(thickness_mm=1000, depth_mm=1, tool_radius_mm=8)
+    dome = press_forces_n(depths_mm, thick)
     hertz = 4 / 3 * REDUCED_MODULUS_KPA * np.sqrt(8.0) * depths_mm**1.5 * 1e-3
     np.testing.assert_allclose(dome, hertz, rtol=0.01, atol=1e-6)
-    flat = press_forces_n(depths_mm, Contact(tool="flat", **thick), reduced_modulus_kpa=100.0)
+    flat = press_forces_n(depths_mm, thick.model_copy(update={"tool": "flat"}), reduced_modulus_kpa=100.0)
     np.testing.assert_allclose(flat, 2 * 100.0 * 8.0 * depths_mm * 1e-3, rtol=0.02)
 
 

@@ -21,9 +21,9 @@ MIDDLE_ERROR_MM = UNIT_MM * 0.38
 def test_force_study_estimates_depth_and_force_better_than_guessing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(indentation, "FORCE_NOISES", (1.0, 30.0))
+    monkeypatch.setattr(indentation, "FORCE_NOISES", (1.0, 100.0))
     force = run(force_study(PADS, sizes=Sizes(300, 120, hidden=12, epochs=25)), tmp_path)
-    expected = [(label, noise) for label in PADS for noise in (1.0, 30.0)]
+    expected = [(label, noise) for label in PADS for noise in (1.0, 100.0)]
     assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == expected
     for row in force["rows"]:
         assert 0 < row["depth_mm"] < 0.7 * row["depth_guessed_mm"]

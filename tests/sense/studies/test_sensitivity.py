@@ -10,13 +10,12 @@ from padforge.sense.studies import sensitivity
 from padforge.sense.studies.sensitivity import sensitivity_study
 from padforge.sense.studies.study import run
 
-
 PADS = {"square": Morphology.straight(3)}
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("SIDE", 16), ("TEST", 300), ("MEMBERS", 2), ("HIDDEN", 15), ("RADII", (0.6, 1.0))):
+    for name, value in (("SIDE", 16), ("TEST", 200), ("MEMBERS", 2), ("HIDDEN", 12), ("RADII", (0.6, 1.0))):
         monkeypatch.setattr(sensitivity, name, value)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings
+from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
@@ -44,7 +44,7 @@ SMALLEST: dict[str, Callable[[], Study]] = {
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
     "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
-    "sensitivity": lambda: sensitivity.sensitivity_study(PADS),
+    "sensitivity": lambda: sensitivity.sensitivity_study({"square": PADS["square"]}),
 }
 
 SMALLER: dict[object, dict[str, object]] = {
@@ -53,6 +53,7 @@ SMALLER: dict[object, dict[str, object]] = {
         **{"MEMBERS": 2, "HIDDEN": 4, "EPOCHS": 2, "RIG": RigSettings(drift_mv=300, presses=40)},
         "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
     },
+    contact: {"DEPTH_STEPS": 4},
     indentation: {"FORCE_NOISES": (1.0,), "TOOLS": ("dome", "flat"), "SETS": {"tools": ("dome", "flat")}},
     scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
     sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "FACTORS": (0.5, 1.0)},
