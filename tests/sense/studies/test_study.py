@@ -159,6 +159,13 @@ def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: 
     assert message in refused("study", *arguments, "--out", "out", cwd=tmp_path)
 
 
+@pytest.mark.parametrize("name", ["force", "shape"])
+def test_study_presses_with_the_contact_of_the_settings(name: str, tmp_path: Path) -> None:
+    (tmp_path / "pad.toml").write_text("[contact]\nradius = 0.6\n")
+    message = refused("study", name, "square@1", "--out", "out", cwd=tmp_path)
+    assert "[contact] model is shape, allowed is layer" in message
+
+
 @pytest.mark.slow
 def test_interrupt_ends_a_study_at_once_and_keeps_finished_tasks(tmp_path: Path) -> None:
     out = tmp_path / "out"
