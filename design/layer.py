@@ -47,7 +47,8 @@ _FACE_WAVES = 20.0
 _DECAY = 25.0
 """Wavenumber times depth below the face at which a field has decayed, to exp(-25)."""
 _MIN_DEPTH_SHARE = 0.01
-"""Least depth below the face, as a share of the thickness, at which strains are computed."""
+"""Least depth below the face at which strains are computed, as a share of the thickness or, if less, of the contact
+radius."""
 
 
 class Strains(NamedTuple):
@@ -108,12 +109,13 @@ class LayerPress:
 
         Args:
             r_mm: distances from the axis; shape (n,).
-            height_mm: height above the base, mm; nearer to the pressed face than a hundredth of the thickness, the
-                strains are those there.
+            height_mm: height above the base, mm; nearer to the pressed face than a hundredth of the thickness or of the
+                contact radius, the strains are those there.
             blur_mm: standard deviation of a Gaussian in the plane by which they are averaged.
         """
         r = np.asarray(r_mm, dtype=float)
-        height_mm = min(height_mm, (1 - _MIN_DEPTH_SHARE) * self.thickness_mm)
+        least = _MIN_DEPTH_SHARE * min(self.thickness_mm, self.contact_radius_mm)
+        height_mm = min(height_mm, self.thickness_mm - least)
         k, weight, load = self._waves(height_mm, r.max(initial=0.0), blur_mm)
         _, outward = _transfer(self.base, k, height_mm, self.thickness_mm)
         amplitude = weight * load * outward * np.exp(-((k * blur_mm) ** 2) / 2)
@@ -123,7 +125,7 @@ class LayerPress:
 
     def _waves(self, height_mm: float, farthest_mm: float, blur_mm: float) -> tuple[Array, Array, Array]:
         """Return wavenumbers, their quadrature weights, and p(k) / 2G, for a field out to a distance."""
-        depth = max(self.thickness_mm - height_mm, _MIN_DEPTH_SHARE * self.thickness_mm)
+        depth = self.thickness_mm - height_mm
         # k depth + k^2 blur^2 / 2 = _DECAY
         largest = 2 * _DECAY / (depth + math.sqrt(depth**2 + 2 * _DECAY * blur_mm**2))
         # panels of ten radians of the fastest oscillation, and twenty of what the layer itself does
