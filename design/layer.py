@@ -39,8 +39,8 @@ REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
 FINGER_COMPLIANCE = 1.0
 """Compliance of a fingertip's pulp as a multiple of the pad's: both are tens of kPa soft."""
 TERMS = 16
-"""Legendre polynomials of phi: forces to 1e-6 up to a contact radius of ten thicknesses, 1e-3 at MAX_CONTACT."""
-MAX_CONTACT = 200.0
+"""Legendre polynomials of phi: forces to 1e-6 up to a contact radius of ten thicknesses, 5e-4 at MAX_CONTACT."""
+MAX_CONTACT = 100.0
 """Largest contact radius, thicknesses."""
 _FACE_WAVES = 20.0
 """Wavenumber times thickness at which a layer is a half-space to 1e-15."""
