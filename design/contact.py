@@ -65,7 +65,7 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
             (..., 2 M, N + 2, 2), grid units.
         presses: centres; shape (Q, 2), grid units. Or C simultaneous presses whose signals add, shape (Q, C, 2); where
             their shapes overlap a fibre counts once for each.
-        contact: contact model; the measured one, `Contact()`, if None.
+        contact: contact model; the default layer, `Contact()`, if None.
 
     Returns:
         Signals; shape (Q, F), or (..., Q, F) of a population; grid units for weights without unit. Uniform Manhattan

@@ -408,7 +408,7 @@ class SearchSettings(Settings):
 
     @property
     def default_contact(self) -> Contact:
-        """Contact designed for if none is stated: the measured one, or the paper's for the paper's own method."""
+        """Contact designed for if none is stated: the layer, or the paper's for the paper's own method."""
         return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
 
     @property
