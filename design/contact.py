@@ -44,6 +44,8 @@ _DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
 LAYER_REACH = {"bonded": 6.0, "slipping": 16.0}
 """Distance beyond the contact at which strains of a layer end, thicknesses. What is left out is 0.5 % of a straight
 fibre's signal if the layer is bonded; strains of a slipping one fall only with the square of the distance."""
+THICK = 4.0
+"""Contact radii above which a thickness counts no more for that: there strains fall with the cube of the distance."""
 FIBRE_BLUR_MM = 0.2
 """Standard deviation of a Gaussian by which strains are averaged: a fibre has a width and is stiffer than silicone, so
 it does not follow the step of the strains at the edge of the contact, which signals, their integrals, hardly show."""
@@ -324,8 +326,9 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
         distance, weight = np.array(contact.sensitivity_profile).T
         return ((distance, weight, np.zeros_like(weight)),)
     press = _press(contact)
-    distance = _layer_distances(press.contact_radius_mm, contact)
-    fade = np.clip((distance[-1] - distance) / contact.thickness_mm, 0, 1)
+    thickness_mm = min(contact.thickness_mm, THICK * press.contact_radius_mm)
+    distance = _layer_distances(press.contact_radius_mm, LAYER_REACH[contact.base] * thickness_mm)
+    fade = np.clip((distance[-1] - distance) / thickness_mm, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
     families = []
     for depth_mm in contact.fibre_depths_mm:
@@ -355,13 +358,14 @@ def half_width_mm(contact: Contact) -> float:
     return float(np.mean(widths))
 
 
-def _layer_distances(contact_radius_mm: float, contact: Contact) -> Array:
-    """Return distances at which strains are computed, densest around the edge of the contact, where they bend.
+def _layer_distances(contact_radius_mm: float, reach_mm: float) -> Array:
+    """Return distances at which strains are computed, up to a reach beyond the contact.
 
-    Their squares are multiples of one step, so that the kernels find the row of a squared distance at once.
+    They are densest around its edge, where strains bend. Their squares are multiples of one step, so that the kernels
+    find the row of a squared distance at once.
     """
     near = 1.5 * contact_radius_mm
-    end = max(contact_radius_mm + LAYER_REACH[contact.base] * contact.thickness_mm, 1.2 * near)
+    end = max(contact_radius_mm + reach_mm, 1.2 * near)
     far = np.rint((np.linspace(near, end, FAR_POINTS) / near) ** 2 * NEAR_POINTS)
     return near * np.sqrt(np.unique(np.append(np.arange(NEAR_POINTS), far)) / NEAR_POINTS)
 

@@ -28,6 +28,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from padforge.design.common.validation import InputError
+
 Array = NDArray[np.float64]
 Tool = Literal["dome", "ball", "flat", "finger"]
 Base = Literal["bonded", "slipping"]
@@ -37,13 +39,16 @@ REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
 FINGER_COMPLIANCE = 1.0
 """Compliance of a fingertip's pulp as a multiple of the pad's: both are tens of kPa soft."""
 TERMS = 16
-"""Legendre polynomials of phi: contact radii up to five thicknesses to 1e-6."""
+"""Legendre polynomials of phi: forces to 1e-6 up to a contact radius of ten thicknesses, 5e-4 at MAX_CONTACT."""
+MAX_CONTACT = 100.0
+"""Largest contact radius, thicknesses."""
 _FACE_WAVES = 20.0
 """Wavenumber times thickness at which a layer is a half-space to 1e-15."""
 _DECAY = 25.0
 """Wavenumber times depth below the face at which a field has decayed, to exp(-25)."""
 _MIN_DEPTH_SHARE = 0.01
-"""Least depth below the face, as a share of the thickness, at which strains are computed."""
+"""Least depth below the face at which strains are computed, as a share of the thickness or, if less, of the contact
+radius."""
 
 
 class Strains(NamedTuple):
@@ -95,9 +100,8 @@ class LayerPress:
         within = r[:, None] <= a
         root = np.sqrt(np.maximum(r[:, None] ** 2 - (a * np.sin(angle)) ** 2, 1e-300))
         half_space = np.where(within, series, series * a * np.cos(angle) / root) @ (np.pi / 2 * weights)
-        k = _FACE_WAVES / self.thickness_mm * nodes
-        softer = 1 - _transfer(self.base, k, self.thickness_mm, self.thickness_mm)[0]
-        layer = weights * _FACE_WAVES / self.thickness_mm * softer * (self.load @ _legendre_waves(k, a))
+        k, softer = _softer(self.base, self.thickness_mm, a + float(r.max(initial=0.0)))
+        layer = softer * (self.load @ _legendre_waves(k, a))
         return 2 / np.pi * (half_space - _bessel(0, r, k) @ layer)
 
     def strains(self, r_mm: ArrayLike, height_mm: float, blur_mm: float = 0.0) -> Strains:
@@ -105,12 +109,13 @@ class LayerPress:
 
         Args:
             r_mm: distances from the axis; shape (n,).
-            height_mm: height above the base, mm; nearer to the pressed face than a hundredth of the thickness, the
-                strains are those there.
+            height_mm: height above the base, mm; nearer to the pressed face than a hundredth of the thickness or of the
+                contact radius, the strains are those there.
             blur_mm: standard deviation of a Gaussian in the plane by which they are averaged.
         """
         r = np.asarray(r_mm, dtype=float)
-        height_mm = min(height_mm, (1 - _MIN_DEPTH_SHARE) * self.thickness_mm)
+        least = _MIN_DEPTH_SHARE * min(self.thickness_mm, self.contact_radius_mm)
+        height_mm = min(height_mm, self.thickness_mm - least)
         k, weight, load = self._waves(height_mm, r.max(initial=0.0), blur_mm)
         _, outward = _transfer(self.base, k, height_mm, self.thickness_mm)
         amplitude = weight * load * outward * np.exp(-((k * blur_mm) ** 2) / 2)
@@ -120,7 +125,7 @@ class LayerPress:
 
     def _waves(self, height_mm: float, farthest_mm: float, blur_mm: float) -> tuple[Array, Array, Array]:
         """Return wavenumbers, their quadrature weights, and p(k) / 2G, for a field out to a distance."""
-        depth = max(self.thickness_mm - height_mm, _MIN_DEPTH_SHARE * self.thickness_mm)
+        depth = self.thickness_mm - height_mm
         # k depth + k^2 blur^2 / 2 = _DECAY
         largest = 2 * _DECAY / (depth + math.sqrt(depth**2 + 2 * _DECAY * blur_mm**2))
         # panels of ten radians of the fastest oscillation, and twenty of what the layer itself does
@@ -146,6 +151,9 @@ def solve_press(
 
     Returns:
         The press. A ball deeper than it can touch a plane with has the radius of contact of its equator.
+
+    Raises:
+        InputError: the contact is wider than MAX_CONTACT.
     """
     from scipy.optimize import brentq
 
@@ -159,9 +167,15 @@ def solve_press(
         return float(shape.sum() - depth_mm * unit.sum())
 
     hertz = math.sqrt(radius_mm * depth_mm)
-    widest = radius_mm * (1 - 1e-6) if tool == "ball" else 3 * hertz
-    if tool == "flat" or (tool == "ball" and excess(widest) < 0):
-        a = radius_mm if tool == "flat" else widest
+    whole = radius_mm if tool == "flat" else radius_mm * (1 - 1e-6) if tool == "ball" else math.inf
+    widest = min(3 * hertz, whole, MAX_CONTACT * thickness_mm)
+    if tool == "flat" or excess(widest) < 0:
+        a = whole
+        if a > MAX_CONTACT * thickness_mm:
+            raise InputError(
+                f"tool_radius_mm is {radius_mm:g}, by which the contact is too wide for a thickness_mm of "
+                f"{thickness_mm:g}, allowed are {MAX_CONTACT:g} times the thickness"
+            )
     else:  # between Hertz's and twice it, the thin layer's
         a = float(brentq(excess, min(0.5 * hertz, widest / 2), widest, xtol=1e-10 * hertz))  # pyright: ignore[reportArgumentType]
     unit, shape = solve(a)
@@ -173,17 +187,29 @@ def _solve_phi(
 ) -> tuple[Array, Array]:
     """Solve for phi on [0, a] with the right side 1 and with f(x), both by Legendre coefficients (TERMS,)."""
     nodes, weights = _gauss(400)
-    k, x = _FACE_WAVES / thickness * nodes, a * nodes
-    softer = 1 - _transfer(base, k, thickness, thickness)[0]
+    x = a * nodes
+    k, softer = _softer(base, thickness, 2 * a)
     waves = _legendre_waves(k, a)
     order = np.arange(TERMS)
     matrix = np.diag((1 + compliance) * a / (4 * order + 1))
-    matrix -= 2 / np.pi * (waves * (softer * weights * _FACE_WAVES / thickness)) @ waves.T
+    matrix -= 2 / np.pi * (waves * softer) @ waves.T
     shape = x * np.arctanh(x / radius) if tool == "ball" else x**2 / radius * (tool != "flat")
     polynomials = np.polynomial.legendre.legvander(nodes, 2 * TERMS - 2)[:, ::2].T
     right = np.stack([polynomials @ (a * weights), polynomials @ (a * weights * shape)])
     unit, shaped = np.linalg.solve(matrix, right.T).T
     return unit, shaped
+
+
+def _softer(base: Base, thickness: float, farthest: float) -> tuple[Array, Array]:
+    """Return wavenumbers k and 1 - W on the face by which the layer differs from a half-space, times their weights.
+
+    Fields that they multiply oscillate as fast as cos(k farthest).
+    """
+    nodes, weights = _gauss(400)
+    panels = math.ceil(farthest / (40 * thickness))  # up to 800 radians in each
+    largest = _FACE_WAVES / thickness / panels
+    k = (largest * (np.arange(panels)[:, None] + nodes)).ravel()
+    return k, np.tile(largest * weights, panels) * (1 - _transfer(base, k, thickness, thickness)[0])
 
 
 def _transfer(base: Base, k: Array, height: float, thickness: float) -> tuple[Array, Array]:

@@ -1,0 +1,256 @@
+"""The layer contact against closed forms of contact mechanics and finite elements."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from padforge.design import InputError
+from padforge.design.contact import profile_weights
+from padforge.design.layer import MAX_CONTACT, solve_press
+from padforge.design.settings import Contact
+from tests.helpers.axisymmetric import press
+
+
+def tool_depth(tool, radius, depth, r):
+    """Depth of the tool's surface below the undeformed face, far above it beside the end of a rod."""
+    if tool == "flat":
+        return np.where(r <= radius * (1 + 1e-9), depth, -1e3)
+    if tool == "ball":
+        return depth - radius + np.sqrt(np.maximum(radius**2 - r**2, 0))
+    return depth - r**2 / (2 * radius)
+
+
+def half_width(r, weight):
+    """Largest distance at which a weight has half of its greatest value."""
+    return r[np.flatnonzero(weight >= weight.max() / 2)[-1]]
+
+
+@pytest.mark.parametrize(("radius", "depth"), [(8.4, 0.5), (4.2, 2.0)])
+def test_dome_on_thick_layer_is_hertz(radius, depth):
+    solved = solve_press("dome", radius, depth, 100 * radius)
+    a = math.sqrt(radius * depth)
+    assert solved.contact_radius_mm == pytest.approx(a, rel=0.02)
+    assert solved.force_n(73) == pytest.approx(73e-3 * 4 / 3 * math.sqrt(radius) * depth**1.5, rel=0.02)
+    r = a * np.array([1.2, 2.0, 4.0])
+    outside = ((2 * a**2 - r**2) * np.arcsin(a / r) + a * np.sqrt(r**2 - a**2)) / (math.pi * radius)
+    np.testing.assert_allclose(solved.deflection(r), outside, atol=0.02 * depth)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.95])  # contact radius over that of the ball
+def test_ball_on_thick_layer_is_sneddon(share):
+    radius, a = 5.0, 5.0 * share
+    solved = solve_press("ball", radius, a * math.atanh(share), 200 * radius)
+    assert solved.contact_radius_mm == pytest.approx(a, rel=0.02)
+    force = 73e-3 * ((a**2 + radius**2) * math.atanh(share) - a * radius)
+    assert solved.force_n(73) == pytest.approx(force, rel=0.02)
+
+
+def test_flat_on_thick_layer_is_sneddon():
+    radius, depth = 3.0, 0.7
+    solved = solve_press("flat", radius, depth, 100 * radius)
+    assert solved.contact_radius_mm == radius
+    assert solved.force_n(73) == pytest.approx(73e-3 * 2 * radius * depth, rel=0.02)
+    r = radius * np.array([1.1, 2.0, 5.0])
+    np.testing.assert_allclose(solved.deflection(r), 2 * depth / np.pi * np.arcsin(radius / r), atol=0.02 * depth)
+
+
+@pytest.mark.parametrize("thickness", [20.0, 100.0, 1000.0])
+@pytest.mark.parametrize("below", [0.25, 1.05])
+def test_strains_near_the_face_of_a_thick_layer_are_those_of_a_half_space(thickness, below):
+    solved = solve_press("dome", 0.84, 0.5, thickness)
+    a, depth = math.sqrt(0.84 * 0.5), 0.5
+    # int k^2 exp(-k z) cos(k s) dk in closed form
+    strain = quad(
+        lambda s: (depth - s**2 / 0.84) * 4 * below**2 * (below**2 - 3 * s**2) / (below**2 + s**2) ** 3 / np.pi, 0, a
+    )[0]
+    assert solved.strains([0.0], thickness - below).compressive[0] == pytest.approx(strain, rel=0.05)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0])
+def test_contact_radius_of_a_bonded_layer_follows_chi(ratio):
+    thickness = 3.0
+    chi = 1 / 4 + 3 / 4 / (1 + 1.3 * ratio)
+    depth = chi * (ratio * thickness) ** 2 / 20
+    solved = solve_press("dome", 20.0, depth, thickness)
+    assert 20.0 * depth / solved.contact_radius_mm**2 == pytest.approx(chi, rel=0.05)
+
+
+def test_thin_bonded_layer_is_a_lubrication_film():
+    a, thickness = 90.0, 1.0
+    dome = solve_press("dome", 1000.0, a**2 / 4000, thickness)
+    flat = solve_press("flat", a, 0.01, thickness)
+    # incompressible silicone flows out of the gap by t^3 / 3 G of the pressure's slope; edges weigh as t / a
+    assert dome.contact_radius_mm == pytest.approx(a, rel=0.03)
+    wide = dome.contact_radius_mm
+    assert dome.force_n(4) == pytest.approx(1e-3 * math.pi * wide**6 / (32 * thickness**3 * 1000), rel=0.11)
+    assert flat.force_n(4) == pytest.approx(1e-3 * 3 * math.pi * 0.01 * a**4 / (8 * thickness**3), rel=0.11)
+
+
+def test_thin_slipping_layer_has_half_of_chi():
+    solved = solve_press("dome", 1000.0, 1.0, 0.5, "slipping")
+    assert 1000.0 / solved.contact_radius_mm**2 == pytest.approx(1 / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+@pytest.mark.parametrize("tool", ["dome", "ball", "flat"])
+def test_face_follows_the_tool_inside_and_stays_clear_of_it_outside(tool, base):
+    solved = solve_press(tool, 8.4, 3.0, 6.0, base)
+    a = solved.contact_radius_mm
+    inside, outside = np.linspace(0, 0.999 * a, 40), np.linspace(1.001 * a, 3 * a, 40)
+    np.testing.assert_allclose(solved.deflection(inside), tool_depth(tool, 8.4, 3.0, inside), atol=1e-3)
+    assert (solved.deflection(outside) > tool_depth(tool, 8.4, 3.0, outside)).all()
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_silicone_keeps_its_volume(base):
+    solved = solve_press("dome", 8.4, 4.0, 6.0, base)
+    heights, weights = np.polynomial.legendre.leggauss(20)
+    for radius in (3.0, 8.0, 14.0):
+        outward = [float(solved.strains([radius], 3 + 3 * height).hoop[0]) * radius for height in heights]
+        r = radius * (1 + heights) / 2
+        displaced = radius / 2 * weights @ (solved.deflection(r) * r)
+        assert radius * 3 * weights @ outward == pytest.approx(displaced, abs=0.01 * 4.0 * 8.0)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_strains_are_differences_of_displacements(base):
+    solved = solve_press("ball", 8.4, 3.0, 6.0, base)
+    r, step = np.linspace(0.5, 15, 20), 1e-4
+    left, right = (x * solved.strains(x, 4.5).hoop for x in (r - step, r + step))
+    strains = solved.strains(r, 4.5)
+    np.testing.assert_allclose((right - left) / (2 * step), strains.radial, atol=1e-6)
+    np.testing.assert_allclose(strains.compressive, strains.radial + strains.hoop, atol=1e-12)
+    heights, weights = np.polynomial.legendre.leggauss(40)
+    squeezed = sum(w * solved.strains(r, 3 + 3 * h).compressive for h, w in zip(heights, weights, strict=True))
+    np.testing.assert_allclose(3 * squeezed, solved.deflection(r), atol=0.01 * 3.0)
+
+
+@pytest.mark.parametrize(
+    ("thickness", "radius", "depth", "widths", "strain"),
+    [  # by scikit-fem on a coarser mesh, Poisson's ratio 0.49, at 0.5, 0.75 and 0.9 of the thickness
+        (8, 8.4, 4, (5.7, 6.1, 6.6), 0.62),
+        (8, 8.4, 5, (6.3, 6.8, 7.4), None),
+        (6, 8.4, 4, (5.8, 6.1, 6.4), 0.80),
+        (10, 8.4, 4, (5.7, 5.9, 6.4), 0.49),
+        (6, 8.4, 2, (4.1, 4.3, 4.7), None),
+        (6, 4.2, 2, (3.0, 2.9, 3.1), None),
+    ],
+)
+def test_half_widths_of_squeeze_are_those_of_finite_elements(thickness, radius, depth, widths, strain):
+    solved, r = solve_press("dome", radius, depth, thickness), np.linspace(0, 12, 601)
+    squeezes = [solved.strains(r, share * thickness).compressive for share in (0.5, 0.75, 0.9)]
+    np.testing.assert_allclose([half_width(r, squeeze) for squeeze in squeezes], widths, rtol=0.07)
+    if strain:
+        assert squeezes[0][0] == pytest.approx(strain, rel=0.07)
+
+
+@pytest.mark.parametrize(
+    ("tool", "thickness", "depth", "base"),
+    [
+        ("dome", 6, 5, "bonded"),
+        ("dome", 6, 1, "slipping"),
+        ("ball", 8, 4, "slipping"),
+        ("ball", 3, 2, "bonded"),
+        ("flat", 6, 2, "bonded"),
+    ],
+)
+def test_layer_is_that_of_finite_elements(tool, thickness, depth, base):
+    solved = solve_press(tool, 8.4, depth, thickness, base)
+    a, results = solved.contact_radius_mm, []
+    for count in (8, 16):  # elements over the contact
+        edges = list(np.linspace(0, 1.5 * a, 3 * count // 2 + 1))
+        while edges[-1] < a + (6 if base == "bonded" else 60) * thickness:
+            edges.append(edges[-1] + 1.3 * (edges[-1] - edges[-2]))
+        heights = np.linspace(0, thickness, max(4, count * thickness // 8) + 1)
+        results.append(
+            press(lambda r: tool_depth(tool, 8.4, depth, r), np.array(edges), heights, bonded=base == "bonded")
+        )
+    coarse, fine = results
+    # an edge of pressure without bound, of a flat end, is what elements see least
+    assert fine.force == pytest.approx(coarse.force, rel=0.01)
+    assert solved.force_n(4e3) == pytest.approx(fine.force, rel=0.01 if tool == "flat" else 0.003)
+    assert fine.contact_radius == pytest.approx(a, rel=1e-9)
+    row = 3 * len(fine.z) // 4
+    beside = np.abs(fine.r - a) > 0.25 * a
+    strains = solved.strains(fine.r, fine.z[row])
+    greatest = np.abs(strains.compressive).max()
+    squeezed = np.gradient(fine.down, fine.z, axis=1)[:, row]
+    np.testing.assert_allclose(squeezed[beside], strains.compressive[beside], atol=0.03 * greatest)
+    hoop = fine.outward[1:, row] / fine.r[1:]
+    np.testing.assert_allclose(hoop[beside[1:]], strains.hoop[1:][beside[1:]], atol=0.03 * greatest)
+
+
+def test_finger_on_thick_layer_is_a_dome_with_half_the_force():
+    dome, finger = (solve_press(tool, 8.4, 1.0, 1000.0) for tool in ("dome", "finger"))
+    assert finger.contact_radius_mm == pytest.approx(dome.contact_radius_mm, rel=0.005)
+    assert finger.force_n() == pytest.approx(dome.force_n() / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("tool", ["dome", "ball", "flat", "finger"])
+def test_half_of_every_length_has_the_same_strains_at_half_the_distance(tool):
+    whole, half = solve_press(tool, 8.4, 4.0, 6.0), solve_press(tool, 4.2, 2.0, 3.0)
+    assert half.contact_radius_mm == pytest.approx(whole.contact_radius_mm / 2, rel=1e-9)
+    assert half.force_n() == pytest.approx(whole.force_n() / 4, rel=1e-9)
+    r = np.linspace(0, 20, 50)
+    np.testing.assert_allclose(half.strains(r / 2, 2.5, 0.1), whole.strains(r, 5.0, 0.2), atol=1e-9)
+
+
+@pytest.mark.parametrize("thickness", [2.0, 6.0, 20.0])
+def test_slipping_base_lies_between_half_space_and_bonded_base(thickness):
+    half_space, slipping, bonded = (
+        solve_press("dome", 8.4, 1.5, t, base)
+        for t, base in ((1000.0, "bonded"), (thickness, "slipping"), (thickness, "bonded"))
+    )
+    assert half_space.contact_radius_mm < slipping.contact_radius_mm < bonded.contact_radius_mm
+    assert half_space.force_n() < slipping.force_n() < bonded.force_n()
+    # a layer that slips goes outward at its base, one that is bonded does not
+    assert slipping.strains([3.0], 0.01).hoop[0] > 0.01 > abs(bonded.strains([3.0], 0.01).hoop[0])
+
+
+@pytest.mark.parametrize(
+    ("tool", "radius", "depth", "thickness"),
+    [
+        ("dome", 1000, 0.09, 0.4),
+        ("dome", 0.1, 0.01, 1000),
+        ("dome", 8.4, 1e-4, 6),
+        ("dome", 0.1, 99, 1000),
+        ("ball", 1000, 0.02, 0.1),
+        ("ball", 1, 5, 6),  # deeper than its radius
+        ("ball", 0.1, 99, 100),
+        ("flat", 100, 0.4, 1.0),
+        ("flat", 0.1, 5, 1000),
+        ("finger", 1000, 0.05, 0.1),
+    ],
+)
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_extreme_presses_are_solved(tool, radius, depth, thickness, base):
+    solved = solve_press(tool, radius, depth, thickness, base)
+    a = solved.contact_radius_mm
+    r = a * np.array([0, 0.3, 0.9, 1.1])
+    assert 0 < a <= 2.001 * math.sqrt(radius * depth) or tool == "flat"
+    assert solved.force_n() > 0
+    assert np.isfinite(solved.strains(r, 0.5 * thickness)).all()
+    face = solved.deflection(r)
+    assert np.isfinite(face).all()
+    if tool != "finger":
+        shape = tool_depth(tool, radius, depth, r[:3])
+        np.testing.assert_allclose(face[:3], shape, atol=0.05 * depth)
+
+
+def test_contact_too_wide_for_the_layer_is_refused():
+    assert solve_press("flat", MAX_CONTACT, 0.1, 1.0).contact_radius_mm == MAX_CONTACT
+    with pytest.raises(InputError, match=r"tool_radius_mm is 1000.*thickness_mm of 0\.1.*100 times"):
+        solve_press("flat", 1000.0, 0.05, 0.1)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_pads_of_any_great_thickness_weigh_fibres_alike(base):
+    thick, thicker = (
+        profile_weights(Contact(thickness_mm=thickness, base=base, tool_radius_mm=2, depth_mm=0.5))
+        for thickness in (100, 1000)
+    )
+    for (distance, plain, directed), (other, *weights) in zip(thick, thicker, strict=True):
+        for weight, second in zip((plain, directed), weights, strict=True):
+            np.testing.assert_allclose(weight, np.interp(distance, other, second), atol=0.05 * plain.max())
