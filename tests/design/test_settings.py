@@ -78,7 +78,7 @@ def test_defaults_are_those_of_the_built_pad_and_its_mould():
         **(layer | shape),
         **{"length": "euclidean", "sensitivity_profile": MEASURED_PROFILE},
     }
-    assert PUBLISHED_CONTACT == Contact(model="shape")
+    assert Contact(model="shape") == PUBLISHED_CONTACT
     assert PUBLISHED_CONTACT.model_dump() == Contact().model_dump() | {"model": "shape", "length": "manhattan"}
     built = {"base": "slipping", "fibre_depths_mm": (0.25, 1.05)}
     assert BUILT_CONTACT.model_dump() == Contact().model_dump() | built
