@@ -63,7 +63,7 @@ def carried_lengths(pad, presses, contact):
     for f, knots in enumerate(pad.knots):
         axis = pad.layout.family(f)
         curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
-        t = np.linspace(*knots[[0, -1], axis], 800)
+        t = np.linspace(knots[0, axis], knots[-1, axis], 800)
         arc = np.append(0, np.cumsum(np.hypot(np.diff(t), np.diff(curve(t)))))
         t = np.interp(np.linspace(0, arc[-1], 2400), arc, t)
         points = pad.unit_mm * np.stack([t, curve(t)][:: 1 - 2 * axis], axis=1)

@@ -99,5 +99,6 @@ def test_tiled_pads_respond_alike_in_every_tile():
     places = np.random.default_rng(1).uniform(1, 8, (40, 2))
     tiled, straight = Morphology.straight(2).tiled(4), Morphology.straight(8)
     for contact in (Contact(), Contact(model="profile")):
-        found = signals(tiled, places, contact)  # by other spans, so that quadrature differs
-        np.testing.assert_allclose(found, signals(straight, places, contact), atol=1e-8)
+        found = signals(tiled, places, contact)
+        # by other spans, of which quadrature sees the edge of the contact more or less finely
+        np.testing.assert_allclose(found, signals(straight, places, contact), rtol=0, atol=3e-7)
