@@ -41,14 +41,14 @@ _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUA
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
 _Sparse = tuple[Ints, Ints]
 _DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
-LAYER_REACH = {"bonded": 6.0, "slipping": 16.0}
-"""Distance beyond the contact at which strains of a layer end, thicknesses. What is left out is 0.5 % of a straight
-fibre's signal if the layer is bonded; strains of a slipping one fall only with the square of the distance."""
+LAYER_REACH = {"bonded": 8.0, "slipping": 16.0}
+"""Distance beyond the contact at which strains of a layer end, thicknesses. What is left out is less than 1 % of a
+straight fibre's largest signal; strains of a slipping layer fall only with the square of the distance."""
 THICK = 4.0
 """Contact radii above which a thickness counts no more for that: there strains fall with the cube of the distance."""
-FIBRE_BLUR_MM = 0.2
-"""Standard deviation of a Gaussian by which strains are averaged: a fibre has a width and is stiffer than silicone, so
-it does not follow the step of the strains at the edge of the contact, which signals, their integrals, hardly show."""
+FIBRE_BLUR_MM = 0.1
+"""Standard deviation of a Gaussian by which strains are averaged, about that of the width of a fibre, 0.3 mm: it does
+not follow the step of the strains at the edge of the contact, which signals, their integrals, hardly show."""
 NEAR_POINTS, FAR_POINTS = 300, 100
 """Distances at which strains are computed, up to half a radius beyond the contact's edge and further out."""
 DEPTH_STEPS = 16

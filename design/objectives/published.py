@@ -73,7 +73,7 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     values = values[..., values.any(axis=(0, 1))]  # the other fibres, most of a large pad's, have no information
     if not values.size:
         return 0.0
-    sigma = noise * values.max() / LEVELS
+    sigma = noise * np.abs(values).max() / LEVELS
     mean = values[:, 0] / sigma
     cell = np.array([x[1] - x[0], y[1] - y[0]]) / np.sqrt(12)
     slope = (values[:, 1::2] - values[:, 2::2]).transpose(0, 2, 1)

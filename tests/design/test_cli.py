@@ -13,6 +13,7 @@ from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
+from padforge.design.contact import half_width_mm
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
@@ -173,8 +174,12 @@ def test_check_applies_keep_outs_of_settings(here):
 
 def test_plan_draws_keep_outs_and_half_width_of_contact():
     holes = [((-3.0, 1.0), (2.0, 1.0), (0.0, 4.0)), [[5, 5], [6, 5], [6, 6], [5, 6]]]
-    patches = draw_plan(Morphology.straight(2, (20.0, 8.0)), Contact(), (), holes).axes[0].patches
-    drawn = [patch.get_xy()[:-1].tolist() for patch in patches if isinstance(patch, Polygon)]
-    assert drawn == [np.array(hole).tolist() for hole in holes]
-    (press,) = (patch for patch in patches if isinstance(patch, Circle))
-    assert press.radius == pytest.approx(np.sqrt(2 * np.log(2)) * 6.2, rel=0.01)
+    for contact, radius_mm in (
+        (Contact(), half_width_mm(Contact())),
+        (Contact(model="profile"), np.sqrt(2 * np.log(2)) * 6.2),
+    ):
+        patches = draw_plan(Morphology.straight(2, (20.0, 8.0)), contact, (), holes).axes[0].patches
+        drawn = [patch.get_xy()[:-1].tolist() for patch in patches if isinstance(patch, Polygon)]
+        assert drawn == [np.array(hole).tolist() for hole in holes]
+        (press,) = (patch for patch in patches if isinstance(patch, Circle))
+        assert press.radius == pytest.approx(radius_mm, rel=0.01)

@@ -100,9 +100,12 @@ ASKED = PadSettings(grid=2), Scatter(0.02, 0.05, 0.36)
 def test_alternative_contacts_begin_with_the_assumed_one():
     """And have none of the others that is the same."""
     profiles, disc = ["profile of 5 mm", "profile of 6.2 mm", "profile of 7.9 mm"], ["published disc, K = 0.6"]
+    presses = ["tool of 4.2 mm", "2.5 mm deep", "pressed flat alone"]
     for assumed, others in (
         (Contact(radius=0.9), profiles + disc),
-        (Contact(), [profiles[0], profiles[2], *disc]),
+        (Contact(), presses),
+        (Contact(stretch=0.0), presses[:2]),
+        (Contact(model="profile"), [profiles[0], profiles[2], *disc]),
         (PUBLISHED_CONTACT, profiles),
     ):
         contacts = alternative_contacts(assumed)

@@ -15,7 +15,13 @@ from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 ROUND = Contact(radius=0.6, sides=None)
-CONTACTS = [ROUND, Contact(radius=0.5, sides=4, length="euclidean"), Contact(), Contact(weight="inverse", sides=None)]
+CONTACTS = [
+    ROUND,
+    Contact(radius=0.5, sides=4, length="euclidean"),
+    Contact(),
+    Contact(model="profile"),
+    Contact(weight="inverse", sides=None),
+]
 
 
 @st.composite
@@ -37,6 +43,11 @@ def turned(pad):
     return Morphology.from_layout(pad.knots[order(pad)][..., ::-1], other)
 
 
+def with_exchanged_depths(contact):
+    """The contact with the depths of a layer's families exchanged."""
+    return contact.model_copy(update={"fibre_depths_mm": contact.fibre_depths_mm[::-1]})
+
+
 def order(pad):
     """The fibres of a pad in the order of those of the turned one."""
     return np.r_[pad.layout.horizontals : pad.layout.fibres, : pad.layout.horizontals]
@@ -46,14 +57,15 @@ def places_on(pad, seed=0, count=40):
     return np.random.default_rng(seed).uniform(-0.3, 0.3 + np.array(pad.layout.extent), (count, 2))
 
 
-@pytest.mark.parametrize("contact", CONTACTS, ids=["disc", "square", "profile", "inverse"])
+@pytest.mark.parametrize("contact", CONTACTS, ids=["disc", "square", "layer", "profile", "inverse"])
 @given(pad=rectangles())
 @settings(max_examples=15)
 def test_signals_of_a_transposed_rectangle(contact, pad):
-    places, other = places_on(pad), turned(pad)
+    places, other, exchanged = places_on(pad), turned(pad), with_exchanged_depths(contact)
     found = signals(pad, places, contact)[:, order(pad)]
-    np.testing.assert_allclose(signals(other, places[:, ::-1], contact), found, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(signals_sparse(other, places[:, ::-1], contact).toarray(), found, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(signals(other, places[:, ::-1], exchanged), found, rtol=1e-8, atol=1e-8)
+    sparse = signals_sparse(other, places[:, ::-1], exchanged).toarray()
+    np.testing.assert_allclose(sparse, found, rtol=1e-8, atol=1e-8)
 
 
 @given(pad=rectangles())
@@ -80,10 +92,11 @@ def test_rules_and_lengths_of_a_transposed_rectangle(pad):
 
 def test_ambiguities_of_a_transposed_rectangle():
     pad = Morphology.random(Layout.create((2, 1), (8.0, 15.0)), 3, seed=1)
-    found, swapped = (
-        ambiguities(each, Contact(), 1, 0.05, PadSettings().for_layout(each.layout)) for each in (pad, turned(pad))
+    found, other = (
+        ambiguities(each, contact, 1, 0.05, PadSettings().for_layout(each.layout))
+        for each, contact in ((pad, Contact()), (turned(pad), with_exchanged_depths(Contact())))
     )
-    assert swapped == pytest.approx(found, rel=2e-3)  # in single precision
+    assert other == pytest.approx(found, rel=2e-3)  # in single precision
 
 
 def test_signals_of_coarse_families_and_single_fibres():

@@ -9,7 +9,7 @@ from padforge import design
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
 from padforge.design.common.settings import commented_toml
 from padforge.design.objectives.published import information
-from padforge.design.settings import MEASURED_PROFILE, PUBLISHED_CONTACT, Layout, sensed_rectangle
+from padforge.design.settings import BUILT_CONTACT, MEASURED_PROFILE, PUBLISHED_CONTACT, Layout, sensed_rectangle
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -43,6 +43,18 @@ REFUSED = [
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0]]}, "sensitivity_profile: got .*3 points or more"),
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [1, 0]]}, "sensitivity_profile: .*distances ascend from 0"),
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [2, 0.1]]}, "sensitivity_profile: .*last weight must be 0"),
+    (Contact, {"model": "half-space"}, "model: got 'half-space', .*'layer', 'profile' or 'shape'"),
+    (Contact, {"tool": "cone"}, "tool: got 'cone', .*'dome', 'ball', 'flat' or 'finger'"),
+    (Contact, {"depth_mm": 6}, "depth_mm is 6, the pad is 6 mm thick"),
+    (Contact, {"thickness_mm": 4}, "depth_mm is 5, the pad is 4 mm thick"),
+    (Contact, {"fibre_depths_mm": [1, 6.5]}, "fibre_depths_mm is 6.5, the pad is 6 mm thick"),
+    (Contact, {"fibre_depths_mm": [1, 0]}, r"fibre_depths_mm.*: got 0, .*greater than 0"),
+    (Contact, {"squeeze": 0, "stretch": 0}, "squeeze and stretch are both 0, one of them must be above"),
+    (Contact, {"length": "manhattan"}, "length is manhattan, a layer stretches along the fibre: allowed is euclidean"),
+    (Contact, {"model": "layer", "radius": 0.9}, "radius is 0.9, which counts where model is shape"),
+    (Contact, {"radius": 0.9, "depth_mm": 2}, "depth_mm is 2.0, which counts where model is layer"),
+    (Contact, {"model": "profile", "scale": 2}, "scale is 2.0, which counts where model is layer"),
+    (Contact, {"sensitivity_profile": [], "tool": "ball"}, "tool is 'ball', which counts where model is layer"),
     # profiles whose splines leave their points
     (Contact, {"sensitivity_profile": [[0, 10], [9, 10], [10, 0]]}, "at 0 and 9 mm .* 20.5, allowed is 8"),
     (Contact, {"sensitivity_profile": [[0, -1], [0.2, 1], [1, 0]]}, "at 0.2 and 1 mm .* 7.48, allowed is"),
@@ -51,14 +63,25 @@ REFUSED = [
 
 @pytest.mark.parametrize(("model", "table", "message"), REFUSED, ids=lambda value: str(value)[:30])
 def test_section_refusals_name_key_value_and_limits(model, table, message):
-    with pytest.raises(InputError, match=rf"^pad\.toml: \[{model.section()}\] .*{message}"):
+    with pytest.raises(InputError, match=rf"^pad\.toml: \[{model.section()}\] .*{message}") as refused:
         Spec({model.section(): table}, "pad.toml", sections=MODELS).section(model)
+    assert len(str(refused.value).splitlines()) == 1
 
 
-def test_defaults_are_those_measured_on_a_built_pad():
-    published = {"radius": 0.6, "sides": 30, "weight": "uniform", "length": "manhattan", "sensitivity_profile": ()}
-    assert PUBLISHED_CONTACT.model_dump() == published
-    assert Contact().model_dump() == published | {"length": "euclidean", "sensitivity_profile": MEASURED_PROFILE}
+def test_defaults_are_those_of_the_built_pad_and_its_mould():
+    layer = {
+        **{"model": "layer", "tool": "dome", "tool_radius_mm": 8.4, "depth_mm": 5.0, "thickness_mm": 6.0},
+        **{"base": "bonded", "fibre_depths_mm": (1.05, 0.25), "squeeze": 1.0, "stretch": 1.0, "scale": 1.0},
+    }
+    shape = {"radius": 0.6, "sides": 30, "weight": "uniform"}
+    assert Contact().model_dump() == {
+        **(layer | shape),
+        **{"length": "euclidean", "sensitivity_profile": MEASURED_PROFILE},
+    }
+    assert Contact(model="shape") == PUBLISHED_CONTACT
+    assert PUBLISHED_CONTACT.model_dump() == Contact().model_dump() | {"model": "shape", "length": "manhattan"}
+    built = {"base": "slipping", "fibre_depths_mm": (0.25, 1.05)}
+    assert BUILT_CONTACT.model_dump() == Contact().model_dump() | built
     distances_mm = {"min_gap_mm": 0.8, "border_mm": 2.0, "keep_out_mm": 1.5, "max_length_mm": 500.0}
     crossings = {"same_family_crossings": 0, "max_crossings": "any", "min_crossing_angle_deg": 0.0}
     others = {"enforce": True, "max_common_track_mm": 2.0, "min_bend_radius_mm": 1.0}
@@ -96,36 +119,53 @@ def test_pad_settings_of_a_rectangle_and_its_sensed_area():
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
 
 
-def test_contact_stated_by_its_shape_has_no_profile():
-    """As it was before contacts were measured, and where it is written out, whatever it is, it reads back so."""
-    ways = (
-        ({}, MEASURED_PROFILE, "euclidean"),
-        ({"length": "manhattan"}, MEASURED_PROFILE, "manhattan"),
-        ({"sensitivity_profile": [[0, 1], [0.5, 0.25], [1, 0]]}, ((0, 1), (0.5, 0.25), (1, 0)), "euclidean"),
-        ({"radius": 0.6}, (), "manhattan"),
-        ({"sides": "circle"}, (), "manhattan"),
-        ({"weight": "inverse", "length": "euclidean"}, (), "euclidean"),
-        ({"sensitivity_profile": []}, (), "manhattan"),
-    )
-    for stated, profile, length in ways:
-        contact = Spec({"contact": stated}).section(Contact)
-        assert (contact.sensitivity_profile, contact.length) == (profile, length), stated
-        assert Contact.model_validate_json(contact.model_dump_json()) == contact
-        assert Contact.model_validate(contact.model_dump()) == contact
-        search = SearchSettings(contacts=(contact, Contact(radius=0.9)))
-        assert SearchSettings.model_validate_json(search.model_dump_json()) == search
-        written = tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))
-        assert Spec(written).section(Contact) == contact
-    stated = tomllib.loads(commented_toml({"contact": Contact}))["contact"] | {"radius": 0.9}
-    with pytest.raises(InputError, match=r"\[contact\] sensitivity_profile: .*counts where .* is \[\]"):
-        Spec({"contact": stated}).section(Contact)
-    assert Spec({"contact": stated | {"sensitivity_profile": []}}).section(Contact).sensitivity_profile == ()
+PROFILE = [[0, 1], [0.5, 0.25], [1, 0]]
+SHAPE = {"radius": 0.6, "sides": 30, "weight": "uniform"}
+
+
+@pytest.mark.parametrize(
+    ("stated", "model", "length"),
+    [
+        ({}, "layer", "euclidean"),
+        ({"tool": "flat", "depth_mm": 1.0, "thickness_mm": 2.0}, "layer", "euclidean"),
+        ({"length": "euclidean"}, "layer", "euclidean"),
+        ({"model": "profile"}, "profile", "euclidean"),
+        ({"model": "profile", "length": "manhattan"}, "profile", "manhattan"),
+        ({"sensitivity_profile": PROFILE}, "profile", "euclidean"),
+        ({"sensitivity_profile": np.array(PROFILE), "length": "manhattan"}, "profile", "manhattan"),
+        ({"model": "shape"}, "shape", "manhattan"),
+        ({"radius": 0.9}, "shape", "manhattan"),
+        ({"sides": "circle"}, "shape", "manhattan"),
+        ({"weight": "inverse", "length": "euclidean"}, "shape", "euclidean"),
+        # as written before there was a layer
+        ({"sensitivity_profile": []}, "shape", "manhattan"),
+        (SHAPE | {"length": "manhattan", "sensitivity_profile": []}, "shape", "manhattan"),
+        (SHAPE | {"length": "euclidean", "sensitivity_profile": PROFILE}, "profile", "euclidean"),
+    ],
+    ids=str,
+)
+def test_contact_model_follows_from_the_stated_keys(stated, model, length):
+    """And wherever the contact is written out, it reads back so."""
+    contact = Spec({"contact": stated}).section(Contact)
+    assert (contact.model, contact.length) == (model, length)
+    assert Contact.model_validate_json(contact.model_dump_json()) == contact
+    assert Contact.model_validate(contact.model_dump()) == contact
+    search = SearchSettings(contacts=(contact, Contact(radius=0.9)))
+    assert SearchSettings.model_validate_json(search.model_dump_json()) == search
+    written = tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))
+    assert Spec(written).section(Contact) == contact
+
+
+def test_contact_written_out_accepts_keys_of_its_model_alone():
+    written = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
+    assert Spec({"contact": written | {"depth_mm": 3.0}}).section(Contact) == Contact(depth_mm=3.0)
+    with pytest.raises(InputError, match=r"\[contact\] .*radius is 0.9, which counts where model is shape"):
+        Spec({"contact": written | {"radius": 0.9}}).section(Contact)
+    stated = {"model": "shape", "length": "manhattan", "radius": 0.9}
+    assert Spec({"contact": written | stated}).section(Contact) == Contact(radius=0.9)
 
 
 def test_measured_profile_is_a_gaussian_and_negative_skirts_are_valid():
-    distance = [d for d, _ in Contact().profile_points(11.25)]
-    assert distance == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.65]  # to the bit
-    assert [d for d, _ in Contact().profile_points(5.0)] == [d / 5 for d, _ in MEASURED_PROFILE]
     for d, weight in MEASURED_PROFILE:
         assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
     for points in (5, 13, 40):

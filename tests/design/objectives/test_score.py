@@ -14,14 +14,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_score_evaluates_the_sensed_area():
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
-    pad = Morphology.random(3, 4, seed=1)
+    pad, profile = Morphology.random(3, 4, seed=1), Contact(model="profile")  # a layer leaves no fibre idle anywhere
     beyond, between, wide = (
-        score(pad, max_failures=1, size=PadSettings(sensed_mm=where)) for where in ("beyond", "fibres", (40, 20))
+        score(pad, profile, max_failures=1, size=PadSettings(sensed_mm=where))
+        for where in ("beyond", "fibres", (40, 20))
     )
     for name in beyond:
         same = name.startswith(("published", "information", "penalty"))
         assert (beyond[name] == between[name] == wide[name]) == same
-    assert score(pad, max_failures=1) == beyond
+    assert score(pad, profile, max_failures=1) == beyond
     disc = Contact(radius=0.9, sides=None)
     terms = published_terms(pad, disc)[0]
     assert score(pad, disc, max_failures=0)["published_objective"] == terms.objective != beyond["published_objective"]

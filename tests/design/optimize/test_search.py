@@ -71,13 +71,14 @@ def test_search_returns_an_origin_that_it_cannot_improve():
 
 
 def test_search_is_never_worse_than_straight_fibres_but_by_the_published_method():
-    worse = Morphology.random(2, 3, seed=0)
-    result = search(PAD, None, QUICK, FREE, origin=worse)
+    """Under the profile; a random start is better than straight fibres at once under a layer."""
+    worse, profile = Morphology.random(2, 3, seed=0), Contact(model="profile")
+    result = search(PAD, profile, QUICK, FREE, origin=worse)
     assert result.candidate == "straight fibres"
     assert result.morphology.knots.shape == worse.knots.shape
     assert np.ptp(result.morphology.knots[:2, :, 1], axis=1).tolist() == [0, 0]
     assert result.straight.items() <= result.terms.items()
-    genetic = search(PAD, Contact(), QUICK.model_copy(update={"method": "genetic"}), FREE, origin=worse)
+    genetic = search(PAD, profile, QUICK.model_copy(update={"method": "genetic"}), FREE, origin=worse)
     assert genetic.candidate in ("genetic", "origin")
     assert genetic.straight == result.straight
     assert genetic.terms["expected_error_mm_0"] > genetic.straight["expected_error_mm_0"]
