@@ -1,7 +1,7 @@
 """The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -166,6 +166,7 @@ _KEYS = {
 SILICONE_MM = 6.0  # default thickness of the cast pad
 FIBRE_MM = 0.3  # default diameter of a fibre
 TRACK_DEPTHS_MM = (1.2, 0.4)  # default depths of the tracks of the deep family and of the other one
+_RIDGES = ("deep_ridge_height_mm", "shallow_ridge_height_mm")  # keys of `[mould]`, in that order
 FIBRE_DEPTHS_MM = (TRACK_DEPTHS_MM[0] - FIBRE_MM / 2, TRACK_DEPTHS_MM[1] - FIBRE_MM / 2)  # centre lines, at the bottom
 
 
@@ -299,15 +300,37 @@ def read_contact(spec: Spec) -> Contact:
     stated = spec.stated(Contact)
     if _stated_model(stated) != "layer":
         return spec.section(Contact)
-    radius_mm = _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
-    keys = ("deep_ridge_height_mm", "shallow_ridge_height_mm")
+    radius_mm = _fibre_radius_mm(spec)
     depths_mm = [
-        _stated_mm(spec, "mould", key, default) - radius_mm for key, default in zip(keys, TRACK_DEPTHS_MM, strict=True)
+        _stated_mm(spec, "mould", key, default) - radius_mm
+        for key, default in zip(_RIDGES, TRACK_DEPTHS_MM, strict=True)
     ]
     if spec.stated(PadSettings).get("deep_family") == "vertical":
         depths_mm.reverse()
     as_cast = {"thickness_mm": _stated_mm(spec, "mould", "silicone_mm", SILICONE_MM), "fibre_depths_mm": depths_mm}
     return spec.section(Contact, **{key: value for key, value in as_cast.items() if key not in stated})
+
+
+def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
+    """Return settings whose mould makes the pad that `[contact]` describes, the inverse of `read_contact`.
+
+    Args:
+        spec: settings file.
+        keys: of `[contact]` that the mould follows, of which those other than lengths of the pad do not count.
+    """
+    contact, tables = read_contact(spec), {}
+    if "thickness_mm" in keys:
+        tables["mould"] = {"silicone_mm": contact.thickness_mm}
+    if "fibre_depths_mm" in keys:
+        radius_mm, (horizontal, vertical) = _fibre_radius_mm(spec), contact.fibre_depths_mm
+        heights_mm = [round(depth + radius_mm, 9) for depth in (max(horizontal, vertical), min(horizontal, vertical))]
+        tables["mould"] = tables.get("mould", {}) | dict(zip(_RIDGES, heights_mm, strict=True))
+        tables["pad"] = {"deep_family": "horizontal" if horizontal > vertical else "vertical"}
+    return spec.replaced(tables)
+
+
+def _fibre_radius_mm(spec: Spec) -> float:
+    return _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
 
 
 def _stated_mm(spec: Spec, section: str, key: str, default: float) -> float:
