@@ -131,13 +131,13 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     from padforge.design.common.plotting import save_figure
     from padforge.design.common.validation import InputError
     from padforge.design.report import draw_plan
-    from padforge.design.settings import Contact
+    from padforge.design.settings import read_contact
 
     path = out or common.pad_folder(morphology) / "plan.svg"
     if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec)
-    save_figure(draw_plan(pad, settings.section(Contact), violations, pad_settings.keep_out_mm), path)
+    save_figure(draw_plan(pad, read_contact(settings), violations, pad_settings.keep_out_mm), path)
     click.echo(f"plan -> {path}")
 
 
@@ -173,10 +173,10 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     padforge design score out/pad/morphology.json --twin out/pad/twin.json
     """
     from padforge.design.objectives.score import score as score_terms
-    from padforge.design.settings import Contact, RulesSettings, SearchSettings
+    from padforge.design.settings import RulesSettings, SearchSettings, read_contact
 
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec, twin)
-    contact, search, rules = (settings.section(model) for model in (Contact, SearchSettings, RulesSettings))
+    contact, search, rules = read_contact(settings), settings.section(SearchSettings), settings.section(RulesSettings)
     terms = score_terms(
         pad, contact, search.max_failures, rules=rules, size=pad_settings, scatter=search.response_scatter
     )

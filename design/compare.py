@@ -15,12 +15,13 @@ from padforge.design.common.plotting import CURVES, FAINT, add_caption, add_titl
 from padforge.design.common.profiling import stage
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError, short_repr
+from padforge.design.contact import half_width_mm
 from padforge.design.contact_comparison import beside_straight, design_contact, errors_by_contact
 from padforge.design.design_run import run_design
 from padforge.design.morphology import Morphology
 from padforge.design.optimize.search import SearchOptions
 from padforge.design.paths.curves import crossings, lengths
-from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings, cast_as_contact
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
@@ -52,7 +53,8 @@ def read_variants(
 ) -> list[Variant]:
     """Return the pads to compare: morphologies, and settings (.toml) under every combination of varied values.
 
-    These are TOML, such as "pad.grid=3,4,6", and apply to settings only, the default ones if there are no sources.
+    These are TOML, such as "pad.grid=3,4,6", and apply to settings only, the default ones if there are no sources. The
+    mould follows the thickness of the pad and the depths of fibres that vary in `[contact]`.
 
     Raises:
         InputError: an invalid file, key or value, two variants of one name, fewer than two variants, or more than
@@ -71,14 +73,15 @@ def read_variants(
             for section, key, value in combination:
                 tables[section][key] = value
             labels = [f"{key} {str(value).strip('()').replace(', ', ' x ')}" for _, key, value in combination]
-            variants.append(Variant(", ".join([*source, *labels]) or "defaults", spec.replaced(tables)))
+            varied_spec = cast_as_contact(spec.replaced(tables), tables["contact"])
+            variants.append(Variant(", ".join([*source, *labels]) or "defaults", varied_spec))
     folders = [variant.folder.casefold() for variant in variants]  # macOS and Windows ignore case
     if len(set(folders)) < len(folders):
         raise InputError(f"{max(folders, key=folders.count)}: two pads have this name, expected different names")
     if not 2 <= len(variants) <= MAX_VARIANTS:
         raise InputError(f"there are {len(variants)} pads to compare, allowed are 2 to {MAX_VARIANTS}")
     for variant in variants:  # before minutes are spent on another one
-        for model in MODELS:
+        for model in (PadSettings, SearchSettings, RulesSettings):
             variant.spec.section(model)
     return variants
 
@@ -150,19 +153,21 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
         "crossings": len(crossings(pad)),
         "errors_mm": errors_mm["designed"],
         "straight_mm": errors_mm["straight"],
-    }
+        "contact": contact.model_dump(mode="json"),
+    } | ({} if contact.model == "shape" else {"half_width_mm": half_width_mm(contact)})
 
 
 def comparison_lines(document: Mapping[str, Any]) -> list[str]:
     """Format a comparison as a table of text, with a second row of straight fibres below a pad that differs."""
     rows = document["rows"]
     n_errors = max(len(row["errors_mm"]) for row in rows)
-    costs = {key: name for key, name in COSTS.items() if any(key in row for row in rows)}
+    columns = {"half_width_mm": "half width (mm)", **COSTS}
+    costs = {key: name for key, name in columns.items() if any(key in row for row in rows)}
     header = ["pad", "fibres", "knots", "fibre (m)", "crossings", *costs.values()]
     table = [[*header, *(f"{n} failed (mm)" for n in range(n_errors))]]
     for row in rows:
         cells = [row["name"], "{} + {}".format(*row["fibres"]), str(row["knots"]), f"{row['length_mm'] / 1000:.2f}"]
-        cells += [str(row["crossings"]), *(f"{row[key]:.3g}" for key in costs)]
+        cells += [str(row["crossings"]), *(f"{row[key]:.3g}" if key in row else "-" for key in costs)]
         table.append([*cells, *(f"{error:.2f}" for error in row["errors_mm"])])
         if row["errors_mm"] != row["straight_mm"]:
             errors = [f"{error:.2f}" for error in row["straight_mm"]]

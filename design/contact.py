@@ -301,11 +301,16 @@ def _profile_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
     families = tuple((distance / unit_mm, *weights) for distance, *weights in profile_weights(contact))
     near = math.inf
     if contact.model == "layer":
-        near = contact.scale * (_press(contact).contact_radius_mm + contact.thickness_mm / 2) / unit_mm
+        near = contact.scale * (contact_press(contact).contact_radius_mm + contact.thickness_mm / 2) / unit_mm
     return geometry.profile_law(_LENGTHS[contact.length], families, near)
 
 
-def _press(contact: Contact) -> LayerPress:
+def contact_press(contact: Contact) -> LayerPress:
+    """Return the press of a tool into the layer of a contact, not widened by its `scale`.
+
+    Args:
+        contact: a layer.
+    """
     return solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
 
 
@@ -325,7 +330,7 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
         return ((distance, weight, np.zeros_like(weight)),)
-    press = _press(contact)
+    press = contact_press(contact)
     thickness_mm = min(contact.thickness_mm, THICK * press.contact_radius_mm)
     distance = _layer_distances(press.contact_radius_mm, LAYER_REACH[contact.base] * thickness_mm)
     fade = np.clip((distance[-1] - distance) / thickness_mm, 0, 1)
@@ -341,9 +346,14 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
 
 
 def half_width_mm(contact: Contact) -> float:
+    """Return the mean of `half_widths_mm` over the families, mm."""
+    return float(np.mean(half_widths_mm(contact)))
+
+
+def half_widths_mm(contact: Contact) -> list[float]:
     """Return the largest distance at which an element of a fibre has half of its greatest weight, mm.
 
-    It is the mean over the directions of the fibre, and of the horizontal and vertical fibres of a layer.
+    It is the mean over the directions of the fibre: of the horizontal and of the vertical fibres of a layer, or of all.
 
     Args:
         contact: a layer or a profile.
@@ -354,8 +364,8 @@ def half_width_mm(contact: Contact) -> float:
         half = weight.max() / 2
         last = int(np.flatnonzero(weight >= half)[-1])  # never the last point, whose weight is 0
         share = (weight[last] - half) / (weight[last] - weight[last + 1])
-        widths.append(distance[last] + share * (distance[last + 1] - distance[last]))
-    return float(np.mean(widths))
+        widths.append(float(distance[last] + share * (distance[last + 1] - distance[last])))
+    return widths
 
 
 def _layer_distances(contact_radius_mm: float, reach_mm: float) -> Array:

@@ -26,6 +26,7 @@ from padforge.design.settings import (
     PadSettings,
     Scatter,
     SearchSettings,
+    read_contact,
 )
 
 if TYPE_CHECKING:
@@ -112,7 +113,8 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
     """Return the contact designed for: the one that `spec` states, or the default of such a search."""
-    return spec.section(Contact) if spec.stated(Contact) else settings.default_contact
+    is_default = settings.method == "genetic" and not spec.stated(Contact)
+    return settings.default_contact if is_default else read_contact(spec)
 
 
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:

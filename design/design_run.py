@@ -71,6 +71,9 @@ def run_design(
     else:
         nominal = spec.section(SearchSettings, **overrides)
         result = search_for_twin(*settings, nominal, origin=start, run=options)
+    # with its provenance, so that its mould is compared with what it was designed for
+    designed = Morphology.from_layout(result.morphology.knots, settings[0].layout, origin)
+    result = replace(result, morphology=designed)
     document = {
         "format": FORMAT,
         "terms": result.terms,
@@ -85,11 +88,11 @@ def run_design(
     }
     with stage("figures"), files.atomic_files(out) as folder:
         pad, contact = settings[:2]
-        Morphology.from_layout(result.morphology.knots, pad.layout, origin).save(folder / path.name)
+        designed.save(folder / path.name)
         # checked again: an interrupted search with the same settings may end with another pad
         files.check_replaceable(path, folder / path.name, regenerated, force)
         document["morphology_sha256"] = files.sha256(folder / path.name)
-        figure = draw_plan(result.morphology, contact, result.violations, pad.keep_out_mm)
+        figure = draw_plan(designed, contact, result.violations, pad.keep_out_mm)
         for name in ("design.svg", "design.png"):
             save_figure(figure, folder / name)
         files.write_json(folder / "design.json", document)

@@ -7,18 +7,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
-from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
+from padforge.design.common.plotting import (
+    ALARM,
+    FAINT,
+    HORIZONTAL,
+    INK,
+    PAPER,
+    VERTICAL,
+    add_caption,
+    save_figure,
+    style_axes,
+)
 from padforge.design.common.validation import InputError, check_array, check_type
-from padforge.design.contact import half_width_mm
+from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_width_mm, half_widths_mm, profile_weights
+from padforge.design.layer import LayerPress
 from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings, sensed_rectangle
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Polygon
 
-    from padforge.design.morphology import Morphology
+    from padforge.design.morphology import Array, Morphology
     from padforge.design.objectives.rules import Violation
 
+FAMILIES = (("horizontal", HORIZONTAL), ("vertical", VERTICAL))
 FORMAT = "padforge-design/2"  # format of design.json
 TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
@@ -69,7 +81,7 @@ def draw_plan(
     for fibre, points in enumerate(flatten(pad, TOLERANCE)):
         family = pad.layout.family(fibre)
         x, y = pad.to_mm(points).T
-        color, name = ((HORIZONTAL, "horizontal"), (VERTICAL, "vertical"))[family]
+        name, color = FAMILIES[family]
         gid = f"{name}-{fibre + 1 - pad.layout.families[family].start}"  # import_plan reads these names
         (line,) = axes.plot(x, y, color=color, linewidth=1.6, solid_capstyle="round", gid=gid)
         line.get_path().should_simplify = False
@@ -176,6 +188,99 @@ def _violation_row(violation: Mapping[str, Any]) -> list[object]:
     fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
     position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
     return [violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]]
+
+
+def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
+    """Draw a press into a layer in section, beside the weights of elements of fibres by their distance from it.
+
+    Args:
+        contact: a layer.
+        pitch_mm: distance of the vertical fibres, which cross the section.
+    """
+    from matplotlib.figure import Figure
+
+    press, families = contact_press(contact), profile_weights(contact)
+    thickness, scale = contact.thickness_mm, contact.scale
+    far = max(1.2 * pitch_mm, 2.2 * scale * press.contact_radius_mm)
+    x = np.linspace(-far, far, 301)
+    face = thickness - press.deflection(np.abs(x) / scale)
+    top = thickness + 0.8 * contact.depth_mm
+
+    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
+    section, weights = figure.subplots(1, 2)
+    for axes in (section, weights):
+        style_axes(axes)
+    section.fill_between(x, 0, face, color=PAPER, linewidth=0)
+    section.plot(x, face, color=INK, linewidth=1)
+    tool = np.maximum(_tool_surface(contact, x / scale), face)
+    section.fill_between(x, tool, top, where=tool < top, color=FAINT, linewidth=0)
+    section.axhline(0, color=INK, linewidth=3)
+    section.text(-far, 0.04 * thickness, f" {contact.base} base", color=INK, fontsize=8, va="bottom")
+    horizontal, vertical = (thickness - depth for depth in contact.fibre_depths_mm)
+    section.plot(x, horizontal - _sink(press, np.abs(x) / scale, horizontal), color=HORIZONTAL, linewidth=1.6)
+    ends = np.arange(-(far // pitch_mm), far // pitch_mm + 1) * pitch_mm
+    section.plot(ends, vertical - _sink(press, np.abs(ends) / scale, vertical), "o", color=VERTICAL, markersize=4)
+    section.set(xlabel="x (mm)", ylabel="height (mm)", xlim=(-far, far), ylim=(-0.05 * thickness, top), aspect="equal")
+    add_caption(section, f"{contact.tool} of {contact.tool_radius_mm:g} mm, {contact.depth_mm:g} mm deep")
+
+    for (name, color), (distance, plain, directed) in zip(FAMILIES, families, strict=True):
+        weights.plot(distance, plain + directed, color=color, label=f"{name}, lengthwise")
+        weights.plot(distance, plain, "--", color=color, label=f"{name}, crosswise")
+    weights.axhline(0, color=FAINT, linewidth=0.8)
+    weights.set(xlabel="distance from the press (mm)", ylabel="weight of an element", xlim=(0, 1.5 * far))
+    weights.legend(frameon=False, fontsize=8)
+    add_caption(weights, "fibres that point to the press, or pass it")
+    return figure
+
+
+def _tool_surface(contact: Contact, x: "Array") -> "Array":
+    """Return the height of the undeformed tool over the base; infinite beside it."""
+    radius, tip = contact.tool_radius_mm, contact.thickness_mm - contact.depth_mm
+    if contact.tool == "flat":
+        return np.where(np.abs(x) <= radius, tip, np.inf)
+    if contact.tool == "ball":
+        return np.where(np.abs(x) <= radius, tip + radius - np.sqrt(np.maximum(radius**2 - x**2, 0)), np.inf)
+    return tip + x**2 / (2 * radius)
+
+
+def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 12) -> "Array":
+    """Return how far the silicone at a height is down, mm: the integral of its vertical strain from the base."""
+    heights = (np.arange(steps) + 0.5) / steps * height_mm
+    return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / steps
+
+
+def press_sections(folder: Path, document: Mapping[str, Any], max_strain: float | None) -> list[PageSection]:
+    """Write the section on the press that a pad is designed for, and its figure `press.png`; none unless a layer.
+
+    Args:
+        folder: folder of the pad.
+        document: its `design.json`; a damaged one raises any of the built-in errors.
+        max_strain: elongation that the fibres bear, relative to their length; None if unknown.
+    """
+    settings = document["provenance"]["settings"]
+    contact = Contact(**settings["contact"])
+    if contact.model != "layer":
+        return []
+    press = contact_press(contact)
+    save_figure(draw_press(contact, PadSettings(**settings["pad"]).layout.pitch_x_mm), folder / "press.png")
+    distances = np.linspace(0, 2 * press.contact_radius_mm, 200)
+    rows = []
+    for (name, _), depth, width in zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), strict=True):
+        strains = press.strains(distances, contact.thickness_mm - depth, FIBRE_BLUR_MM)
+        stretch = float(max(strains.radial.max(), strains.hoop.max()))
+        result = "-" if max_strain is None else "pass" if stretch <= max_strain else "warn"
+        bears = "-" if max_strain is None else f"{max_strain:.0%}"
+        squeeze = float(strains.compressive.max())
+        rows.append([name, depth, f"{width:.1f}", f"{squeeze:.0%}", f"{stretch:.0%}", bears, result])
+    lead = (
+        f"A {contact.tool} of {contact.tool_radius_mm:g} mm, pressed {contact.depth_mm:g} mm deep into silicone of"
+        f" {contact.thickness_mm:g} mm, touches it within {press.contact_radius_mm:.1f} mm and takes"
+        f" {press.force_n():.1f} N on EcoFlex 00-20. Fibres respond to being pressed flat and stretched, by the strains"
+        " of an elastic layer, which are small ones: large presses exceed what it says."
+    )
+    caption = "The press in section, true to scale, and the weight of an element of a fibre by its distance from it."
+    head = ["fibres", "depth (mm)", "half width (mm)", "pressed flat by", "stretched by", "they bear", "result"]
+    return [PageSection("Press", [paragraph(lead), figures([(folder / "press.png", caption)]), table(head, rows)])]
 
 
 def contact_line(document: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """The sections of `pad.toml` that design owns: the pad, the contact, the search and the rules."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from padforge.design.common.settings import Settings, as_tuple, null_as, to_builtins
+from padforge.design.common.settings import Settings, Spec, as_tuple, null_as, to_builtins
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 
 if TYPE_CHECKING:
@@ -166,6 +166,7 @@ _KEYS = {
 SILICONE_MM = 6.0  # default thickness of the cast pad
 FIBRE_MM = 0.3  # default diameter of a fibre
 TRACK_DEPTHS_MM = (1.2, 0.4)  # default depths of the tracks of the deep family and of the other one
+_RIDGES = ("deep_ridge_height_mm", "shallow_ridge_height_mm")  # keys of `[mould]`, in that order
 FIBRE_DEPTHS_MM = (TRACK_DEPTHS_MM[0] - FIBRE_MM / 2, TRACK_DEPTHS_MM[1] - FIBRE_MM / 2)  # centre lines, at the bottom
 
 
@@ -193,8 +194,9 @@ class Contact(Settings):
         tool: "dome" is a paraboloid of that tip radius, "finger" one as soft as the pad, "flat" the end of a rod.
         depth_mm: of the tool's tip, less than the thickness.
         base: "bonded" where friction or glue holds the pad on what it lies on, "slipping" where nothing does.
-        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed; of
-            the default mould, pressed on the side of its tracks, if not stated.
+        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed.
+            This and the thickness are of the mould, pressed on the side of its tracks, where a settings file does not
+            state them (`read_contact`).
         sides: number of sides D; None for a circle ("circle" in pad.toml).
         weight: "inverse" is 1 / max(d, K / 100), the paper's 1 / d kept finite within a hundredth of the radius.
         length: "manhattan" is the default of shapes, "euclidean" that of the others.
@@ -234,17 +236,12 @@ class Contact(Settings):
     @classmethod
     def _infer_model(cls, stated: object) -> object:
         """Fill in the model and the length from the keys that are stated."""
-        stated = to_builtins(stated)  # `Settings` does so later, and the truth value of an array is ambiguous
+        stated = to_builtins(stated)  # `Settings` does so later
         if not isinstance(stated, Mapping):
             return stated
-        profile = stated.get("sensitivity_profile")
-        if isinstance(profile, list | tuple) and not profile:
-            model, stated = "shape", {name: value for name, value in stated.items() if name != "sensitivity_profile"}
-        elif profile is not None:
-            model = "profile"
-        else:
-            model = "shape" if stated.keys() & set(_KEYS["shape"]) else "layer"
-        model = stated.get("model", model)
+        model = _stated_model(stated)
+        if stated.get("sensitivity_profile") in ([], ()):
+            stated = {name: value for name, value in stated.items() if name != "sensitivity_profile"}
         return {"model": model, "length": "manhattan" if model == "shape" else "euclidean", **stated}
 
     @model_validator(mode="after")
@@ -276,6 +273,70 @@ class Contact(Settings):
         if profile != MEASURED_PROFILE:  # so that the default does not import SciPy, which takes a while
             _check_overshoot(profile)
         return profile
+
+
+def _stated_model(stated: Mapping[str, Any]) -> Any:
+    """Return the model of the contact with the keys that are stated."""
+    profile = to_builtins(stated.get("sensitivity_profile"))  # the truth value of an array is ambiguous
+    if profile is not None and profile not in ([], ()):
+        model = "profile"
+    else:
+        model = "shape" if profile is not None or stated.keys() & set(_KEYS["shape"]) else "layer"
+    return stated.get("model", model)
+
+
+def read_contact(spec: Spec) -> Contact:
+    """Read `[contact]`; lengths of the pad that it does not state are those of the pad as it will be cast.
+
+    These are `thickness_mm`, by `[mould]`, and `fibre_depths_mm`, by the ridges of `[mould]`, the diameter of `[fibre]`
+    and the deep family of `[pad]`, as far as the settings state them.
+
+    Args:
+        spec: settings file.
+
+    Raises:
+        InputError: an unknown key or a value out of range, or a pad that is too thin for the press or its fibres.
+    """
+    stated = spec.stated(Contact)
+    if _stated_model(stated) != "layer":
+        return spec.section(Contact)
+    radius_mm = _fibre_radius_mm(spec)
+    depths_mm = [
+        _stated_mm(spec, "mould", key, default) - radius_mm
+        for key, default in zip(_RIDGES, TRACK_DEPTHS_MM, strict=True)
+    ]
+    if spec.stated(PadSettings).get("deep_family") == "vertical":
+        depths_mm.reverse()
+    as_cast = {"thickness_mm": _stated_mm(spec, "mould", "silicone_mm", SILICONE_MM), "fibre_depths_mm": depths_mm}
+    return spec.section(Contact, **{key: value for key, value in as_cast.items() if key not in stated})
+
+
+def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
+    """Return settings whose mould makes the pad that `[contact]` describes, the inverse of `read_contact`.
+
+    Args:
+        spec: settings file.
+        keys: of `[contact]` that the mould follows, of which those other than lengths of the pad do not count.
+    """
+    contact, tables = read_contact(spec), {}
+    if "thickness_mm" in keys:
+        tables["mould"] = {"silicone_mm": contact.thickness_mm}
+    if "fibre_depths_mm" in keys:
+        radius_mm, (horizontal, vertical) = _fibre_radius_mm(spec), contact.fibre_depths_mm
+        heights_mm = [round(depth + radius_mm, 9) for depth in (max(horizontal, vertical), min(horizontal, vertical))]
+        tables["mould"] = tables.get("mould", {}) | dict(zip(_RIDGES, heights_mm, strict=True))
+        tables["pad"] = {"deep_family": "horizontal" if horizontal > vertical else "vertical"}
+    return spec.replaced(tables)
+
+
+def _fibre_radius_mm(spec: Spec) -> float:
+    return _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
+
+
+def _stated_mm(spec: Spec, section: str, key: str, default: float) -> float:
+    """Return a length that a section states; the default if it is none: those who own the section refuse it."""
+    value = spec.stated(section).get(key, default)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
 
 
 def profile_spline(distances: "ArrayLike", weights: "ArrayLike") -> "CubicSpline":
@@ -582,4 +643,5 @@ PUBLISHED: Mapping[str, Settings] = {
     **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
-BUILT: Mapping[str, Settings] = {"contact": BUILT_CONTACT}  # settings of the pad that the authors built
+# settings of the pad that the authors built
+BUILT: Mapping[str, Settings] = {"pad": PadSettings(deep_family="vertical"), "contact": BUILT_CONTACT}

@@ -12,9 +12,11 @@ from padforge.design.settings import (
     SILICONE_MM,
     TRACK_DEPTHS_MM,
     TRACK_WIDTH_MM,
+    Contact,
     Layout,
     PadSettings,
     RulesSettings,
+    read_contact,
 )
 
 from .materials import FibreSettings, SiliconeSettings
@@ -163,7 +165,8 @@ _MAX_TERRACE_STEP_MM = 0.03
 class FabricationSettings:
     """All settings of a mould and of fibre placement; the pad's fibres are those of the morphology.
 
-    From `[pad]` come the deep family, keep-outs, leads and the radius that it is bent to.
+    From `[pad]` come the deep family, keep-outs, leads and the radius that it is bent to; from `[contact]`, if it is
+    stated, what a press on a pad is believed to be that does not say so itself.
     """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
@@ -173,14 +176,17 @@ class FabricationSettings:
     silicone: SiliconeSettings = field(default_factory=SiliconeSettings)
     fibre: FibreSettings = field(default_factory=FibreSettings)
     dispenser: DispenserSettings = field(default_factory=DispenserSettings)
+    contact: Contact | None = None
 
     def __post_init__(self) -> None:
         for name, model in self._models().items():
             check_type(name, getattr(self, name), model)
+        if self.contact is not None:
+            check_type("contact", self.contact, Contact)
 
     @classmethod
     def _models(cls) -> dict[str, Any]:
-        return {section.name: section.default_factory for section in fields(cls)}
+        return {section.name: section.default_factory for section in fields(cls) if section.name != "contact"}
 
     @classmethod
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
@@ -189,7 +195,8 @@ class FabricationSettings:
         Args:
             spec: settings file.
         """
-        return cls(*map(check_type("spec", spec, Spec).section, cls._models().values()))
+        sections = map(check_type("spec", spec, Spec).section, cls._models().values())
+        return cls(*sections, contact=read_contact(spec) if spec.stated(Contact) else None)
 
     @property
     def ridge_slope(self) -> float:

@@ -26,10 +26,13 @@ def write_report(folder: Path) -> Path:
     """
     from padforge.design.common.page import PageSection, collapsible, page, paragraph, table
     from padforge.design.report import FORMAT as DESIGN_FORMAT
-    from padforge.design.report import contact_sections, design_sections
+    from padforge.design.report import contact_sections, design_sections, press_sections
     from padforge.fabricate.outputs.report import fabrication_sections
     from padforge.sense.report import sections as sense
     from padforge.sense.report.identification import identification_sections
+
+    def write_design(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+        return [*design_sections(folder, document), *press_sections(folder, document, _max_strain(folder))]
 
     folder = check_path("folder", folder)
     recover(folder)
@@ -38,7 +41,7 @@ def write_report(folder: Path) -> Path:
     provenance: list[list[object]] = []
     mismatches: list[str] = []
     for format_, file, write_sections in (
-        (DESIGN_FORMAT, "design.json", design_sections),
+        (DESIGN_FORMAT, "design.json", write_design),
         ("padforge-fabrication/2", "fabrication.json", fabrication_sections),
         ("padforge-recording/2", "recording/start.json", sense.recording_sections),
         ("padforge-identification/3", "identification.json", identification_sections),
@@ -72,6 +75,16 @@ def write_report(folder: Path) -> Path:
     if mismatches:
         raise Fault(f"{folder / 'report.html'}: {'; '.join(mismatches)}")
     return folder / "report.html"
+
+
+def _max_strain(folder: Path) -> float | None:
+    """Return the elongation that the fibres of the mould in a folder bear; None if there is none, or it is unknown."""
+    path = folder / "fabrication.json"
+    if not path.exists():
+        return None
+    with reraise_as_input_error(path):
+        max_strain = read_json(path, "padforge-fabrication/2")["fibre"]["max_strain"]
+        return None if max_strain is None else float(max_strain)
 
 
 def _find_mismatches(

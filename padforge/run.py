@@ -65,6 +65,13 @@ def section_models() -> "dict[str, type[Settings]]":
     return {name: resolve_name(path) for name, path in SECTIONS.items()}
 
 
+def _read_section(spec: "Spec", name: str) -> "Settings":
+    """Read a section; the contact with lengths of the pad as it will be cast."""
+    from padforge.design.settings import read_contact
+
+    return read_contact(spec) if name == "contact" else spec.section(resolve_name(SECTIONS[name]))
+
+
 @dataclass(frozen=True)
 class Run:
     """The request for a run.
@@ -126,9 +133,9 @@ class _StageCache:
         """
         from padforge.design.settings import Contact
 
-        run, models, names = self._run, section_models(), _STAGE_SECTIONS[stage]
+        run, names = self._run, _STAGE_SECTIONS[stage]
         content = {
-            "settings": {name: run.spec.section(models[name]).model_dump(mode="json") for name in names},
+            "settings": {name: _read_section(run.spec, name).model_dump(mode="json") for name in names},
             # a contact that is stated is designed for, even if it is the default one
             "stated": {"contact": run.spec.stated(Contact)} if "contact" in names else {},
             "seed": run.seed,
@@ -173,8 +180,8 @@ def check_run(run: Run) -> None:
     from padforge.sense.recording.recording import check_replaceable
     from padforge.sense.settings import LocalizerSettings, RigSettings
 
-    for model in section_models().values():
-        run.spec.section(model)
+    for name in SECTIONS:
+        _read_section(run.spec, name)
     require_formats(run.formats)
     FabricationSettings.from_spec(run.spec).require_consistent(run.spec.section(PadSettings).layout)
     localizer = run.spec.section(LocalizerSettings)

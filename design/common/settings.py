@@ -153,15 +153,17 @@ class Spec:
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
 
-    def stated(self, model: type[Settings]) -> Mapping[str, Any]:
+    def stated(self, model: type[Settings] | str) -> Mapping[str, Any]:
         """Return what the file states of a section, without defaults and not validated.
 
         Args:
-            model: of the section.
+            model: of the section, or the section's name.
         """
-        if not (isinstance(model, type) and issubclass(model, Settings)):
+        if isinstance(model, type) and issubclass(model, Settings):
+            model = model.section()
+        if not isinstance(model, str):
             raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
-        return self._tables.get(model.section(), {})
+        return self._tables.get(model, {})
 
 
 def or_default(

@@ -18,7 +18,7 @@ from padforge.design.morphology import MAX_COORDINATE, Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguity_map, free_presses
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import add_spare_knots, beziers, remove_spare_knots
-from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.settings import PadSettings, RulesSettings, SearchSettings, read_contact
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
@@ -74,7 +74,7 @@ class EditSession:
         self._provenance = provenance("padforge design edit", None, [] if source is None else [source])
         pad = Morphology.straight(spec.section(PadSettings).layout) if source is None else Morphology.load(source)
         self._layout, self._pad_settings = pad.layout, spec.section(PadSettings, **pad.layout.settings)
-        self._rules, self._contact = spec.section(RulesSettings), spec.section(Contact)
+        self._rules, self._contact = spec.section(RulesSettings), read_contact(spec)
         self._max_failures = spec.section(SearchSettings).max_failures
         self._provenance["settings"] = {"pad": self._pad_settings.model_dump(mode="json")}
         check_replaceable(out, self._provenance, force=force)

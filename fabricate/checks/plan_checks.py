@@ -1,7 +1,7 @@
 """Checks on the plan of a mould: whether it prints, releases its casting, and takes the fibres."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -12,13 +12,16 @@ import shapely
 from numpy.typing import NDArray
 from shapely import ops
 
+from padforge.design.common.settings import validate
+from padforge.design.common.validation import InputError
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import bend_radius, beziers, flatten, slope_beziers, trace_curve
+from padforge.design.settings import Contact
 from padforge.fabricate.checks import Finding, Position, Status, check_result, grade
 from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.checks.surface import find_thin_patches
 from padforge.fabricate.mesh import mesh_arrays, mould_mesh, read_mesh
-from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, overlap, without
+from padforge.fabricate.plan import COVER_MM, FAMILIES, INTO_WALL_MM, Plan, overlap, without
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 CheckedMesh = tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]
@@ -60,7 +63,8 @@ def check_mould(plan: Plan) -> CheckedMesh:
 def check_plan(plan: Plan) -> list[Finding]:
     """Run the checks that need no mesh: on the mould as it is printed, and on the pad as it is used.
 
-    Common tracks, keep-outs and bending are only checked if the settings have any.
+    Common tracks, keep-outs and bending are only checked if the settings have any, and lengths that the design of the
+    pad believes only if it says so.
     """
     mould = plan.shrinkage_compensated
     findings = [
@@ -79,6 +83,7 @@ def check_plan(plan: Plan) -> list[Finding]:
         _check_folds(mould),
         _check_numbers(mould),
     ]
+    findings += _check_believed_layer(plan)
     if plan.settings.pad.keep_out_mm:
         findings += _check_keep_outs(plan)
     return findings + _check_fibre_strain(plan)
@@ -90,6 +95,7 @@ _BEND_TURN, _BEND_SLACK = 2.5e-3, 1e-3  # turn between points of a bend, rad; le
 _MAX_KINK = 0.5  # turn of a fibre in one point, rad, that the rule for bends lets pass
 _MAX_NAMES = 8  # more fibres are counted instead of named
 _PILLAR_LINES = 2  # printed lines, side by side, of a pillar that stands
+_BELIEF_SHARE = 0.02  # of the thickness: by how much lengths may differ from those of the design
 _STRAIN_SHARE = 0.5  # share of a fibre's greatest strain that bending may use: presses take the remainder
 
 
@@ -243,6 +249,48 @@ def _check_cover(plan: Plan) -> Finding:
         message += f"; for {len(plan.heights_mm)} depths the pad is {thickness:g} mm thick, not {nominal:g}"
     status: Status = "warn" if cover < COVER_MM - 1e-9 or thickness > nominal else "pass"
     return Finding("cover", status, cover, COVER_MM, message)
+
+
+def _believed_contact(plan: Plan) -> Contact | None:
+    """Return the contact that the pad was designed for, or else that of the settings; None if neither says."""
+    settings = plan.pad.provenance.get("settings")
+    stated = settings.get("contact") if isinstance(settings, Mapping) else None
+    if not isinstance(stated, Mapping):
+        return plan.settings.contact
+    try:
+        return validate(Contact, stated, "the pad's contact")
+    except InputError:  # the provenance of a morphology is free
+        return None
+
+
+def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
+    """Check that the pad is as thick, and its fibres lie as deep, as its design believes.
+
+    Either face of the pad may be the one that is pressed, for all fibres.
+    """
+    contact = _believed_contact(plan)
+    if contact is None or contact.model != "layer":
+        return
+    thickness, believed = plan.thickness_mm, contact.thickness_mm
+    slack = _BELIEF_SHARE * believed
+    fits = abs(thickness - believed) <= slack
+    message = f"silicone is {thickness:.4g} mm thick, the design believes {believed:.4g}"
+    yield Finding("silicone_thickness", "pass" if fits else "warn", thickness, believed, message)
+
+    radius = plan.settings.fibre.material.diameter_mm / 2
+    depths = np.array([plan.depths_mm[layer] - radius for layer in plan.layer_indices])
+    expected = np.repeat(contact.fibre_depths_mm, plan.pad.layout.counts)
+    depths = min(depths, thickness - depths, key=lambda face: float(np.abs(face - expected).max()))
+    errors = np.abs(depths - expected)
+    families = [rows for rows in plan.pad.layout.families if len(errors[rows])]
+    worst = [rows.start + int(errors[rows].argmax()) for rows in families]
+    measured, limits = depths[worst].tolist(), expected[worst].tolist()
+    parts = [
+        f"{FAMILIES[plan.family(fibre)]} fibres lie {depth:.3g} mm deep, the design believes {limit:.3g}"
+        for fibre, depth, limit in zip(worst, measured, limits, strict=True)
+    ]
+    fits = errors.max() <= slack
+    yield Finding("fibre_depths", "pass" if fits else "warn", measured, limits, "; ".join(parts))
 
 
 def _check_fibre_bend(plan: Plan) -> Finding:

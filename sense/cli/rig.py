@@ -79,7 +79,7 @@ def record(
     An interrupted recording keeps every finished press; --resume records the others.
     Software is not the emergency stop: keep the robot's own one within reach.
     """
-    from padforge.design.settings import Contact, PadSettings
+    from padforge.design.settings import PadSettings, read_contact
     from padforge.design.twin import Twin
     from padforge.sense.rig import operation
     from padforge.sense.rig.config import RigConfig
@@ -113,7 +113,7 @@ def record(
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
-        config = RigConfig(pad, settings.section(Contact), options, target, command, inputs, pad_settings, folder)
+        config = RigConfig(pad, read_contact(settings), options, target, command, inputs, pad_settings, folder)
         recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
 
@@ -217,7 +217,7 @@ def doctor(
     """
     from dataclasses import asdict
 
-    from padforge.design.settings import Contact, PadSettings
+    from padforge.design.settings import PadSettings, read_contact
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
@@ -227,7 +227,7 @@ def doctor(
     pad, options = _load_pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
     has_pad = morphology is not None or rig == "simulated" or virtual_hardware
     inputs = options.inputs(len(pad.knots)) if has_pad else options.channels
-    contact, folder = settings.section(Contact), common.pad_folder(morphology)
+    contact, folder = read_contact(settings), common.pad_folder(morphology)
     config = RigConfig(pad, contact, options, Path(), "padforge sense doctor", folder=folder)
     diagnoses = _diagnose(rig, config, inputs, virtual_hardware)
     passed = all(diagnosis.status != "fail" for diagnosis in diagnoses)

@@ -116,11 +116,11 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     For recordings of a built pad (figures 13 and 14) see `padforge sense fibre-loss`.
     """
-    from padforge.design.settings import Contact
+    from padforge.design.settings import Contact, read_contact
     from padforge.sense.studies.robustness import robustness_study
 
     settings = common.load_spec(spec)
-    contact = settings.section(Contact) if settings.stated(Contact) else None
+    contact = read_contact(settings) if settings.stated(Contact) else None
     return robustness_study(_pads(names, seed), seed=seed, contact=contact, **options)
 
 

@@ -20,7 +20,7 @@ from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.design.settings import Contact, PadSettings
+from padforge.design.settings import PadSettings, read_contact
 from padforge.design.twin import Twin
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.model import LocalizerModel
@@ -103,7 +103,7 @@ def record_simulated(
     plan = pad.morphology if isinstance(pad, Twin) else pad
     pad_settings = spec.section(PadSettings, **plan.layout.settings)
     with stage("simulate"):
-        recording = simulate(pad, rig, spec.section(Contact), pad_settings, like)
+        recording = simulate(pad, rig, read_contact(spec), pad_settings, like)
     inputs = [*inputs, *([rig.plan_file] if rig.plan_file else [])]
     recording.save(out, provenance("padforge sense record --rig simulated", rig.seed, inputs), replacing)
     return recording

@@ -9,7 +9,14 @@ from padforge import design
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
 from padforge.design.common.settings import commented_toml
 from padforge.design.objectives.published import information
-from padforge.design.settings import BUILT_CONTACT, MEASURED_PROFILE, PUBLISHED_CONTACT, Layout, sensed_rectangle
+from padforge.design.settings import (
+    BUILT_CONTACT,
+    MEASURED_PROFILE,
+    PUBLISHED_CONTACT,
+    Layout,
+    read_contact,
+    sensed_rectangle,
+)
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -209,3 +216,30 @@ def test_default_contact_is_measured_or_published():
     assert information(pad) == information(pad, Contact()) == terms["information"]
     for name in terms:
         assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name
+
+
+@pytest.mark.parametrize(
+    ("tables", "thickness_mm", "depths_mm"),
+    [
+        ({}, 6.0, (1.05, 0.25)),
+        ({"pad": {"deep_family": "vertical"}}, 6.0, (0.25, 1.05)),
+        ({"mould": {"silicone_mm": 8, "deep_ridge_height_mm": 2.0}, "contact": {"depth_mm": 7.0}}, 8.0, (1.85, 0.25)),
+        ({"mould": {"shallow_ridge_height_mm": 0.5}, "fibre": {"diameter_mm": 0.4}}, 6.0, (1.0, 0.3)),
+        ({"mould": {"silicone_mm": 8.0}, "contact": {"thickness_mm": 7.0, "fibre_depths_mm": [2, 3]}}, 7.0, (2, 3)),
+        ({"mould": {"silicone_mm": "thick"}}, 6.0, (1.05, 0.25)),
+    ],
+)
+def test_unstated_lengths_of_contact_are_those_of_the_mould(tables, thickness_mm, depths_mm):
+    contact = read_contact(Spec(tables))
+    assert contact.thickness_mm == thickness_mm
+    assert contact.fibre_depths_mm == pytest.approx(depths_mm)
+
+
+def test_other_contacts_do_not_depend_on_the_mould():
+    for stated in ({"radius": 0.5}, {"model": "profile"}, {"sensitivity_profile": []}):
+        assert read_contact(Spec({"contact": stated, "mould": {"silicone_mm": 8.0}})) == Contact(**stated)
+
+
+def test_contact_refuses_mould_too_thin_for_press():
+    with pytest.raises(InputError, match=r"^pad: \[contact\] .*depth_mm is 5, the pad is 4 mm thick"):
+        read_contact(Spec({"mould": {"silicone_mm": 4.0}}, "pad"))

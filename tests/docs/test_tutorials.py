@@ -32,6 +32,7 @@ BASES = {
     "tutorial-fabricate": "tutorial-design",
     "tutorial-sense": "tutorial-design",
     "tutorial-study": "tutorial-design",
+    "tutorial-press": None,
     "tutorial-twin": "tutorial-sense",
     "howto-ros": "tutorial-sense",
     "howto-microcontroller": "tutorial-sense",

@@ -5,8 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from padforge.design import Morphology, Spec
+from padforge.design import Contact, Morphology, Spec
 from padforge.design import compare as comparison
+from padforge.design.contact import half_width_mm
+from padforge.design.settings import read_contact
+from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called
 
 
@@ -21,6 +24,8 @@ def test_compare_evaluates_finished_pads(tmp_path):
     assert plain["errors_mm"] == plain["straight_mm"] != bent["errors_mm"]
     assert len(plain["errors_mm"]) == 4, "0 to 3 lost"
     assert plain["mould_ml"] > 0
+    assert plain["half_width_mm"] == pytest.approx(half_width_mm(Contact()))
+    assert plain["contact"]["model"] == "layer"
     assert (tmp_path / "both" / "plain" / "mould.stl").exists()
     assert (tmp_path / "both" / "comparison.png").stat().st_size > 10_000
 
@@ -37,6 +42,25 @@ def test_compare_designs_every_variant_in_its_folder(tmp_path):
     assert "1 failed (mm)" in result.out
     pad = Morphology.load(tmp_path / "c" / folders[0] / "morphology.json")
     assert (pad.layout.counts, pad.pitch_mm) == ((1, 1), (8.0, 12.0))
+
+
+def test_mould_follows_varied_lengths_of_the_layer():
+    """Also where the settings state another mould, as those of `padforge init` do."""
+    vary = ["contact.thickness_mm=4.0,8", "contact.fibre_depths_mm=[0.25,1.25]", "contact.depth_mm=2.0"]
+    spec = Spec({"mould": {"silicone_mm": 5.0, "floor_mm": 3.0}})
+    variants = comparison.read_variants([], vary, lambda path: spec)
+    moulds = [FabricationSettings.from_spec(variant.spec) for variant in variants]
+    assert [mould.mould.silicone_mm for mould in moulds] == [4, 8]
+    assert [read_contact(variant.spec).thickness_mm for variant in variants] == [4, 8]
+    assert {(mould.mould.deep_ridge_height_mm, mould.mould.shallow_ridge_height_mm) for mould in moulds} == {(1.4, 0.4)}
+    assert {(mould.pad.deep_family, mould.mould.floor_mm) for mould in moulds} == {("vertical", 3)}
+
+
+def test_compare_refuses_layer_too_thin_for_its_fibres(tmp_path):
+    vary = ("--vary", "contact.thickness_mm=1,6", "--vary", "contact.depth_mm=0.5")
+    result = called("design", "compare", *vary, cwd=tmp_path)
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "fibre_depths_mm is 1.05, the pad is 1 mm thick" in result.err
 
 
 @pytest.mark.parametrize(("names", "line"), [(("a b", "a-b"), "a-b: two pads"), (("one", "ONE"), "one: two pads")])

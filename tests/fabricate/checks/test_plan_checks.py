@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from padforge.design.common.settings import Spec
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import beziers, cubic
-from padforge.design.settings import RulesSettings
+from padforge.design.settings import Contact, RulesSettings
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS
 from padforge.fabricate.checks.plan_checks import check, check_plan, compute_bending_strains
@@ -296,3 +297,44 @@ def test_fibre_strain_by_material(stretch, status):
     (finding,) = (finding for finding in check_plan(plan) if finding.name == "fibre_strain")
     assert finding.status == status
     assert finding.measured == pytest.approx(1.95 / 23)
+
+
+def designed_for(contact: Contact, **settings: Any) -> dict[str, Finding]:
+    """Findings on straight fibres designed for a contact, by name."""
+    origin = {"settings": {"contact": contact.model_dump(mode="json")}}
+    pad = Morphology.from_layout(Morphology.straight(2).knots, Morphology.straight(2).layout, origin)
+    return {finding.name: finding for finding in check_plan(Plan(pad, with_settings(**settings)))}
+
+
+@pytest.mark.parametrize(
+    ("contact", "settings", "thickness", "depths"),
+    [
+        (Contact(), {}, "pass", "pass"),
+        (Contact(fibre_depths_mm=(4.95, 5.75)), {}, "pass", "pass"),  # pressed on the other face
+        (Contact(), {"silicone": {"shrinkage": 0.01}}, "pass", "pass"),
+        (Contact(), {"mould": {"silicone_mm": 8.0}}, "warn", "pass"),
+        (Contact(), {"pad": {"deep_family": "vertical"}}, "pass", "warn"),
+        (Contact(), {"mould": {"deep_ridge_height_mm": 1.6}}, "pass", "warn"),
+    ],
+)
+def test_mould_is_compared_with_the_layer_that_the_design_believes(contact, settings, thickness, depths):
+    findings = designed_for(contact, **settings)
+    assert (findings["silicone_thickness"].status, findings["fibre_depths"].status) == (thickness, depths)
+
+
+def test_finding_names_what_mould_and_design_differ_in():
+    findings = designed_for(Contact(), mould={"silicone_mm": 8.0}, pad={"deep_family": "vertical"})
+    assert findings["silicone_thickness"].message == "silicone is 8 mm thick, the design believes 6"
+    assert findings["fibre_depths"].message == (
+        "horizontal fibres lie 0.25 mm deep, the design believes 1.05; "
+        "vertical fibres lie 1.05 mm deep, the design believes 0.25"
+    )
+
+
+def test_contact_of_settings_counts_if_the_pad_has_none():
+    tables = {"mould": {"silicone_mm": 8.0}, "contact": {"thickness_mm": 6.0}}
+    pad = Morphology.straight(2)
+    assert find(pad, "silicone_thickness", FabricationSettings.from_spec(Spec(tables))).status == "warn"
+    for contact in ({"radius": 0.6}, {}):
+        settings = FabricationSettings.from_spec(Spec(tables | {"contact": contact}))
+        assert "silicone_thickness" not in {finding.name for finding in check_plan(Plan(pad, settings))}

@@ -15,6 +15,7 @@ from padforge.design.common.files import provenance
 from padforge.design.common.validation import Fault, InputError
 from padforge.design.morphology import Morphology
 from padforge.design.report import contact_line
+from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
@@ -35,10 +36,10 @@ MOST_PAGE_BYTES = 8_000_000
 def test_every_stage_has_a_linked_section(page: Path) -> None:
     text = page.read_text()
     titles = re.findall(r'<h2 id="(.*?)">(.*?)</h2>', text)
-    names = ["Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Contact model"]
+    names = ["Fibres", "Press", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Contact model"]
     assert [title for _, title in titles] == [*names, "Studies", "Provenance"]
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
-    assert text.count("data:image/") == 5  # plan, mould, tracks, which way round, and the study's figure
+    assert text.count("data:image/") == 6  # plan, press, mould, tracks, which way round, and the study's figure
     assert page.stat().st_size < MOST_PAGE_BYTES
 
 
@@ -183,7 +184,7 @@ def test_report_works_with_one_stage(made: Path, tmp_path: Path, name: str) -> N
     shutil.copy(made / f"{name}.json", tmp_path / f"{name}.json")
     text = write_report(tmp_path).read_text()
     assert "Provenance" in text
-    assert "<figure><img" not in text
+    assert ("<figure><img" in text) == (name == "design"), "the press alone is drawn by the report"
 
 
 def test_report_refuses_folder_without_results(tmp_path: Path) -> None:
@@ -230,7 +231,8 @@ def test_report_omits_mould_of_other_checks(pad: Path, tmp_path: Path, name: str
 def test_report_omits_pictures_of_other_mould(pad: Path) -> None:
     build(PAD, pad, ["stl"])
     shutil.copy(pad / "studies" / "drift.png", pad / "mould.png")
-    assert write_report(pad).read_text().count("data:image/") == 3  # plan, which way round, and the study's figure
+    pictures = write_report(pad).read_text().count("data:image/")
+    assert pictures == 4, "plan, press, which way round, and the study's figure"
 
 
 def test_report_shows_errors_by_contact(page: Path) -> None:
@@ -269,3 +271,25 @@ def test_report_shows_depth_and_force(pad: Path) -> None:
     (pad / "recording" / "journal.ndjson").write_text("{}\n")
     with pytest.raises(InputError, match=r"journal\.ndjson: line 1"):
         write_report(pad)
+
+
+def test_report_compares_strain_of_fibres_with_what_they_bear(pad: Path) -> None:
+    design, mould = design_document(), json.loads((pad / "fabrication.json").read_text())
+    design["provenance"]["settings"]["contact"] = Contact(depth_mm=2.0, thickness_mm=8.0).model_dump(mode="json")
+    mould["fibre"]["max_strain"] = 0.01
+    written(pad / "design.json", design)
+    written(pad / "fabrication.json", mould)
+    text = write_report(pad).read_text()
+    assert "pressed 2 mm deep into silicone of 8 mm" in text
+    assert text.count('<td class="number">1%</td>') == 2
+    assert re.search(r'1%</td><td class="warn">warn</td>', text)
+    assert (pad / "press.png").stat().st_size > 10_000
+
+
+def test_report_of_other_contacts_has_no_press(pad: Path) -> None:
+    design = design_document()
+    design["provenance"]["settings"]["contact"] = Contact(radius=0.6).model_dump(mode="json")
+    written(pad / "design.json", design)
+    (pad / "press.png").unlink(missing_ok=True)
+    assert ">Press</h2>" not in write_report(pad).read_text()
+    assert not (pad / "press.png").exists()
