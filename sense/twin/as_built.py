@@ -26,7 +26,9 @@ EPSILON = 1e-6  # squared distance below which the direction to the press is und
 N_ELEMENTS = 160  # elements of a fibre
 FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
 N_SPLINES = 12  # splines of a profile
-SPLINE_STEP = 0.48  # their distance, as a share of the standard deviation of the Gaussian profile that fits best
+SPLINE_STEP = 0.48
+"""Their distance, as a share of the standard deviation of the Gaussian profile that fits best. A layer's strains go out
+to more than five of these; a profile that ends before makes a fit shrink the pad to reach as far."""
 N_OFFSET, N_SENSITIVITY = 12, 8  # splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity
 N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
 """Parameters that all channels share (transform and two profiles), and those of each channel."""

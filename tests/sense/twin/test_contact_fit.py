@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from padforge.design.contact import signals
+from padforge.design.layer import Base
 from padforge.design.settings import Contact
 from padforge.design.twin import PlanTransform
 from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
@@ -20,7 +21,7 @@ def press(contact: Contact, transform: PlanTransform, presses: int = 200) -> Res
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_fit_contact_recovers_scale_and_shares(base: str) -> None:
+def test_fit_contact_recovers_scale_and_shares(base: Base) -> None:
     stated = Contact(base=base)
     pressed = Contact(base=base, scale=1.15, squeeze=0.7, stretch=1.3)
     responses = press(pressed, PlanTransform(True, 3.0, (1.0, -0.5), 1.02))
