@@ -345,12 +345,23 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 @recording_argument
 @click.option("--morphology", type=FILE, required=True, help="The pad as planned: morphology.json or published .mat.")
 @common.seed_option
+@common.spec_option
 @common.out_option()
 @common.force_option
 @common.json_option
 @common.profile_option
-def identify(recording: Path, morphology: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
+def identify(
+    recording: Path,
+    morphology: Path,
+    seed: int | None,
+    spec: Path | None,
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
     """Identify the twin of a printed pad from RECORDING: fibres as built, wiring, pose and sensitivity profile.
+
+    If [contact] is a layer, its width, squeeze and stretch are measured.
 
     \b
     padforge sense identify out/pad/recording --morphology out/pad/morphology.json
@@ -360,11 +371,14 @@ def identify(recording: Path, morphology: Path, seed: int | None, out: Path | No
     """
     from padforge.design.common.files import locked_folder
     from padforge.design.morphology import Morphology
+    from padforge.design.settings import Contact
     from padforge.sense.report.identification import identification_lines, identify_into
 
+    contact = common.load_spec(spec).section(Contact)
     folder, pad = out or common.pad_folder(recording), Morphology.load(morphology)
     inputs = [path for path in (recording, morphology) if not path.is_dir()]
     with locked_folder(folder), common.progress_bar("identify") as show:
         opened = read_recording(recording)
-        document = identify_into(opened, pad, folder, seed or 0, inputs=inputs, on_progress=show, force=force)
+        options = {"contact": contact, "inputs": inputs, "on_progress": show, "force": force}
+        document = identify_into(opened, pad, folder, seed or 0, **options)
     common.show_result(document, identification_lines(document, folder), as_json)

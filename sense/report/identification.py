@@ -17,8 +17,9 @@ from padforge.design.common.profiling import stage
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
+from padforge.design.settings import Contact
 from padforge.sense.recording.recording import Recording
-from padforge.sense.twin.identification import Identification, identify_pad
+from padforge.sense.twin.identification import Identification, MeasuredContact, identify_pad
 
 FORMAT = "padforge-identification/3"
 MIN_ADVANTAGE = 0.02
@@ -33,6 +34,7 @@ def identify_into(
     out: Path,
     seed: int = 0,
     *,
+    contact: Contact | None = None,
     inputs: list[Path] | None = None,
     on_progress: OnProgress = ignore_progress,
     force: bool = False,
@@ -44,6 +46,7 @@ def identify_into(
         pad: as planned.
         out: folder.
         seed: of what is drawn.
+        contact: as `identify`.
         inputs: files whose digests become part of the provenance.
         on_progress: called with (steps done, total, what is being done).
         force: whether a twin is replaced that other files in `out` were made from.
@@ -58,7 +61,7 @@ def identify_into(
     origin = provenance(COMMAND, seed, inputs or [])  # minutes later they may differ from what was read
     check_replaceable(out / TWIN, origin, force=force)
     with stage("identify"):
-        result = identify_pad(recording, pad, seed, on_progress)
+        result = identify_pad(recording, pad, contact, seed, on_progress)
     document = _document(result) | {"rig_mirrored": recording.mirrored, "provenance": origin}
     with atomic_files(out) as folder, stage("figures"):
         replace(result.twin, provenance=origin).save(folder / TWIN)
@@ -88,12 +91,25 @@ def _document(result: Identification) -> dict[str, Any]:
         "explained": float(result.explained.mean()),
         "explained_on_plan": result.explained_on_plan,
         "explained_by_straight": result.explained_by_straight,
+        "contact": None if result.contact is None else _contact_document(result.contact),
         "noise": twin.noise,
         "frame": asdict(twin.frame),
         "sensitivity_profile": {"distance_mm": twin.distance_mm.tolist(), "weight": twin.weight.tolist()},
         "angular": twin.angular_weight is not None,
         "sensed_mm": list(twin.sensed_mm),
         "n_alternatives": len(result.alternatives),
+    }
+
+
+def _contact_document(measured: MeasuredContact) -> dict[str, Any]:
+    """Return a measured contact as JSON: the keys of `[contact]`, and how much each model explains."""
+    best = measured.best
+    return {
+        "stated": measured.stated.model_dump(mode="json"),
+        **{name: getattr(best, name) for name in ("scale", "squeeze", "stretch", "scale_std", "shares_std")},
+        "explained": best.explained,
+        "explained_on_plan": measured.on_plan.explained,
+        "explained_on_plan_by_gaussian": measured.gaussian_on_plan.explained,
     }
 
 
@@ -169,8 +185,23 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
         f"explained {document['explained']:.3f} of held-out responses; {document['explained_on_plan']:.3f} on the plan"
         f" as it is; noise {document['noise']:.1%} of full scale",
         f"the pad lay {_pose(document)}",
+        *_contact_lines(document),
         *_warnings(document),
     ]
+
+
+def _contact_lines(document: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is measured of the contact, if it is a layer, as a user may state it in `[contact]`."""
+    if contact := document.get("contact"):
+        yield (
+            f"a press as [contact] with scale {contact['scale']:.2f} ± {contact['scale_std']:.2f}, squeeze"
+            f" {contact['squeeze']:.2f} and stretch {contact['stretch']:.2f} ± {contact['shares_std']:.2f}"
+        )
+        yield (
+            f"this layer explains {contact['explained']:.3f}; on the plan {contact['explained_on_plan']:.3f}, a"
+            f" Gaussian {contact['explained_on_plan_by_gaussian']:.3f}, a free profile"
+            f" {document['explained_on_plan']:.3f}"
+        )
 
 
 def _channel_cells(row: Mapping[str, Any]) -> list[str]:
@@ -206,7 +237,12 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
         (folder / "twin_plan.png", "The plan, and the fibres as built over it."),
         (folder / "twin_responses.png", "Responses of each channel by position: measured, predicted, residual."),
     ]
-    body = [paragraph(summary), *map(paragraph, _warnings(document)), channels, figures(pictures)]
+    body = [
+        paragraph(summary),
+        *map(paragraph, [*_contact_lines(document), *_warnings(document)]),
+        channels,
+        figures(pictures),
+    ]
     result = (f"{document['explained']:.0%}", "of the responses explained by the twin")
     return [PageSection("The pad as built", body, [result])]
 

@@ -25,8 +25,10 @@ from padforge.sense.twin.responses import Responses
 EPSILON = 1e-6  # squared distance below which the direction to the press is undefined, squared grid units
 N_ELEMENTS = 160  # elements of a fibre
 FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
-N_SPLINES = 9  # splines of a profile
-SPLINE_STEP = 0.36  # their distance, as a share of the standard deviation of the Gaussian profile that fits best
+N_SPLINES = 12  # splines of a profile
+SPLINE_STEP = 0.48
+"""Their distance, as a share of the standard deviation of the Gaussian profile that fits best. A layer's strains go out
+to more than five of these; a profile that ends before makes a fit shrink the pad to reach as far."""
 N_OFFSET, N_SENSITIVITY = 12, 8  # splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity
 N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
 """Parameters that all channels share (transform and two profiles), and those of each channel."""
@@ -209,6 +211,18 @@ class AsBuiltPad:
         """Return the middles (N_ELEMENTS, 2), grid units, and sensitivities (N_ELEMENTS,) of a channel's fibre."""
         offset, log_gain = (evaluate_along_fibre(curves, N_ELEMENTS)[0][0] for curves in self._curves(channel))
         return self.plan.paths[self.fibres[channel]] + offset.T, np.exp(log_gain[0])
+
+    def elements(self, channel: int) -> tuple[Array, Array, Array]:
+        """Return the elements of a channel's fibre, grid units.
+
+        They are middles (N_ELEMENTS, 2), lengths times sensitivities (N_ELEMENTS,) and unit tangents (N_ELEMENTS, 2).
+        """
+        plan, fibre = self.plan, self.fibres[channel]
+        middles, sensitivities = self.path(channel)
+        change = evaluate_along_fibre(self._curves(channel)[0], N_ELEMENTS)[0][1]
+        steps = np.ascontiguousarray(plan.lengths[fibre][:, None] * plan.tangents[fibre] + change.T)
+        lengths = np.hypot(*steps.T)
+        return np.ascontiguousarray(middles), sensitivities * lengths, steps / lengths[:, None]
 
     def _curves(self, channel: int) -> tuple[Array, Array]:
         """Return the coefficients of lateral offset (2, N_OFFSET) and log-sensitivity (1, N_SENSITIVITY)."""

@@ -4,6 +4,7 @@
 2. Channels that respond to the position at all are live: a Gaussian process explains them better than noise.
 3. Wirings and poses are searched for on the plan; each of the best is fitted as built, and the most probable one taken.
 4. It is fitted to all presses, with an angular term if held-out presses ask for one.
+5. How wide a press is, and how much of it is stretch, is measured on its fibres by the layer it is believed to be.
 """
 
 from dataclasses import dataclass, replace
@@ -15,14 +16,16 @@ from threadpoolctl import threadpool_limits
 
 from padforge.design import Morphology
 from padforge.design.common.progress import OnProgress, ignore_progress
+from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.paths.curves import lengths
-from padforge.design.settings import sensed_rectangle
+from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import MAX_INFORMATION_GAIN, PlanTransform, Twin, TwinChannel, TwinReadings, TwinScatter
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.simulated_recording import measure_rig_settings
 from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
+from padforge.sense.twin.contact_fit import ContactFit, fit_contact
 from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built
 from padforge.sense.twin.responses import Responses, compute_responses, fisher_information, fit_gp, select_one_depth
 
@@ -35,6 +38,7 @@ MAX_PRESSES = 2000  # presses of the last fit
 N_CANDIDATES, N_COMPARED = 8, 150
 """Wirings that are fitted, and presses by which they are compared: residuals are correlated over about half a grid
 unit, so that more presses would count the same evidence twice."""
+N_CONTACT = 400  # presses that a contact is fitted to, for the same reason
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
 MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live, and another wiring is ruled out
 SAME_LOG_EVIDENCE = 1.0  # difference of log evidence below which two fits are equally good
@@ -161,6 +165,21 @@ def _refine(scorer: _Scorer, wiring: Wiring, unit_mm: float) -> Wiring:
 
 
 @dataclass(frozen=True)
+class MeasuredContact:
+    """The contact that a pad was believed to be pressed by, against its presses."""
+
+    stated: Contact  # a layer, pressed as deep as the recording says if it does
+    as_built: ContactFit  # of the fibres as built, which a profile without direction was fitted with
+    on_plan: ContactFit  # of fibres that lie as planned
+    gaussian_on_plan: ContactFit  # the same of a Gaussian profile, of which only the width is fitted
+
+    @property
+    def best(self) -> ContactFit:
+        """The fit that explains more: fibres as built fit their profile, planned ones do not fit what deviates."""
+        return max(self.as_built, self.on_plan, key=lambda fit: fit.explained)
+
+
+@dataclass(frozen=True)
 class Identification:
     """An identified pad; C' channels of the recording are live, and only these in `fit`, `training` and `held_out`."""
 
@@ -175,6 +194,7 @@ class Identification:
     alternatives: list[Wiring]  # those that the presses do not rule out
     readings: TwinReadings | None  # None where there are too few presses
     scatter: TwinScatter
+    contact: MeasuredContact | None  # None of a contact that is no layer, or thinner than a press is deep
     training: Responses
     held_out: Responses
 
@@ -241,12 +261,19 @@ def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array]:
     return distance, weight, angular_weight
 
 
-def identify(recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = ignore_progress) -> Twin:
+def identify(
+    recording: Recording,
+    pad: Morphology,
+    contact: Contact | None = None,
+    seed: int = 0,
+    on_progress: OnProgress = ignore_progress,
+) -> Twin:
     """Identify the twin of a printed pad: its wiring, pose, fibres as built and sensitivity profile.
 
     Args:
         recording: presses at known positions over most of the pad; of several depths, the most common one is used.
         pad: as planned.
+        contact: what the pad is believed to be pressed by; `Contact()` if None. The twin does not depend on it.
         seed: of what is drawn.
         on_progress: called with (steps done, total, what is being done).
 
@@ -257,16 +284,21 @@ def identify(recording: Recording, pad: Morphology, seed: int = 0, on_progress: 
         InputError: too few presses of known position, all in one part of the pad, no channel that responds, more that
             do than there are fibres, or a recording of another pad.
     """
-    return identify_pad(recording, pad, seed, on_progress).twin
+    return identify_pad(recording, pad, contact, seed, on_progress).twin
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def identify_pad(
-    recording: Recording, pad: Morphology, seed: int = 0, on_progress: OnProgress = ignore_progress
+    recording: Recording,
+    pad: Morphology,
+    contact: Contact | None = None,
+    seed: int = 0,
+    on_progress: OnProgress = ignore_progress,
 ) -> Identification:
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
     rng = np.random.default_rng(check_int("seed", seed, 0, 2**64 - 1))
     check_type("pad", pad, Morphology)
+    contact = or_default("contact", contact, Contact)
     recording = select_one_depth(check_type("recording", recording, Recording))
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
@@ -299,7 +331,7 @@ def identify_pad(
             f" {MIN_MATCH:.0%} or more"
         )
     ranked = _rank_as_built(candidates, compared)
-    best = ranked[0][1]
+    wiring, best = ranked[0]
     straight_plan = PadPlan.from_morphology(Morphology.straight(pad.layout))
     explained_by_straight = None
     if not np.allclose(straight_plan.paths, plan.paths):
@@ -309,6 +341,10 @@ def identify_pad(
     # 4. All presses
     on_progress(0, 3, "paths")
     fit = _fit_all(best.pad, training, on_progress)
+
+    # 5. Contact
+    on_plan = next(planned.pad for candidate, planned in candidates if candidate is wiring)
+    measured = _measure_contact(_as_deep(contact, recording), fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)
     noise_v[live] = fit_gp(fit.pad.residuals(training), pad.unit_mm)[0]
     full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
@@ -326,6 +362,7 @@ def identify_pad(
         ],
         readings=_estimate_readings(recording, live, fit.pad, noise_v, training.positions_mm),
         scatter=estimate_scatter(fit.pad, training, noise_v[live]),
+        contact=measured,
         training=training,
         held_out=held_out,
     )
@@ -401,6 +438,37 @@ def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
     systematic_var = np.maximum(residuals.variance - noise_var, 0)
     repeats = max(len(responses) / N_COMPARED, 1)
     return np.sqrt((noise_var + systematic_var * repeats) / (noise_var + systematic_var))
+
+
+def _as_deep(contact: Contact, recording: Recording) -> Contact | None:
+    """Return a layer pressed as deep as a recording says, if it does; None if that cannot be, or it is no layer."""
+    depths_mm = recording.actual_depths_mm[recording.has_position]
+    depths_mm = depths_mm[depths_mm > 0]
+    depth_mm = float(np.median(depths_mm)) if len(depths_mm) else contact.depth_mm
+    if contact.model != "layer" or depth_mm >= contact.thickness_mm:
+        return None
+    return contact.model_copy(update={"depth_mm": depth_mm})
+
+
+def _measure_contact(
+    contact: Contact | None, as_built: AsBuiltPad, on_plan: AsBuiltPad, training: Responses, held_out: Responses
+) -> MeasuredContact | None:
+    """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian."""
+    if contact is None:
+        return None
+
+    training = training.select(np.arange(min(N_CONTACT, len(training))))
+
+    def fit(pad: AsBuiltPad, contact: Contact) -> ContactFit:
+        noise_v = _noise_inflation(pad, training) * np.sqrt(pad.residuals(training).variance)
+        return fit_contact(pad, contact, training, held_out, noise_v)
+
+    return MeasuredContact(
+        stated=contact,
+        as_built=fit(as_built, contact),
+        on_plan=fit(on_plan, contact),
+        gaussian_on_plan=fit(on_plan, Contact(model="profile")),
+    )
 
 
 def _estimate_readings(

@@ -12,7 +12,7 @@ from padforge.benchmarks import twin as bench
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import InputError, Morphology
 from padforge.design.common.progress import ignore_progress
-from padforge.design.settings import PadSettings
+from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
 from padforge.sense import identify
 from padforge.sense.recording.recording import Recording
@@ -74,17 +74,33 @@ def test_twin_responds_as_the_fitted_pad(result: Identification) -> None:
     assert volts == pytest.approx(fitted, abs=0.05 * np.abs(fitted).max())
 
 
+@few_candidates()
+def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
+    recording = simulate(PLAN, RigSettings(presses=200, depth_mm=4.0, seed=2), Contact(depth_mm=4.0))
+    result = identify_pad(recording, PLAN, seed=1)
+    assert result.fit.pad.fibres == (0, 1, 2, 3)
+    assert result.contact is not None
+    assert result.contact.stated.depth_mm == 4.0
+    best = result.contact.best
+    assert best.scale == pytest.approx(1, rel=0.1)
+    assert (best.squeeze, best.stretch) == pytest.approx((1, 1), rel=0.2)
+    assert result.contact.on_plan.explained > result.contact.gaussian_on_plan.explained
+
+
 @pytest.mark.slow
 def test_identify_recovers_the_printed_pad_among_all_candidates(printed: Twin) -> None:
     assert_recovered(identify_pad(simulate(printed, RigSettings(presses=500, seed=3)), PLAN, seed=1), printed)
 
 
 @few_candidates()
-def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible() -> None:
+def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_without_a_layer() -> None:
     pad = Morphology.straight(2)
     printed = printed_pad(pad, np.random.default_rng(0), lateral_offset_mm=0.2, n_dead=0)
     recording = simulate(printed, RigSettings(presses=150, seed=1))  # of seed 0 it is just not as good
-    result, again = (identify_pad(recording, pad, seed=1) for _ in range(2))
+    # no layer, and a layer that is thinner than presses are deep
+    contacts = Contact(model="profile"), Contact(thickness_mm=4.0, depth_mm=3.0)
+    result, again = (identify_pad(recording, pad, contact, seed=1) for contact in contacts)
+    assert result.contact is again.contact is None
     assert np.array_equal(again.fit.pad.values, result.fit.pad.values)
     assert result.alternatives
     assert result.explained_by_straight is None

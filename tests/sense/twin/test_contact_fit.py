@@ -1,0 +1,52 @@
+"""Scale and shares of a contact, from responses whose contact is known."""
+
+import numpy as np
+import pytest
+
+from padforge.design.contact import signals
+from padforge.design.layer import Base
+from padforge.design.settings import Contact
+from padforge.design.twin import PlanTransform
+from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
+from padforge.sense.twin.contact_fit import fit_contact
+from padforge.sense.twin.responses import Responses
+
+from .conftest import PLAN
+
+
+def press(contact: Contact, transform: PlanTransform, presses: int = 200) -> Responses:
+    positions_mm = np.random.default_rng(0).uniform(-14, 14, (presses, 2))
+    volts = 0.3 - 0.5 * signals(PLAN, PLAN.to_grid(transform.to_plan(positions_mm)), contact)
+    return Responses(positions_mm, volts, np.random.default_rng(1).uniform(size=volts.shape) < 0.95)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_fit_contact_recovers_scale_and_shares(base: Base) -> None:
+    stated = Contact(base=base)
+    pressed = Contact(base=base, scale=1.15, squeeze=0.7, stretch=1.3)
+    responses = press(pressed, PlanTransform(True, 3.0, (1.0, -0.5), 1.02))
+    training, held_out = responses.select(np.arange(150)), responses.select(np.arange(150, 200))
+    pad = AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), (0, 1, 2, 3), PlanTransform(True), 0.5)
+    noise_v = 0.05 * np.sqrt(training.variance)
+    fit = fit_contact(pad, stated, training, held_out, noise_v)
+    assert fit.scale == pytest.approx(1.15, abs=0.03)
+    assert (fit.squeeze, fit.stretch) == pytest.approx((0.7, 1.3), abs=0.1)
+    assert fit.explained > 0.995
+    assert 0 < fit.scale_std < 0.1 > fit.shares_std > 0
+    gaussian = fit_contact(pad, Contact(model="profile"), training, held_out, noise_v)
+    assert gaussian.explained < fit.explained
+    assert gaussian.shares_std == 0
+
+
+def test_elements_of_a_pad_sum_to_its_lengths_and_follow_its_offsets() -> None:
+    plan = PadPlan.from_morphology(PLAN)
+    pad = AsBuiltPad.from_plan(plan, (2, 0), PlanTransform(), 0.5)
+    middles, lengths, tangents = pad.elements(0)
+    assert lengths == pytest.approx(plan.lengths[2])
+    assert tangents == pytest.approx(plan.tangents[2])
+    pad = pad.with_values(pad.values + 0.05 * np.random.default_rng(0).standard_normal(pad.values.size))
+    middles, weighted, tangents = pad.elements(0)
+    steps = np.gradient(middles, axis=0)[1:-1]
+    lengths = np.hypot(*steps.T)
+    assert tangents[1:-1] == pytest.approx(steps / lengths[:, None], abs=0.1)
+    assert weighted[1:-1] == pytest.approx(lengths * pad.path(0)[1][1:-1], rel=0.1)
