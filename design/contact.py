@@ -148,7 +148,7 @@ def press_forces_n(
     """
     contact, depths_mm = _check_depths(contact, depths_mm)
     modulus_kpa = check_float("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
-    forces = [_press(pressed).force_n(modulus_kpa) for pressed in _depth_steps(contact)]
+    forces = [contact_press(pressed).force_n(modulus_kpa) for pressed in _depth_steps(contact)]
     return _depth_weights(depths_mm, contact) @ np.array(forces)
 
 
