@@ -13,7 +13,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from padforge.design import Contact, Morphology
-from padforge.design.contact import relative_stretch
+from padforge.design.contact import DEPTH_STEPS, indented_signals, relative_stretch
+from padforge.design.paths.curves import lengths
 from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
 
@@ -55,11 +56,14 @@ def resistance_changes(pad: Morphology, positions_mm: Array, depths_mm: Array, c
     presses = pad.to_grid(positions_mm)
     if contact.model != "layer":
         return WEIGHT_GAUGE_FACTOR / FULL_DEPTH_MM * depths_mm[:, None] * relative_stretch(pad, presses, contact)
+    depths = np.unique(depths_mm).tolist()
+    pressed = [Contact(**contact.model_dump() | {"depth_mm": depth_mm}) for depth_mm in depths]
+    if len(depths) > DEPTH_STEPS:
+        return GAUGE_FACTOR * indented_signals(pad, presses, depths_mm, pressed[-1]) / lengths(pad)
     changes = np.empty((len(presses), len(pad.knots)))
-    for depth_mm in np.unique(depths_mm).tolist():
+    for depth_mm, at_depth in zip(depths, pressed, strict=True):
         rows = depths_mm == depth_mm
-        pressed = Contact(**contact.model_dump() | {"depth_mm": depth_mm})
-        changes[rows] = GAUGE_FACTOR * relative_stretch(pad, presses[rows], pressed)
+        changes[rows] = GAUGE_FACTOR * relative_stretch(pad, presses[rows], at_depth)
     return changes
 
 
