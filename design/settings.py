@@ -193,7 +193,7 @@ class Contact(Settings):
         model: "layer" if no key of another model is stated.
         tool: "dome" is a paraboloid of that tip radius, "finger" one as soft as the pad, "flat" the end of a rod.
         depth_mm: of the tool's tip, less than the thickness.
-        base: "bonded" where friction or glue holds the pad on what it lies on, "slipping" where nothing does.
+        base: "slipping" where the pad lies on a table, as the readings of the built pad say; "bonded" where it is glued.
         fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed.
             This and the thickness are of the mould, pressed on the side of its tracks, where a settings file does not
             state them (`read_contact`).
@@ -211,7 +211,7 @@ class Contact(Settings):
     tool_radius_mm: float = Field(default=8.4, ge=0.1, le=1000, description="tip radius of the tool, mm")
     depth_mm: float = Field(default=5.0, ge=0.01, le=100, description="depth of the press, of a layer, mm")
     thickness_mm: float = Field(default=SILICONE_MM, ge=0.1, le=1000, description="thickness of the pad, mm")
-    base: Literal["bonded", "slipping"] = Field(default="bonded", description="what the pad does on what it lies on")
+    base: Literal["bonded", "slipping"] = Field(default="slipping", description="what the pad does on what it lies on")
     fibre_depths_mm: Annotated[FibreDepths, BeforeValidator(as_tuple)] = Field(
         default=FIBRE_DEPTHS_MM, description="depth of the [horizontal, vertical] fibres below the pressed face, mm"
     )

@@ -78,7 +78,7 @@ def test_section_refusals_name_key_value_and_limits(model, table, message):
 def test_defaults_are_those_of_the_built_pad_and_its_mould():
     layer = {
         **{"model": "layer", "tool": "dome", "tool_radius_mm": 8.4, "depth_mm": 5.0, "thickness_mm": 6.0},
-        **{"base": "bonded", "fibre_depths_mm": (1.05, 0.25), "squeeze": 1.0, "stretch": 1.0, "scale": 1.0},
+        **{"base": "slipping", "fibre_depths_mm": (1.05, 0.25), "squeeze": 1.0, "stretch": 1.0, "scale": 1.0},
     }
     shape = {"radius": 0.6, "sides": 30, "weight": "uniform"}
     assert Contact().model_dump() == {

@@ -14,7 +14,7 @@ from padforge.sense.formats.ros_recording import export_bag
 @pytest.fixture(scope="session")
 def eight() -> Recording:
     """Eight presses: one without position, one without depth, one without force; some readings are missing."""
-    plain = simulate(Morphology.straight(2), RigSettings(presses=8, depths_mm=(1.0, 2.3, 0.7)))
+    plain = simulate(Morphology.straight(2), RigSettings(presses=8, depths_mm=(3.0, 4.3, 2.7)))
     readings, positions, depths = (np.array(each) for each in (plain.readings, plain.presses_mm, plain.depths_mm))
     readings[5, 1] = readings[70] = positions[2] = depths[3] = np.nan
     forces = np.linspace(0, 3, 8) ** 2 / 7

@@ -57,7 +57,7 @@ def test_detect_presses_of_the_published_recording(published: Path) -> None:
         *[(4, RigSettings(presses=150, noise_mv=noise_mv)) for noise_mv in (1.6, 5)],
         *[(4, RigSettings(presses=150, hysteresis=share, creep=0.8 * share)) for share in (0.5, 0)],
         (4, RigSettings(presses=150, drift_mv=150)),
-        (4, RigSettings(presses=150, depth_mm=1)),
+        (4, RigSettings(presses=150, depth_mm=2.5)),
         *[(4, RigSettings(presses=150, rate_hz=rate, readings_per_press=n)) for rate, n in ((13.3, 12), (5, 20))],
         (4, RigSettings(presses=60, rate_hz=100, readings_per_press=200)),
         (4, RigSettings(presses=20, rate_hz=1000, readings_per_press=2000)),
