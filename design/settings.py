@@ -193,7 +193,7 @@ class Contact(Settings):
         model: "layer" if no key of another model is stated.
         tool: "dome" is a paraboloid of that tip radius, "finger" one as soft as the pad, "flat" the end of a rod.
         depth_mm: of the tool's tip, less than the thickness.
-        base: "slipping" where the pad lies on a table, as the readings of the built pad say; "bonded" where it is glued.
+        base: "slipping" where the pad lies on a table, as the built pad says; "bonded" where it is glued.
         fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed.
             This and the thickness are of the mould, pressed on the side of its tracks, where a settings file does not
             state them (`read_contact`).
