@@ -79,25 +79,33 @@ def runs(text: str) -> Iterator[Run]:
         yield Run(block["body"], shown, begin, int(share[1]) / 100 if share else 0.0, "numbers vary" in how)
 
 
-def kinds(text: str) -> set[str]:
-    """Lines without their numbers and lists of numbers, each once."""
-    return {" ".join(re.sub(r"#(?:, #)*", "#", NUMBER.sub("#", line)).split()) for line in text.strip().splitlines()}
-
-
-def difference(shown: str, printed: str, share: float) -> str:
+def difference(block: Run, printed: str) -> str:
     """Where what is printed differs from what a page shows; empty if it does not."""
-    pages, prints = (SECONDS.sub("# s", text).strip().splitlines() for text in (shown, printed))
+    pages, prints = (SECONDS.sub("# s", text).strip().splitlines() for text in (block.shown, printed))
+    if block.varies:
+        odd = {kind(line) for line in pages} ^ {kind(line) for line in prints}
+        return f"{sorted(odd)} are lines of the page or printed, not both" if odd else ""
     if len(pages) != len(prints):
         return f"{len(prints)} lines, the page has {len(pages)}"
     for page, line in zip(pages, prints, strict=True):
-        if not (page.rstrip() == line.rstrip() or (share and alike(page, line, share))):
+        if not (page.rstrip() == line.rstrip() or (block.share and alike(page, line, block.share))):
             return f"{line!r}, the page has {page!r}"
     return ""
 
 
+def masked(line: str) -> str:
+    """A line without its numbers, and with single spaces."""
+    return " ".join(NUMBER.sub("#", line).split())
+
+
+def kind(line: str) -> str:
+    """A line without its numbers and lists of numbers."""
+    return re.sub(r"#(?:, #)*", "#", masked(line))
+
+
 def alike(page: str, line: str, share: float) -> bool:
     """Whether two lines differ by their decimals alone, and these by no more than a share of them."""
-    if NUMBER.sub("#", page).split() != NUMBER.sub("#", line).split():
+    if masked(page) != masked(line):
         return False
     for one, other in zip(NUMBER.findall(page), NUMBER.findall(line), strict=True):
         chances = one.startswith("1e") and other.startswith("1e")
@@ -140,11 +148,7 @@ def follow(page: Path, folder: Path) -> str:
     moved = 0
     for block in blocks:
         printed = run(block.commands, folder)
-        if block.varies:
-            odd = kinds(block.shown) ^ kinds(printed)
-            wrong = f"{sorted(odd)} are lines of the page or printed, not both" if odd else ""
-        else:
-            wrong = difference(block.shown, printed, block.share)
+        wrong = difference(block, printed)
         if wrong and not REWRITE:
             return f"{relative(page)}: {block.commands}printed {wrong}"
         if wrong and block.begin >= 0:
