@@ -49,6 +49,9 @@ THICK = 4.0
 FIBRE_BLUR_MM = 0.1
 """Standard deviation of a Gaussian by which strains are averaged, about that of the width of a fibre, 0.3 mm: it does
 not follow the step of the strains at the edge of the contact, which signals, their integrals, hardly show."""
+FAR_BLUR = 1 / 30
+"""The same half a radius and more beyond the contact's edge, as a share of its radius: strains are smooth there, and
+change by 4e-4 of the largest."""
 NEAR_POINTS, FAR_POINTS = 300, 100
 """Distances at which strains are computed, up to half a radius beyond the contact's edge and further out."""
 DEPTH_STEPS = 16
@@ -337,9 +340,13 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     fade = fade * fade * (3 - 2 * fade)
     families = []
     for depth_mm in contact.fibre_depths_mm:
-        strains = press.strains(distance, contact.thickness_mm - depth_mm, FIBRE_BLUR_MM)
-        plain = contact.squeeze * strains.compressive + contact.stretch * strains.hoop
-        directed = contact.stretch * (strains.radial - strains.hoop)
+        height_mm = contact.thickness_mm - depth_mm
+        near = press.strains(distance[:NEAR_POINTS], height_mm, FIBRE_BLUR_MM)
+        far_blur_mm = max(FIBRE_BLUR_MM, FAR_BLUR * press.contact_radius_mm)
+        far = press.strains(distance[NEAR_POINTS:], height_mm, far_blur_mm)
+        compressive, radial, hoop = (np.concatenate(parts) for parts in zip(near, far, strict=True))
+        plain = contact.squeeze * compressive + contact.stretch * hoop
+        directed = contact.stretch * (radial - hoop)
         directed[0] = 0.0  # to rounding, by symmetry
         families.append((contact.scale * distance, fade * plain, fade * directed))
     return tuple(families)

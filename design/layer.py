@@ -128,8 +128,9 @@ class LayerPress:
         depth = self.thickness_mm - height_mm
         # k depth + k^2 blur^2 / 2 = _DECAY
         largest = 2 * _DECAY / (depth + math.sqrt(depth**2 + 2 * _DECAY * blur_mm**2))
-        # panels of ten radians of the fastest oscillation, and twenty of what the layer itself does
-        panels = 20 + math.ceil(largest * (self.contact_radius_mm + farthest_mm) / 10)
+        # panels of up to 24 radians of the fastest oscillation, which 16 nodes follow to 1e-10, and at least twenty of
+        # what the layer itself does
+        panels = 20 + math.ceil(largest * (self.contact_radius_mm + farthest_mm) / 24)
         nodes, weights = _gauss(16)
         k = (largest / panels * (np.arange(panels)[:, None] + nodes)).ravel()
         weight = np.tile(largest / panels * weights, panels)
