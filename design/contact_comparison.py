@@ -16,7 +16,7 @@ from padforge.design.common.profiling import stage
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.networks import SimulatedPresses
-from padforge.design.objectives.expected_error import straight_full_scale
+from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import (
     MEASURED_PROFILE,
@@ -103,6 +103,7 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
     """Simulate presses with scattered responses, by the same draws for every pad of as many fibres."""
     rng = np.random.default_rng([3, seed])
     scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
+    scatter = scatter_of_full_scale(scatter, contact, scale)
 
     def respond(positions: Array) -> Array:
         stretch = relative_stretch(pad, positions, contact) / scale

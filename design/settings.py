@@ -439,7 +439,9 @@ class SearchSettings(Settings):
     """`[search]`: how the fibres are optimised.
 
     Attributes:
-        noise: additive scatter; this and the next two default to the scatter measured on a built pad.
+        noise: additive scatter; this and the next two default to the scatter measured on a built pad. It is a share of
+            the full scale of straight fibres: of the default pad under the default press for a layer, whose responses
+            are strains, of the pad itself for other contacts, whose responses have no unit.
         contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
     """
 

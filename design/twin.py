@@ -227,7 +227,7 @@ class Twin:
         for fibre, path in enumerate(self.as_built_mm):
             if path is not None:
                 sensitivity = None if self.sensitivity is None else self.sensitivity[fibre]
-                out[:, fibre] = sum_elements(*_cut(self.morphology.to_grid(path), sensitivity), presses, law)
+                out[:, fibre] = sum_elements(*_cut(self.morphology.to_grid(path), sensitivity), presses, law, 0)
         return out / lengths(self.morphology)
 
     @classmethod

@@ -290,11 +290,19 @@ def find_stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: 
 
 @njit(cache=True, error_model="numpy")
 def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
-    """Return the signal of a stretch inside the press, split at the kink of the 1/d weight."""
+    """Return the signal of a stretch inside the press, split where the weight bends or may be missed.
+
+    That is at the kink of the 1/d weight, or at the edge of a contact and abreast of the press.
+    """
     roots, work, p, stack, _ = scratch
-    if law.weight != INVERSE:
+    circle = law.radius / 100 if law.weight == INVERSE else law.edge
+    if circle == 0:
         return _integrate_stretch(span, a, b, law, stack)
-    count = find_circle_roots(span, a, b, law.radius / 100, roots, np.int64(0), work, p)
+    count = find_circle_roots(span, a, b, circle, roots, np.int64(0), work, p)
+    if law.weight == PROFILE and a < 0 < b:
+        roots[count] = 0.0
+        count += 1
+        shell_sort(roots, count)
     total, begin = 0.0, a
     for i in range(count):
         total += _integrate_stretch(span, begin, roots[i], law, stack)

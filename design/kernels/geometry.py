@@ -15,7 +15,11 @@ Array = NDArray[np.float64]
 EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
-NO_PROFILE, NO_BINS = np.empty((2, 0, 9)), np.empty(0, np.int32)
+DEGREE = 7
+"""Degree of the polynomials of a profile; a layer has one for as many intervals of its distances, a spline is cubic."""
+PLAIN, DIRECTED, COLUMNS = 1, 2 + DEGREE, 3 + 2 * DEGREE
+"""First columns of the coefficients of w and v in a row of a profile, and their number."""
+NO_PROFILE, NO_BINS = np.empty((2, 0, COLUMNS)), np.empty(0, np.int32)
 MAX_BINS = 1 << 15
 
 
@@ -33,17 +37,18 @@ class WeightLaw(NamedTuple):
 
     A profile is w(d) + v(d) cos^2 phi, with d the distance to the press centre and phi the angle between the fibre and
     the way there; v is 0 at d = 0. It has a table for each family, whose fibres may lie at another depth: rows of a
-    squared distance, and the coefficients of the cubics w and v in the excess over it, up to the next row's.
+    squared distance, and the coefficients of the polynomials w and v in the excess over it, up to the next row's.
     """
 
     radius: float  # circumradius of the shape, or the distance at which a profile ends
     weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
     length: int  # MANHATTAN or EUCLIDEAN
-    profile: Array = NO_PROFILE  # shape (2, B, 9), or (B, 9) in the frame of a family
+    profile: Array = NO_PROFILE  # shape (2, B, COLUMNS), or (B, COLUMNS) in the frame of a family
     bins: NDArray[np.int32] = NO_BINS  # row of the profile at the begin of each of equal steps of the squared distance
     bin_rate: float = 0.0  # steps per squared distance
     directional: bool = False  # whether v counts
     near: float = math.inf  # distance beyond which the profile is so smooth that a coarse quadrature serves
+    edge: float = 0.0  # distance at which the profile bends most, the edge of a contact; 0 if there is none
 
 
 @njit(cache=True, error_model="numpy")
@@ -67,6 +72,26 @@ def find_row(square: float, profile: Any, law: Any) -> int:
 
 
 @njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
+    """Return a polynomial of a profile, PLAIN or DIRECTED, at the excess x over the squared distance of its row."""
+    c, square = column, x * x
+    low = profile[row, c] + x * (profile[row, c + 1] + x * (profile[row, c + 2] + x * profile[row, c + 3]))
+    high = profile[row, c + 4] + x * (profile[row, c + 5] + x * (profile[row, c + 6] + x * profile[row, c + 7]))
+    return low + square * square * high
+
+
+@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+def differentiate_row(profile: Any, row: int, column: int, x: float) -> float:
+    """Return the derivative of `evaluate_row` by x."""
+    c, square = column, x * x
+    low = profile[row, c + 1] + x * (2 * profile[row, c + 2] + 3 * x * profile[row, c + 3])
+    high = 4 * profile[row, c + 4] + x * (
+        5 * profile[row, c + 5] + x * (6 * profile[row, c + 6] + 7 * x * profile[row, c + 7])
+    )
+    return low + square * x * high
+
+
+@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
 def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
     """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
     square = dt * dt + dv * dv
@@ -74,12 +99,10 @@ def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law:
         return 0.0
     i = find_row(square, profile, law)
     x = square - profile[i, 0]
-    weight = profile[i, 1] + x * (profile[i, 2] + x * (profile[i, 3] + x * profile[i, 4]))
+    weight = evaluate_row(profile, i, PLAIN, x)
     if law.directional and square > 0:
         along = dt * ut + dv * uv
-        weight += (profile[i, 5] + x * (profile[i, 6] + x * (profile[i, 7] + x * profile[i, 8]))) * (
-            along * along / square
-        )
+        weight += evaluate_row(profile, i, DIRECTED, x) * (along * along / square)
     return weight
 
 
@@ -92,15 +115,16 @@ def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> floa
     return weigh_profile(t, v, run / norm, rise / norm, law.profile, law)
 
 
-def profile_law(length: int, families: tuple[tuple[Array, Array, Array], ...], near: float = math.inf) -> WeightLaw:
+def profile_law(
+    length: int, families: tuple[tuple[Array, Array, Array], ...], near: float = math.inf, edge: float = 0.0
+) -> WeightLaw:
     """Return the law of profiles by their (distances, weights w, weights v), once for both families or for each.
 
-    All have the same distances; both functions are a `profile_spline` through them.
+    All have the same distances. Both functions are a `profile_spline` through them, or with an edge polynomials of the
+    squared distance through every DEGREE + 1 of them, each of which begins where the last one ends.
     """
-    tables = []
-    for distance, plain, directed in families:
-        splines = [profile_spline(distance, values) for values in (plain, directed)]
-        tables.append(np.column_stack([splines[0].x[:-1], *(spline.c[::-1].T for spline in splines)]))
+    fit = _fit_polynomials if edge else _fit_splines
+    tables = [fit(*family) for family in families]
     profile = np.ascontiguousarray(np.stack([tables[0], tables[-1]]))
     end, starts = float(families[0][0][-1]), profile[0, :, 0]
     finest = float(np.diff(np.append(starts, end**2)).min())
@@ -108,7 +132,27 @@ def profile_law(length: int, families: tuple[tuple[Array, Array, Array], ...], n
     # a row that begins at a step's begin, to rounding, is its row
     bins = np.searchsorted(starts, np.arange(steps + 1) * (end**2 / steps) * (1 + 1e-12), side="right") - 1
     directional = any(bool(np.any(directed)) for _, _, directed in families)
-    return WeightLaw(end, PROFILE, length, profile, bins.astype(np.int32), steps / end**2, directional, near)
+    return WeightLaw(end, PROFILE, length, profile, bins.astype(np.int32), steps / end**2, directional, near, edge)
+
+
+def _fit_splines(distance: Array, plain: Array, directed: Array) -> Array:
+    """Return the rows (n - 1, COLUMNS) of splines through weights at distances, all (n,)."""
+    rows = np.zeros((len(distance) - 1, COLUMNS))
+    for column, weight in ((PLAIN, plain), (DIRECTED, directed)):
+        spline = profile_spline(distance, weight)
+        rows[:, 0], rows[:, column : column + 4] = spline.x[:-1], spline.c[::-1].T
+    return rows
+
+
+def _fit_polynomials(distance: Array, plain: Array, directed: Array) -> Array:
+    """Return the rows (B, COLUMNS) of polynomials through weights at distances, all (DEGREE B + 1,)."""
+    index = DEGREE * np.arange(len(distance) // DEGREE)[:, None] + np.arange(DEGREE + 1)
+    squares = distance[index] ** 2
+    start, width = squares[:, :1], squares[:, -1:] - squares[:, :1]
+    powers = ((squares - start) / width)[..., None] ** np.arange(DEGREE + 1)
+    weights = np.stack([plain[index], directed[index]], axis=-1)
+    coefficients = np.linalg.solve(powers, weights) / width[..., None] ** np.arange(DEGREE + 1)[:, None]
+    return np.column_stack([start, coefficients[..., 0], coefficients[..., 1]])
 
 
 @lru_cache(maxsize=64)
@@ -145,8 +189,8 @@ def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], 
 def select_frame(shape: Any, family: int) -> Any:
     """Return a shape (chains and extents in both frames, law) in the frame of one family."""
     chains, extents, law = shape
-    profile = law.profile[family]
-    framed = WeightLaw(law.radius, law.weight, law.length, profile, law.bins, law.bin_rate, law.directional, law.near)
+    table = law.profile[family], law.bins, law.bin_rate, law.directional
+    framed = WeightLaw(law.radius, law.weight, law.length, *table, law.near, law.edge)
     return (chains[0] if family == 0 else chains[1]), extents[family], framed
 
 

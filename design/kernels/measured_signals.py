@@ -13,24 +13,33 @@ from numba import njit
 from numpy.typing import NDArray
 
 from padforge.design.kernels.exact_gradient import differentiate_cubic
-from padforge.design.kernels.geometry import MANHATTAN, WeightLaw, find_row, weigh_profile
+from padforge.design.kernels.geometry import (
+    DIRECTED,
+    MANHATTAN,
+    PLAIN,
+    WeightLaw,
+    differentiate_row,
+    evaluate_row,
+    find_row,
+    weigh_profile,
+)
 from padforge.design.kernels.pchip import extremes
 
 Array = NDArray[np.float64]
 
 PRECISION = 5e-5
 """Error of signals here, as a share of the largest one: far below that of measured profiles."""
-LAYER_PRECISION = 4e-3
-"""Root of the mean squared error of signals of a layer, as a share of the largest one: a tenth of the noise. Strains of
-a shallow fibre step at the edge of the contact, and to resolve the step everywhere would take five times as long."""
+LAYER_PRECISION, FINE_PRECISION = 4e-3, 3e-4
+"""Root of the mean squared error of signals of a layer, as a share of the largest one, in a search, a fifth of the
+noise, and where a pad is evaluated: strains of a shallow fibre step at the edge of the contact, and to resolve the step
+takes twice as long."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 _LAYER_NODES, _LAYER_WEIGHTS = np.polynomial.legendre.leggauss(5)
 _LAYER_NODES, _LAYER_WEIGHTS = (1 + _LAYER_NODES) / 2, _LAYER_WEIGHTS / 2
-_FAR_NODES, _FAR_WEIGHTS = np.polynomial.legendre.leggauss(2)
-_FAR_NODES, _FAR_WEIGHTS = (1 + _FAR_NODES) / 2, _FAR_WEIGHTS / 2
-FAR_SPACING = 0.4
-"""Spacing of elements beyond `WeightLaw.near`, as a share of that distance."""
+_FAR_NODES, _FAR_WEIGHTS = np.array([0.5]), np.array([1.0])
+FAR_SPACING = 0.5
+"""Spacing of elements beyond `WeightLaw.near` in a search, as a share of that distance; by the midpoint rule."""
 MAX_REFINEMENTS = 24
 """Refinements of the spacing by a fifth, from a quarter of the profile on; a steep profile needs them."""
 MAX_PIECES = 512
@@ -52,12 +61,17 @@ class Elements(NamedTuple):
     weight: Array  # quadrature weight, as a share of the span
 
 
-def element_spacing(law: WeightLaw) -> float:
-    """Return the largest spacing at which straight fibres of both families are within PRECISION, by their profiles."""
-    return min(_spacing(profile, law) for profile in law.profile[: 1 + int((law.profile[0] != law.profile[1]).any())])
+def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
+    """Return the largest spacing at which straight fibres of both families are precise, and that of far elements.
+
+    The error, as a share of the largest signal, is at most `precision`; of a layer it is the root of its mean square.
+    """
+    families = law.profile[: 1 + int((law.profile[0] != law.profile[1]).any())]
+    far = FAR_SPACING * law.near * math.sqrt(precision / LAYER_PRECISION)
+    return min(_spacing(profile, law, precision) for profile in families), far
 
 
-def _spacing(profile: Array, law: WeightLaw) -> float:
+def _spacing(profile: Array, law: WeightLaw, precision: float) -> float:
     end = law.radius
     distances, shifts = end * np.arange(32) / 32, np.arange(16)[:, None] / 16
     rule, weights = (_LAYER_NODES, _LAYER_WEIGHTS) if law.directional else (_NODES, _WEIGHTS)
@@ -75,7 +89,7 @@ def _spacing(profile: Array, law: WeightLaw) -> float:
         signals = straight_signals(spacing)
         reference = signals.mean(axis=1, keepdims=True)  # far more precise than any one of them
         error, largest = np.abs(signals - reference), np.abs(reference).max()
-        if (math.sqrt((error**2).mean()) / LAYER_PRECISION if law.directional else error.max() / PRECISION) <= largest:
+        if (math.sqrt((error**2).mean()) if law.directional else error.max()) <= precision * largest:
             break
         spacing *= 0.8
     return spacing
@@ -147,15 +161,15 @@ def _place_elements(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def fibre_elements(
-    along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacing: float
+    along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacings: tuple[float, float]
 ) -> Any:
-    """Cut one pad's spans into `Elements` `spacing` apart, except spans beyond the profile of every press."""
+    """Cut one pad's spans into `Elements`, near and far ones, except spans beyond the profile of every press."""
     low, high = np.empty((2, 2)), np.empty((2, 2))  # of presses near a span, and of all
     for axis in range(2):
         least, largest = extremes(presses[:, axis])
         for i, reach in enumerate((min(law.near, law.radius), law.radius)):
             low[i, axis], high[i, axis] = least - reach, largest + reach
-    curves, far_spacing = (along, across, slope, horizontals), FAR_SPACING * law.near
+    curves, (spacing, far_spacing) = (along, across, slope, horizontals), spacings
     nodes, weights = (_LAYER_NODES, _LAYER_WEIGHTS) if law.directional else (_NODES, _WEIGHTS)
     pieces, starts = _count_elements(*curves, low[0], high[0], len(nodes), spacing, np.int64(0))
     total = starts[-1, -1]
@@ -189,27 +203,28 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
                 visited += 1
-                first = elements.starts if _is_near(t, v, j, ct, cv, law.near) else elements.far_starts
-                for k in range(first[f, j], first[f, j + 1]):
+                begin, after = elements.far_starts[f, j], elements.far_starts[f, j + 1]
+                if _is_near(t, v, j, ct, cv, law.near):
+                    begin, after = elements.starts[f, j], elements.starts[f, j + 1]
+                for k in range(begin, after):
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
                     if square < end * end:
                         i = find_row(square, profile, law)
                         x = square - profile[i, 0]
-                        weight = profile[i, 1] + x * (profile[i, 2] + x * (profile[i, 3] + x * profile[i, 4]))
+                        weight = evaluate_row(profile, i, PLAIN, x)
                         if law.directional and square > 0:
                             way = dt * elements.tangent_along[k] + dv * elements.tangent_across[k]
-                            directed = profile[i, 5] + x * (profile[i, 6] + x * (profile[i, 7] + x * profile[i, 8]))
-                            weight += directed * (way * way / square)
+                            weight += evaluate_row(profile, i, DIRECTED, x) * (way * way / square)
                         total += elements.length[k] * weight
             out[q, f] = total
     return visited
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any) -> Any:
+def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any, family: int) -> Any:
     """Sum the weights of E elements for each press (Q,), by their points (E, 2), lengths (E,) and tangents (E, 2)."""
-    out, profile = np.zeros(len(presses)), law.profile[0]
+    out, profile = np.zeros(len(presses)), law.profile[family]
     for q in range(len(presses)):
         for k in range(len(length)):
             dt, dv = points[k, 0] - presses[q, 0], points[k, 1] - presses[q, 1]
@@ -235,25 +250,26 @@ def _differentiate_elements(
             for j in range(n - 1 if bottom - end < cv < top + end else 0):
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
-                first = elements.starts if _is_near(t, v, j, ct, cv, law.near) else elements.far_starts
-                for k in range(first[f, j], first[f, j + 1]):
+                begin, after = elements.far_starts[f, j], elements.far_starts[f, j + 1]
+                if _is_near(t, v, j, ct, cv, law.near):
+                    begin, after = elements.starts[f, j], elements.starts[f, j + 1]
+                for k in range(begin, after):
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
                     if square < end * end:
                         i = find_row(square, profile, law)
                         x, up_length = square - profile[i, 0], up * elements.length[k]
-                        radial_derivative = (
-                            2 * up_length * (profile[i, 2] + x * (2 * profile[i, 3] + 3 * x * profile[i, 4]))
-                        )
-                        weight = profile[i, 1] + x * (profile[i, 2] + x * (profile[i, 3] + x * profile[i, 4]))
+                        radial_derivative = 2 * up_length * differentiate_row(profile, i, PLAIN, x)
+                        weight = evaluate_row(profile, i, PLAIN, x)
                         if law.directional and square > 0:
                             ut, uv = elements.tangent_along[k], elements.tangent_across[k]
-                            directed = profile[i, 5] + x * (profile[i, 6] + x * (profile[i, 7] + x * profile[i, 8]))
-                            rate = profile[i, 6] + x * (2 * profile[i, 7] + 3 * x * profile[i, 8])
-                            way = (dt * ut + dv * uv) / square
+                            directed = evaluate_row(profile, i, DIRECTED, x)
+                            rate = differentiate_row(profile, i, DIRECTED, x)
+                            inverse = 1 / square
+                            way = (dt * ut + dv * uv) * inverse
                             cosine_square = way * way * square
                             weight += directed * cosine_square
-                            radial_derivative += 2 * up_length * cosine_square * (rate - directed / square)
+                            radial_derivative += 2 * up_length * cosine_square * (rate - directed * inverse)
                             turn = 2 * up_length * directed * way
                             out[k, 0] += turn * ut
                             out[k, 1] += turn * uv

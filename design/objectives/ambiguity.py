@@ -16,9 +16,7 @@ import numpy as np
 from numba import njit
 
 from padforge.design.common.validation import InputError
-from padforge.design.contact import element_spacing, fibre_axes, grid_positions, press_shape, relative_stretch, signals
-from padforge.design.kernels.measured_signals import element_signals, fibre_elements
-from padforge.design.kernels.pchip import population_slopes
+from padforge.design.contact import grid_positions, quick_signals, relative_stretch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares, failure_subsets
 from padforge.design.paths.curves import lengths
@@ -98,7 +96,7 @@ def ambiguity_map(
     Each of the `presses` (Q, 2) may be taken for any other. Signals are exact, but for a layer or a profile within the
     PRECISION of `measured_signals`; `noise` is a share of full scale.
     """
-    stretch = _fast_signals(pad, presses, contact) / lengths(pad)
+    stretch = quick_signals(pad, presses, contact) / lengths(pad)
     largest = stretch.max(axis=0)
     scale = largest[largest > 0].mean() if largest.any() else 1.0
     fibres = stretch.shape[1]
@@ -109,20 +107,6 @@ def ambiguity_map(
     values = _press_ambiguities(np.ascontiguousarray(stretch / (2 * noise * scale)), presses, failed)
     ends = np.cumsum([len(level) for level in subsets])
     return np.stack([level.mean(axis=1) for level in np.split(values, ends[:-1], axis=1)])
-
-
-def _fast_signals(pad: Morphology, presses: Array, contact: Contact) -> Array:
-    """Return signals (Q, F) as precise as a search needs them, without torch."""
-    if contact.model == "shape":
-        return signals(pad, presses, contact)
-    along, across, ends, _ = fibre_axes(pad)
-    slope = population_slopes(along, across)[0]
-    law = press_shape(contact, pad.unit_mm)[2]
-    spacing = element_spacing(contact, pad.unit_mm)
-    elements = fibre_elements(along[0], across[0], slope, ends.horizontals, presses, law, spacing)
-    out = np.empty((len(presses), len(slope)))
-    element_signals(along[0], across[0], elements, presses, law, out)
-    return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

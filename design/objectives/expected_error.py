@@ -64,6 +64,8 @@ and strongly curved pads: a network's mean error is below the root of a variance
 """
 EPSILON = 1e-12
 """Squared length, so that its root has a gradient at 0."""
+DEFAULT_FULL_SCALE = 0.182
+"""Full scale of straight fibres of the default pad under the default press, a relative stretch."""
 FULL_SCALE_SIDE = 24
 """Presses along a side by which the full scale of straight fibres is computed."""
 
@@ -92,6 +94,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
     windows = evaluation_windows(size.sensed)
     masks = [failure_masks(fibres, k, max(MAX_SETS * GRIDS // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
+    scatter = scatter_of_full_scale(search.response_scatter, contact, scale)
     errors: list[list[float]] = []  # by window, means over the sets of each size
     for window in windows:
         presses = window_presses(size, window, EVALUATION_SIDE, rng)
@@ -111,7 +114,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
             mask = torch.tensor(unique)
             partners = confusable(weighted[0], weighted[1], mask)
             responses, positions = torch.cat([near, far[:, partners]], dim=1)[touched], presses.with_partners(partners)
-            values = expected_error(responses, positions, step, free, mask, search.response_scatter, weights[touched])
+            values = expected_error(responses, positions, step, free, mask, scatter, weights[touched])
             errors[-1].append(float(values.numpy()[rows].mean()))
     return np.mean(errors, axis=0).tolist()
 
@@ -125,6 +128,17 @@ def straight_full_scale(layout: Layout, contact: Contact, sensed_mm: Sensed) -> 
         for rows in layout.families:
             largest[rows] = largest[rows].max(initial=0.0)
     return float(largest[largest > 0].mean()) if largest.any() else 1.0
+
+
+def scatter_of_full_scale(scatter: Scatter, contact: Contact, full_scale: float) -> Scatter:
+    """Return a scatter whose floor is a share of a full scale.
+
+    What a layer responds is a strain, and what it scatters by has nothing to do with how strong a press is: the floor
+    of `scatter` is a share of DEFAULT_FULL_SCALE. What other contacts respond has no unit: it is a share of their own.
+    """
+    return (
+        scatter._replace(floor=scatter.floor * DEFAULT_FULL_SCALE / full_scale) if contact.model == "layer" else scatter
+    )
 
 
 def kernel_weights(layout: Layout) -> Tensor:

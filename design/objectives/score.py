@@ -17,7 +17,7 @@ from torch import Tensor
 
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
-from padforge.design.contact import fibre_axes, serpentine_presses, signals, signals_quantized
+from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_presses, signals_quantized
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives import published as formula
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
@@ -63,7 +63,7 @@ class ScoredPad:
     @cached_property
     def serpentine_signals(self) -> Array:
         """(Q, F) signals of presses in an order of neighbours."""
-        return signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
+        return evaluated_signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
 
     @property
     def published_contact(self) -> Contact:

@@ -295,7 +295,7 @@ class GradientSearch:
         shares = failure_shares(search.max_failures)
         failures = sample_failures(pad.layout.fibres, shares, self.rng)
         step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, failures))
-        masks, scatter = masks.float(), search.response_scatter.scaled(noise_factor)
+        masks, stated_scatter = masks.float(), search.response_scatter.scaled(noise_factor)
         weights = objective.kernel_weights(pad.layout).float().to(search.device)
         total = torch.zeros((), device=search.device)
         for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
@@ -312,6 +312,7 @@ class GradientSearch:
                     near, far = (weights[:, None] * respond(x) for x in (presses.positions, presses.far))
                     positions = presses.with_partners(objective.confusable(near, far, masks))
             # 3. expected error, and the terms that `[search]` weighs
+            scatter = objective.scatter_of_full_scale(stated_scatter, contact, scale)
             responses, positions = respond(positions.numpy()), positions.to(search.device)
             errors = objective.expected_error(responses, positions, step, free, masks, scatter, weights)
             total = total + objective.aggregate_failures(errors, masks, shares)

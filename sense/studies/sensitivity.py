@@ -20,7 +20,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.contact import relative_stretch, signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import SimulatedPresses, fit_batch
-from padforge.design.objectives.expected_error import straight_full_scale
+from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
 from padforge.design.settings import Contact, SearchSettings
 from padforge.sense.arrays import Array
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
@@ -116,18 +116,19 @@ def _name(contact: Contact) -> str:
 def _evaluate(pad: Morphology, stated: Contact, trained: Contact, objects: list[Contact], seed: int) -> State:
     """Compute mean errors (MEMBERS, objects), grid units, of networks trained with one object.
 
-    The noise of a layer's responses is a share of the full scale of the stated contact, whatever presses.
+    The noise of a layer's responses is the same whatever presses.
     """
     rng = np.random.default_rng([5, seed])
     rngs, noise_rng = rng.spawn(MEMBERS), rng.spawn(1)[0]
     full_scale = straight_full_scale(pad.layout, stated, "fibres")
+    scatter = scatter_of_full_scale(SCATTER, stated, full_scale)
 
     def respond(positions: Array, contact: Contact) -> Array:
         if contact.model == "shape":
             return signals(pad, positions, contact)
         stretch = relative_stretch(pad, positions, contact) / full_scale
-        noise = SCATTER.floor * noise_rng.standard_normal(stretch.shape)
-        return stretch * SCATTER.sample_gains(stretch.shape, noise_rng) + noise
+        noise = scatter.floor * noise_rng.standard_normal(stretch.shape)
+        return stretch * scatter.sample_gains(stretch.shape, noise_rng) + noise
 
     presses = SimulatedPresses.simulate(pad, SIDE, TEST, seed, partial(respond, contact=trained))
     networks = fit_batch(presses.train_signals, presses.train_positions, rngs, HIDDEN)

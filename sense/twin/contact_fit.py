@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from padforge.design.contact import profile_weights
-from padforge.design.kernels.geometry import EUCLIDEAN, profile_law
+from padforge.design.contact import profile_law
 from padforge.design.kernels.measured_signals import sum_elements
 from padforge.design.settings import Contact
 from padforge.design.twin import PlanTransform
@@ -109,16 +108,8 @@ class _Signals:
         if contact.model == "layer":
             shares = [{"squeeze": 1.0, "stretch": 0.0}, {"squeeze": 0.0, "stretch": 1.0}]
             parts = [contact.model_copy(update={"scale": 1.0, **share}) for share in shares]
-        laws = [
-            [profile_law(EUCLIDEAN, ((distance / layout.unit_mm, w, v),)) for distance, w, v in profile_weights(part)]
-            for part in parts
-        ]
-        self._pad = pad
-        self._channels = [
-            # a profile is the same for both families
-            (pad.elements(channel), [families[min(layout.family(fibre), len(families) - 1)] for families in laws])
-            for channel, fibre in enumerate(pad.fibres)
-        ]
+        self._pad, self._laws = pad, [profile_law(part, layout.unit_mm) for part in parts]
+        self._channels = [(pad.elements(channel), layout.family(fibre)) for channel, fibre in enumerate(pad.fibres)]
 
     def __call__(self, values: Array, positions_mm: Array) -> Array:
         turn, *shift, plan_scale, log_scale, share = values.tolist()
@@ -127,9 +118,9 @@ class _Signals:
         width = math.exp(log_scale)
         presses = np.ascontiguousarray(self._pad.plan.to_grid(transform.to_plan(positions_mm)) / width)
         signals = np.zeros((len(presses), len(self._channels)))
-        for c, ((points, lengths, tangents), laws) in enumerate(self._channels):
-            for law, weight in zip(laws, (1 - share, share) if len(laws) > 1 else (1.0,), strict=True):
-                signals[:, c] += weight * sum_elements(points / width, lengths, tangents, presses, law)
+        for c, ((points, lengths, tangents), family) in enumerate(self._channels):
+            for law, weight in zip(self._laws, (1 - share, share) if len(self._laws) > 1 else (1.0,), strict=True):
+                signals[:, c] += weight * sum_elements(points / width, lengths, tangents, presses, law, family)
         return signals
 
 

@@ -1,6 +1,7 @@
 """`pad.toml`: defaults, comments, refusals."""
 
 import tomllib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -236,7 +237,8 @@ def test_unstated_lengths_of_contact_are_those_of_the_mould(tables, thickness_mm
 
 
 def test_other_contacts_do_not_depend_on_the_mould():
-    for stated in ({"radius": 0.5}, {"model": "profile"}, {"sensitivity_profile": []}):
+    tables: list[dict[str, Any]] = [{"radius": 0.5}, {"model": "profile"}, {"sensitivity_profile": []}]
+    for stated in tables:
         assert read_contact(Spec({"contact": stated, "mould": {"silicone_mm": 8.0}})) == Contact(**stated)
 
 
