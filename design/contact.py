@@ -148,7 +148,7 @@ def indented_signals(
         contact: a layer, whose depth is the greatest one; `Contact()` if None.
 
     Returns:
-        Signals; shape (Q, F), grid units; those of `signals` within 0.5 % of the largest.
+        Signals; shape (Q, F), grid units; those of `signals` within 1 % of the largest.
 
     Raises:
         InputError: presses or depths of the wrong shape, not finite or out of range, or a contact that is no layer.

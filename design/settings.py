@@ -175,7 +175,7 @@ def _as_tuples(value: object) -> object:
     return tuple(as_tuple(item) for item in value) if isinstance(value, list | tuple) else value
 
 
-class Contact(Settings):
+class Contact(Settings, frozen=True):
     """`[contact]`: the contact model of a press, by which each fibre responds.
 
     The signal of a fibre is the line integral of a weight along it. The model "layer" computes the weight from the

@@ -6,7 +6,7 @@ import sys
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
@@ -29,10 +29,6 @@ class Settings(BaseModel):
             super().__init__(**values)
         except ValidationError as error:
             raise _to_input_error(error, type(self), f"[{self.section()}]") from error
-
-    if TYPE_CHECKING:  # frozen models have it
-
-        def __hash__(self) -> int: ...
 
     @model_validator(mode="before")
     @classmethod

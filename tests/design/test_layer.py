@@ -247,10 +247,11 @@ def test_contact_too_wide_for_the_layer_is_refused():
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 def test_pads_of_any_great_thickness_weigh_fibres_alike(base):
-    thick, thicker = (
-        profile_weights(Contact(thickness_mm=thickness, base=base, tool_radius_mm=2, depth_mm=0.5))
-        for thickness in (100, 1000)
-    )
+    def weigh(thickness: float) -> tuple[tuple[np.ndarray, ...], ...]:
+        contact = Contact(thickness_mm=thickness, base=base, tool_radius_mm=2, depth_mm=0.5)
+        return profile_weights(contact)
+
+    thick, thicker = weigh(100), weigh(1000)
     for (distance, plain, directed), (other, *weights) in zip(thick, thicker, strict=True):
         for weight, second in zip((plain, directed), weights, strict=True):
             np.testing.assert_allclose(weight, np.interp(distance, other, second), atol=0.05 * plain.max())

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import BarycentricInterpolator, PchipInterpolator
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.contact import fibre_axes, half_width_mm, profile_weights
+from padforge.design.kernels.geometry import DEGREE
 from padforge.design.kernels.measured_signals import LAYER_PRECISION
-from padforge.design.settings import BUILT_CONTACT, profile_spline
+from padforge.design.settings import BUILT_CONTACT
 from padforge.design.torch_signals import pchip_slopes, press_signals
 
 CONTACTS = {
@@ -26,10 +27,10 @@ CONTACTS = {
 
 
 def layer_oracle(pad, press, contact, fibre):
-    """One signal: adaptive quadrature on the PCHIP curve, in mm, by the family's splines."""
+    """One signal: adaptive quadrature on the PCHIP curve, in mm, by the polynomials through the family's weights."""
     axis = pad.layout.family(fibre)
     distance, *weights = profile_weights(contact)[axis]
-    plain, directed = (profile_spline(distance, values) for values in weights)
+    plain, directed = (panel_polynomials(distance**2, values) for values in weights)
     knots, centre = pad.unit_mm * pad.knots[fibre], pad.unit_mm * np.asarray(press)
     curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
     slope = curve.derivative()
@@ -46,6 +47,16 @@ def layer_oracle(pad, press, contact, fibre):
     parts = (np.linspace(*span, 5) for span in pairwise(knots[:, axis]))  # else `quad` takes steps too long
     spans = (part for ends in parts for part in pairwise(ends))
     return sum(quad(density, *span, epsabs=1e-10, epsrel=1e-11, limit=400)[0] for span in spans) / pad.unit_mm
+
+
+def panel_polynomials(squares, values):
+    """The function of a squared distance that is a polynomial between every eighth of them."""
+    ends, degree = squares[::DEGREE], DEGREE + 1
+    panels = [
+        BarycentricInterpolator(squares[i : i + degree], values[i : i + degree])
+        for i in range(0, len(squares) - 1, DEGREE)
+    ]
+    return lambda square: panels[np.searchsorted(ends[1:], square, side="right")](square)
 
 
 def search_signals(pad, presses, contact, along=None, across=None):

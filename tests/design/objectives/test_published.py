@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.benchmarks import contact as objective
-from padforge.design import Morphology, published_objective, signals
+from padforge.design import Contact, Morphology, published_objective, signals
 from padforge.design.contact import serpentine_presses
 from padforge.design.objectives.published import (
     idle_share,
@@ -90,9 +90,14 @@ def test_information_matches_explicit_covariances(grid, noise):
     pad, side, step = Morphology.random(grid, 3, seed=2), 4, 1e-4
     line = np.linspace(0, grid - 1, 2 * side + 1)[1::2] + 1 if grid > 1 else np.linspace(0.5, 1.5, 2 * side + 1)[1::2]
     cells = np.array([(x, y) for y in line for x in line])
-    mean = signals(pad, cells)
-    slopes = [(signals(pad, cells + d) - signals(pad, cells - d)) / (2 * step) for d in step * np.eye(2)]
-    largest = max(signals(pad, cells + d).max() for d in step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]))
+    contact = Contact(model="profile")
+    mean = signals(pad, cells, contact)
+    slopes = [
+        (signals(pad, cells + d, contact) - signals(pad, cells - d, contact)) / (2 * step) for d in step * np.eye(2)
+    ]
+    largest = max(
+        signals(pad, cells + d, contact).max() for d in step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    )
     sigma, fibres = noise * largest / 4096, 2 * grid
     jacobian = np.stack(slopes, axis=2)
     position_var = (line[1] - line[0]) ** 2 / 12
@@ -106,4 +111,4 @@ def test_information_matches_explicit_covariances(grid, noise):
 
     confused = np.array([[overlap(a, b) for b in range(len(cells))] for a in range(len(cells))]).mean(axis=1)
     expected = (log_det - fibres * np.log(sigma**2)).mean() / 2 - np.log(confused).mean()
-    assert information(pad, noise=noise, side=side) == pytest.approx(expected / np.log(2), rel=1e-6)
+    assert information(pad, contact, noise=noise, side=side) == pytest.approx(expected / np.log(2), rel=1e-6)

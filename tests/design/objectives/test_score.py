@@ -14,19 +14,18 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_score_evaluates_the_sensed_area():
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
-    pad, profile = Morphology.random(3, 4, seed=1), Contact(model="profile")  # a layer leaves no fibre idle anywhere
+    # a layer leaves no fibre idle anywhere
+    pad, disc = Morphology.random(3, 4, seed=1), Contact(radius=0.9, sides=None)
     beyond, between, wide = (
-        score(pad, profile, max_failures=1, size=PadSettings(sensed_mm=where))
-        for where in ("beyond", "fibres", (40, 20))
+        score(pad, disc, max_failures=1, size=PadSettings(sensed_mm=where)) for where in ("beyond", "fibres", (40, 20))
     )
     for name in beyond:
         same = name.startswith(("published", "information", "penalty"))
         assert (beyond[name] == between[name] == wide[name]) == same
-    assert score(pad, profile, max_failures=1) == beyond
-    disc = Contact(radius=0.9, sides=None)
-    terms = published_terms(pad, disc)[0]
-    assert score(pad, disc, max_failures=0)["published_objective"] == terms.objective != beyond["published_objective"]
-    assert beyond["published_objective"] == published_terms(pad)[0].objective  # a measured contact has none of its own
+    assert score(pad, disc, max_failures=1) == beyond
+    layer = score(pad, max_failures=0)
+    assert beyond["published_objective"] == published_terms(pad, disc)[0].objective != layer["published_objective"]
+    assert layer["published_objective"] == published_terms(pad)[0].objective  # a layer has none of its own
 
 
 def test_score_joint_entropy_saturates_before_those_of_families():
