@@ -29,9 +29,9 @@ Array = NDArray[np.float64]
 
 PRECISION = 5e-5
 """Error of signals here, as a share of the largest one: far below that of measured profiles."""
-LAYER_PRECISION, FINE_PRECISION = 1e-2, 1e-3
+LAYER_PRECISION, FINE_PRECISION = 1.5e-2, 1e-3
 """Root of the mean squared error of signals of a layer near a press, as a share of the largest one, in a search and
-where a pad is evaluated; over all of a pad it is a tenth to a quarter of that. Strains of a shallow fibre step at the edge
+where a pad is evaluated; over a pad it is a tenth to a quarter of it. Strains of a shallow fibre step at the edge
 of the contact, and to resolve the step takes twice as long."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
@@ -64,8 +64,8 @@ class Elements(NamedTuple):
 def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
     """Return the largest spacing at which straight fibres of both families are precise, and that of far elements.
 
-    The error, as a share of the largest signal, is at most `precision`; of a layer it is the root of its mean square near
-    the press.
+    The error, as a share of the largest signal, is at most `precision`; of a layer it is the root of its mean square
+    near the press.
     """
     families = law.profile[: 1 + int((law.profile[0] != law.profile[1]).any())]
     far = FAR_SPACING * law.near * math.sqrt(precision / LAYER_PRECISION)
