@@ -178,7 +178,7 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         what = (
             f"Tools of {len(sizes)} radii press every pad to {len(others)} depths, less than its thickness. Responses "
             f"scatter by {100 * SCATTER.share:.0f} % and have noise of {100 * SCATTER.floor:.0f} % of what straight "
-            "fibres answer to the stated tool and depth"
+            "fibres of the default pad answer to the default press"
         )
     else:
         what = (
