@@ -115,7 +115,8 @@ def test_resume_repeats_stages_of_changed_settings(
     (folder / "pad.toml").write_text(SMALL.replace(old, new))
     assert resumed(folder, *more) == kept
     after = digests(folder)
-    assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
+    watched = ("recording",) if more else ("mould.stl", "recording")  # another seed may find another pad or none
+    assert {name for name in watched if after[name] != before[name]} == others
 
 
 def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
