@@ -202,7 +202,7 @@ def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
     press, families = contact_press(contact), profile_weights(contact)
     thickness, scale = contact.thickness_mm, contact.scale
     far = max(1.2 * pitch_mm, 2.2 * scale * press.contact_radius_mm)
-    x = np.linspace(-far, far, 301)
+    x = np.linspace(-far, far, 151)
     face = thickness - press.deflection(np.abs(x) / scale)
     top = thickness + 0.8 * contact.depth_mm
 
@@ -243,7 +243,7 @@ def _tool_surface(contact: Contact, x: "Array") -> "Array":
     return tip + x**2 / (2 * radius)
 
 
-def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 12) -> "Array":
+def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 6) -> "Array":
     """Return how far the silicone at a height is down, mm: the integral of its vertical strain from the base."""
     heights = (np.arange(steps) + 0.5) / steps * height_mm
     return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / steps
@@ -263,7 +263,7 @@ def press_sections(folder: Path, document: Mapping[str, Any], max_strain: float 
         return []
     press = contact_press(contact)
     save_figure(draw_press(contact, PadSettings(**settings["pad"]).layout.pitch_x_mm), folder / "press.png")
-    distances = np.linspace(0, 2 * press.contact_radius_mm, 200)
+    distances = np.linspace(0, 2 * press.contact_radius_mm, 100)
     rows = []
     for (name, _), depth, width in zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), strict=True):
         strains = press.strains(distances, contact.thickness_mm - depth, FIBRE_BLUR_MM)

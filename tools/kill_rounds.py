@@ -33,8 +33,6 @@ knots = 2
 starts = 2
 steps = 30
 max_failures = 1
-[rules]
-enforce = false
 [rig]
 presses = 60
 readings_per_press = 8

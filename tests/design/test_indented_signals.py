@@ -21,27 +21,22 @@ def presses_on(pad: Morphology, count: int) -> np.ndarray:
 )
 def test_indented_signals_are_those_of_solved_contacts(contact: Contact) -> None:
     presses, full_scale = presses_on(PAD, 12), np.abs(signals(PAD, presses_on(PAD, 60), contact)).max()
-    depths_mm = (0.03, 1.1, 2.6, 4.7)
-    interpolated = indented_signals(PAD, np.tile(presses, (4, 1)), np.repeat(depths_mm, len(presses)), contact)
+    depths_mm = (0.03, 1.3)
+    interpolated = indented_signals(PAD, np.tile(presses, (2, 1)), np.repeat(depths_mm, len(presses)), contact)
+    np.testing.assert_array_equal(indented_signals(PAD, presses[7:8], depths_mm[1], contact), interpolated[19:20])
     solved = [signals(PAD, presses, contact.model_copy(update={"depth_mm": each})) for each in depths_mm]
     np.testing.assert_allclose(interpolated, np.concatenate(solved), rtol=0, atol=0.01 * full_scale)
     deepest = indented_signals(PAD, presses, contact.depth_mm, contact)
     np.testing.assert_array_equal(deepest, evaluated_signals(PAD, presses, contact))
     assert not indented_signals(PAD, presses, 0.0, contact).any()
+    assert indented_signals(PAD, [], [], contact).shape == (0, 4)
 
 
 def test_indented_signals_of_a_flat_end_grow_in_proportion_to_the_depth() -> None:
     contact, presses = Contact(tool="flat", tool_radius_mm=5.0), presses_on(PAD, 5)
-    depths_mm = np.array([0.0, 0.02, 1.0, 3.3, 4.9])
+    depths_mm = np.array([0.0, 0.02, 4.9])
     expected = depths_mm[:, None] / 5.0 * evaluated_signals(PAD, presses, contact)
     np.testing.assert_allclose(indented_signals(PAD, presses, depths_mm, contact), expected, rtol=1e-6, atol=1e-9)
-
-
-def test_indented_signals_do_not_depend_on_other_presses() -> None:
-    presses, depths_mm = presses_on(PAD, 20), np.linspace(0.1, 5, 20)
-    together = indented_signals(PAD, presses, depths_mm)
-    np.testing.assert_array_equal(indented_signals(PAD, presses[7:8], depths_mm[7:8]), together[7:8])
-    assert indented_signals(PAD, [], []).shape == (0, 4)
 
 
 @pytest.mark.parametrize("contact", [Contact(), Contact(tool="ball", tool_radius_mm=6.0, base="slipping")])

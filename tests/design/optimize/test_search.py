@@ -63,6 +63,7 @@ def test_search_from_an_origin_improves_on_it_and_on_straight_fibres():
     assert np.prod(errors) < 0.5 * np.prod(straight)
 
 
+@pytest.mark.slow
 def test_search_returns_an_origin_that_it_cannot_improve():
     settings = SMALL.model_copy(update={"steps": 500, "starts": 1})  # at fewer, a step may still improve it
     origin = search(PAD, PUBLISHED_CONTACT, settings, FREE).morphology
