@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -249,11 +250,10 @@ def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 6) -> "A
     return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / steps
 
 
-def press_sections(folder: Path, document: Mapping[str, Any], max_strain: float | None) -> list[PageSection]:
-    """Write the section on the press that a pad is designed for, and its figure `press.png`; none unless a layer.
+def press_sections(document: Mapping[str, Any], max_strain: float | None) -> list[PageSection]:
+    """Return the section on the press that a pad is designed for, with its picture; none unless a layer.
 
     Args:
-        folder: folder of the pad.
         document: its `design.json`; a damaged one raises any of the built-in errors.
         max_strain: elongation that the fibres bear, relative to their length; None if unknown.
     """
@@ -262,7 +262,6 @@ def press_sections(folder: Path, document: Mapping[str, Any], max_strain: float 
     if contact.model != "layer":
         return []
     press = contact_press(contact)
-    save_figure(draw_press(contact, PadSettings(**settings["pad"]).layout.pitch_x_mm), folder / "press.png")
     distances = np.linspace(0, 2 * press.contact_radius_mm, 100)
     rows = []
     for (name, _), depth, width in zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), strict=True):
@@ -280,7 +279,11 @@ def press_sections(folder: Path, document: Mapping[str, Any], max_strain: float 
     )
     caption = "The press in section, true to scale, and the weight of an element of a fibre by its distance from it."
     head = ["fibres", "depth (mm)", "half width (mm)", "pressed flat by", "stretched by", "they bear", "result"]
-    return [PageSection("Press", [paragraph(lead), figures([(folder / "press.png", caption)]), table(head, rows)])]
+    with TemporaryDirectory() as temporary:
+        path = Path(temporary) / "press.png"
+        save_figure(draw_press(contact, PadSettings(**settings["pad"]).layout.pitch_x_mm), path)
+        picture = figures([(path, caption)])
+    return [PageSection("Press", [paragraph(lead), picture, table(head, rows)])]
 
 
 def contact_line(document: Mapping[str, Any]) -> str:

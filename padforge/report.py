@@ -32,7 +32,7 @@ def write_report(folder: Path) -> Path:
     from padforge.sense.report.identification import identification_sections
 
     def write_design(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-        return [*design_sections(folder, document), *press_sections(folder, document, _max_strain(folder))]
+        return [*design_sections(folder, document), *press_sections(document, _max_strain(folder))]
 
     folder = check_path("folder", folder)
     recover(folder)
