@@ -213,6 +213,10 @@ class LivePad:
         self._gains = np.ones(len(pad.knots))
         self._is_touched = False
 
+    def prepare(self) -> None:
+        """Compile and solve what the first press would wait for."""
+        self._response(np.zeros(2))
+
     def volts(self, positions_mm: Array, depths_mm: Array) -> Array:
         """Return the readings (R, C), V, at further positions (R, 2) of the tip, from the pad's centre.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design import Contact, Morphology, signals
+from padforge.design import Contact, Morphology
 from padforge.sense.arrays import Array
 from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.devices import Board
@@ -58,6 +58,7 @@ class Finger:
         """Hold the finger over a pad; `mishaps` is the share of presses that become one of `MISHAPS`."""
         rng = np.random.default_rng(rig.seed)
         self._model = LivePad(pad, contact, rig, rate_hz, rng)
+        self._model.prepare()  # before the board has to keep up
         self._rng, self._depth_mm = rng.spawn(1)[0], rig.depth_mm
         self._mishaps = mishaps
         self._view: Mapping[str, Any] = {"phase": "settle"}
@@ -117,7 +118,6 @@ class Finger:
 def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Board, Finger]]:
     """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it."""
     finger = Finger(pad, contact, rig, rig.board_rate_hz)
-    signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
     with EmulatedDue(finger.volts) as emulated:
         settings = rig.model_copy(update={"port": emulated.port})
         with closing(DueBoard.from_settings(settings, range(len(pad.knots)))) as board:

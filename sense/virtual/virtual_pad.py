@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design import Contact, Morphology, signals
+from padforge.design import Contact, Morphology
 from padforge.design.common.files import read_json
 from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
@@ -54,7 +54,7 @@ class VirtualPad:
 
     def connect(self) -> Mapping[str, Any]:
         """Start sampling; see `Board`."""
-        signals(self._pad, self._pad.to_grid([[0.0, 0.0]]), self._contact)  # compiled before it has to keep up
+        self._model.prepare()  # before it has to keep up
         self._start_s, self._n_samples = self._clock(), 0
         fibres = len(self._pad.knots)
         identity = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}

@@ -5,7 +5,7 @@ from contextlib import closing, contextmanager
 
 import numpy as np
 
-from padforge.design import Contact, Morphology, signals
+from padforge.design import Contact, Morphology
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.printer import Printer
@@ -67,7 +67,7 @@ def _emulate_board(
     frame, inputs = RobotFrame.from_settings(rig), rig.inputs(len(pad.knots))
     n_inputs = max(MIN_LINE_INPUTS, 1 + max(inputs))
     model = LivePad(pad, contact, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
-    signals(pad, pad.to_grid([[0.0, 0.0]]), contact)  # compiled before the board has to keep up
+    model.prepare()  # before the board has to keep up
 
     def source(times_s: Array) -> Array:
         volts = np.zeros((len(times_s), n_inputs))
