@@ -320,7 +320,7 @@ def press_shape(contact: Contact, unit_mm: float) -> PressShape:
     if contact.model == "shape":
         law = geometry.WeightLaw(contact.radius, _WEIGHTS[contact.weight], _LENGTHS[contact.length])
         return *geometry.frame_shape(contact.radius, contact.sides), law
-    law = profile_law(contact, unit_mm)
+    law = contact_law(contact, unit_mm)
     return *geometry.frame_shape(law.radius, None), law
 
 
@@ -334,11 +334,11 @@ def element_spacings(contact: Contact, unit_mm: float, precision: float | None =
         precision: error as a share of the largest signal; that of a search if None.
     """
     search = measured_signals.LAYER_PRECISION if contact.model == "layer" else measured_signals.PRECISION
-    return measured_signals.element_spacings(profile_law(contact, unit_mm), precision or search)
+    return measured_signals.element_spacings(contact_law(contact, unit_mm), precision or search)
 
 
 @lru_cache(maxsize=128)  # DEPTH_STEPS of several tools
-def profile_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
+def contact_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
     """Convert a contact that is no shape to a weight law, in grid units of `unit_mm`."""
     families = tuple((distance / unit_mm, *weights) for distance, *weights in profile_weights(contact))
     near, edge = math.inf, 0.0

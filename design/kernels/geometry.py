@@ -16,7 +16,7 @@ EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
 DEGREE = 7
-"""Degree of the polynomials of a profile; a layer has one for as many intervals of its distances, a spline is cubic."""
+"""Degree of the polynomials of a profile: those of a layer; splines are cubic, and their other coefficients are 0."""
 PLAIN, DIRECTED, COLUMNS = 1, 2 + DEGREE, 3 + 2 * DEGREE
 """First columns of the coefficients of w and v in a row of a profile, and their number."""
 NO_PROFILE, NO_BINS = np.empty((2, 0, COLUMNS)), np.empty(0, np.int32)

@@ -56,14 +56,17 @@ def resistance_changes(pad: Morphology, positions_mm: Array, depths_mm: Array, c
     presses = pad.to_grid(positions_mm)
     if contact.model != "layer":
         return WEIGHT_GAUGE_FACTOR / FULL_DEPTH_MM * depths_mm[:, None] * relative_stretch(pad, presses, contact)
+
+    def pressed(depth_mm: float) -> Contact:
+        return Contact(**contact.model_dump() | {"depth_mm": depth_mm})
+
     depths = np.unique(depths_mm).tolist()
-    pressed = [Contact(**contact.model_dump() | {"depth_mm": depth_mm}) for depth_mm in depths]
     if len(depths) > DEPTH_STEPS:
-        return GAUGE_FACTOR * indented_signals(pad, presses, depths_mm, pressed[-1]) / lengths(pad)
+        return GAUGE_FACTOR * indented_signals(pad, presses, depths_mm, pressed(depths[-1])) / lengths(pad)
     changes = np.empty((len(presses), len(pad.knots)))
-    for depth_mm, at_depth in zip(depths, pressed, strict=True):
+    for depth_mm in depths:
         rows = depths_mm == depth_mm
-        changes[rows] = GAUGE_FACTOR * relative_stretch(pad, presses[rows], at_depth)
+        changes[rows] = GAUGE_FACTOR * relative_stretch(pad, presses[rows], pressed(depth_mm))
     return changes
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from padforge.design.contact import profile_law
+from padforge.design.contact import contact_law
 from padforge.design.kernels.measured_signals import sum_elements
 from padforge.design.settings import Contact
 from padforge.design.twin import PlanTransform
@@ -108,7 +108,7 @@ class _Signals:
         if contact.model == "layer":
             shares = [{"squeeze": 1.0, "stretch": 0.0}, {"squeeze": 0.0, "stretch": 1.0}]
             parts = [contact.model_copy(update={"scale": 1.0, **share}) for share in shares]
-        self._pad, self._laws = pad, [profile_law(part, layout.unit_mm) for part in parts]
+        self._pad, self._laws = pad, [contact_law(part, layout.unit_mm) for part in parts]
         self._channels = [(pad.elements(channel), layout.family(fibre)) for channel, fibre in enumerate(pad.fibres)]
 
     def __call__(self, values: Array, positions_mm: Array) -> Array:
