@@ -18,7 +18,7 @@ from padforge.design.twin import PlanTransform, Twin, TwinChannel
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.response_model import RIDGE_POSITION, rbf_features
 from padforge.sense.recording.recording import Recording
-from padforge.sense.settings import RigSettings
+from padforge.sense.settings import IDEAL_RIG
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.twin.as_built import PadPlan
 from padforge.sense.twin.identification import Identification, identify_pad
@@ -129,7 +129,7 @@ def printed(world: str) -> Twin:
 @cache
 def recorded(world: str, presses: int) -> Recording:
     """Simulate presses of the pad of a world."""
-    return simulate(printed(world), RigSettings(presses=presses, seed=presses))
+    return simulate(printed(world), IDEAL_RIG.model_copy(update={"presses": presses, "seed": presses}))
 
 
 def _identify(world: str, presses: int) -> Identification:

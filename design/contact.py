@@ -5,6 +5,7 @@ profile of the distance to the press centre, or of the published weight inside a
 """
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -105,7 +106,13 @@ def evaluated_signals(pad: Morphology, presses: ArrayLike, contact: Contact) -> 
     return quick_signals(pad, presses, contact, measured_signals.FINE_PRECISION)
 
 
-def quick_signals(pad: Morphology, presses: ArrayLike, contact: Contact, precision: float | None = None) -> Array:
+def quick_signals(
+    pad: Morphology,
+    presses: ArrayLike,
+    contact: Contact,
+    precision: float | None = None,
+    sensitivity: Array | None = None,
+) -> Array:
     """Compute `signals` (Q, F) of a layer or a profile by elements of the fibres, as a search does.
 
     Args:
@@ -113,6 +120,8 @@ def quick_signals(pad: Morphology, presses: ArrayLike, contact: Contact, precisi
         presses: centres; shape (Q, 2), grid units.
         contact: contact model; signals of a shape are exact.
         precision: as of `element_spacings`.
+        sensitivity: factors on the response of each fibre, at K >= 2 even steps along its axis; shape (F, K). 1 if
+            None, and for a shape.
     """
     if contact.model == "shape":
         return signals(pad, presses, contact)
@@ -127,10 +136,29 @@ def quick_signals(pad: Morphology, presses: ArrayLike, contact: Contact, precisi
     elements = measured_signals.fibre_elements(
         along[0], across[0], slope, ends.horizontals, centres, shape[2], spacings
     )
+    if sensitivity is not None:
+        measured_signals.weigh_elements(elements, along[0], sensitivity)
     visited = measured_signals.element_signals(along[0], across[0], elements, centres, shape[2], out)
     if profiling.is_profiling():
         record_visits(along, geometry.max_offsets(across, ends), ends, centres, shape[1], visited)
     return out
+
+
+def widened(contact: Contact, factor: float) -> Contact:
+    """Return a contact whose press is wider by a factor, and as strong in its middle.
+
+    Args:
+        contact: a contact of any model.
+        factor: > 0.
+    """
+    if factor == 1:
+        return contact
+    if contact.model == "layer":
+        return contact.model_copy(update={"scale": factor * contact.scale})
+    if contact.model == "shape":
+        return contact.model_copy(update={"radius": factor * contact.radius})
+    points = tuple((factor * distance_mm, weight) for distance_mm, weight in contact.sensitivity_profile)
+    return contact.model_copy(update={"sensitivity_profile": points})
 
 
 def indented_signals(
@@ -160,12 +188,33 @@ def indented_signals(
     fibres = len(check_type("pad", pad, Morphology).knots)
     check_memory(len(centres) * fibres)
     out = np.zeros((len(centres), fibres))
-    weights = _depth_weights(np.broadcast_to(depths_mm, len(centres)), contact)
+    for rows, weight, pressed in depth_terms(np.broadcast_to(depths_mm, len(centres)), contact):
+        out[rows] += weight[:, None] * evaluated_signals(pad, centres[rows], pressed)
+    return out
+
+
+def depth_terms(depths_mm: Array, contact: Contact) -> Iterator[tuple[Ints, Array, Contact]]:
+    """Yield the terms that sum to what is 0 at depth 0, of presses of known depths into a layer.
+
+    Args:
+        depths_mm: depth of each press; shape (Q,), 0 to the depth of the contact, mm.
+        contact: a layer.
+
+    Yields:
+        Indices (n,) of presses, the weights (n,) of a solved contact for them, and that contact. They are the contacts
+        themselves if there are few depths.
+    """
+    depths = np.unique(depths_mm)
+    if len(depths) <= DEPTH_STEPS:
+        for depth_mm in depths[depths > 0].tolist():
+            rows = np.flatnonzero(depths_mm == depth_mm)
+            yield rows, np.ones(len(rows)), Contact(**contact.model_dump() | {"depth_mm": depth_mm})
+        return
+    weights = _depth_weights(depths_mm, contact)
     for pressed, weight in zip(_depth_steps(contact), weights.T, strict=True):
         rows = np.flatnonzero(weight)
         if rows.size:
-            out[rows] += weight[rows, None] * evaluated_signals(pad, centres[rows], pressed)
-    return out
+            yield rows, weight[rows], pressed
 
 
 def press_forces_n(

@@ -22,9 +22,10 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact
 
-FORMAT = "padforge-twin/3"
+FORMAT = "padforge-twin/4"
 MAX_VOLTS, MAX_MM = 1e3, 1e4
-MAX_INFORMATION_GAIN = 1e3
+PARTS = "held", "onset", "creep", "after"
+"""Parts of a press."""
 MAX_CHANNELS = 1024
 MAX_ELEMENT_LENGTH = 0.02  # length of the elements that an as-built fibre is summed over, grid units
 MAX_ELEMENTS = 2**23  # elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million
@@ -100,18 +101,62 @@ class TwinScatter:
 
 @dataclass(frozen=True)
 class TwinReadings:
-    """Noise, drift and hysteresis of the readings, for simulations."""
+    """Statistics of the readings, for simulations; fields as in `[rig]`."""
 
     noise_mv: float  # standard deviation of the white noise of a reading
     drift_mv: float  # standard deviation of the drifting baseline
-    hysteresis: float  # residual response after a press, of opposite sign, as a share of its response
-    hysteresis_s: float  # time constant of its decay
-    # Fisher information on the position in all readings of a press over that in the twin's responses with `noise_v`
-    information_gain: float = 1.0
+    hysteresis_s: float  # time constant by which what remains of a press decays
+    memory: float = 0.0  # share of what remains of a press that another one at its place takes away
+    memory_mm: float = 9.0  # distance by which that falls
+    gain_wander: float = 0.0  # standard deviation of the gains that wander over minutes
+    touch_s: float = 0.0  # standard deviation over the pad of when it is touched
 
     def __post_init__(self) -> None:
-        _check_fields(self, noise_mv=(0, 1e3), drift_mv=(0, 1e3), hysteresis=(0, 0.99), hysteresis_s=(0.01, 1e4))
-        _check_fields(self, information_gain=(1, MAX_INFORMATION_GAIN))
+        _check_fields(self, noise_mv=(0, 1e3), drift_mv=(0, 1e3), hysteresis_s=(0.01, 1e4))
+        _check_fields(self, memory=(0, 1), memory_mm=(0.01, 1e3), gain_wander=(0, 1), touch_s=(0, 1))
+
+
+@dataclass(frozen=True)
+class TwinPart:
+    """Part of a press, without what it takes away of the residues of earlier ones; the same fibres respond with it.
+
+    Attributes:
+        distance_mm: as of the twin; shape (n,).
+        weight: as of the twin; shape (n,).
+        gains_v: of each channel, V for a relative stretch of 1; shape (C,).
+        angular_weight: as of the twin; shape (n,).
+        sensitivity: as of the twin.
+    """
+
+    distance_mm: Array
+    weight: Array
+    gains_v: Array
+    angular_weight: Array | None = None
+    sensitivity: tuple[Array | None, ...] | None = None
+
+    def contact(self) -> Contact:
+        """Return the contact of which this is the profile."""
+        return _profile_contact(self.distance_mm, self.weight)
+
+
+@dataclass(frozen=True)
+class TwinResidual:
+    """Smooth function of the position that is left between measured and predicted parts of a press.
+
+    Attributes:
+        middle_mm: centre of the square that it is given on, in the arm's frame.
+        half_mm: half of its side.
+        volts: on a grid over the square, x before y; shape (parts, C, n, n), in the order of `PARTS`.
+    """
+
+    middle_mm: tuple[float, float]
+    half_mm: float
+    volts: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "middle_mm", _check_pair("middle_mm", self.middle_mm))
+        _check_fields(self, half_mm=(1e-3, MAX_MM))
+        object.__setattr__(self, "volts", check_array("volts", self.volts, MAX_VOLTS))
 
 
 @dataclass(frozen=True)
@@ -135,6 +180,8 @@ class Twin:
         provenance: origin of the twin; free JSON.
         readings: statistics of the readings; None where they were not measured.
         scatter: part of `noise`, and of the channels' noise, that grows with the response.
+        parts: of a press, by name in `PARTS`; none where there were too few presses.
+        residual: what is left of the parts; None where there are none.
 
     Raises:
         InputError: values that do not fit together, or are out of range.
@@ -154,6 +201,8 @@ class Twin:
     provenance: Mapping[str, Any] = field(default_factory=dict, compare=False)
     readings: TwinReadings | None = None
     scatter: TwinScatter = TwinScatter()
+    parts: Mapping[str, TwinPart] = field(default_factory=dict)
+    residual: TwinResidual | None = None
 
     def __post_init__(self) -> None:
         fibres = len(check_type("morphology", self.morphology, Morphology).knots)
@@ -162,11 +211,9 @@ class Twin:
             raise InputError(f"a channel reads fibre {max(wiring)}, allowed are 0 to {fibres - 1}")
         if len(set(wiring)) < len(wiring):
             raise InputError("two channels read the same fibre")
-        for name in ("distance_mm", "weight", *(["angular_weight"] if self.angular_weight is not None else [])):
-            object.__setattr__(self, name, check_array(name, getattr(self, name), MAX_MM))
-            if getattr(self, name).shape != (len(self.distance_mm),):
-                raise InputError(f"{name} of sensitivity_profile must be a row of {len(self.distance_mm)} numbers")
+        _check_profile(self)
         self._check_paths(fibres)
+        self._check_parts()
         _check_fields(self, noise=(1e-9, 10))
         object.__setattr__(self, "sensed_mm", _check_pair("sensed_mm", self.sensed_mm))
         if min(self.sensed_mm) <= 0:
@@ -184,17 +231,40 @@ class Twin:
         if length_mm > limit_mm:
             raise InputError(f"as_built_mm are {length_mm:.3g} mm long in all, allowed are {limit_mm:.3g}")
         object.__setattr__(self, "as_built_mm", paths)
-        if self.sensitivity is not None:
-            rows = tuple(None if row is None else check_array("sensitivity", row, MAX_MM) for row in self.sensitivity)
-            expected = [None if path is None else (len(path) - 1,) for path in paths]
+        self._check_sensitivity(self)
+
+    def _check_sensitivity(self, part: "Twin | TwinPart") -> None:
+        """Check the sensitivities of a part against the paths."""
+        if part.sensitivity is not None:
+            rows = tuple(None if row is None else check_array("sensitivity", row, MAX_MM) for row in part.sensitivity)
+            expected = [None if path is None else (len(path) - 1,) for path in self.as_built_mm]
             if [None if row is None else row.shape for row in rows] != expected:
                 raise InputError("sensitivity must have a number for each piece of each path in as_built_mm")
-            object.__setattr__(self, "sensitivity", rows)
+            object.__setattr__(part, "sensitivity", rows)
+
+    def _check_parts(self) -> None:
+        check_mapping("parts", self.parts)
+        if self.parts and set(self.parts) != set(PARTS):
+            raise InputError(f"parts are {', '.join(self.parts)}, expected none or {', '.join(PARTS)}")
+        for name, part in self.parts.items():
+            _check_profile(check_type(name, part, TwinPart))
+            self._check_sensitivity(part)
+            gains_v = check_array(f"gains_v of {name}", part.gains_v, MAX_VOLTS)
+            if gains_v.shape != (len(self.channels),):
+                raise InputError(f"gains_v of {name} must be a row of {len(self.channels)} numbers")
+            object.__setattr__(part, "gains_v", gains_v)
+            part.contact()
+        if (self.residual is not None) != bool(self.parts):
+            raise InputError("residual and parts go together, got one without the other")
+        if self.residual is not None:
+            found, side = self.residual.volts.shape, self.residual.volts.shape[-1]
+            expected = len(PARTS), len(self.channels), side, side
+            if side < 2 or found != expected:
+                raise InputError(f"volts of residual have the shape {found}, expected {expected}, of 2 or more a side")
 
     def contact(self) -> Contact:
         """Return the measured contact."""
-        points = zip(self.distance_mm.tolist(), self.weight.tolist(), strict=True)
-        return Contact(sensitivity_profile=tuple(points), length="euclidean")
+        return _profile_contact(self.distance_mm, self.weight)
 
     def ignored_effects(self) -> str | None:
         """Describe effects measured on this pad that are ignored for any other pad; None if there are none."""
@@ -204,13 +274,14 @@ class Twin:
             effects.append(f"the uneven response along fibres ({np.mean(stds):.0%})")
         return f"ignored for other pads than the measured one: {' and '.join(effects)}" if effects else None
 
-    def as_built_stretch(self, positions_mm: ArrayLike) -> Array:
+    def as_built_stretch(self, positions_mm: ArrayLike, part: str | None = None) -> Array:
         """Compute the relative stretch of the as-built fibres: signal over planned length.
 
         Fibres are summed over elements of at most MAX_ELEMENT_LENGTH, within about 1e-4 of the integral.
 
         Args:
             positions_mm: presses in the arm's frame; shape (Q, 2), mm.
+            part: a name in `parts`; the response, with what history adds to it on average, if None.
 
         Returns:
             Relative stretch; shape (Q, F); 0 for a fibre that no channel reads.
@@ -219,14 +290,15 @@ class Twin:
         if pressed_mm.shape[1:] != (2,):
             raise InputError(f"positions_mm have shape {pressed_mm.shape}, expected (Q, 2)")
         presses, _ = check_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
-        distance, weight, angular = self.distance_mm / self.morphology.unit_mm, self.weight, self.angular_weight
-        angular = np.zeros_like(weight) if angular is None else angular
+        of = self if part is None else self.parts[part]
+        angular = np.zeros_like(of.weight) if of.angular_weight is None else of.angular_weight
         # cos 2 phi = 2 cos^2 phi - 1
-        law = profile_law(EUCLIDEAN, ((distance, weight - angular, 2 * angular),))
+        distance = of.distance_mm / self.morphology.unit_mm
+        law = profile_law(EUCLIDEAN, ((distance, of.weight - angular, 2 * angular),))
         out = np.zeros((len(presses), len(self.as_built_mm)))
         for fibre, path in enumerate(self.as_built_mm):
             if path is not None:
-                sensitivity = None if self.sensitivity is None else self.sensitivity[fibre]
+                sensitivity = None if of.sensitivity is None else of.sensitivity[fibre]
                 out[:, fibre] = sum_elements(*_cut(self.morphology.to_grid(path), sensitivity), presses, law, 0)
         return out / lengths(self.morphology)
 
@@ -242,20 +314,23 @@ class Twin:
         """
         document = read_json(path := as_path("path", path), FORMAT)
         try:
-            profile = document["sensitivity_profile"]
             return cls(
                 morphology=Morphology.from_dict(document["morphology"]),
                 channels=tuple(TwinChannel(**channel) for channel in document["channels"]),
                 frame=PlanTransform(**document["frame"]),
-                **{"angular_weight": None, **profile},
+                **_profile_from(document),
                 as_built_mm=tuple(document["as_built_mm"]),
                 noise=document["noise"],
                 sensed_mm=document["sensed_mm"],
                 presses=document["presses"],
-                sensitivity=None if document.get("sensitivity") is None else tuple(document["sensitivity"]),
                 provenance=document.get("provenance", {}),
                 readings=TwinReadings(**document["readings"]) if document.get("readings") else None,
                 scatter=TwinScatter(**document["scatter"]),
+                parts={
+                    name: TwinPart(gains_v=part["gains_v"], **_profile_from(part))
+                    for name, part in document["parts"].items()
+                },
+                residual=TwinResidual(**document["residual"]) if document["residual"] else None,
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise InputError(f"{path}: no valid twin ({error!r})") from error
@@ -268,15 +343,17 @@ class Twin:
         Args:
             path: a `twin.json`.
         """
-        profile = {name: getattr(self, name) for name in ("distance_mm", "weight", "angular_weight")}
         document = {
             "format": FORMAT,
             "morphology": self.morphology.to_dict(),
             "channels": [asdict(channel) for channel in self.channels],
             "frame": asdict(self.frame),
-            "sensitivity_profile": {name: row.tolist() for name, row in profile.items() if row is not None},
             "as_built_mm": _round_rows(self.as_built_mm),
-            "sensitivity": None if self.sensitivity is None else _round_rows(self.sensitivity),
+            **_profile_document(self),
+            "parts": {
+                name: {"gains_v": part.gains_v.tolist(), **_profile_document(part)} for name, part in self.parts.items()
+            },
+            "residual": None if self.residual is None else _residual_document(self.residual),
             "noise": self.noise,
             "scatter": asdict(self.scatter),
             "sensed_mm": list(self.sensed_mm),
@@ -284,6 +361,38 @@ class Twin:
             "provenance": dict(self.provenance),
         } | ({"readings": asdict(self.readings)} if self.readings else {})
         write_json(as_path("path", path), document)
+
+
+def _check_profile(part: "Twin | TwinPart") -> None:
+    """Check the rows of a sensitivity profile, and store them as arrays."""
+    for name in ("distance_mm", "weight", *(["angular_weight"] if part.angular_weight is not None else [])):
+        object.__setattr__(part, name, check_array(name, getattr(part, name), MAX_MM))
+        if getattr(part, name).shape != (len(part.distance_mm),):
+            raise InputError(f"{name} of sensitivity_profile must be a row of {len(part.distance_mm)} numbers")
+
+
+def _profile_contact(distance_mm: Array, weight: Array) -> Contact:
+    points = zip(distance_mm.tolist(), weight.tolist(), strict=True)
+    return Contact(sensitivity_profile=tuple(points), length="euclidean")
+
+
+def _profile_document(part: "Twin | TwinPart") -> dict[str, Any]:
+    """Return the sensitivity profile, and the sensitivity along the fibres, as JSON."""
+    profile = {name: getattr(part, name) for name in ("distance_mm", "weight", "angular_weight")}
+    return {
+        "sensitivity_profile": {name: row.tolist() for name, row in profile.items() if row is not None},
+        "sensitivity": None if part.sensitivity is None else _round_rows(part.sensitivity),
+    }
+
+
+def _residual_document(residual: TwinResidual) -> dict[str, Any]:
+    return asdict(residual) | {"volts": np.round(residual.volts, 6).tolist()}
+
+
+def _profile_from(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `_profile_document` was made of."""
+    sensitivity = document["sensitivity"]
+    return dict(document["sensitivity_profile"]) | {"sensitivity": None if sensitivity is None else tuple(sensitivity)}
 
 
 def _round_rows(rows: Sequence[Array | None]) -> list[list[Any] | None]:

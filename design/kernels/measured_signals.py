@@ -186,6 +186,20 @@ def fibre_elements(
 
 
 @njit(cache=True, error_model="numpy")
+def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
+    """Multiply the lengths of elements by the sensitivity (F, K) of their fibre, given at even steps along its axis."""
+    fibres, n = along.shape
+    last = sensitivity.shape[1] - 1
+    for f in range(fibres):
+        first, rate = along[f, 0], last / (along[f, n - 1] - along[f, 0])
+        for starts in (elements.starts, elements.far_starts):
+            for k in range(starts[f, 0], starts[f, n - 1]):
+                at = min(max((elements.along[k] - first) * rate, 0.0), float(last))
+                i = min(int(at), last - 1)
+                elements.length[k] *= sensitivity[f, i] + (at - i) * (sensitivity[f, i + 1] - sensitivity[f, i])
+
+
+@njit(cache=True, error_model="numpy")
 def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
     """Whether span j, which lies in the box of its ends, comes within `end` of (ct, cv) along both axes."""
     is_beside = t[j] < ct + end and t[j + 1] > ct - end

@@ -10,7 +10,7 @@ import pytest
 from padforge.design import InputError, Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.paths.curves import flatten
-from padforge.design.twin import PlanTransform, TwinChannel, TwinReadings, TwinScatter
+from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter
 
 PAD = Morphology.random(2, knots=3, seed=5)
 DISTANCE = np.linspace(0, 1.6, 9)
@@ -28,13 +28,18 @@ def twin() -> Twin:
     return Twin(PAD, channels, frame, DISTANCE * PAD.pitch_mm, WEIGHT, laid, 0.015, (20.0, 22.0), 900)
 
 
-READINGS = TwinReadings(noise_mv=2.0, drift_mv=18.0, hysteresis=0.3, hysteresis_s=14.0, information_gain=8.0)
+READINGS = TwinReadings(noise_mv=2.0, drift_mv=18.0, hysteresis_s=14.0, memory=0.8, memory_mm=9.0, gain_wander=0.05)
 
 
 def test_twin_file_round_trip(twin, tmp_path):
     uneven = tuple(None if line is None else np.linspace(0.8, 1.2, len(line) - 1) for line in twin.as_built_mm)
+    narrow = TwinPart(0.7 * twin.distance_mm, WEIGHT, np.array([-0.03, 0.0, -0.02, -0.04]), sensitivity=uneven)
     whole = replace(
-        twin, sensitivity=uneven, angular_weight=0.1 * WEIGHT, readings=READINGS, scatter=TwinScatter(0.1, 0.3, 0.9)
+        twin,
+        **{"sensitivity": uneven, "angular_weight": 0.1 * WEIGHT, "readings": READINGS},
+        scatter=TwinScatter(0.1, 0.3, 0.9),
+        parts=dict.fromkeys(PARTS, narrow),
+        residual=TwinResidual((1.0, -2.0), 11.0, np.random.default_rng(0).uniform(-1e-3, 1e-3, (4, 4, 5, 5))),
     )
     for each in (twin, whole):
         each.save(tmp_path / "twin.json")
@@ -44,8 +49,15 @@ def test_twin_file_round_trip(twin, tmp_path):
         assert back.contact() == each.contact()
         assert back.contact().sensitivity_profile == tuple(zip(each.distance_mm, each.weight, strict=True))
         assert back.contact().length == "euclidean"
-        assert back.as_built_stretch(PLACES) == pytest.approx(each.as_built_stretch(PLACES), abs=1e-3)
-    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/3"
+        for part in (None, *each.parts):
+            expected = each.as_built_stretch(PLACES, part)
+            assert back.as_built_stretch(PLACES, part) == pytest.approx(expected, abs=1e-3)
+    assert back.parts["after"].gains_v == pytest.approx(narrow.gains_v)
+    assert back.residual is not None
+    assert (back.residual.middle_mm, back.residual.half_mm) == ((1.0, -2.0), 11.0)
+    assert back.residual.volts == pytest.approx(whole.residual.volts, abs=1e-6)
+    assert np.abs(back.as_built_stretch(PLACES, "after")).sum() < np.abs(back.as_built_stretch(PLACES)).sum()
+    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/4"
 
 
 def test_as_built_stretch_matches_the_contact_model(twin):
@@ -77,6 +89,15 @@ def test_as_built_stretch_matches_the_contact_model(twin):
         ({"as_built_mm": (None,)}, "as_built_mm must have"),
         ({"sensitivity": (None, None, None, None)}, "sensitivity must have"),
         ({"sensed_mm": (20.0, 0.0)}, "sensed_mm"),
+        (
+            {"parts": {"onset": TwinPart(DISTANCE, WEIGHT, np.zeros(4))}},
+            "parts are onset, expected none or held, onset",
+        ),
+        (
+            {"parts": dict.fromkeys(PARTS, TwinPart(DISTANCE, WEIGHT, np.zeros(3)))},
+            "gains_v of held must be a row of 4",
+        ),
+        ({"residual": TwinResidual((0.0, 0.0), 1.0, np.zeros((4, 4, 2, 2)))}, "residual and parts go together"),
     ],
 )
 def test_twin_refuses_inconsistent_values(twin, change, message):
@@ -87,7 +108,7 @@ def test_twin_refuses_inconsistent_values(twin, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "padforge-design/1"}, "padforge-twin/3"),
+        ({"format": "padforge-design/1"}, "padforge-twin/4"),
         ({"channels": [{"gain": 1}]}, "no valid twin"),
         ({"frame__scale": -1}, "scale"),
         ({"readings__noise_mv": "much"}, "noise_mv"),
