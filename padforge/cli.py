@@ -32,7 +32,11 @@ except ModuleNotFoundError as error:
         raise InputError("bench runs in a checkout of the repository only, whose benchmarks are not installed")
 
 
-PRESETS = {"published": "padforge.design.settings:PUBLISHED", "built": "padforge.design.settings:BUILT"}
+PRESETS = {
+    "published": "padforge.design.settings:PUBLISHED",
+    "built": "padforge.design.settings:BUILT",
+    "ideal": "padforge.sense.settings:IDEAL",
+}
 """Settings other than the defaults, by section, that `padforge init` can write."""
 
 EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
@@ -99,7 +103,8 @@ def _compare(
 @click.option(
     "--preset",
     type=click.Choice(list(PRESETS)),
-    help="published: contact, noise and area of the paper; built: the press on its pad.",
+    help="published: contact, noise and area of the paper; built: the press on its pad; ideal: a simulated pad as"
+    " planned.",
 )
 def _init(path: Path, preset: str | None) -> None:
     """Write a settings file, pad.toml, with every default and a comment on each key.

@@ -54,16 +54,47 @@ class RigSettings(Settings):
         default=(), description="depths that presses take in turn, in place of depth_mm"
     )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the positions and of the simulated pad")
-    noise_mv: float = Field(default=1.6, ge=0, le=1000, description="simulated pad: white noise of a reading, mV")
-    drift_mv: float = Field(default=40.0, ge=0, le=1000, description="simulated pad: std of the drifting baseline, mV")
-    creep: float = Field(default=0.1, ge=0, lt=1, description="simulated pad: share of a fibre's response that creeps")
-    hysteresis: float = Field(default=0.2, ge=0, lt=1, description="simulated pad: overshoot on unloading, share of it")
-    hysteresis_s: float = Field(default=2.5, ge=0.01, le=1e4, description="simulated pad: its time constant, s")
+    noise_mv: float = Field(default=2.0, ge=0, le=1000, description="simulated pad: white noise of a reading, mV")
+    drift_mv: float = Field(default=20.0, ge=0, le=1000, description="simulated pad: std of the drifting baseline, mV")
+    creep: float = Field(default=0.3, ge=0, lt=1, description="simulated pad: share of a response lost by creep")
+    hysteresis: float = Field(
+        default=0.65,
+        ge=0,
+        lt=1,
+        description="simulated pad: share of the response that remains, inverted, after it",
+    )
+    hysteresis_s: float = Field(default=30.0, ge=0.01, le=1e4, description="simulated pad: its time constant, s")
+    onset_width: float = Field(
+        default=0.75, ge=0.1, le=2, description="simulated pad: width of a press at its onset over that of the held one"
+    )
+    after_width: float = Field(
+        default=0.7, ge=0.1, le=2, description="simulated pad: width of what remains of a press over that of the press"
+    )
+    sensitivity: float = Field(
+        default=0.6, ge=0, le=2, description="simulated pad: std of the logarithm of the sensitivity along a fibre"
+    )
+    own_sensitivity: float = Field(
+        default=1.3, ge=0, le=2, description="simulated pad: the same of what differs in onset, creep and what remains"
+    )
+    path_mm: float = Field(default=1.0, ge=0, le=10, description="simulated pad: std of the paths off their plan, mm")
+    memory: float = Field(
+        default=0.8, ge=0, le=1, description="simulated pad: share of what remains of a press that one there takes away"
+    )
+    memory_mm: float = Field(default=10.0, gt=0, le=1e3, description="simulated pad: distance by which that falls, mm")
+    gain_wander: float = Field(
+        default=0.06, ge=0, le=1, description="simulated pad: std of the gains that wander over minutes, share"
+    )
+    floor_mv: float = Field(
+        default=3.0, ge=0, le=1000, description="simulated pad: scatter of a response that does not grow with it, mV"
+    )
+    touch_s: float = Field(
+        default=0.025, ge=0, le=1, description="simulated pad: std over the pad of when it is touched, s"
+    )
     scatter: float = Field(
-        default=0.18, ge=0, le=1, description="simulated pad: scatter of a response from press to press, share of it"
+        default=0.17, ge=0, le=1, description="simulated pad: scatter of a response from press to press, share of it"
     )
     scatter_common: float = Field(
-        default=0.36, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
+        default=0.7, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
     )
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
     board: str = Field(default="due", min_length=1, max_length=100, description="name of the board")
@@ -136,6 +167,30 @@ class RigSettings(Settings):
         if repeated := [number for number in inputs if inputs.count(number) > 1]:
             raise InputError(f"[rig] channels: got input {repeated[0]} for more than one fibre, expected one for each")
         return inputs
+
+
+IDEAL_RIG = RigSettings(
+    noise_mv=1.6,
+    drift_mv=40.0,
+    creep=0.0,
+    hysteresis=0.2,
+    hysteresis_s=2.5,
+    onset_width=1.0,
+    after_width=1.0,
+    sensitivity=0.0,
+    own_sensitivity=0.0,
+    path_mm=0.0,
+    memory=0.0,
+    gain_wander=0.0,
+    floor_mv=0.0,
+    touch_s=0.0,
+    scatter=0.18,
+    scatter_common=0.36,
+)
+"""A pad laid as planned, whose parts of a press respond alike."""
+SIMULATED = frozenset(IDEAL_RIG.model_fields_set | {"memory_mm"})
+"""Names of the settings of the simulated pad."""
+IDEAL = {"rig": IDEAL_RIG}
 
 
 class LocalizerSettings(Settings):

@@ -31,7 +31,7 @@ from padforge.sense.recording.press_plan import (
 )
 from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
-from padforge.sense.settings import Millimetres, RigSettings
+from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
 FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/2"
 _ROUNDING_MM = 1e-6
@@ -42,7 +42,7 @@ _CHANGEABLE = {
     *_PLAN_KEYS,  # the plan is stored
     *("host", "port", "baud", "printer_port", "printer_baud"),  # serial numbers are compared
     *("box_mm", "max_depth_mm", "max_force_n"),
-    *("noise_mv", "drift_mv", "creep", "hysteresis", "hysteresis_s"),
+    *SIMULATED,
 }
 """Settings that may change within a recording; any other changes what a press is."""
 _IDENTITY_KEYS = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "firmware")}

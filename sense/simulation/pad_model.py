@@ -1,32 +1,39 @@
 """Physical model of a simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The response of a fibre is the change of its resistance by the contact model. Effects of
-the published recording, whose sizes are the defaults of `[rig]`, are added: the response scatters about that of the
-position, creeps, and has hysteresis (unloaded, a fibre overshoots its rest and comes back within seconds); the rest
-drifts over minutes. An ADC with white noise reads the middle of the fibre and a fixed resistor.
+The response of a fibre is the change of its resistance by the contact model. Effects of a built pad, whose sizes in the
+published recording are the defaults of `[rig]`, are added: it scatters about that of the position, follows the probe
+with a lag, creeps, and has hysteresis (unloaded, a fibre overshoots its rest and comes back within seconds, or
+when it is pressed there again); the rest drifts over minutes. An ADC with white noise reads the middle of the fibre and
+a fixed resistor.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
 from padforge.design import Contact, Morphology
-from padforge.design.contact import DEPTH_STEPS, indented_signals, relative_stretch
-from padforge.design.paths.curves import lengths
+from padforge.design.contact import depth_terms
 from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.built_pad import BuiltPad, PressParts, build_pad, press_contacts
+from padforge.sense.simulation.residual_indentation import MAX_LAG, RETURNED, replaced_residues
 
 SUPPLY_V = 3.3
 ADC_STEPS = 4095
 GAUGE_FACTOR = 0.65  # relative change of a fibre's resistance per strain in a layer
 WEIGHT_GAUGE_FACTOR = 0.4  # and per relative stretch of a contact with weights about 1, pressed FULL_DEPTH_MM deep
 FULL_DEPTH_MM = 5.0
-TRAVEL_S = 0.15  # time that the probe takes from the surface to its depth, and back
-DELAY_S = (0.08, 0.2)  # range of the time from the command to the touch, and to the start of the release
-CREEP_S = (0.4, 6.0)  # time constants of creep, in equal shares
+TRAVEL_S = 0.1  # time that the probe takes from the surface to its depth, and back
+DELAY_S = (0.04, 0.22)  # range of the time from the command to the touch
+RELEASE_S = (0.0, 0.06)  # and to the start of the release
+ONSET_S = 0.15  # time constant by which a response goes from that of the onset to the held one
+CREEP_S = 1.0  # time constant by which it creeps
 DRIFT_S = 600.0  # correlation time of the drift
+SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and waves that make it up
+MIN_DEPTH_MM = 1e-3  # to which no press is solved
 REST_V = (1.7, 2.1)  # range of the voltages at rest; the divider is matched to half the supply only roughly
 
 
@@ -48,69 +55,127 @@ class Cycle:
         return min(self.down_index + math.ceil((DELAY_S[1] + TRAVEL_S) * self.rate_hz), self.readings - 1)
 
 
-def resistance_changes(pad: Morphology, positions_mm: Array, depths_mm: Array, contact: Contact) -> Array:
+def resistance_changes(
+    pad: BuiltPad, positions_mm: Array, depths_mm: Array, contact: Contact, rig: RigSettings
+) -> PressParts[Array]:
     """Compute the relative changes of resistance (Q, C) by presses (Q, 2) of depths (Q,).
 
     A layer is pressed as deep, other contacts, which know no depth, respond in proportion to it.
     """
-    presses = pad.to_grid(positions_mm)
-    if contact.model != "layer":
-        return WEIGHT_GAUGE_FACTOR / FULL_DEPTH_MM * depths_mm[:, None] * relative_stretch(pad, presses, contact)
-
-    def pressed(depth_mm: float) -> Contact:
-        return Contact(**contact.model_dump() | {"depth_mm": depth_mm})
-
-    depths = np.unique(depths_mm).tolist()
-    if len(depths) > DEPTH_STEPS:
-        return GAUGE_FACTOR * indented_signals(pad, presses, depths_mm, pressed(depths[-1])) / lengths(pad)
-    changes = np.empty((len(presses), len(pad.knots)))
-    for depth_mm in depths:
-        rows = depths_mm == depth_mm
-        changes[rows] = GAUGE_FACTOR * relative_stretch(pad, presses[rows], pressed(depth_mm))
-    return changes
+    changes = np.zeros((4, len(positions_mm), len(pad.paths.knots)))
+    if contact.model == "layer":
+        deepest = Contact(**contact.model_dump() | {"depth_mm": float(depths_mm.max(initial=MIN_DEPTH_MM))})
+        for rows, weight, pressed in depth_terms(depths_mm, deepest):
+            stretch = pad.stretch(positions_mm[rows], press_contacts(pressed, rig))
+            changes[:, rows] += GAUGE_FACTOR * weight[:, None] * np.stack(stretch)
+    else:
+        stretch = pad.stretch(positions_mm, press_contacts(contact, rig))
+        changes += WEIGHT_GAUGE_FACTOR / FULL_DEPTH_MM * depths_mm[:, None] * np.stack(stretch)
+    held, onset, creep, after = changes
+    return PressParts(held, onset, rig.creep * creep, rig.hysteresis * after)
 
 
-def relative_depths(cycle: Cycle, delays_s: Array) -> Array:
-    """Compute the relative depth (Q, 2 readings), 0 to 1, in a press's cycle and the next, from `delays_s` (Q, 2)."""
+class Gains:
+    """Factors on the responses of presses, an interval apart: they scatter from press to press, and wander."""
+
+    def __init__(self, interval_s: float, channels: int, rig: RigSettings, rng: np.random.Generator) -> None:
+        self._channels, self._rig, self._rng = channels, rig, rng
+        self._wander = Drift(channels, 1 / interval_s, rng)
+
+    def __call__(self, presses: int) -> Array:
+        """Sample those (Q, C) of the next presses."""
+        scatter = self._rig.response_scatter.sample_gains((presses, self._channels), self._rng)
+        return scatter * (1 + self._rig.gain_wander * self._wander(presses))
+
+
+def sample_delays(positions_mm: Array, rig: RigSettings, rng: np.random.Generator) -> Array:
+    """Sample the times (Q, 2), s, from the commands to touch and to release: uneven pads are touched at other times."""
+    modes = positions_mm @ (rng.standard_normal((2, SURFACE_WAVES)) / SURFACE_MM)
+    surface = np.sqrt(2 / SURFACE_WAVES) * np.cos(modes + rng.uniform(0, 2 * np.pi, SURFACE_WAVES)).sum(axis=1)
+    low, high = np.transpose([DELAY_S, RELEASE_S])
+    delays = rng.uniform(low, high, (len(positions_mm), 2))
+    delays[:, 0] += rig.touch_s * surface
+    return np.maximum(delays, 0)
+
+
+class Motion(NamedTuple):
+    """Motion of the probe in the cycles of presses and in the next ones; shapes (Q, 2 readings)."""
+
+    depth: Array  # relative, 0 to 1
+    onset: Array  # share of it by which the response is still that of the onset
+
+
+def probe_motion(cycle: Cycle, delays_s: Array) -> Motion:
+    """Compute how the probe moves, from the delays (Q, 2) of `sample_delays`."""
     times_s = np.arange(2 * cycle.readings) / cycle.rate_hz
-    touch_s = cycle.down_index / cycle.rate_hz + delays_s[:, :1]
-    release_s = cycle.readings / cycle.rate_hz + delays_s[:, 1:]
-    return np.clip((times_s - touch_s) / TRAVEL_S, 0, 1) - np.clip((times_s - release_s) / TRAVEL_S, 0, 1)
+    pressed_s = times_s - cycle.down_index / cycle.rate_hz - delays_s[:, :1]
+    released_s = times_s - cycle.readings / cycle.rate_hz - delays_s[:, 1:]
+    depth = np.clip(pressed_s / TRAVEL_S, 0, 1) - np.clip(released_s / TRAVEL_S, 0, 1)
+    return Motion(depth, depth * np.exp(-np.maximum(pressed_s, 0) / ONSET_S))
 
 
-def superpose_strain(responses: Array, depths: Array) -> Array:
-    """Superpose the strain (Q readings, C) of presses by their responses (Q, C) and relative depths (Q, 2 readings)."""
-    readings = depths.shape[1] // 2
-    strain = responses[:, None, :] * depths[:, :readings, None]
-    strain[1:] += responses[:-1, None, :] * depths[:-1, readings:, None]
-    return strain.reshape(-1, responses.shape[1])
+def scaled(responses: PressParts[Array], gains: Array) -> PressParts[Array]:
+    """Return responses (Q, C) of which those while it is pressed are times gains (Q, C)."""
+    held, onset, creep, after = responses
+    return PressParts(gains * held, gains * onset, gains * creep, after)
 
 
-class CreepHysteresis:
-    """Creep of a share of the response, and hysteresis: an overshoot by a share of the strain lost, which decays."""
+class Strain(NamedTuple):
+    """Strain (R, C) of the fibres, reading by reading, which `Viscoelasticity` makes visible."""
+
+    pressed: Array  # while the probe is in the silicone
+    creeping: Array  # is lost of it as it creeps
+    residue: Array  # what becomes of residues at each reading: left behind, less what is taken away
+
+
+def superpose_strain(responses: PressParts[Array], replaced: Array, motion: Motion) -> Strain:
+    """Superpose presses by their responses, and the residues that they replace, both (Q, C)."""
+    readings = motion.depth.shape[1] // 2
+    steps = np.diff(motion.depth, axis=1, prepend=0.0)
+    strain = Strain(*np.zeros((3, len(steps) * readings, replaced.shape[1])))
+    for behind, of in ((0, slice(None, readings)), (1, slice(readings, None))):
+        presses, begin = len(steps) - behind, behind * readings
+        pressed = PressParts(*(part[:presses, None] for part in responses))
+        moved = (values[:presses, of, None] for values in (*motion, steps))
+        for part, of_presses in zip(strain, strain_of(pressed, replaced[:presses, None], *moved), strict=True):
+            part[begin:] += of_presses.reshape(-1, part.shape[1])
+    return strain
+
+
+def strain_of(responses: PressParts[Array], replaced: Array, depth: Any, onset: Any, step: Any) -> Strain:
+    """Compute the strain at a depth and its share of the onset, as in `Motion`, reached by a step from another."""
+    up, down = np.maximum(-step, 0), np.maximum(step, 0)
+    pressed = depth * responses.held + onset * (responses.onset - responses.held)
+    residue = up * (responses.after + RETURNED * replaced) - down * replaced
+    return Strain(pressed, depth * responses.creep, residue)
+
+
+class Viscoelasticity:
+    """Creep, and residues, which decay."""
 
     def __init__(self, rate_hz: float, rig: RigSettings) -> None:
-        self._creep, self._hysteresis = rig.creep, rig.hysteresis
-        self._creep_decays = [np.exp(-1 / (rate_hz * time_constant)) for time_constant in CREEP_S]
+        self._creep = _LowPass(rate_hz, CREEP_S)
         self._decay = np.exp(-1 / (rate_hz * rig.hysteresis_s))
-        self._last: Array | None = None  # strain, and the states of the filters after it
-        self._lags: list[Array] = []
-        self._overshoot = np.zeros(0)
+        self._left: Array | None = None
 
-    def __call__(self, strain: Array) -> Array:
-        """Compute the visible part of further strain (R, C), which settles at the strain."""
-        if self._last is None:  # settled at the first strain
-            self._last, self._overshoot = strain[:1], np.zeros_like(strain[:1])
-            self._lags = [decay * strain[:1] for decay in self._creep_decays]
-        visible = (1 - self._creep) * strain
-        for i, decay in enumerate(self._creep_decays):
-            lagged, self._lags[i] = lfilter([1 - decay], [1.0, -decay], strain, axis=0, zi=self._lags[i])
-            visible = visible + self._creep / len(self._lags) * lagged
-        previous = np.concatenate([self._last, strain[:-1]])
-        unloading = np.sign(previous) * np.maximum(np.abs(previous) - np.abs(strain), 0)
-        overshoot, self._overshoot = lfilter([1.0], [1.0, -self._decay], unloading, axis=0, zi=self._overshoot)
-        self._last = strain[-1:].copy()
-        return visible - self._hysteresis * overshoot
+    def __call__(self, strain: Strain) -> Array:
+        """Compute the visible part (R, C) of further strain, which starts settled."""
+        left = np.zeros_like(strain.residue[:1]) if self._left is None else self._left
+        residue, self._left = lfilter([1.0], [1.0, -self._decay], strain.residue, axis=0, zi=left)
+        return strain.pressed - self._creep(strain.creeping) - residue
+
+
+class _LowPass:
+    """First-order low pass of rows, settled at the first one."""
+
+    def __init__(self, rate_hz: float, time_s: float) -> None:
+        self._decay = np.exp(-1 / (rate_hz * time_s))
+        self._state: Array | None = None
+
+    def __call__(self, rows: Array) -> Array:
+        state = self._decay * rows[:1] if self._state is None else self._state
+        out, self._state = lfilter([1 - self._decay], [1.0, -self._decay], rows, axis=0, zi=state)
+        return out
 
 
 class Drift:
@@ -145,16 +210,17 @@ class Divider:
     def __init__(
         self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator, linear: bool = False
     ) -> None:
+        self.channels = fibres
         self._rest_v = rng.uniform(*REST_V, fibres)
-        self._creep_hysteresis = CreepHysteresis(rate_hz, rig)
+        self._viscoelasticity = Viscoelasticity(rate_hz, rig)
         self._drift = Drift(fibres, rate_hz, rng)
         self._rig, self._rng, self._linear = rig, rng, linear
 
-    def __call__(self, strain: Array) -> Array:
-        """Read the voltages of further strain (R, C)."""
-        if not len(strain):
-            return strain
-        visible = self._creep_hysteresis(strain)
+    def __call__(self, strain: Strain) -> Array:
+        """Read the voltages (R, C) of further strain."""
+        if not len(strain.pressed):
+            return strain.pressed
+        visible = self._viscoelasticity(strain)
         volts = self._rest_v + visible if self._linear else divider_voltage(self._rest_v, visible)
         volts += self._rig.drift_mv * 1e-3 * self._drift(len(volts))
         volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
@@ -162,33 +228,34 @@ class Divider:
 
 
 def simulate_readings(
-    responses: Array,
+    responses: PressParts[Array],
+    positions_mm: Array,
     cycle: Cycle,
     rig: RigSettings,
     rng: np.random.Generator,
     noise_v: Array | None = None,
 ) -> Array:
-    """Simulate the readings (Q readings, C), V, of presses.
+    """Simulate the readings (Q readings, C), V, of presses (Q, 2), one in each cycle.
 
-    Responses (Q, C) are relative changes of resistance; or V, as measured (a held press minus the rest), with the
-    standard deviation `noise_v` (C,) that does not depend on them.
+    Responses (Q, C) are relative changes of resistance; or V, as measured, of which a held press scatters by `noise_v`
+    (C,) about what its position explains, whatever its size.
     """
-    presses, channels = responses.shape
+    presses, channels = responses.held.shape
     # The divider draws first, as in `LivePad`: with the same seed fibres have the same rests there.
     divider = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
-    responses = responses * rig.response_scatter.sample_gains((presses, channels), rng)
+    interval_s = cycle.readings / cycle.rate_hz
+    touch_s = interval_s * np.arange(presses)
+    release_s = touch_s + (cycle.readings - cycle.down_index) / cycle.rate_hz
+    replaced = replaced_residues(positions_mm, touch_s, release_s, responses.after, responses.held, rig)
+    responses = scaled(responses, Gains(interval_s, channels, rig, rng)(presses))
     if noise_v is not None:
         press_noise_v = np.sqrt(np.maximum(noise_v**2 - _reading_noise_v(cycle, rig) ** 2, 0))
-        responses = (responses + press_noise_v * rng.standard_normal(responses.shape)) / _held_share(cycle, rig)
-    depths = relative_depths(cycle, rng.uniform(*DELAY_S, (presses, 2)))
-    return divider(superpose_strain(responses, depths))
-
-
-def _held_share(cycle: Cycle, rig: RigSettings) -> float:
-    """Return the mean response while a press is held, as a share of what it would settle at."""
-    pressed = np.zeros((cycle.readings, 1))
-    pressed[cycle.down_index :] = 1.0
-    return float(CreepHysteresis(cycle.rate_hz, rig)(pressed)[cycle.held_index :].mean())
+    else:
+        # near half of the supply the reading falls by a quarter of the supply for a change of resistance of 1
+        press_noise_v = 4e-3 / SUPPLY_V * rig.floor_mv
+    held = responses.held + press_noise_v * rng.standard_normal((presses, channels))
+    responses = responses._replace(held=held)
+    return divider(superpose_strain(responses, replaced, probe_motion(cycle, sample_delays(positions_mm, rig, rng))))
 
 
 def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
@@ -208,13 +275,14 @@ class LivePad:
     def __init__(
         self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, rng: np.random.Generator
     ) -> None:
-        self._pad, self._contact = pad, contact
-        self._divider = Divider(len(pad.knots), rate_hz, rig, rng)
-        self._rig, self._rng = rig, rng
+        channels = len(pad.knots)
+        self._divider = Divider(channels, rate_hz, rig, rng)
+        self._gains = Gains(rig.readings_per_press / rig.rate_hz, channels, rig, rng)
+        self._pad, self._contact, self._rig, self._rate_hz = build_pad(pad, rig), contact, rig, rate_hz
         self._depth_mm = max(rig.depths_mm, default=rig.depth_mm)
-        self._cache: dict[tuple[float, float], Array] = {}
-        self._gains = np.ones(len(pad.knots))
-        self._is_touched = False
+        self._cache: dict[tuple[float, float], PressParts[Array]] = {}
+        self._presses: list[_Press] = []  # the last of them
+        self._depth, self._n_read = 0.0, 0
 
     def prepare(self) -> None:
         """Compile and solve what the first press would wait for."""
@@ -225,19 +293,52 @@ class LivePad:
 
         Depths (R,) are below the surface, negative above.
         """
-        strain = np.zeros((len(positions_mm), len(self._pad.knots)))
-        for row, is_touched in enumerate(depths_mm > 0):
-            if is_touched and not self._is_touched:
-                self._gains = self._rig.response_scatter.sample_gains((1, len(self._gains)), self._rng)[0]
-            self._is_touched = bool(is_touched)
-            if is_touched:
-                strain[row] = depths_mm[row] / self._depth_mm * self._gains * self._response(positions_mm[row])
+        strain = Strain(*np.zeros((3, len(positions_mm), self._divider.channels)))
+        for row, depth in enumerate(np.maximum(depths_mm / self._depth_mm, 0).tolist()):
+            step, self._depth = depth - self._depth, depth
+            if not (depth or step):
+                continue
+            if depth and step == depth:
+                self._touch(positions_mm[row], (self._n_read + row) / self._rate_hz)
+            press, time_s = self._presses[-1], (self._n_read + row) / self._rate_hz
+            if depth:
+                press.response, press.release_s = self._response(positions_mm[row]), time_s
+            onset = depth * math.exp((press.touch_s - time_s) / ONSET_S)
+            parts = strain_of(scaled(press.response, press.gains), press.replaced, depth, onset, step)
+            for part, of_press in zip(strain, parts, strict=True):
+                part[row] = of_press
+        self._n_read += len(positions_mm)
         return self._divider(strain)
 
-    def _response(self, position_mm: Array) -> Array:
-        """(C,) of the deepest press; the tip of an arm at rest stays within hundredths of a millimetre."""
+    def _touch(self, position_mm: Array, time_s: float) -> None:
+        """Begin a press, which takes away residues of earlier ones."""
+        response = self._response(position_mm)
+        press = _Press(position_mm, time_s, time_s, self._gains(1), response, np.zeros_like(response.held))
+        self._presses = [*self._presses[-MAX_LAG:], press]
+        positions_mm, touch_s, release_s = (
+            np.array([getattr(each, name) for each in self._presses])
+            for name in ("position_mm", "touch_s", "release_s")
+        )
+        held = np.concatenate([each.response.held for each in self._presses])
+        residues = np.concatenate([each.response.after for each in self._presses])
+        press.replaced = replaced_residues(positions_mm, touch_s, release_s, residues, held, self._rig)[-1:]
+
+    def _response(self, position_mm: Array) -> PressParts[Array]:
+        """(1, C) of the deepest press; the tip of an arm at rest stays within hundredths of a millimetre."""
         x, y = np.round(position_mm, 2).tolist()
         if (x, y) not in self._cache:
             position, depth = np.array([[x, y]]), np.array([self._depth_mm])
-            self._cache = {(x, y): resistance_changes(self._pad, position, depth, self._contact)[0]}
+            self._cache = {(x, y): resistance_changes(self._pad, position, depth, self._contact, self._rig)}
         return self._cache[x, y]
+
+
+@dataclass
+class _Press:
+    """A press of a `LivePad`; its response at the full depth."""
+
+    position_mm: Array
+    touch_s: float
+    release_s: float
+    gains: Array
+    response: PressParts[Array]
+    replaced: Array

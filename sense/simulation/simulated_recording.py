@@ -1,24 +1,24 @@
 """Simulated recordings of presses, with the responses of the contact model or of a twin; and settings measured for it.
 
-`measure_rig_settings` estimates the noise, drift and hysteresis of a recorded pad. A press leaves a share of its
-response behind, with the opposite sign, which decays: so rests differ from press to press. Their variogram separates
-what decays within some presses from what drifts over minutes; the overshoot after a release, regressed on the response,
-is the share.
+`measure_rig_settings` estimates the noise, drift and hysteresis of a recorded pad. What remains of a press decays: so
+rests differ from press to press. Their variogram separates what decays within some presses from what drifts over
+minutes.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from math import ceil
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import nnls
 
 from padforge.design import Contact, Morphology, Twin
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import MAX_VALUES, InputError, check_int, check_type
-from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
-from padforge.design.twin import TwinChannel
+from padforge.design.twin import PARTS, TwinChannel, TwinPart
 from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array, Indices
 from padforge.sense.recording.press_plan import (
     PositionTest,
@@ -30,11 +30,10 @@ from padforge.sense.recording.press_plan import (
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.built_pad import PressParts, build_pad
 from padforge.sense.simulation.pad_model import (
-    DELAY_S,
     DRIFT_S,
     FULL_DEPTH_MM,
-    TRAVEL_S,
     Cycle,
     resistance_changes,
     simulate_readings,
@@ -42,8 +41,9 @@ from padforge.sense.simulation.pad_model import (
 
 MIN_SINGULAR = 0.3  # relative; below it both sides of a pad, turned by more than some 28 degrees, count as equal
 JITTER = 0.1  # standard deviation of the interval between readings over its mean: the loop that records is no clock
+MIN_SENSITIVITY = 1e-3  # of a piece of a fibre, below which it counts as that
 MIN_PRESSES = 100  # presses from which noise, drift and hysteresis are measured
-REST_S, AFTER_S = 0.7, (0.7, 1.4)  # times before and after a press in which fibres rest and show what it left behind
+REST_S = 0.7  # time before a press in which fibres rest
 DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are tried
 
 
@@ -53,26 +53,29 @@ class PadModel:
 
     corners_mm: Array  # low and high corner of where it is pressed, in the frame of the arm; shape (2, 2)
     free: PositionTest  # which positions (Q, 2) may be pressed
-    responses: Callable[[Array, Array], Array]  # (Q, C) of positions (Q, 2) and depths (Q,), mm; as `simulate_readings`
+    responses: Callable[
+        [Array, Array], PressParts[Array]
+    ]  # of positions (Q, 2) and depths (Q,), mm; as `simulate_readings`
     source: dict[str, Any]  # description of the pad for the recording, JSON
     noise_v: Array | None = None  # deviation of responses that no position explains, shape (C,); None for stretches
-    rig: dict[str, float] = field(default_factory=dict)  # measured settings of `[rig]`
 
 
-def model_plan(pad: Morphology, contact: Contact, size: PadSettings | None = None) -> PadModel:
-    """Model a pad as make_plan; `size` says where it is pressed, as `fit_pad_settings`."""
+def model_plan(pad: Morphology, contact: Contact, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
+    """Model a pad that is built as `[rig]` says; `size` says where it is pressed, as `fit_pad_settings`."""
     size = fit_pad_settings(pad, size)
     keys = {"sensed_mm", "keep_out_mm"} if size.keep_out_mm else {"sensed_mm"}
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
     source |= size.model_dump(mode="json", include=keys)
 
-    def responses(positions_mm: Array, depths_mm: Array) -> Array:
-        return resistance_changes(pad, positions_mm, depths_mm, contact)
+    built = build_pad(pad, rig)
+
+    def responses(positions_mm: Array, depths_mm: Array) -> PressParts[Array]:
+        return resistance_changes(built, positions_mm, depths_mm, contact, rig)
 
     return PadModel(pad.to_mm(size.sensed), pressable_test(pad, size), responses, source)
 
 
-def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
+def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
     """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; dead channels stay at rest."""
     live = _live_channels(twin)
     columns = [twin.channels.index(channel) for channel in live]
@@ -81,16 +84,28 @@ def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
     noise_v = np.zeros(len(twin.channels))
     noise_v[columns] = [channel.noise_v for channel in live]
 
-    def responses(positions_mm: Array, depths_mm: Array) -> Array:
-        out = np.zeros((len(positions_mm), len(twin.channels)))
-        out[:, columns] = gains_v * twin.as_built_stretch(positions_mm)[:, fibres]
-        return depths_mm[:, None] / FULL_DEPTH_MM * out
+    def responses(positions_mm: Array, depths_mm: Array) -> PressParts[Array]:
+        parts = np.zeros((len(PARTS), len(positions_mm), len(twin.channels)))
+        for name, part in zip(PARTS, parts, strict=True):
+            if name in twin.parts:
+                stretch = twin.as_built_stretch(positions_mm, name)[:, fibres]
+                part[:, columns] = twin.parts[name].gains_v[columns] * stretch
+            else:
+                part[:, columns] = _share(name, rig) * gains_v * twin.as_built_stretch(positions_mm)[:, fibres]
+        if twin.residual is not None:
+            positions = (positions_mm - twin.residual.middle_mm) / twin.residual.half_mm
+            maps = twin.residual.volts.transpose(2, 3, 0, 1)
+            axis = np.linspace(-1, 1, len(maps))
+            left = RegularGridInterpolator((axis, axis), maps)(np.clip(positions, -1, 1))
+            parts += left.transpose(1, 0, 2)
+        held, onset, creep, after = depths_mm[:, None] / FULL_DEPTH_MM * parts
+        return PressParts(held, onset, creep, after)
 
     # Sides along the axes of the arm that span `sensed_mm` along those of the plan.
     spans = np.abs(twin.frame.rotate(np.eye(2))).T
     sides, *_ = np.linalg.lstsq(spans, np.array(twin.sensed_mm) / twin.frame.scale, rcond=MIN_SINGULAR)
     half_mm = np.maximum(sides, 0) / 2
-    plan = model_plan(twin.morphology, twin.contact(), size)
+    plan = model_plan(twin.morphology, twin.contact(), rig, size)
     return replace(
         plan,
         corners_mm=np.array([-half_mm, half_mm]),
@@ -100,22 +115,40 @@ def model_twin(twin: Twin, size: PadSettings | None = None) -> PadModel:
     )
 
 
-def model_like_twin(pad: Morphology, twin: Twin, size: PadSettings | None = None) -> PadModel:
-    """Model another pad as make_plan, with the sensitivity profile of a twin and its median gain and noise.
+def model_like_twin(pad: Morphology, twin: Twin, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
+    """Model another pad as make_plan, with the sensitivity profiles of a twin and its median gains and noise.
 
-    How its channels will differ is unknown before it is made: fibre i is on channel i, and all have the same gain.
+    How its channels will differ is unknown before it is made: fibre i is on channel i, all have the same gain, and
+    their sensitivities vary as those of the twin do.
     """
-    gains_v, noises_v = np.array([(channel.gain_v, channel.noise_v) for channel in _live_channels(twin)]).T
-    gain_v = np.copysign(np.median(np.abs(gains_v)), gains_v.sum())
-    plan = model_plan(pad, twin.contact(), size)
-    noise_v = np.full(len(pad.knots), np.median(noises_v))
-    contact = twin.contact()
+    live = _live_channels(twin)
+    columns = [twin.channels.index(channel) for channel in live]
+    plan = model_plan(pad, twin.contact(), rig, size)
+    noise_v = np.full(len(pad.knots), np.median([channel.noise_v for channel in live]))
+    whole, gain_v = twin.contact(), _median_gain(np.array([channel.gain_v for channel in live]))
+    parts = [twin.parts.get(name) for name in PARTS]
+    contacts = PressParts(*(whole if part is None else part.contact() for part in parts))
+    gains_v = [
+        _share(name, rig) * gain_v if part is None else _median_gain(part.gains_v[columns])
+        for name, part in zip(PARTS, parts, strict=True)
+    ]
+    built = build_pad(pad, rig)
 
-    def responses(positions_mm: Array, depths_mm: Array) -> Array:
-        stretch = relative_stretch(pad, pad.to_grid(positions_mm), contact)
-        return gain_v / FULL_DEPTH_MM * depths_mm[:, None] * stretch
+    def responses(positions_mm: Array, depths_mm: Array) -> PressParts[Array]:
+        stretch = built.stretch(positions_mm, contacts)
+        depth = depths_mm[:, None] / FULL_DEPTH_MM
+        return PressParts(*(gain_v * depth * part for gain_v, part in zip(gains_v, stretch, strict=True)))
 
     return replace(plan, responses=responses, **_measured(twin, noise_v, plan.source))
+
+
+def _median_gain(gains_v: Array) -> float:
+    return float(np.copysign(np.median(np.abs(gains_v)), gains_v.sum()))
+
+
+def _share(part: str, rig: RigSettings) -> float:
+    """Return the share of the response that a part is where it was not measured."""
+    return {"held": 1.0, "onset": 1.0, "creep": rig.creep, "after": rig.hysteresis}[part]
 
 
 def _live_channels(twin: Twin) -> list[TwinChannel]:
@@ -126,18 +159,28 @@ def _live_channels(twin: Twin) -> list[TwinChannel]:
 
 
 def _measured(twin: Twin, noise_v: Array, source: dict[str, Any]) -> dict[str, Any]:
-    """Return `noise_v`, `rig` and `source` of a `PadModel` that is like a twin.
+    """Return `noise_v` and `source` of a `PadModel` that is like a twin."""
+    description = {"presses": twin.presses, "noise": twin.noise, "provenance": dict(twin.provenance)}
+    return {"noise_v": twin.scatter.floor * noise_v, "source": source | {"twin": description}}
 
-    A simulated press deviates in all its readings by the same, so by less than a measured one while it is held: as much
-    as limits the localization from all that was read of a press.
-    """
-    rig = asdict(twin.readings) if twin.readings else {}
-    information_gain = rig.pop("information_gain", 1.0)
-    rig |= {"scatter": twin.scatter.share / np.sqrt(information_gain), "scatter_common": twin.scatter.common}
-    description = {"presses": twin.presses, "noise": twin.noise, "information_gain": information_gain}
-    description |= {"provenance": dict(twin.provenance)}
-    noise_v = twin.scatter.floor * noise_v / np.sqrt(information_gain)
-    return {"noise_v": noise_v, "rig": rig, "source": source | {"twin": description}}
+
+def measured_rig(twin: Twin, rig: RigSettings) -> RigSettings:
+    """Return `[rig]` with what was measured of a pad."""
+    measured = asdict(twin.readings) if twin.readings else {}
+    measured |= {"scatter": twin.scatter.share, "scatter_common": twin.scatter.common}
+    held = _log_sensitivities(twin.parts.get("held", twin))
+    if held is not None:
+        own = [_log_sensitivities(twin.parts[name]) for name in PARTS[1:] if name in twin.parts]
+        differences = [part - held for part in own if part is not None]
+        measured |= {"sensitivity": min(float(held.std()), 2.0)}
+        measured |= {"own_sensitivity": min(float(np.std(differences)), 2.0)} if differences else {}
+    return rig.model_copy(update=measured)
+
+
+def _log_sensitivities(part: Twin | TwinPart) -> Array | None:
+    """Return the logarithms of the sensitivities along all fibres, each of zero mean; None where they are uniform."""
+    rows = [np.log(np.maximum(row, MIN_SENSITIVITY)) for row in part.sensitivity or () if row is not None]
+    return np.concatenate([row - row.mean() for row in rows]) if rows else None
 
 
 def simulate(
@@ -171,13 +214,14 @@ def simulate(
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     if rig.plan == "adaptive":
         raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
+    if measured := pad if isinstance(pad, Twin) else like:
+        rig = measured_rig(check_type("like", measured, Twin), rig)
     if isinstance(pad, Twin):
-        model = model_twin(pad, size)
+        model = model_twin(pad, rig, size)
     elif like is None:
-        model = model_plan(pad, contact, size)
+        model = model_plan(pad, contact, rig, size)
     else:
-        model = model_like_twin(pad, check_type("like", like, Twin), size)
-    rig = rig.model_copy(update=model.rig)
+        model = model_like_twin(pad, like, rig, size)
     rng = np.random.default_rng(rig.seed)
     plan = make_plan_in(model.corners_mm, rig, rng, model.free)
     values = len(plan) * rig.readings_per_press * channels
@@ -185,7 +229,7 @@ def simulate(
         raise InputError(f"[rig] presses is {len(plan)}: they have {values} readings, allowed are {MAX_VALUES}")
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     responses = model.responses(plan.positions_mm, plan.depths_mm)
-    readings = simulate_readings(responses, cycle, rig, rng, model.noise_v)
+    readings = simulate_readings(responses, plan.positions_mm, cycle, rig, rng, model.noise_v)
     intervals_s = (1 + JITTER * np.clip(rng.standard_normal(len(readings)), -3, 3)) / rig.rate_hz
     first = cycle.readings * np.arange(len(plan))
     return Recording(
@@ -206,7 +250,7 @@ def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, si
 
 
 def measure_rig_settings(recording: Recording) -> dict[str, float]:
-    """Measure the `noise_mv`, `drift_mv`, `hysteresis` and `hysteresis_s` of `[rig]` in a recording.
+    """Measure the `noise_mv`, `drift_mv` and `hysteresis_s` of `[rig]` in a recording.
 
     Channels that miss readings or are constant are ignored; none are returned for fewer than MIN_PRESSES or no channel.
     """
@@ -214,24 +258,15 @@ def measure_rig_settings(recording: Recording) -> dict[str, float]:
     valid = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > MIN_SCALE_V)
     if len(down_command) < MIN_PRESSES or not valid.any():
         return {}
-    readings, next_down = recording.readings[:, valid], recording.down_command[1:]
-    held, rested, first, last = np.ceil(np.array([DELAY_S[1] + TRAVEL_S, REST_S, *AFTER_S]) * rate_hz).astype(int)
+    readings, rested = recording.readings[:, valid], ceil(REST_S * rate_hz)
     rest = _interval_means(readings, np.maximum(down_command - rested, np.append(0, up_command[:-1])), down_command)
-    response = _interval_means(readings, np.minimum(down_command + held, up_command - 1), up_command) - rest
-    after = _interval_means(
-        readings, np.minimum(up_command + first, next_down - 1), np.minimum(up_command + last, next_down)
-    )
-    residue = after - rest
     decay_s, drift_v = _fit_variogram(rest, float(np.median(np.diff(recording.times_s[down_command]))))
-    response, residue = response - response.mean(axis=0), residue - residue.mean(axis=0)
-    share = -float((response * residue).sum() / (response**2).sum()) * np.exp(np.mean(AFTER_S) / decay_s)
     middle = (down_command + up_command) // 2
     second_differences = readings[middle - 1] - 2 * readings[middle] + readings[middle + 1]
     return {
         # The variance of a second difference of white noise is six times that of the noise.
         "noise_mv": 1e3 * float(np.sqrt((second_differences**2).mean() / 6)),
         "drift_mv": 1e3 * drift_v,
-        "hysteresis": float(np.clip(share, 0, 0.99)),
         "hysteresis_s": decay_s,
     }
 

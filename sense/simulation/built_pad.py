@@ -1,0 +1,118 @@
+"""A simulated pad as it comes out of the mould: fibres beside their plan, with a sensitivity that varies along them.
+
+The response to a press has four parts: held; onset, while the probe moves; creep, by which the held one relaxes; and
+what remains after the release. The held one is that of the contact. The others are as wide as `[rig]` says, and have
+sensitivities along the fibres of their own. So a trace tells more of the position than any one of its readings, as that
+of a built pad does.
+"""
+
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from padforge.design import Contact, Morphology
+from padforge.design.contact import quick_signals, widened
+from padforge.design.kernels.measured_signals import FINE_PRECISION
+from padforge.design.morphology import split_axes
+from padforge.design.paths.curves import lengths
+from padforge.sense.arrays import Array
+from padforge.sense.settings import RigSettings
+
+T = TypeVar("T")
+SMOOTH_MM = 8.0
+"""Length over which the sensitivity changes along a fibre, and a path comes back to its plan: half a wave."""
+SAMPLES = 65
+"""Samples of the sensitivity along the axis of a fibre."""
+KNOTS_PER_WAVE = 8
+"""Knots of an as-built path in each half wave."""
+
+
+class PressParts(NamedTuple, Generic[T]):
+    """What there is of each of the parts of a press."""
+
+    held: T
+    onset: T  # from which the held response develops, with a lag
+    creep: T  # is lost of it while the probe rests
+    after: T  # remains after the release, with the opposite sign
+
+
+def build_pad(plan: Morphology, rig: RigSettings) -> "BuiltPad":
+    """Return the pad that `[rig]` makes of a plan, the same for the same seed."""
+    return BuiltPad.sample(plan, rig, np.random.default_rng([2, rig.seed]))
+
+
+@dataclass(frozen=True)
+class BuiltPad:
+    """Fibres of a pad as built.
+
+    Attributes:
+        paths: their paths.
+        sensitivities: along the axis of each, for each part of a response; shapes (F, SAMPLES). Uniform if None.
+    """
+
+    paths: Morphology
+    sensitivities: PressParts[Array] | None = None
+
+    @classmethod
+    def sample(cls, plan: Morphology, rig: RigSettings, rng: np.random.Generator) -> "BuiltPad":
+        """Sample the pad that is built by a plan, as far from it as `[rig]` says."""
+        paths = _deviate(plan, rig.path_mm, rng) if rig.path_mm else plan
+        if not (rig.sensitivity or rig.own_sensitivity):
+            return cls(paths)
+        held, *own = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
+        logarithms = [held := rig.sensitivity * held, *(held + rig.own_sensitivity * each for each in own)]
+        return cls(paths, PressParts(*map(_factors, logarithms)))
+
+    def stretch(self, positions_mm: Array, contacts: PressParts[Contact]) -> PressParts[Array]:
+        """Compute the relative stretch (Q, F) of the fibres by presses (Q, 2), of which each part has its contact."""
+        presses, parts = self.paths.to_grid(positions_mm), []
+        for contact, sensitivity in zip(contacts, self.sensitivities or [None] * len(contacts), strict=True):
+            signals = quick_signals(self.paths, presses, contact, FINE_PRECISION, sensitivity)
+            parts.append(signals / lengths(self.paths))
+        return PressParts(*parts)
+
+
+def press_contacts(contact: Contact, rig: RigSettings) -> PressParts[Contact]:
+    """Return the contacts of the parts of a press, as wide as `[rig]` says."""
+    after = widened(contact, rig.after_width)
+    return PressParts(contact, widened(contact, rig.onset_width), after, after)
+
+
+def _deviate(plan: Morphology, deviation_mm: float, rng: np.random.Generator) -> Morphology:
+    """Return a pad whose paths leave their plan by a standard deviation across their axes; ends and sides stay."""
+    from scipy.interpolate import PchipInterpolator
+
+    horizontals, knots = plan.layout.counts[0], []
+    along, across = (axis[0] for axis in split_axes(plan.knots[None], horizontals))
+    extents_mm = plan.unit_mm * (along[:, -1] - along[:, 0])
+    waves = max(int(extents_mm.max() / SMOOTH_MM), 1)
+    at = np.linspace(0, 1, KNOTS_PER_WAVE * waves + 1)
+    for fibre, (t, v) in enumerate(zip(along, across, strict=True)):
+        modes = np.sin(np.pi * np.outer(at, np.arange(1, _waves(extents_mm[fibre]) + 1)))
+        offset = deviation_mm / plan.unit_mm * np.sqrt(2 / modes.shape[1]) * modes @ rng.standard_normal(modes.shape[1])
+        t_new = t[0] + at * (t[-1] - t[0])
+        path = np.stack([t_new, PchipInterpolator(t, v)(t_new) + offset], axis=1)
+        path[[0, -1]] = [(t[0], v[0]), (t[-1], v[-1])]
+        knots.append(path if fibre < horizontals else path[:, ::-1])
+    return Morphology.from_layout(np.clip(np.stack(knots), 0, plan.layout.extent), plan.layout)
+
+
+def _log_sensitivity(plan: Morphology, rng: np.random.Generator) -> Array:
+    """Sample a smooth function (F, SAMPLES) of zero mean and unit variance along each fibre."""
+    at, rows = np.linspace(0, 1, SAMPLES), []
+    for extent in np.repeat(plan.unit_mm * np.array(plan.layout.extent), plan.layout.counts):
+        modes = np.cos(np.pi * np.outer(at, np.arange(1, _waves(extent) + 1)))
+        falling = 1 / np.arange(1, modes.shape[1] + 1)
+        rows.append(np.sqrt(2 / (falling**2).sum()) * (falling * modes) @ rng.standard_normal(modes.shape[1]))
+    return np.array(rows)
+
+
+def _waves(extent_mm: float) -> int:
+    return max(int(extent_mm / SMOOTH_MM), 1)
+
+
+def _factors(logarithm: Array) -> Array:
+    """Return factors of mean 1 along each fibre."""
+    factors = np.exp(logarithm)
+    return factors / factors.mean(axis=1, keepdims=True)
