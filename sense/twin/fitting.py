@@ -41,6 +41,7 @@ FIRST_PRIOR_STEP = 3  # step from which these are estimated; before, a poor fit 
 TOLERANCE = 1e-4  # relative change of the objective at which a fit has converged
 MAX_DAMPING = 1e8
 MAX_STEPS = 25
+WANDER_PRESSES = 250  # presses over which gains are averaged
 MIN_PAIRS = 30  # pairs of presses that the scatter is estimated from, at least
 
 
@@ -51,13 +52,14 @@ class Priors:
     lateral_offset_mm: float = 0.0
     log_sensitivity: float = 0.0
     angular: bool = False  # whether the response may depend on the angle between fibre and press
+    pose: bool = True  # whether the plan transform is fitted; else it stays
 
     def free_mask(self, channels: int) -> Mask:
         """Return which of `AsBuiltPad.values` are fitted."""
         by_channel = np.ones((channels, N_CHANNEL), bool)
         by_channel[:, OFFSET], by_channel[:, SENSITIVITY] = self.lateral_offset_mm > 0, self.log_sensitivity > 0
         shared = np.ones(N_SHARED, bool)
-        shared[4 + N_SPLINES :] = self.angular
+        shared[:4], shared[4 + N_SPLINES :] = self.pose, self.angular
         return np.concatenate([shared, by_channel.ravel()])
 
 
@@ -230,13 +232,16 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     expected = pad.predict(responses.positions_mm) - pad.channel_values[:, 1]
     residual = responses.volts - expected
     difference = (residual[first] - residual[second]) / noise_v
-    response = (expected[first] + expected[second]) / 2 / noise_v
+    response = (responses.volts[first] + responses.volts[second]) / 2 / noise_v
     variance = difference**2 / 2
     floor, share = 1.0, 0.0
     for _ in range(10):  # reweighted: the variance of one pair scatters by about itself
         weight = 1 / (floor + share * response.ravel() ** 2).clip(1e-3)
         design_matrix = np.column_stack([np.ones(response.size), response.ravel() ** 2])
         (floor, share), _ = nnls(weight[:, None] * design_matrix, weight * variance.ravel())
+    # where the variance grows otherwise than by its square, in all it is that of the noise
+    total = floor + share * float(np.mean(response**2))
+    floor, share = (part / total if total > 0 else part for part in (floor, share))
     above = np.triu_indices(response.shape[1], 1)
     scale = 1 / (floor + share * response**2).clip(1e-3)
     response_products, difference_products = (
@@ -247,3 +252,17 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     common = float((response_products * difference_products).sum() / squared) if squared > 0 else 0.0
     share, floor = (float(np.sqrt(min(part, 1.0))) for part in (share, floor))
     return TwinScatter(share, float(np.clip(common, 0, 0.99)), floor)
+
+
+def gain_wander(pad: AsBuiltPad, responses: Responses) -> float:
+    """Estimate how far the gains of channels wander between blocks of presses in their order, beyond chance."""
+    expected = pad.predict(responses.positions_mm) - pad.channel_values[:, 1]
+    volts = np.where(responses.valid, responses.volts - pad.channel_values[:, 1], expected)
+    blocks = len(volts) // WANDER_PRESSES
+    if blocks < 2:
+        return 0.0
+    y, x = (values[: blocks * WANDER_PRESSES].reshape(blocks, WANDER_PRESSES, -1) for values in (volts, expected))
+    power = np.maximum((x**2).sum(axis=1), MIN_SCALE_V**2)
+    gain = (x * y).sum(axis=1) / power
+    chance = ((y - gain[:, None] * x) ** 2 * x**2).sum(axis=1) / power**2
+    return float(np.clip(np.mean(gain.var(axis=0, ddof=1) - chance.mean(axis=0)), 0, 1) ** 0.5)

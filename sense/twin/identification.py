@@ -20,14 +20,25 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
-from padforge.design.twin import MAX_INFORMATION_GAIN, PlanTransform, Twin, TwinChannel, TwinReadings, TwinScatter
+from padforge.design.twin import (
+    PARTS,
+    PlanTransform,
+    Twin,
+    TwinChannel,
+    TwinPart,
+    TwinReadings,
+    TwinResidual,
+    TwinScatter,
+)
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.recording import Recording
+from padforge.sense.simulation.built_pad import PressParts
 from padforge.sense.simulation.simulated_recording import measure_rig_settings
 from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
 from padforge.sense.twin.contact_fit import ContactFit, fit_contact
-from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built
-from padforge.sense.twin.responses import Responses, compute_responses, fisher_information, fit_gp, select_one_depth
+from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built, gain_wander
+from padforge.sense.twin.press_parts import normalize, smooth_maps, split_presses
+from padforge.sense.twin.responses import Responses, compute_responses, fit_gp, select_one_depth
 
 PROFILE_POINTS, MIN_WEIGHT = 13, 0.01  # points of the sensitivity profile of a twin, and the least weight that counts
 MIN_PRESSES = 60
@@ -43,6 +54,7 @@ FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
 MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live, and another wiring is ruled out
 SAME_LOG_EVIDENCE = 1.0  # difference of log evidence below which two fits are equally good
 MIN_ANGULAR_GAIN = 0.01  # share of the variance of held-out responses that an angular term must explain
+MAP_STRIDE = 3  # every such node of the maps of residuals is kept: they change over several
 MIN_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else the recording is of another pad."""
 
@@ -192,6 +204,8 @@ class Identification:
     noise_v: Array  # (C,), scatter of the responses that neither position nor history explains
     noise: float  # that of live channels as a share of full scale
     alternatives: list[Wiring]  # those that the presses do not rule out
+    parts: dict[str, AsBuiltFit]  # of a press, by name in `PARTS`; none where there are too few presses
+    residual: TwinResidual | None  # smooth part of the residuals of all parts; as `readings`
     readings: TwinReadings | None  # None where there are too few presses
     scatter: TwinScatter
     contact: MeasuredContact | None  # None of a contact that is no layer, or thinner than a press is deep
@@ -231,6 +245,7 @@ class Identification:
             gain_v = float(built.channel_values[row, 0] * mean * fibre_lengths[fibre])
             explained = float(self.explained[row])
             channels[channel] = replace(channels[channel], fibre=fibre, gain_v=gain_v, explained=explained)
+        parts = {name: self._part(fit.pad, len(channels)) for name, fit in self.parts.items()}
         distance, weight, angular_weight = _sample_profile(built)
         pressed = built.transform.to_plan(self.training.positions_mm)
         return Twin(
@@ -243,22 +258,38 @@ class Identification:
             noise=self.noise,
             sensed_mm=tuple(np.ptp(pressed, axis=0).tolist()),
             presses=len(self.training),
-            angular_weight=angular_weight if angular_weight.any() else None,
+            angular_weight=angular_weight,
             sensitivity=tuple(sensitivities),
             readings=self.readings,
             scatter=self.scatter,
+            parts=parts,
+            residual=self.residual,
         )
 
+    def _part(self, built: AsBuiltPad, channels: int) -> TwinPart:
+        """Return a part of a press, of a pad whose fibres lie as those of `fit`."""
+        sensitivities: list[Array | None] = [None] * len(self.pad.knots)
+        gains_v = np.zeros(channels)
+        for row, channel in enumerate(self.live.tolist()):
+            fibre, sensitivity = built.fibres[row], built.path(row)[1]
+            sensitivities[fibre] = sensitivity / sensitivity.mean()
+            gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * lengths(self.pad)[fibre]
+        distance, weight, angular_weight = _sample_profile(built)
+        return TwinPart(distance * self.pad.unit_mm, weight, gains_v, angular_weight, tuple(sensitivities))
 
-def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array]:
-    """Return distances (PROFILE_POINTS,), grid units, up to where weights are negligible, and w and v there."""
+
+def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array | None]:
+    """Return distances (PROFILE_POINTS,), grid units, up to where weights are negligible, and w and v there.
+
+    v is None where the response does not depend on the angle.
+    """
     fine = np.linspace(0, pad.max_distance, 400)
     felt = np.flatnonzero(np.abs(pad.profile(fine)).max(axis=0) > MIN_WEIGHT)
     distance = np.linspace(0, min(fine[felt[-1]] * (1 + 1 / PROFILE_POINTS), pad.max_distance), PROFILE_POINTS)
     weights = pad.profile(distance)
     weights[:, -1] = 0.0
     weight, angular_weight = weights / np.abs(weights[0]).max()
-    return distance, weight, angular_weight
+    return distance, weight, angular_weight if angular_weight.any() else None
 
 
 def identify(
@@ -319,7 +350,8 @@ def identify_pad(
         raise InputError(
             f"{len(live)} channels of the recording respond to presses, the pad has {len(pad.knots)} fibres"
         )
-    training, held_out = responses.select(rows, live), responses.select(np.flatnonzero(held_out_mask), live)
+    held_out_rows = np.flatnonzero(held_out_mask)
+    training, held_out = responses.select(rows, live), responses.select(held_out_rows, live)
     compared = training.select(np.arange(min(N_COMPARED, len(training))))
 
     # 3. Wiring
@@ -342,11 +374,26 @@ def identify_pad(
     on_progress(0, 3, "paths")
     fit = _fit_all(best.pad, training, on_progress)
 
-    # 5. Contact
+    # 5. Parts of a press
+    readings, parts, residual, pressed = None, {}, None, training
+    if statistics := measure_rig_settings(recording):
+        on_progress(0, 1, "parts of a press")
+        split = split_presses(recording, ~held_out_mask, statistics["hysteresis_s"])
+        parts = {name: _fit_part(fit, getattr(split.parts, name).select(rows, live)) for name in PARTS}
+        residual = _residual_maps(split.parts, parts, live, ~held_out_mask)
+        pressed = split.pressed.select(rows, live)
+        wander = gain_wander(parts["held"].pad, split.pressed.select(np.arange(len(positions_mm)), live))
+        readings = TwinReadings(**statistics | split.rig, gain_wander=wander)
+
+    # 6. Contact
     on_plan = next(planned.pad for candidate, planned in candidates if candidate is wiring)
     measured = _measure_contact(_as_deep(contact, recording), fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)
-    noise_v[live] = fit_gp(fit.pad.residuals(training), pad.unit_mm)[0]
+    held = parts["held"].pad if parts else fit.pad
+    noise_v[live] = fit_gp(held.residuals(pressed), pad.unit_mm)[0]
+    scatter = estimate_scatter(held, pressed, noise_v[live])
+    if readings:  # which contains that of gains that wander
+        scatter = replace(scatter, share=float(np.sqrt(max(scatter.share**2 - readings.gain_wander**2, 0))))
     full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
     return Identification(
         pad=pad,
@@ -360,8 +407,10 @@ def identify_pad(
         alternatives=[
             wiring for wiring, other in ranked[1:] if best.log_evidence - other.log_evidence < MIN_LOG_BAYES_FACTOR
         ],
-        readings=_estimate_readings(recording, live, fit.pad, noise_v, training.positions_mm),
-        scatter=estimate_scatter(fit.pad, training, noise_v[live]),
+        readings=readings,
+        parts=parts,
+        residual=residual,
+        scatter=scatter,
         contact=measured,
         training=training,
         held_out=held_out,
@@ -471,13 +520,26 @@ def _measure_contact(
     )
 
 
-def _estimate_readings(
-    recording: Recording, live: Indices, pad: AsBuiltPad, noise_v: Array, positions_mm: Array
-) -> TwinReadings | None:
-    """Return noise, drift and hysteresis of the readings, and how much more than the responses they tell."""
-    statistics = measure_rig_settings(recording)
-    if not statistics:
-        return None
-    responses_information = (pad.mean_squared_slope(positions_mm) / noise_v[live] ** 2).sum()
-    information_gain = fisher_information(recording, live).sum() / responses_information
-    return TwinReadings(**statistics, information_gain=float(np.clip(information_gain, 1, MAX_INFORMATION_GAIN)))
+def _fit_part(fit: AsBuiltFit, training: Responses) -> AsBuiltFit:
+    """Fit a part of a press, to which the fibres lie where they do to the response."""
+    start = fit.pad.fit_gains(training)
+    priors = replace(fit.priors, lateral_offset_mm=0.0, pose=False)
+    return fit_as_built(start, training, priors, _noise_inflation(start, training))
+
+
+def _residual_maps(
+    parts: PressParts[Responses], fits: dict[str, AsBuiltFit], live: Indices, training: Mask
+) -> TwinResidual:
+    """Return the smooth function of the position that is left in the parts of presses."""
+    positions, middle_mm, half_mm = normalize(parts.held.positions_mm)
+    valid = parts.held.valid[training][:, live]
+    residuals = []
+    for name, fit in fits.items():
+        part: Responses = getattr(parts, name)
+        # what they are far from any fibre counts to it
+        stretched = fit.pad.predict(part.positions_mm[training]) - fit.pad.channel_values[:, 1]
+        residuals.append(part.volts[training][:, live] - stretched)
+    maps = smooth_maps(positions[training], np.stack(residuals, axis=2), valid)[::MAP_STRIDE, ::MAP_STRIDE]
+    volts = np.zeros((len(fits), parts.held.volts.shape[1], *maps.shape[:2]))
+    volts[:, live] = maps.transpose(3, 2, 0, 1)
+    return TwinResidual(tuple(middle_mm.tolist()), half_mm, volts)

@@ -1,19 +1,17 @@
 """Responses of the channels to presses at known positions, and what they say without a model of the pad.
 
 A response is one number for a press and a channel: the mean while the tip rests in the silicone, minus the rest before
-and what the channel's history adds. How much all windows of a press tell of its position is Fisher's information
-J' S^-1 J, with J their slope by the response model and S the covariance of its residuals on presses held out.
+and what the channel's history adds.
 """
 
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.localizer.features import DOWN, PressFeatures, compute_features
-from padforge.sense.localizer.response_model import GRID_CELLS, ResponseModel, remove_history
+from padforge.sense.localizer.response_model import ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
 DEPTH_TOLERANCE = 0.15  # share of its depth by which another press may differ that counts as equally deep
@@ -83,43 +81,6 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
     )
     windows = remove_history(inputs.windows, inputs.history, model.history_coef, model.history_mean_v)
     return Responses(positions_mm, windows @ HOLD, inputs.fibre_mask)
-
-
-def fisher_information(recording: Recording, channels: Indices) -> Array:
-    """Compute the Fisher information on the position in all windows of a press, mean over the pressed area.
-
-    Its trace (C',), 1/mm^2, is of each of the channels, from presses in which it gave enough readings.
-    """
-    positions_mm, positions, inputs = _positions_and_features(recording, "press_and_release")
-    information = []
-    for channel in channels.tolist():
-        valid = inputs.fibre_mask[:, channel]
-        windows, history = inputs.windows[valid, channel], inputs.history[valid, channel]
-        information.append(_channel_information(positions[valid], windows, history))
-    return np.array(information) * (2 / np.ptp(positions_mm, axis=0).max()) ** 2
-
-
-def _channel_information(positions: Array, windows: Array, history: Array) -> float:
-    """Return the trace of the Fisher information of one channel from positions (Q, 2), windows (Q, F), history (Q, J).
-
-    Two response models are fitted to half the presses each. Residuals are those on the other half, and slopes of the
-    two are multiplied: noise that one model takes for a slope is not in the other.
-    """
-    windows, history, fibre_mask = windows[:, None], history[:, None], np.ones((len(positions), 1), bool)
-    grid, odd = np.linspace(-1, 1, GRID_CELLS + 1), np.arange(len(positions)) % 2 == 1
-    residual, tables = np.empty_like(windows), []
-    for half in (odd, ~odd):
-        model = ResponseModel.fit(positions[half], windows[half], history[half], fibre_mask[half])
-        expected = RegularGridInterpolator((grid, grid), model.table)(positions[~half])
-        settled = remove_history(windows[~half], history[~half], model.history_coef, model.history_mean_v)
-        residual[~half] = settled - expected
-        tables.append(model.table[:, :, 0])
-    # pseudo-inverse, since short presses have the same reading in two windows
-    precision, trace = np.linalg.pinv(np.cov(residual[:, 0].T), hermitian=True), 0.0
-    for axis in (0, 1):
-        first, second = (np.asarray(np.gradient(table, 2 / GRID_CELLS, axis=axis)) for table in tables)
-        trace += float(np.einsum("xyf,fg,xyg->xy", first, precision, second).mean())
-    return max(trace, 0.0)
 
 
 def _positions_and_features(recording: Recording, features: str) -> tuple[Array, Array, PressFeatures]:

@@ -18,7 +18,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "depth_mm": 5.0,
         "seed": 0,
     }
-    expected |= {"noise_mv": 1.6, "drift_mv": 40.0, "creep": 0.1, "hysteresis": 0.2}
+    expected |= {"noise_mv": 2.0, "drift_mv": 20.0, "memory_mm": 10.0, "sensitivity": 0.6, "path_mm": 1.0}
     expected |= {"board_rate_hz": 1000.0, "channels": (), "mirrored": "unknown", "max_depth_mm": 6.0}
     expected |= dict.fromkeys(("box_mm", "contact_mm", "pad_mm", "tcp_mm"), "unknown") | {"pad_angle_deg": 0.0}
     expected |= {"clearance_mm": 10.0, "travel_mm_s": 100.0, "press_mm_s": 40.0, "acceleration_mm_s2": 500.0}

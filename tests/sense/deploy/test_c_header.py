@@ -31,6 +31,7 @@ from tests.sense.live.conftest import first_presses
 
 TOLERANCE_MM = 1e-3
 MAX_RATIO = 1.25  # of the mean errors of a student and its teacher
+MAX_RATIO_BEFORE_RELEASE = 2.2  # and of a student that does not see the release, as its teacher does
 
 
 def check_twin(output: Output, twin: tuple, failed: tuple[int, ...] = ()) -> None:
@@ -138,11 +139,11 @@ def test_student_is_nearly_as_accurate_as_its_teacher(
     assert set(test.tolist()) == set(localizer.test)
     evaluation = evaluate_student(student, [localizer], recording, test)
     header, teacher = evaluation["errors"]["header"], evaluation["errors"]["press_and_release"]
-    assert header[0]["mean_mm"] < MAX_RATIO * teacher[0]["mean_mm"]
+    assert header[0]["mean_mm"] < MAX_RATIO_BEFORE_RELEASE * teacher[0]["mean_mm"]
     assert [row["n_failed"] for row in header] == [0, 1, 2, 3]
     assert all(0.75 < row["within_r90"] < 1 for row in header)
     assert (evaluation["n_detected"], evaluation["n_false"]) == (len(test), 0)
-    assert evaluation["detected_mean_mm"] < MAX_RATIO * teacher[0]["mean_mm"]
+    assert evaluation["detected_mean_mm"] < MAX_RATIO_BEFORE_RELEASE * teacher[0]["mean_mm"]
 
 
 @pytest.mark.slow

@@ -28,8 +28,8 @@ from tests.sense.health.pads import BAD_FROM, PRESSES, TRAINED, detect, detect_l
 @pytest.mark.parametrize(
     ("fault", "kinds", "within"),
     [
-        *(("stuck", {"stuck"}, 20), ("open", {"open"}, 20), ("floating", {"open"}, 20), ("noisy", {"noisy"}, 20)),
-        *(("swapped", {"swapped", "offset"}, 20), ("offset", {"offset"}, 20)),
+        *(("stuck", {"stuck"}, 20), ("open", {"open"}, 20), ("noisy", {"noisy"}, 20), ("offset", {"offset"}, 20)),
+        *(("swapped", {"swapped", "offset"}, 20), ("floating", {"open", "offset"}, 20)),
         *(("drifting", {"drifting"}, 60), ("reduced_gain", {"reduced_gain"}, 60)),
     ],
 )

@@ -13,7 +13,8 @@ from padforge.design.common.validation import InputError
 from padforge.design.settings import Counts
 from padforge.sense import PressDetector, Recording, RigSettings, detect_presses, import_mat, simulate
 from padforge.sense.signals.press_detection import Presses, align_to_detected, estimate_commands
-from padforge.sense.simulation.pad_model import Divider
+from padforge.sense.simulation.pad_model import Divider, Strain
+from tests.helpers.rigs import ideal_rig
 
 RATE_HZ, COUNT_V = 14.0, 3.3 / 1023
 TOUCH_DELAY_S, RELEASE_DELAY_S, BLOCK_S = 0.16, 0.08, 0.03
@@ -70,8 +71,8 @@ def test_detect_presses_of_simulated_pads(grid: Counts, rig: RigSettings) -> Non
     recall, false, touches, releases = evaluate(detect_presses(recording.readings, recording.times_s), recording)
     assert recall >= 0.985
     assert false <= 0.015
-    for offsets in (touches, releases):  # commands take 0.08 to 0.2 s to show, and a block or two of 0.07 s passes
-        assert np.mean((offsets / rig.rate_hz > -0.1) & (offsets / rig.rate_hz < 0.5)) > 0.97
+    for offsets in (touches, releases):  # commands take up to 0.22 s to show, and a block or two of 0.07 s passes
+        assert np.mean((offsets / rig.rate_hz > -0.1) & (offsets / rig.rate_hz < 0.5)) >= 0.95
 
 
 def evenly(presses: int, held_s: float, pause_s: float) -> Spans:
@@ -98,13 +99,14 @@ def test_detect_presses_of_any_protocol(spans: Spans, rate_hz: float, ramp_s: fl
     """A press without an end lasts to the end of the recording."""
     rng = np.random.default_rng(0)
     times = np.arange(int((spans[-1][1] + 4) * rate_hz)) / rate_hz
-    strain = np.zeros((len(times), 6))
+    strain = Strain(*np.zeros((3, len(times), 6)))
     for down, up in spans:
         depth = np.clip((times - down) / ramp_s, 0, 1) - np.clip((times - up) / ramp_s, 0, 1)
         responses = np.clip(rng.normal(0.3, 0.4, 6), 0, None)
         responses[rng.integers(6)] += 0.5
-        strain += depth[:, None] * responses
-    readings = Divider(6, rate_hz, RigSettings(), rng)(strain)
+        strain.pressed[:] += depth[:, None] * responses
+        strain.residue[:] += 0.2 * np.maximum(-np.diff(depth, prepend=0.0), 0)[:, None] * responses
+    readings = Divider(6, rate_hz, ideal_rig(), rng)(strain)
     touched, released = detect_presses(readings, times)
     assert abs(len(touched) - len(spans)) <= 0.05 * len(spans)
     tolerance_s = ramp_s + 2.5 / rate_hz + 2 * BLOCK_S

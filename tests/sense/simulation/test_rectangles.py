@@ -14,6 +14,7 @@ from padforge.sense.recording.press_plan import pad_source
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.virtual.virtual_pad import virtual_pad_of
+from tests.helpers.rigs import ideal_rig
 
 KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
@@ -60,9 +61,9 @@ def test_localization_of_a_rectangular_pad_is_in_mm(
 
 @pytest.mark.parametrize("counts", [(0, 3), (3, 0), pytest.param((1, 0), marks=pytest.mark.slow)])
 def test_localization_on_strips_of_parallel_fibres(counts: tuple[int, int]) -> None:
-    """Straight parallel fibres give no position along them; across, they do where two respond."""
+    """Straight fibres of uniform sensitivity give no position along them; across, they do where two respond."""
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=(8.0, 8.0))
-    recording = simulate(Morphology.straight(size.layout), RigSettings(presses=200, seed=1), size=size)
+    recording = simulate(Morphology.straight(size.layout), ideal_rig(presses=200, seed=1), size=size)
     localizer, evaluation = calibrate(recording, QUICK)
     errors = np.abs(localizer.predict(recording).positions_mm - recording.presses_mm).mean(axis=0) / 4.0
     along, across = errors if counts[0] else errors[::-1]

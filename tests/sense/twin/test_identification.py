@@ -21,13 +21,14 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.twin import identification
 from padforge.sense.twin.identification import Identification, identify_pad
+from tests.helpers.rigs import ideal_rig
 
 from .conftest import PLAN
 
 
 @pytest.fixture(scope="module")
 def recording(printed: Twin) -> Recording:
-    return simulate(printed, RigSettings(presses=300, seed=3))
+    return simulate(printed, ideal_rig(presses=300, seed=3))
 
 
 def few_candidates():
@@ -76,7 +77,7 @@ def test_twin_responds_as_the_fitted_pad(result: Identification) -> None:
 
 @few_candidates()
 def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
-    recording = simulate(PLAN, RigSettings(presses=200, depth_mm=4.0, seed=2), Contact(depth_mm=4.0))
+    recording = simulate(PLAN, ideal_rig(presses=200, depth_mm=4.0, seed=2), Contact(depth_mm=4.0))
     result = identify_pad(recording, PLAN, seed=1)
     assert result.fit.pad.fibres == (0, 1, 2, 3)
     assert result.contact is not None
@@ -89,7 +90,7 @@ def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
 
 @pytest.mark.slow
 def test_identify_recovers_the_printed_pad_among_all_candidates(printed: Twin) -> None:
-    assert_recovered(identify_pad(simulate(printed, RigSettings(presses=500, seed=3)), PLAN, seed=1), printed)
+    assert_recovered(identify_pad(simulate(printed, ideal_rig(presses=500, seed=3)), PLAN, seed=1), printed)
 
 
 @few_candidates()

@@ -1,58 +1,13 @@
-"""Responses, their noise and their information, against what is known of a simulated pad."""
+"""Responses and their noise, against what is known of a simulated pad."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from padforge.design import Morphology, Twin
-from padforge.design.twin import TwinReadings
-from padforge.sense import Recording, RigSettings, simulate
-from padforge.sense.twin.responses import Responses, compute_responses, fisher_information, fit_gp, select_one_depth
-
-QUIET = TwinReadings(noise_mv=1.0, drift_mv=0.0, hysteresis=0.0, hysteresis_s=2.5)
-
-
-def exact_information(twin: Twin, positions_mm: np.ndarray) -> np.ndarray:
-    """Squared slope of the responses of live channels over their noise variance; (C',) 1/mm^2."""
-    live = [channel for channel in twin.channels if channel.fibre is not None]
-    ahead, behind = ([twin.as_built_stretch(positions_mm + step) for step in half * np.eye(2)] for half in (0.5, -0.5))
-    slopes = np.square(np.subtract(ahead, behind)).sum(axis=0).mean(axis=0)
-    return np.array([slopes[c.fibre] * (c.gain_v / c.noise_v) ** 2 for c in live])
-
-
-@pytest.fixture(scope="module")
-def noisy(printed: Twin) -> Twin:
-    """As noisy as built pads are, which is more than what the response model smooths away."""
-    channels = tuple(replace(channel, noise_v=3 * channel.noise_v) for channel in printed.channels)
-    return replace(printed, channels=channels, readings=QUIET)
-
-
-@pytest.fixture(scope="module")
-def recording(noisy: Twin) -> Recording:
-    return simulate(noisy, RigSettings(presses=800, creep=0, seed=1))
-
-
-def test_fisher_information_agrees_with_the_simulated_pad(noisy: Twin, recording: Recording) -> None:
-    live = np.flatnonzero([channel.fibre is not None for channel in noisy.channels])
-    information, exact = fisher_information(recording, live), exact_information(noisy, recording.presses_mm[:200])
-    assert information.sum() == pytest.approx(exact.sum(), rel=0.2)
-    assert information == pytest.approx(exact, rel=0.6)
-
-
-def test_fisher_information_ignores_presses_without_readings(noisy: Twin, recording: Recording) -> None:
-    channel = next(c.channel for c in noisy.channels if c.fibre is not None)
-    readings, channels = np.array(recording.readings), np.array([channel])
-    readings[: recording.down_command[300], channel] = np.nan
-    partial = replace(recording, readings=readings)
-    assert fisher_information(partial, channels) == pytest.approx(fisher_information(recording, channels), rel=0.35)
-
-
-def test_fisher_information_of_short_presses_is_finite() -> None:
-    recording = simulate(Morphology.random(2, 3, seed=0), RigSettings(presses=120, readings_per_press=8, seed=0))
-    information = fisher_information(recording, np.arange(recording.fibres))
-    assert np.isfinite(information).all()
-    assert (information > 0).any()
+from padforge.design import Morphology
+from padforge.sense import RigSettings, simulate
+from padforge.sense.twin.responses import Responses, compute_responses, fit_gp, select_one_depth
 
 
 def test_response_is_the_held_level_minus_the_rest() -> None:

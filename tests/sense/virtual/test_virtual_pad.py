@@ -16,12 +16,13 @@ from padforge.sense.rig.streams import RECORDED
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.virtual.virtual_pad import VirtualPad, virtual_pad_of
+from tests.helpers.rigs import quiet_rig
 from tests.sense.rig.fakes import Time
 
 
 def test_virtual_pad_is_the_pad_of_the_recording() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
-    rig = RigSettings(presses=20, seed=4, noise_mv=0.0, drift_mv=0.0)
+    rig = quiet_rig(presses=20, seed=4)
     recorded, time = simulate(pad, rig), Time(least_s=0)
     board = VirtualPad(pad, rig, PUBLISHED_CONTACT, time)
     with pytest.raises(RigFault, match="not connected"):
@@ -42,7 +43,7 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
 
 
 def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
-    rig = RigSettings(presses=4, seed=4, noise_mv=0.0, drift_mv=0.0, depths_mm=(0.5, 5.0), readings_per_press=20)
+    rig = quiet_rig(presses=4, seed=4, depths_mm=(0.5, 5.0), readings_per_press=20)
     time = Time(least_s=0)
     board = VirtualPad(Morphology.straight(2), rig, Contact(), time)
     board.connect()
