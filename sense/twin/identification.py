@@ -4,7 +4,9 @@
 2. Channels that respond to the position at all are live: a Gaussian process explains them better than noise.
 3. Wirings and poses are searched for on the plan; each of the best is fitted as built, and the most probable one taken.
 4. It is fitted to all presses, with an angular term if held-out presses ask for one.
-5. How wide a press is, and how much of it is stretch, is measured on its fibres by the layer it is believed to be.
+5. Presses are split into their parts, and each is fitted on the same paths; with it how presses take away what remains
+   of earlier ones, and how responses scatter.
+6. How wide a press is, and how much of it is stretch, is measured on its fibres by the layer it is believed to be.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The parts of each press, held response, onset, creep and what remains, separated by how they show in its windows.
+"""The parts of each press (held response, onset, creep, what remains), separated by how they show in its windows.
 
 The windows of a press are linear in its four parts, and in what it takes away of the residues of earlier presses; how
 each shows in them follows from the viscoelastic model by which presses are simulated. What is taken away follows from
@@ -38,6 +38,8 @@ DELAYS = 5
 """Delays over their range that the windows are averaged over."""
 BOUNDS = {"memory": (0.0, 1.0), "memory_mm": (1.0, 30.0), "hysteresis_s": (2.0, 100.0)}
 """Of what is fitted to pairs of presses, settings of `[rig]`."""
+MAX_TOUCH_S = 1.0
+"""Largest `touch_s` of `[rig]`, of a recording of readings that are longer apart."""
 SINGLE = 5
 """Windows of the touch that are one reading long."""
 FIRST_MEMORY, FIRST_MEMORY_MM = 0.7, 9.0
@@ -82,7 +84,7 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
         replaced, kernels = replaced_residues(*presses, rig), part_kernels(cycle, rig)
     pressed = pressed - kernels[4, is_held].mean() * replaced
     held, onset, creep, after = (Responses(positions_mm, part, valid) for part in parts)
-    touch_s = _surface_s(positions_mm, inputs.windows, is_held) / recording.rate_hz
+    touch_s = min(_surface_s(positions_mm, inputs.windows, is_held) / recording.rate_hz, MAX_TOUCH_S)
     fitted = {name: getattr(rig, name) for name in BOUNDS} | {"touch_s": touch_s}
     return SplitPresses(PressParts(held, onset, creep, after), Responses(positions_mm, pressed, valid), fitted)
 
