@@ -74,7 +74,7 @@ class RigSettings(Settings):
         default=0.6, ge=0, le=2, description="simulated pad: std of the logarithm of the sensitivity along a fibre"
     )
     own_sensitivity: float = Field(
-        default=1.3, ge=0, le=2, description="simulated pad: the same of what differs in onset, creep and what remains"
+        default=1.0, ge=0, le=2, description="simulated pad: the same of what differs in onset, creep and what remains"
     )
     path_mm: float = Field(default=1.0, ge=0, le=10, description="simulated pad: std of the paths off their plan, mm")
     memory: float = Field(
