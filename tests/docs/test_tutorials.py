@@ -83,7 +83,7 @@ def difference(block: Run, printed: str) -> str:
     """Where what is printed differs from what a page shows; empty if it does not."""
     pages, prints = (SECONDS.sub("# s", text).strip().splitlines() for text in (block.shown, printed))
     if block.varies:
-        odd = ({kind(line) for line in pages} ^ {kind(line) for line in prints}) - {VERDICT}
+        odd = ({kind(line) for line in pages} ^ {kind(line) for line in prints}) - VERDICTS
         return f"{sorted(odd)} are lines of the page or printed, not both" if odd else ""
     if len(pages) != len(prints):
         return f"{len(prints)} lines, the page has {len(pages)}"
@@ -93,8 +93,11 @@ def difference(block: Run, printed: str) -> str:
     return ""
 
 
-VERDICT = "not significantly better than straight fibres with # failed fibres"
-"""A line that follows a search only where its pad is that little better."""
+VERDICTS = {
+    "not significantly better than straight fibres with # failed fibres",
+    "straight fibres explain #, about as much as this plan does: is it the recording of this pad?",
+}
+"""Lines that follow a search, and an identification, only where the pad is that little better."""
 
 
 def masked(line: str) -> str:
