@@ -44,7 +44,7 @@ SINGLE = 5
 """Windows of the touch that are one reading long."""
 FIRST_MEMORY, FIRST_MEMORY_MM = 0.7, 9.0
 """Values from which that search starts."""
-N_SEARCHED, MAX_EVALUATIONS = 4500, 60
+N_SEARCHED, MAX_EVALUATIONS = 1500, 40
 """Presses that it looks at, the last ones, and values that it tries in each round."""
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from .limited import MIB, Ended
 from .workplace import require_whole_file
 
-MOST_MEMORY, MOST_CPU_S = 1024 * MIB, 10.0
+MOST_MEMORY, MOST_CPU_S = 1024 * MIB, 40.0
 """Bytes that a process may have resident, and seconds that it may compute."""
 SUSPECT_MEMORY = 450 * MIB
 """A copy of a process that has all imports done may have so much more, before a fresh one is asked."""

@@ -24,7 +24,7 @@ class Limits:
 
     memory: int = 3000 * MIB
     file: int = 1000 * MIB
-    cpu_s: int = 20
+    cpu_s: int = 60
     wall_s: float = 60.0
 
 
