@@ -53,9 +53,8 @@ class PadModel:
 
     corners_mm: Array  # low and high corner of where it is pressed, in the frame of the arm; shape (2, 2)
     free: PositionTest  # which positions (Q, 2) may be pressed
-    responses: Callable[
-        [Array, Array], PressParts[Array]
-    ]  # of positions (Q, 2) and depths (Q,), mm; as `simulate_readings`
+    # of positions (Q, 2) and depths (Q,), mm; as `simulate_readings`
+    responses: Callable[[Array, Array], PressParts[Array]]
     source: dict[str, Any]  # description of the pad for the recording, JSON
     noise_v: Array | None = None  # deviation of responses that no position explains, shape (C,); None for stretches
 
@@ -67,10 +66,8 @@ def model_plan(pad: Morphology, contact: Contact, rig: RigSettings, size: PadSet
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
     source |= size.model_dump(mode="json", include=keys)
 
-    built = build_pad(pad, rig)
-
     def responses(positions_mm: Array, depths_mm: Array) -> PressParts[Array]:
-        return resistance_changes(built, positions_mm, depths_mm, contact, rig)
+        return resistance_changes(build_pad(pad, rig), positions_mm, depths_mm, contact, rig)
 
     return PadModel(pad.to_mm(size.sensed), pressable_test(pad, size), responses, source)
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import nnls
-from scipy.spatial import KDTree
 
 from padforge.design.twin import TwinScatter
 from padforge.sense.arrays import MIN_SCALE_V, Array, Indices, Mask
@@ -27,7 +26,7 @@ from padforge.sense.twin.as_built import (
     channel_indices,
     evaluate_along_fibre,
 )
-from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.responses import Responses, near_pairs
 
 CORRELATION_LENGTH = 0.3  # correlation length of lateral offsets and log-sensitivities, as a share of the fibre
 TRANSFORM_STD = np.array([0.1, 5.0, 5.0, 0.05])
@@ -227,8 +226,7 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     valid = np.flatnonzero(responses.valid.all(axis=1))
     if len(valid) < 2 * MIN_PAIRS:
         return TwinScatter()
-    pairs = valid[KDTree(responses.positions_mm[valid]).query(responses.positions_mm[valid], 2)[1]]
-    first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
+    first, second = (valid[pair] for pair in near_pairs(responses.positions_mm[valid]))
     expected = pad.predict(responses.positions_mm) - pad.channel_values[:, 1]
     residual = responses.volts - expected
     difference = (residual[first] - residual[second]) / noise_v

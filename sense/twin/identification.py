@@ -39,8 +39,8 @@ from padforge.sense.simulation.simulated_recording import measure_rig_settings
 from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
 from padforge.sense.twin.contact_fit import ContactFit, fit_contact
 from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built, gain_wander
-from padforge.sense.twin.press_parts import normalize, smooth_maps, split_presses
-from padforge.sense.twin.responses import Responses, compute_responses, fit_gp, select_one_depth
+from padforge.sense.twin.press_parts import smooth_maps, split_presses
+from padforge.sense.twin.responses import Responses, compute_responses, fit_gp, normalize, select_one_depth
 
 PROFILE_POINTS, MIN_WEIGHT = 13, 0.01  # points of the sensitivity profile of a twin, and the least weight that counts
 MIN_PRESSES = 60

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.spatial import KDTree
 
-from padforge.sense.arrays import MIN_SCALE_V, Array, Indices, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid
 from padforge.sense.recording.recording import Recording
@@ -28,7 +27,7 @@ from padforge.sense.simulation.pad_model import (
     superpose_strain,
 )
 from padforge.sense.simulation.residual_indentation import replaced_residues
-from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.responses import Responses, near_pairs, normalize
 
 N_ROUNDS = 3
 """Times that parts and what is taken away are estimated in turn."""
@@ -89,13 +88,6 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     return SplitPresses(PressParts(held, onset, creep, after), Responses(positions_mm, pressed, valid), fitted)
 
 
-def _near_pairs(positions_mm: Array) -> tuple[Indices, Indices]:
-    """Return the indices (n,) of presses and of their nearest neighbours, each pair once."""
-    pairs = KDTree(positions_mm).query(positions_mm, 2)[1]
-    first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
-    return first, second
-
-
 def _surface_s(positions_mm: Array, windows: Array, is_held: Mask) -> float:
     """Return how far the time of the touch varies over the pad, standard deviation in readings.
 
@@ -111,7 +103,7 @@ def _surface_s(positions_mm: Array, windows: Array, is_held: Mask) -> float:
     k = np.where(above.any(axis=1), above.argmax(axis=1), SINGLE - 1)
     below, step = rise[rows, k], rise[rows, k + 1] - rise[rows, k]
     half = k + np.clip((0.5 - below) / np.where(step > 0, step, 1.0), 0, 1)
-    first, second = _near_pairs(positions_mm)
+    first, second = near_pairs(positions_mm)
     return float(np.sqrt(max(half.var() - ((half[first] - half[second]) ** 2).mean() / 2, 0.0)))
 
 
@@ -120,7 +112,7 @@ def _fit_memory(presses: tuple[Array, ...], pressed: Array, training: Mask, rig:
     last = slice(-N_SEARCHED, None)
     positions_mm, touch_s, release_s, residues, held = (values[last] for values in presses)
     rows = np.flatnonzero(training[last])
-    first, second = (rows[pair] for pair in _near_pairs(positions_mm[rows]))
+    first, second = (rows[pair] for pair in near_pairs(positions_mm[rows]))
     low, high = np.array(list(BOUNDS.values())).T
     scale = np.array([0.2, 2.0, 0.2 * rig.hysteresis_s])
     start = np.array([getattr(rig, name) for name in BOUNDS])
@@ -136,13 +128,6 @@ def _fit_memory(presses: tuple[Array, ...], pressed: Array, training: Mask, rig:
     simplex = np.vstack([start, start - np.diag(scale * np.where(start - scale > low, 1, -1))])
     options = {"maxfev": MAX_EVALUATIONS, "initial_simplex": simplex, "xatol": np.inf, "fatol": 1e-3}
     return at(minimize(misfit, start, method="Nelder-Mead", options=options).x)
-
-
-def normalize(positions_mm: Array) -> tuple[Array, Array, float]:
-    """Return positions (Q, 2) within the square [-1, 1] about all of them, its centre (2,) and half its side, mm."""
-    middle_mm = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
-    half_mm = float(np.abs(positions_mm - middle_mm).max())
-    return (positions_mm - middle_mm) / half_mm, middle_mm, half_mm
 
 
 def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, PressFeatures, compute_features
+from padforge.sense.localizer.features import DOWN, compute_features
 from padforge.sense.localizer.response_model import ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
@@ -75,7 +76,10 @@ def select_one_depth(recording: Recording) -> Recording:
 
 def compute_responses(recording: Recording, training: Mask) -> Responses:
     """Compute the responses to all Q presses of known position; history is fitted to those in the mask `training`."""
-    positions_mm, normalized, inputs = _positions_and_features(recording, "causal")
+    known = recording.has_position
+    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
+    positions_mm = recording.presses_mm[known]
+    normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
         normalized[training], inputs.windows[training], inputs.history[training], inputs.fibre_mask[training]
     )
@@ -83,13 +87,18 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
     return Responses(positions_mm, windows @ HOLD, inputs.fibre_mask)
 
 
-def _positions_and_features(recording: Recording, features: str) -> tuple[Array, Array, PressFeatures]:
-    """Return positions (Q, 2) in mm, the same in the square [-1, 1] about all of them, and the features of presses."""
-    known = recording.has_position
-    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], features)
-    positions_mm = recording.presses_mm[known]
-    middle = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
-    return positions_mm, (positions_mm - middle) / np.abs(positions_mm - middle).max(), inputs
+def normalize(positions_mm: Array) -> tuple[Array, Array, float]:
+    """Return positions (Q, 2) within the square [-1, 1] about all of them, its centre (2,) and half its side, mm."""
+    middle_mm = (positions_mm.min(axis=0) + positions_mm.max(axis=0)) / 2
+    half_mm = float(np.abs(positions_mm - middle_mm).max())
+    return (positions_mm - middle_mm) / half_mm, middle_mm, half_mm
+
+
+def near_pairs(positions_mm: Array) -> tuple[Indices, Indices]:
+    """Return the indices (n,) of presses and of their nearest neighbours, each pair once."""
+    pairs = KDTree(positions_mm).query(positions_mm, 2)[1]
+    first, second = np.unique(np.sort(pairs, axis=1), axis=0).T
+    return first, second
 
 
 def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
