@@ -6,6 +6,7 @@ From there a few Gauss-Newton steps lead to the maximum a posteriori position, t
 (the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -14,11 +15,16 @@ import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Mask
+from padforge.sense.localizer.features import NOW
 from padforge.sense.localizer.model_files import check_arrays
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
 COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
-COARSENING = 2  # cells of the response table along a side of a cell of the posterior's grid
+STAGES = (12, 13, 14, 15, 17)
+"""Numbers of complete windows of a press from which on a localizer of its own answers, the first one after the release
+has shown: before, it errs a third more than a network."""
+LINEARIZED, COARSENING = 2, 3
+"""Cells of the response table along a side of a cell of the linearization, and of the posterior's grid."""
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
 """Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
 MIN_VARIANCE = 1e-4  # of scaled features, which are about 1
@@ -61,6 +67,7 @@ class BayesianLocalizer:
         low, high = positions.min(axis=0), positions.max(axis=0)
         grid = grid_positions(side)
         step, coarse = float(grid[1, 0, 0] - grid[0, 0, 0]), grid[::COARSENING, ::COARSENING]
+        fine = (slice(None, None, LINEARIZED),) * 2
         cell = float(coarse[1, 0, 0] - coarse[0, 0, 0])
         inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
         residual = inputs - interpolate_grid(table.reshape(side, side, -1), positions).reshape(inputs.shape)
@@ -85,10 +92,10 @@ class BayesianLocalizer:
             jacobian = np.stack(np.gradient(expected, step, axis=(0, 1)), axis=2)
             weighted = jacobian @ np.linalg.inv(covariance)
             fisher = weighted @ jacobian.swapaxes(2, 3)
-            responses.append(expected)
-            jacobians.append(weighted.reshape(side, side, -1))
+            responses.append(expected[fine])
+            jacobians.append(weighted[fine].reshape(*responses[-1].shape[:2], -1))
             diagonal = (np.maximum(fisher[..., k, k], 0) for k in (0, 1))  # rounding may leave less than 0
-            informations.append(np.stack([*diagonal, fisher[..., 0, 1]], axis=2))
+            informations.append(np.stack([*diagonal, fisher[..., 0, 1]], axis=2)[fine])
             # A position of the grid stands for its cell, over which the response varies by its slope.
             slope = jacobian[::COARSENING, ::COARSENING][inside]
             blurred = covariance[::COARSENING, ::COARSENING][inside] + cell**2 / 12 * slope.swapaxes(1, 2) @ slope
@@ -147,14 +154,15 @@ class BayesianLocalizer:
         """Apply a function to every array in single precision, as to convert them to torch."""
         return BayesianLocalizer(*map(function, self.to_arrays().values()))
 
-    def to_arrays(self) -> dict[str, Any]:
-        """Return the arrays by their names in files, in single precision, which is exact."""
-        return {PREFIX + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
+    def to_arrays(self, number: int = 0) -> dict[str, Any]:
+        """Return the arrays of the `number`-th stage by their names in files, in single precision, which is exact."""
+        prefix = f"{PREFIX}{number}."
+        return {prefix + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], fibres: int, n_features: int) -> "BayesianLocalizer":
+    def from_arrays(cls, arrays: Mapping[str, Any], number: int, fibres: int, n_features: int) -> "BayesianLocalizer":
         """Read what `to_arrays` returned, and check shapes and values; KeyError if an array is missing."""
-        bayes = cls(**{each.name: arrays[PREFIX + each.name].astype(np.float64) for each in fields(cls)})
+        bayes = cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"].astype(np.float64) for each in fields(cls)})
         n_grid, side = (len(part) if part.ndim else 0 for part in (bayes.grid, bayes.linearization))
         shapes = {
             "projection": (fibres, n_features, COMPONENTS),
@@ -168,6 +176,29 @@ class BayesianLocalizer:
         if fisher.min() < 0:
             raise InputError(f"linearization has a Fisher information of {fisher.min():g}, expected 0 or more")
         return bayes
+
+
+def fit_stages(
+    table: Any, inputs: Any, fibre_mask: Mask, positions: Any, n_timed: int
+) -> tuple[BayesianLocalizer, ...]:
+    """Fit a localizer for each of `STAGES`, or one if `n_timed` = K is 0; arguments as in `BayesianLocalizer.fit`.
+
+    The first K features are windows in the order in which they are complete; two more say where the finger is now.
+    """
+    stages = []
+    for n_complete in STAGES if n_timed else (0,):
+        unused = slice(n_complete, n_timed + len(NOW) if n_timed else 0)
+        kept = table.copy()
+        kept[:, :, :, unused] = 0
+        stages.append(BayesianLocalizer.fit(kept, inputs, fibre_mask, positions))
+    return tuple(stages)
+
+
+def stage_of(n_complete: int, n_timed: int) -> int | None:
+    """Return which of the localizers of `fit_stages` answers when so many of K windows are complete, if any."""
+    if not n_timed:
+        return 0
+    return bisect_right(STAGES, n_complete) - 1 if n_complete >= STAGES[0] else None
 
 
 def _fit_lda(expected: Array, residual: Array) -> Array:

@@ -4,8 +4,9 @@ Presses are split three ways: training, calibration of the uncertainty, and test
 whose error ends the training.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,19 @@ from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
 from padforge.sense.localizer.evaluation import Evaluation, conformal, evaluate, held_back_presses
-from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features
+from padforge.sense.localizer.features import MODULATED, FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights, check_weights, predict_members
+from padforge.sense.localizer.moments import complete_at, count_complete
+from padforge.sense.localizer.network import (
+    MAX_LOG_ERROR,
+    MIN_LOG_ERROR,
+    RESIDUAL,
+    Networks,
+    Weights,
+    answering,
+    check_weights,
+    predict_members,
+)
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
@@ -34,7 +45,8 @@ MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
-INTERVAL_SUBSETS = 32  # sets of failed fibres of a size that intervals are calibrated on, at most
+INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 8
+"""Sets of failed fibres of a size that intervals are calibrated on, at most; and for each moment, if there are several."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +57,11 @@ class CalibrationData:
     detected: PressFeatures | None  # as they would be detected in the readings, to augment the others
     positions_mm: Array  # (Q, 2)
     measures: Mapping[str, Array]  # (Q,) of each of depth and force to be predicted
-    feature_set: str  # a name in `FEATURES`, or "array"
+    feature_set: FeatureSet
     rate_hz: float
     sha256: str  # of what they came from
+    # features of presses when so many windows are complete; None if features know no moment
+    at: Callable[[int, Indices], PressFeatures] | None = None
 
 
 def calibrate(
@@ -78,10 +92,8 @@ def calibrate(
     check_type("recording", recording, Recording)
     options = or_default("options", options, LocalizerSettings)
     time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
-    if options.method == "published":
-        if time_budget is not None:
-            raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
-        options = options.model_copy(update={"features": "published"})
+    if options.method == "published" and time_budget is not None:
+        raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
     rng = np.random.default_rng(options.seed)
     known = np.flatnonzero(recording.has_position)
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
@@ -111,11 +123,16 @@ def fit_recording(
     detected, measures = None, {}
     if options.method == "ensemble":
         again = align_to_detected(readings, recording.times_s, *commands)
-        detected = compute_features(readings, *again, options.features)
+        detected = compute_features(readings, *again)
         measures = known_measures(recording, training)
-    features = compute_features(readings, *commands, options.features)
-    origin = options.features, recording.rate_hz, recording.digest
-    data = CalibrationData(features, detected, recording.presses_mm, measures, *origin)
+    is_published = options.method == "published"
+    features = compute_features(readings, *commands, is_published=is_published)
+
+    def at(n_complete: int, presses: Indices) -> PressFeatures:
+        return compute_features(readings, *commands, complete_at(n_complete, *commands))[presses]
+
+    origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
+    data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
     return fit_model(data, training, options, rng, on_progress, time_budget)
 
 
@@ -142,44 +159,77 @@ def fit_model(
     features, rows = data.features[train], train
     if data.detected is not None:
         features, rows = features + data.detected[train], np.concatenate([train, train])
-    phases = FEATURES[data.feature_set].phases if data.feature_set in FEATURES else ()
+    n_timed = data.features.seen.shape[1]
+    phases = MODULATED if n_timed else ()
     positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures)
-    bayes, residual_network = None, {}
+    bayes, residual_network = (), {}
     if is_ensemble:
-        weights, bayes, residual_network = train_members(presses, table, options, rng, on_progress, time_budget)
+        networks, bayes, residual_network = train_members(presses, table, options, rng, on_progress, time_budget)
     else:
         held_back = scaler.training_presses(data.features[early_stop], data.positions_mm[early_stop])
-        weights = train_published(presses, held_back, rng)
-    check_trained(weights, residual_network, scaler, options)
+        networks = {"press": train_published(presses, held_back, rng)}
+    check_trained(networks, residual_network, scaler, options, n_timed)
     model = LocalizerModel(
-        weights=weights,
+        networks=networks,
         scaler=scaler,
         table=table,
         bayes=bayes,
         residual_network=residual_network,
         method=options.method,
-        features=data.feature_set,  # pyright: ignore[reportArgumentType]
-        interval_factors=np.ones((1, 3 + len(measures))),
+        features=data.feature_set,
+        interval_factors=np.ones((n_timed + 1, 1, 3 + len(measures))),
         rate_hz=data.rate_hz,
         training_recording_sha256=data.sha256,
     )
-    levels = _n_levels(options, model.fibres)
-    scaled, positions_mm = scaler.transform(data.features[calibration]), data.positions_mm[calibration]
-    if bayes is not None:
-        model = calibrate_scales(model, scaled, positions_mm, levels)
+    if data.at is None:
+        moments = [scaler.transform(data.features[calibration])]
+    else:
+        moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
+    positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
-    factors = calibrate_intervals(model, scaled, positions_mm, levels, measures)
-    return replace(model, interval_factors=factors)
+    return calibrate_uncertainty(model, moments, positions_mm, _n_levels(options, model.fibres), measures)
+
+
+def calibrate_uncertainty(
+    model: LocalizerModel,
+    moments: Sequence[ScaledFeatures],
+    positions_mm: Array,
+    levels: int,
+    measures: Mapping[str, Array] | None = None,
+) -> LocalizerModel:
+    """Calibrate the expected errors of the members, and `interval_factors`, on presses never trained on.
+
+    `moments` are the presses when 1, 2, ... windows are complete, or once if features know no moment. Other arguments
+    are as in `evaluation.conformal`.
+    """
+    if model.method == "ensemble":
+        model = _calibrate_scales(model, moments, positions_mm, levels)
+    plain, n_sets = replace(model, interval_factors=np.ones_like(model.interval_factors)), INTERVAL_SUBSETS
+    if len(moments) > 1:
+        n_sets = MOMENT_SUBSETS
+    factors = [
+        [
+            conformal(
+                [plain.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)],
+                positions_mm,
+                measures,
+            )
+            for level in range(levels)
+        ]
+        for presses in moments
+    ]
+    factors = factors[:1] * (len(moments) > 1) + factors  # before any window is complete, nothing is predicted
+    return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6))
 
 
 def _n_levels(options: LocalizerSettings, fibres: int) -> int:
     return min(options.max_failures, fibres - 1) + 1 if options.method == "ensemble" else 1
 
 
-def calibrate_scales(
-    model: LocalizerModel, presses: ScaledFeatures, positions_mm: Array, levels: int
+def _calibrate_scales(
+    model: LocalizerModel, moments: Sequence[ScaledFeatures], positions_mm: Array, levels: int
 ) -> LocalizerModel:
     """Scale the expected errors of the members to those on presses never trained on, so that their weights are right.
 
@@ -187,53 +237,46 @@ def calibrate_scales(
     response that it predicts them by.
     """
     targets = model.scaler.scale_targets(positions_mm)
-    ratios = []
-    networks = model.bayes, model.residual_network
-    for failed in (subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)):
-        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(model.fibres), failed)
-        outputs = predict_members(model.weights, presses.inputs, fibre_mask, "ensemble", *networks)
-        predicted, log_error = np.split(outputs, 2, axis=2)
-        expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
-        ratios.append(np.abs(predicted - targets).mean(axis=2) / expected)
-    ratio = np.mean(ratios, axis=0)
-    log_scale = np.log((PRIOR_COUNT + ratio.sum(axis=1)) / (PRIOR_COUNT + ratio.shape[1]))
+    subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
+    ratios: dict[str, list[Array]] = {}
+    for n_complete, presses in enumerate(moments, int(len(moments) > 1)):
+        rows = np.flatnonzero(count_complete(presses.seen) == n_complete)  # not those that the next press cuts off
+        for failed in subsets if len(rows) else ():
+            fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
+            outputs = predict_members(model.networks, presses.inputs[rows], fibre_mask, presses.seen[rows], *model.corrected)
+            predicted, log_error = np.split(outputs, 2, axis=2)
+            expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
+            ratio = (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)
+            names = answering(model.networks, n_complete, presses.seen.shape[1], bool(model.bayes))
+            for name in names:
+                members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
+                ratios.setdefault(name, []).append(ratio[:members])
+                ratio = ratio[members:]
+    presses = len(positions_mm)
+    log_scales = {
+        name: np.log((PRIOR_COUNT + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
+        for name, ratio in ratios.items()
+    }
 
-    def scaled(weights: Weights, log_scale: Array) -> Weights:
+    def scaled(name: str, weights: Weights) -> Weights:
+        if name not in log_scales:
+            return weights
         bias = weights["last.b"].copy()
-        bias[:, :, 2:] += log_scale[:, None, None]
+        bias[:, :, bias.shape[2] // 2 :] += log_scales[name][:, None, None]
         return {**weights, "last.b": bias}
 
-    residual_network = scaled(model.residual_network, log_scale[-1:])
-    return replace(model, weights=scaled(model.weights, log_scale[:-1]), residual_network=residual_network)
-
-
-def calibrate_intervals(
-    model: LocalizerModel,
-    presses: ScaledFeatures,
-    positions_mm: Array,
-    levels: int,
-    measures: Mapping[str, Array] | None = None,
-) -> Array:
-    """Return the (levels, 3 + T) `interval_factors`, by failed fibres, that hold on presses never trained on.
-
-    Other arguments are as in `evaluation.conformal`.
-    """
-    plain = replace(model, interval_factors=np.ones((1, model.interval_factors.shape[1])))
-    factors = []
-    for level in range(levels):
-        subsets = failure_subsets(model.fibres, level, INTERVAL_SUBSETS)
-        predictions = [plain.predict_features(presses, subset) for subset in subsets]
-        factors.append(conformal(predictions, positions_mm, measures))
-    return np.clip(factors, 1e-6, 1e6)
+    networks = {name: scaled(name, weights) for name, weights in model.networks.items()}
+    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network))
 
 
 def check_trained(
-    weights: Weights, residual_network: Weights, scaler: FeatureScaler, options: LocalizerSettings
+    networks: Networks, residual_network: Weights, scaler: FeatureScaler, options: LocalizerSettings, n_timed: int
 ) -> None:
     """Raise InputError if a training diverged."""
-    n_inputs = scaler.n_inputs(options.method)
+    n_inputs = scaler.n_inputs(options.method, n_timed)
     try:
-        check_weights(weights, n_inputs, options.method, len(scaler.measures))
+        for weights in networks.values():
+            check_weights(weights, n_inputs, options.method, len(scaler.measures))
         if residual_network:
             check_weights(residual_network, n_inputs + N_SUMMARY, options.method)
     except InputError as error:

@@ -10,7 +10,7 @@ import numpy as np
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.features import FEATURES, interpolate_gaps, window_means
+from padforge.sense.localizer.features import DOWN, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 
@@ -251,7 +251,7 @@ def errors_by_position(predicted_mm: Array, pressed_mm: Array) -> list[dict[str,
 def idle_share(recording: Recording) -> Array:
     """Return the (C,) share of presses in which a fibre changes by less than `ACTIVE` of its range over all presses."""
     readings, commands = interpolate_gaps(recording.readings), (recording.down_command, recording.up_command)
-    changes = window_means(readings, *commands, FEATURES["causal"])[:, :, -1]
+    changes = window_means(readings, *commands, recording.up_command)[:, :, len(DOWN) - 1]
     return (np.abs(changes) <= ACTIVE * np.ptp(changes, axis=0)).mean(axis=0)
 
 

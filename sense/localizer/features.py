@@ -6,6 +6,7 @@ affects no other. Short gaps (NaN) are interpolated, and a fibre that lacks too 
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,12 @@ DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 
 ONSET = 6  # windows of `DOWN` that end within six readings of the touch, which comes two after the command
 UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
+NOW: tuple[Window, ...] = ((-1, 0), (-2, -1))
+"""Windows before the moment, or before the release if that is earlier: where the finger is now if it moves."""
+N_TIMED = len(DOWN) + len(UP)  # K, windows of a press in the order in which they are complete
+MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)  # windows whose sensitivity is modulated together
+FeatureSet = Literal["windows", "published", "array"]
+"""What is computed of a press: the windows above, the published running medians, or arrays that a caller computed."""
 PAST: tuple[Window, ...] = (
     *((-2, 0), (-5, -2), (-10, -5), (-15, -10), (-18, -15), (-20, -18), (-30, -20), (-40, -30)),
     *((-50, -40), (-60, -50), (-80, -60), (-100, -80), (-120, -100), (-160, -120)),
@@ -26,41 +33,10 @@ PAST: tuple[Window, ...] = (
 """Windows of the history: silicone creeps for seconds to minutes after a press."""
 SLOW = (800, 4000)  # lengths, in readings before the press, of slow medians: a minute and five at 13 Hz
 SLOW_SAMPLES = 200  # readings that a slow median is taken of
+N_FEATURES, N_HISTORY = N_TIMED + len(NOW) + len(MODULATED), len(PAST) + len(SLOW)
 MEDIAN = 15  # width of the published running median, readings
 MEDIAN_OFFSET = 10  # readings from a command to the middle of the published median
 MIN_PRESENT = 0.75  # share of a press's readings that a fibre must have given to be valid in it
-
-
-@dataclass(frozen=True)
-class FeatureSet:
-    """What is computed of each fibre for a press."""
-
-    down: tuple[Window, ...]
-    up: tuple[Window, ...]
-    phases: tuple[slice, ...]  # windows whose sensitivity is modulated together, in each of G phases of a press
-    n_windows: int  # F, numbers of each fibre
-    n_history: int  # J, numbers of its history
-    readings_needed: tuple[int, int]  # after the probe was sent down, and after it was sent up
-
-    @property
-    def n_features(self) -> int:
-        """F + G, windows and sensitivity modulations of each fibre."""
-        return self.n_windows + len(self.phases)
-
-
-def _windowed(down: tuple[Window, ...], up: tuple[Window, ...], *phases: slice) -> FeatureSet:
-    needed = down[-1][1], up[-1][1] if up else 0
-    return FeatureSet(down, up, phases, len(down) + len(up), len(PAST) + len(SLOW), needed)
-
-
-FEATURES: dict[str, FeatureSet] = {
-    "press_and_release": _windowed(DOWN, UP, slice(2, 5), slice(5, 9), slice(12, 17)),
-    "causal": _windowed(DOWN, (), slice(2, 5), slice(5, 9)),
-    "onset": _windowed(DOWN[:ONSET], (), slice(2, 6)),
-    "published": FeatureSet((), (), (), 3, 0, (DOWN[-1][1], MEDIAN_OFFSET + MEDIAN // 2 + 1)),
-}
-"""Sets of features by name (`settings.Features` lists the names): press and release, the press up to its end, its first
-readings, or the published running medians."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +46,10 @@ class PressFeatures:
     windows: Array  # (Q, C, F)
     history: Array  # (Q, C, J), relative to the rest before the press
     fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
+    seen: Mask  # (Q, K), which windows of `DOWN` and `UP` are complete; K = 0 if the features know no moment
 
     def __getitem__(self, rows: Indices | slice) -> "PressFeatures":
-        return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows])
+        return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows], self.seen[rows])
 
     def __add__(self, other: "PressFeatures") -> "PressFeatures":
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
@@ -82,22 +59,42 @@ class PressFeatures:
         return len(self.windows)
 
 
-def compute_features(readings: Array, down_command: Indices, up_command: Indices, features: str) -> PressFeatures:
-    """Compute the features, a name in `FEATURES`, of every press from (R, C) readings, V, NaN where missing.
+def compute_features(
+    readings: Array,
+    down_command: Indices,
+    up_command: Indices,
+    until: Indices | None = None,
+    is_published: bool = False,
+) -> PressFeatures:
+    """Compute the features of every press from (R, C) readings, V, NaN where missing.
 
-    Commands are the (Q,) first readings after the probe was sent down, and after it was sent up.
+    Commands are the (Q,) first readings after the probe was sent down, and after it was sent up. A press is looked at
+    up to before the reading `until` (Q,), to its end and to the next press if it is None. `is_published` asks for the
+    published running medians, which know no such moment.
     """
-    filled, kind = interpolate_gaps(readings), FEATURES[features]
-    # A press counts up to its end, or to the end of its release if that is looked at.
-    ends = up_command + UP[-1][1] if kind.readings_needed[1] else up_command
-    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(ends, len(readings))
+    filled = interpolate_gaps(readings)
+    _, next_begin = _neighbours(down_command, up_command, len(readings))
+    until = next_begin if until is None else np.clip(until, down_command + 1, next_begin)
+    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + UP[-1][1])
     counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
     fibre_mask = counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
-    if not kind.n_history:
+    if is_published:
         medians = _running_medians(filled, down_command, up_command)
-        return PressFeatures(medians, np.empty((*fibre_mask.shape, 0)), fibre_mask)
-    windows = window_means(filled, down_command, up_command, kind)
-    return PressFeatures(windows, compute_history(filled, down_command), fibre_mask)
+        empty = np.empty((*fibre_mask.shape, 0)), np.empty((len(medians), 0), bool)
+        return PressFeatures(medians, empty[0], fibre_mask, empty[1])
+    windows = window_means(filled, down_command, up_command, until)
+    seen = complete_windows(down_command, up_command, until)
+    return PressFeatures(windows, compute_history(filled, down_command), fibre_mask, seen)
+
+
+def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
+    """Return (Q, K) which windows of `DOWN` and `UP` are complete before the readings `until` (Q,).
+
+    A press that is shorter than `DOWN` has all of it once it has ended: its last reading is repeated.
+    """
+    released = (until > up_command)[:, None]
+    down = (down_command[:, None] + [end for _, end in DOWN] <= until[:, None]) | released
+    return np.hstack([down, released & (up_command[:, None] + [end for _, end in UP] <= until[:, None])])
 
 
 def interpolate_gaps(readings: Array) -> Array:
@@ -113,12 +110,14 @@ def interpolate_gaps(readings: Array) -> Array:
     return filled
 
 
-def window_means(readings: Array, down_command: Indices, up_command: Indices, kind: FeatureSet) -> Array:
-    """Return (Q, C, F) means over the windows of a press, V, less the mean at rest before it."""
-    previous_end, next_begin = _neighbours(down_command, up_command, len(readings))
+def window_means(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Array:
+    """Return (Q, C, F) means over the windows `DOWN`, `UP` and `NOW` of a press, V, less the mean at rest before it."""
+    previous_end, _ = _neighbours(down_command, up_command, len(readings))
     rest = _gather(readings, down_command, REST, previous_end, down_command).mean(axis=1)
-    means = [_gather(readings, down_command, window, down_command, up_command).mean(axis=1) for window in kind.down]
-    means += [_gather(readings, up_command, window, down_command, next_begin).mean(axis=1) for window in kind.up]
+    held = np.minimum(up_command, until)
+    places = [(down_command, window, held) for window in DOWN] + [(up_command, window, until) for window in UP]
+    places += [(held, window, held) for window in NOW]
+    means = [_gather(readings, origin, window, down_command, high).mean(axis=1) for origin, window, high in places]
     return np.stack(means, axis=2) - rest[:, :, None]
 
 

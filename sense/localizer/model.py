@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,21 +17,28 @@ from pydantic import ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 from padforge.design.common.files import read_json, reraise_write_error, write_text
 from padforge.design.common.validation import InputError, check_type, short_repr
-from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
-from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
+from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Indices, Mask
+from padforge.sense.localizer.bayes import N_SUMMARY, STAGES, BayesianLocalizer
 from padforge.sense.localizer.bayes import PREFIX as BAYES
-from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features
+from padforge.sense.localizer.features import (
+    N_FEATURES,
+    N_HISTORY,
+    N_TIMED,
+    FeatureSet,
+    PressFeatures,
+    compute_features,
+)
 from padforge.sense.localizer.model_files import check_arrays, check_same_pad, files_of
-from padforge.sense.localizer.network import Weights, check_weights, combine_members, predict_members
+from padforge.sense.localizer.moments import PHASES, count_complete
+from padforge.sense.localizer.network import RESIDUAL, Networks, Weights, check_weights, predict
 from padforge.sense.localizer.response_model import GRID_CELLS
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.recording.recording import Recording
-from padforge.sense.settings import Features, Method, Split
+from padforge.sense.settings import Method, Split
 
-FORMAT = "padforge-localizer/3"
+FORMAT = "padforge-localizer/4"
 NAME = "localizer"  # of its files, `localizer.json` and `localizer.safetensors`
-TABLE, RESIDUAL = "table", "residual."
-"""Names among the arrays: the response table, and the prefix of the residual network."""
+TABLE = "table"  # name of the response table among the arrays
 UNIFORM = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and radii of 50 and 90 % of a uniform distribution over a square of half-width 1."""
 MEASURE_COLUMNS = {"depth_mm": ("depth_mm", "depth_r90_mm"), "force_n": ("force_n", "force_r90_n")}
@@ -99,11 +106,11 @@ class LocalizerDocument:
 
     __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
     method: Method
-    features: Features | Literal["array"]  # "array" for features that were passed as arrays
+    features: FeatureSet
     rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the recording of the training
     scaler: FeatureScaler
-    # (K, 3 + T) by number of failed fibres: factors from the expected error to the standard deviation, to the radii of
-    # 50 and 90 %, and to the r90 of T measures, from presses never trained on
+    # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the expected error to the
+    # standard deviation, to the radii of 50 and 90 %, and to the r90 of T measures, from presses never trained on
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
     training_recording_sha256: Digest
     split: Split = "random"  # how the test presses of the training were held back
@@ -121,15 +128,15 @@ class LocalizerModel(LocalizerDocument):
     """A trained localizer: its document and its arrays.
 
     Attributes:
-        weights: of the members, see `network.Weights`.
+        networks: of the members, see `network.Networks`.
         table: (S, S, C, F + G) scaled response by position, by which a recalibration augments presses.
-        bayes: the Bayesian localizer; None where depths vary, and of method "published".
-        residual_network: weights of the network that corrects it.
+        bayes: the Bayesian localizers, see `bayes.fit_stages`; none where depths vary, and of method "published".
+        residual_network: weights of the network that corrects them.
     """
 
-    weights: Weights
+    networks: Networks
     table: Floats
-    bayes: BayesianLocalizer | None = None
+    bayes: tuple[BayesianLocalizer, ...] = ()
     residual_network: Weights = field(default_factory=dict)
 
     @property
@@ -137,11 +144,22 @@ class LocalizerModel(LocalizerDocument):
         """C, the number of fibres it was trained on."""
         return len(self.scaler.mean_v)
 
-    def raw_features(self, recording: Recording) -> PressFeatures:
+    @property
+    def max_failures(self) -> int:
+        """Failed fibres that it was trained for, at most."""
+        return self.interval_factors.shape[1] - 1
+
+    @property
+    def corrected(self) -> tuple[tuple[BayesianLocalizer, ...], Weights]:
+        """The Bayesian localizers and the network that corrects them."""
+        return self.bayes, self.residual_network
+
+    def raw_features(self, recording: Recording, until: Indices | None = None) -> PressFeatures:
         """Return the features of every press, V.
 
         Args:
             recording: of a pad with the fibres and the rate of the training.
+            until: (Q,) first readings that are not looked at; None for all up to the next press.
 
         Raises:
             InputError: another pad, or a localizer that was fitted to arrays.
@@ -150,28 +168,37 @@ class LocalizerModel(LocalizerDocument):
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
         check_type("recording", recording, Recording)
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
-        return compute_features(recording.readings, recording.down_command, recording.up_command, self.features)
+        commands = recording.down_command, recording.up_command
+        return compute_features(recording.readings, *commands, until, self.features == "published")
 
-    def scaled_features(self, recording: Recording) -> ScaledFeatures:
+    def scaled_features(self, recording: Recording, until: Indices | None = None) -> ScaledFeatures:
         """Return the scaled features of every press.
 
         Args:
             recording: as `raw_features`, and raises as it does.
+            until: as there.
         """
-        return self.scaler.transform(self.raw_features(recording))
+        return self.scaler.transform(self.raw_features(recording, until))
 
-    def predict(self, recording: Recording, failed: ArrayLike = (), fibre_mask: Mask | None = None) -> Localization:
+    def predict(
+        self,
+        recording: Recording,
+        failed: ArrayLike = (),
+        fibre_mask: Mask | None = None,
+        until: Indices | None = None,
+    ) -> Localization:
         """Predict the position of every press of a recording.
 
         Args:
             recording: of a pad with the fibres and the rate of the training.
             failed: indices of fibres to mask in every press.
             fibre_mask: (Q, C), false where a fibre is masked in a press; see `health.fault_detector.mask_faults`.
+            until: as in `raw_features`.
 
         Raises:
             InputError: as `raw_features` and `predict_features`.
         """
-        features = self.scaled_features(recording)
+        features = self.scaled_features(recording, until)
         if fibre_mask is not None:
             mask = np.asarray(fibre_mask)
             if mask.dtype != bool or mask.shape != features.fibre_mask.shape:
@@ -194,22 +221,25 @@ class LocalizerModel(LocalizerDocument):
         check_type("presses", presses, ScaledFeatures)
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
-        networks, parts = (self.method, self.bayes, self.residual_network), []
+        parts = []
         for first in range(0, len(presses), chunk):
             rows = slice(first, first + chunk)
-            outputs = predict_members(self.weights, presses.inputs[rows], fibre_mask[rows], *networks)
-            parts.append(combine_members(outputs))
+            inputs = presses.inputs[rows], fibre_mask[rows], presses.seen[rows]
+            parts.append(predict(self.networks, *inputs, *self.corrected))
         empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
         targets, std = (np.concatenate(part) for part in zip((empty, empty), *parts, strict=True))
-        level = np.minimum((~fibre_mask).sum(axis=1), len(self.interval_factors) - 1)
-        to_std, to_r50, to_r90 = self.interval_factors[level, :3].T * self.scaler.scale_mm
+        n_complete, level = count_complete(presses.seen), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
+        factors = self.interval_factors[n_complete, level]
+        to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
-        blind = np.logical_not(fibre_mask.all(axis=1) if self.method == "published" else fibre_mask.any(axis=1))
+        is_complete = n_complete > 0 if presses.seen.shape[1] else np.ones(len(presses), bool)
+        has_fibres = fibre_mask.all(axis=1) if self.method == "published" else fibre_mask.any(axis=1)
+        blind = np.logical_not(is_complete & has_fibres)
         anywhere = np.array(UNIFORM) * self.scaler.scale_mm
         measures = {}
         for column, target in enumerate(self.scaler.measures):
             value = target.inverse_transform(np.where(blind, 0.0, targets[:, 2 + column]))
-            r90 = np.where(blind, 1.0, self.interval_factors[level, 3 + column] * std[:, 2 + column])
+            r90 = np.where(blind, 1.0, factors[:, 3 + column] * std[:, 2 + column])
             measures[target.name] = MeasureEstimate(value, target.scale * r90)
         return Localization(
             self.scaler.positions_mm(np.where(blind[:, None], 0.0, targets[:, :2])),
@@ -243,9 +273,11 @@ class LocalizerModel(LocalizerDocument):
             InputError: the folder cannot be written.
         """
         document = {"format": FORMAT, **_DOCUMENT.dump_python(self, warnings=False)}
-        arrays = {**self.weights, TABLE: self.table}
-        if self.bayes is not None:
-            arrays |= self.bayes.to_arrays() | {RESIDUAL + name: part for name, part in self.residual_network.items()}
+        networks = {**self.networks, RESIDUAL: self.residual_network}
+        arrays = {f"{name}.{part}": array for name, network in networks.items() for part, array in network.items()}
+        arrays |= {TABLE: self.table}
+        for number, stage in enumerate(self.bayes):
+            arrays |= stage.to_arrays(number)
         files_of(folder, NAME).write(document, arrays, "localizer")
 
     @classmethod
@@ -261,22 +293,26 @@ class LocalizerModel(LocalizerDocument):
         files = files_of(folder, NAME)
         document, digest = _read_document(read_json(files.document, FORMAT), str(files.document))
         scaler, method = document.scaler, document.method
-        n_inputs, n_measures = scaler.n_inputs(method), len(scaler.measures)
-        with files.arrays(digest, "the localizer") as weights:
-            table, shape = weights.pop(TABLE), (GRID_CELLS + 1, GRID_CELLS + 1, *scaler.mean_v.shape)
+        n_timed = len(document.interval_factors) - 1
+        n_inputs, n_measures = scaler.n_inputs(method, n_timed), len(scaler.measures)
+        with files.arrays(digest, "the localizer") as arrays:
+            table, shape = arrays.pop(TABLE), (GRID_CELLS + 1, GRID_CELLS + 1, *scaler.mean_v.shape)
             check_arrays({TABLE: table}, {TABLE: (shape, np.float32)}, MAX_INPUT)
-            parts = {name: weights.pop(name) for name in list(weights) if name.startswith((BAYES, RESIDUAL))}
-            check_weights(weights, n_inputs, method, n_measures)
-            bayes, residual_network = None, {}
-            if parts:
+            networks: dict[str, dict[str, Any]] = {name: {} for name in (*PHASES[n_timed], RESIDUAL)}
+            for name in [name for name in arrays if not name.startswith(BAYES)]:
+                phase, _, part = name.partition(".")
+                networks[phase][part] = arrays.pop(name)
+            residual_network = networks.pop(RESIDUAL)
+            for weights in networks.values():
+                check_weights(weights, n_inputs, method, n_measures)
+            bayes: tuple[BayesianLocalizer, ...] = ()
+            if arrays or residual_network:
                 if method != "ensemble" or n_measures:
                     raise InputError("a Bayesian localizer is there beside measures or method published, expected none")
-                bayes = BayesianLocalizer.from_arrays(parts, *scaler.mean_v.shape)
-                residual_network = {
-                    name.removeprefix(RESIDUAL): part for name, part in parts.items() if name.startswith(RESIDUAL)
-                }
+                stages = range(len(STAGES) if n_timed else 1)
+                bayes = tuple(BayesianLocalizer.from_arrays(arrays, n, *scaler.mean_v.shape) for n in stages)
                 check_weights(residual_network, n_inputs + N_SUMMARY, method)
-        return cls(**vars(document), weights=weights, table=table, bayes=bayes, residual_network=residual_network)
+        return cls(**vars(document), networks=networks, table=table, bayes=bayes, residual_network=residual_network)
 
 
 def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDocument, str]:
@@ -292,17 +328,17 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
         )
         raise InputError(f"{where}: {key} is {value}: {first['msg'].lower()}") from error
     scaler, shape = read.scaler, read.scaler.mean_v.shape
-    kind = FEATURES.get(read.features)
     names = [each.name for each in scaler.measures]
     if names != ["depth_mm", "force_n"][: len(names)] or (names and read.method == "published"):
         raise InputError(
             f"{where}: scaler.measures are {', '.join(names)} of method {read.method}, expected none, depth_mm, or "
             "depth_mm and force_n, and of method ensemble"
         )
-    if read.method == "published" and read.features != "published":
-        raise InputError(f"{where}: method is published, features are {read.features}, expected published")
-    n_features = kind.n_features if kind else shape[-1]
-    n_history, fibres = kind.n_history if kind else 0, shape[0] if shape else 0
+    if (read.method == "published") != (read.features == "published"):
+        raise InputError(f"{where}: method is {read.method}, features are {read.features}, expected both published or none")
+    n_features = {"windows": N_FEATURES, "published": 3}.get(read.features, shape[-1])
+    n_history, fibres = N_HISTORY if read.features == "windows" else 0, shape[0] if shape else 0
+    n_timed = N_TIMED if read.features == "windows" else 0
     expected = {
         "mean_v": (fibres, n_features),
         "scale_v": (fibres, n_features),
@@ -312,9 +348,10 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
         "half_size_mm": (2,),
     }
     shapes = {f"scaler.{name}": (getattr(scaler, name).shape, size) for name, size in expected.items()}
-    shapes["interval_factors"] = read.interval_factors.shape, (len(read.interval_factors), 3 + len(names))
+    levels = read.interval_factors.shape[1:2]
+    shapes["interval_factors"] = read.interval_factors.shape, (n_timed + 1, *levels, 3 + len(names))
     for name, (size, wanted) in shapes.items():
-        if size != wanted or 0 in size[:1]:
+        if size != wanted or 0 in size[:2]:
             raise InputError(f"{where}: {name} has shape {size}, expected {wanted} of features {read.features}")
     if len(set(read.test)) != len(read.test):
         raise InputError(f"{where}: test names a press twice, expected different ones")

@@ -5,15 +5,16 @@ one network serves every set of failed fibres. Residual layers are h + gelu(laye
 position (and depth, force) and the logarithms of their expected absolute errors. Method "published": one tanh layer.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
-from padforge.sense.localizer.bayes import BayesianLocalizer
+from padforge.sense.localizer.bayes import BayesianLocalizer, stage_of
 from padforge.sense.localizer.model_files import check_arrays
+from padforge.sense.localizer.moments import PHASES, count_complete
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
@@ -47,12 +48,13 @@ def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int 
     check_arrays(weights, {name: (shape, np.float32) for name, shape in expected.items()}, MAX_WEIGHT)
 
 
-def network_inputs(features: Floats, fibre_mask: Mask) -> Floats:
-    """Return (Q, C F + C) inputs of a network from (Q, C, F) features and a (Q, C) mask."""
-    # Features of masked fibres are replaced, not multiplied, by 0: not even NaN gets through.
-    masked = np.where(fibre_mask[:, :, None], features, np.float32(0))
-    masked = masked.reshape(len(features), np.prod(features.shape[1:]))
-    return np.concatenate([masked, fibre_mask.astype(np.float32)], axis=1)
+def network_inputs(features: Floats, fibre_mask: Mask, seen: Mask) -> Floats:
+    """Return (Q, C F + C + K) inputs of a network from (Q, C, F) features and the (Q, C) and (Q, K) masks."""
+    untimed = np.ones((len(seen), features.shape[2] - seen.shape[1]), bool)
+    mask = fibre_mask[:, :, None] & np.hstack([seen, untimed])[:, None]
+    # What is masked is replaced, not multiplied, by 0: not even NaN gets through.
+    masked = np.where(mask, features, np.float32(0)).reshape(len(features), np.prod(features.shape[1:]))
+    return np.concatenate([masked, fibre_mask.astype(np.float32), seen.astype(np.float32)], axis=1)
 
 
 def forward(weights: Weights, x: Floats) -> Floats:
@@ -66,26 +68,66 @@ def forward(weights: Weights, x: Floats) -> Floats:
     return _gelu(_layer_norm(h)) @ weights["last.w"] + weights["last.b"]
 
 
+Networks = Mapping[str, Weights]
+"""Networks by phase, see `moments.PHASES`."""
+RESIDUAL = "residual"
+"""Name of the network that corrects the Bayesian localizers."""
+
+
+def answering(networks: Networks, n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
+    """Return the names of the networks that answer when so many of K windows are complete, in their order."""
+    names = [name for name in networks if n_complete in PHASES[n_timed][name]]
+    return [*names, RESIDUAL] if has_bayes and stage_of(n_complete, n_timed) is not None else names
+
+
 def predict_members(
-    weights: Weights,
+    networks: Networks,
     features: Floats,
     fibre_mask: Mask,
-    method: str = "ensemble",
-    bayes: BayesianLocalizer | None = None,
+    seen: Mask,
+    bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
-    """Return the (E, Q, 2 N) outputs of all members for (Q, C, F + G) scaled features and a (Q, C) mask.
+    """Return the (E, Q, 2 N) outputs of all members that answer for Q presses with as many complete windows.
 
-    The last member is the Bayesian localizer, if any, corrected by its residual network.
+    Features are (Q, C, F + G), scaled, with (Q, C) and (Q, K) masks. The last member is the Bayesian localizer of the
+    phase, if any, corrected by its residual network.
     """
-    x = features.reshape(len(features), -1) if method == "published" else network_inputs(features, fibre_mask)
-    outputs = forward(weights, x)
-    if bayes is None:
-        return outputs
-    position, summary = bayes.predict(features.astype(np.float64), fibre_mask)
-    corrected = forward(residual_network, np.concatenate([x, summary.astype(np.float32)], axis=1))
-    corrected[:, :, :2] += position
-    return np.concatenate([outputs, corrected])
+    n_complete, n_timed = int(seen[:1].sum()), seen.shape[1]
+    is_published = "hidden.w" not in next(iter(networks.values()))
+    x = features.reshape(len(features), -1) if is_published else network_inputs(features, fibre_mask, seen)
+    names = answering(networks, n_complete, n_timed, bool(bayes))
+    outputs = [forward(networks[name], x) for name in names if name != RESIDUAL]
+    if RESIDUAL in names:
+        localizer = bayes[stage_of(n_complete, n_timed) or 0]
+        position, summary = localizer.predict(features.astype(np.float64), fibre_mask)
+        outputs.append(forward(residual_network, np.concatenate([x, summary.astype(np.float32)], axis=1)))
+        outputs[-1][:, :, :2] += position
+    return np.concatenate(outputs)
+
+
+def predict(
+    networks: Networks,
+    features: Floats,
+    fibre_mask: Mask,
+    seen: Mask,
+    bayes: Sequence[BayesianLocalizer] = (),
+    residual_network: Weights = MappingProxyType({}),
+) -> tuple[Floats, Floats]:
+    """Return (Q, N) targets and their standard deviations, scaled, for presses at any moments; 0 before the first one.
+
+    Arguments are as in `predict_members`.
+    """
+    n_complete = count_complete(seen)
+    last, *_ = (weights["last.w"] for weights in networks.values())
+    n_targets = last.shape[2] if "hidden.w" not in next(iter(networks.values())) else last.shape[2] // 2
+    targets, std = np.zeros((2, len(seen), n_targets), np.float32)
+    for count in np.unique(n_complete).tolist():
+        if count or not seen.shape[1]:
+            rows = n_complete == count
+            inputs = features[rows], fibre_mask[rows], seen[rows]
+            targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
+    return targets, std
 
 
 def combine_members(outputs: Floats) -> tuple[Floats, Floats]:

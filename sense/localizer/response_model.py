@@ -16,9 +16,9 @@ from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 
 RBF_SIDE = 21  # basis functions along a side of the pad
 RBF_STD = 2.0  # their standard deviation, in distances between neighbours: wide enough that sums of them are smooth
-RIDGE_POSITION, RIDGE_HISTORY = 1.0, 300.0
-"""Penalties on squared weights, of basis functions and of standardized history. Features of the history are collinear:
-with a small penalty weights cancel each other, and a few hundred presses err by a tenth more."""
+RIDGE_POSITION, RIDGE_HISTORY, RIDGE_MODULATION = 1.0, 3000.0, 300.0
+"""Penalties on squared weights, of basis functions, of standardized history, and of its modulations. Features of the
+history are collinear: with a small penalty weights cancel each other, and presses err by up to a tenth more."""
 GRID_CELLS = 60  # cells along a side of the grid on which the response is tabulated
 _CHUNK = 16_384
 
@@ -149,5 +149,5 @@ def _sensitivity_modulation(expected: Array, residual: Array, past: Array) -> Ar
     if not past.shape[1] or scale <= MIN_SCALE_V:
         return np.zeros(past.shape[1])
     design_matrix = np.hstack([expected[:, None] / scale * past, past])  # an additive effect is no modulation
-    gram = design_matrix.T @ design_matrix + RIDGE_HISTORY * np.eye(design_matrix.shape[1])
+    gram = design_matrix.T @ design_matrix + RIDGE_MODULATION * np.eye(design_matrix.shape[1])
     return np.linalg.solve(gram, design_matrix.T @ residual)[: past.shape[1]] / scale

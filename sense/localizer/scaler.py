@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 from pydantic_core import PydanticCustomError
 
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask
-from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.features import DOWN, NOW, PressFeatures
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 
 MAX_INPUT = 1e4  # largest scaled feature, in standard deviations; beyond lies no press, and features are clipped
@@ -43,9 +43,10 @@ class ScaledFeatures:
 
     inputs: Floats  # (Q, C, F + G), about 1
     fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
+    seen: Mask  # (Q, K), which windows are complete, see `PressFeatures`
 
     def __getitem__(self, rows: slice | Indices) -> "ScaledFeatures":
-        return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows])
+        return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows], self.seen[rows])
 
     def __len__(self) -> int:
         return len(self.inputs)
@@ -122,14 +123,14 @@ class FeatureScaler:
         scaler = cls(mean, scale, *history, origin, scale_mm, (high - low) / 2, targets)
         return scaler, scaler.scale(response.table)
 
-    def n_inputs(self, method: str) -> int:
-        """Return D, the inputs of a network: features and, of method "ensemble", the mask of the fibres."""
-        return self.mean_v.size + (len(self.mean_v) if method == "ensemble" else 0)
+    def n_inputs(self, method: str, n_timed: int) -> int:
+        """Return D, the inputs of a network: features and, of method "ensemble", the masks of C fibres and K windows."""
+        return self.mean_v.size + (len(self.mean_v) + n_timed if method == "ensemble" else 0)
 
     def transform(self, features: PressFeatures) -> ScaledFeatures:
         """Remove the history from features in volts and scale them."""
         windows = remove_history(features.windows, features.history, self.history_coef, self.history_mean_v)
-        return ScaledFeatures(self.scale(windows), features.fibre_mask)
+        return ScaledFeatures(self.scale(windows), features.fibre_mask, features.seen)
 
     def scale(self, windows: Array) -> Floats:
         """Scale (..., C, F + G) windows without history and modulations."""
@@ -154,7 +155,16 @@ class FeatureScaler:
     ) -> "TrainingPresses":
         """Scale features and targets of presses."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        return TrainingPresses(scaled.inputs, scaled.fibre_mask, targets, self.depth_gain)
+        now = self._to_now(scaled.seen.shape[1])
+        return TrainingPresses(scaled.inputs, scaled.fibre_mask, scaled.seen, targets, self.depth_gain, *now)
+
+    def _to_now(self, n_timed: int) -> tuple[Floats, Floats]:
+        """(C, len(NOW), len(DOWN)) factors and offsets that turn scaled windows of `DOWN` into scaled ones of `NOW`."""
+        now = slice(n_timed, n_timed + len(NOW))
+        down = slice(len(DOWN) if n_timed else 0)
+        scale = self.scale_v[:, None, down] / self.scale_v[:, now, None]
+        offset = (self.mean_v[:, None, down] - self.mean_v[:, now, None]) / self.scale_v[:, now, None]
+        return scale.astype(np.float32), offset.astype(np.float32)
 
 
 def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
@@ -168,7 +178,10 @@ class TrainingPresses(ScaledFeatures):
     """Scaled presses of known targets, to train or to check on."""
 
     targets: Floats  # (Q, 2 + T)
-    depth_gain: float = 0.0  # see `FeatureScaler.depth_gain`
+    depth_gain: float  # see `FeatureScaler.depth_gain`
+    # (C, len(NOW), len(DOWN)), which turn scaled windows of `DOWN` into scaled ones of `NOW`
+    now_factor: Floats
+    now_offset: Floats
 
 
 def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:

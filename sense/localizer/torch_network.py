@@ -88,13 +88,17 @@ def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, generator: 
     return (rank >= count) | full
 
 
-def network_inputs(features: Tensor, fibre_mask: Tensor, bayes: BayesianLocalizer | None) -> tuple[Tensor, Tensor]:
+def network_inputs(
+    features: Tensor, fibre_mask: Tensor, seen: Tensor, bayes: BayesianLocalizer | None
+) -> tuple[Tensor, Tensor]:
     """Return the (B, D) inputs of a network and the (B, 2) position that it corrects, or 0 without `bayes`.
 
-    The posterior summary of `bayes`, which is in tensors, is an input beside features (B, C, F) and mask (B, C).
+    The posterior summary of `bayes`, which is in tensors, is an input beside features (B, C, F) and masks (B, C) and
+    (B, K).
     """
-    masked = torch.where(fibre_mask[..., None], features, 0.0)
-    x = torch.cat([masked.flatten(1), fibre_mask.to(features.dtype)], dim=1)
+    timed = functional.pad(seen, (0, features.shape[2] - seen.shape[1]), value=True)
+    masked = torch.where(fibre_mask[..., None] & timed[:, None], features, 0.0)
+    x = torch.cat([masked.flatten(1), fibre_mask.to(features.dtype), seen.to(features.dtype)], dim=1)
     if bayes is None:
         return x, x.new_zeros(())
     with torch.no_grad():
