@@ -10,7 +10,6 @@ from padforge.design.common.settings import Settings, as_tuple, null_as
 from padforge.design.common.validation import InputError
 from padforge.design.settings import Scatter
 
-Features = Literal["press_and_release", "causal", "onset", "published"]
 Method = Literal["ensemble", "published"]
 Split = Literal["random", "chronological"]
 
@@ -198,11 +197,7 @@ class LocalizerSettings(Settings):
 
     method: Method = Field(
         default="ensemble",
-        description="one ensemble for every loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
-    )
-    features: Features = Field(
-        default="press_and_release",
-        description="press and release; causal: up to its end; onset: its first readings; or published",
+        description="one ensemble for every moment and loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
     )
     split: Split = Field(
         default="random", description="presses held back for the test: drawn at random, or the last ones"
@@ -213,7 +208,7 @@ class LocalizerSettings(Settings):
         default=2,
         ge=1,
         le=64,
-        description="members combined by their variances, the last of several a Bayesian localizer",
+        description="members combined by their variances, the last of several a Bayesian localizer of the release",
     )
     hidden: int = Field(default=256, ge=1, le=4096, description="width of the hidden layers")
     layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")

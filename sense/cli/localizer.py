@@ -11,7 +11,6 @@ import click
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
 from padforge.sense.cli.options import (
-    FEATURES,
     FILE,
     FOLDER,
     METHODS,
@@ -32,12 +31,6 @@ from padforge.sense.cli.options import (
     "--method",
     type=click.Choice(METHODS),
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
-)
-@click.option(
-    "--features",
-    type=click.Choice(FEATURES),
-    help="Part of a press that is used: press_and_release (most accurate), causal (to the end of the press), onset "
-    "(earliest), or as published.",
 )
 @click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
 @click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 METHODS, SPLITS = ("ensemble", "published"), ("random", "chronological")
-FEATURES = ("press_and_release", "causal", "onset", "published")
 REFRESH_HZ = 15
 """How often lines on a terminal are redrawn."""
 FILE = click.Path(path_type=Path, dir_okay=False)

@@ -46,7 +46,7 @@ MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one 
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
 INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 8
-"""Sets of failed fibres of a size that intervals are calibrated on, at most; and for each moment, if there are several."""
+"""Sets of failed fibres of a size that intervals are calibrated on, at most: of one moment, or of each of several."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def fit_model(
     phases = MODULATED if n_timed else ()
     positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
-    presses = scaler.training_presses(features, positions_mm, measures)
+    presses = scaler.training_presses(features, positions_mm, measures, data.rate_hz)
     bayes, residual_network = (), {}
     if is_ensemble:
         networks, bayes, residual_network = train_members(presses, table, options, rng, on_progress, time_budget)
@@ -243,7 +243,8 @@ def _calibrate_scales(
         rows = np.flatnonzero(count_complete(presses.seen) == n_complete)  # not those that the next press cuts off
         for failed in subsets if len(rows) else ():
             fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
-            outputs = predict_members(model.networks, presses.inputs[rows], fibre_mask, presses.seen[rows], *model.corrected)
+            inputs = presses.inputs[rows], fibre_mask, presses.seen[rows]
+            outputs = predict_members(model.networks, *inputs, *model.corrected)
             predicted, log_error = np.split(outputs, 2, axis=2)
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
             ratio = (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)

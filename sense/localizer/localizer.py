@@ -170,7 +170,7 @@ class Localizer:
             InputError: not fitted, or as `evaluation.evaluate`.
         """
         model = self._fitted
-        most = len(model.interval_factors) - 1 if max_failures is None else max_failures
+        most = model.max_failures if max_failures is None else max_failures
         return evaluate(model, recording, range(min(most, model.fibres - 1) + 1)).errors
 
     def save(self, folder: str | Path) -> None:
@@ -195,8 +195,7 @@ class Localizer:
             InputError: as `LocalizerModel.load`.
         """
         model = LocalizerModel.load(folder)
-        options = {} if model.features == "array" else {"features": model.features}
-        localizer = cls(len(model.interval_factors) - 1, method=model.method, split=model.split, **options)
+        localizer = cls(model.max_failures, method=model.method, split=model.split)
         localizer.model_ = model
         return localizer
 
@@ -213,7 +212,8 @@ def _array_features(X: ArrayLike) -> PressFeatures:
         raise InputError(f"X has shape {windows.shape}, expected (Q, C, F)")
     check_magnitude("X", windows.reshape(len(windows), -1), MAX_VOLTS, "V", missing=True)
     present = np.isfinite(windows).all(axis=2)
-    return PressFeatures(np.where(present[:, :, None], windows, 0.0), np.empty((*present.shape, 0)), present)
+    empty = np.empty((*present.shape, 0)), np.empty((len(present), 0), bool)
+    return PressFeatures(np.where(present[:, :, None], windows, 0.0), empty[0], present, empty[1])
 
 
 def _array_positions(y: ArrayLike | None) -> Array:

@@ -335,7 +335,9 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
             "depth_mm and force_n, and of method ensemble"
         )
     if (read.method == "published") != (read.features == "published"):
-        raise InputError(f"{where}: method is {read.method}, features are {read.features}, expected both published or none")
+        raise InputError(
+            f"{where}: method is {read.method}, features are {read.features}, expected both published or neither"
+        )
     n_features = {"windows": N_FEATURES, "published": 3}.get(read.features, shape[-1])
     n_history, fibres = N_HISTORY if read.features == "windows" else 0, shape[0] if shape else 0
     n_timed = N_TIMED if read.features == "windows" else 0

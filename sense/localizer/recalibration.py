@@ -21,6 +21,7 @@ from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.evaluation import Measures, conformal, distances, error_row
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel, concatenate
+from padforge.sense.localizer.moments import CORRECTED, PHASES
 from padforge.sense.localizer.network import Weights
 from padforge.sense.localizer.response_model import grid_positions
 from padforge.sense.recording.recording import Recording
@@ -103,7 +104,7 @@ def recalibrate(
     rows = np.random.default_rng(seed).permutation(known)
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
-    subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(len(model.interval_factors))]
+    subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(model.max_failures + 1)]
     validation = CrossValidation(features, positions_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
     before = validation.predict([model] * FOLDS)
     changed, after, changes = _select_changes(model, validation, before, seed, on_progress)
@@ -170,12 +171,19 @@ def _fine_tuned(
     predicted = model.predict_features(model.scaler.transform(features)).measures
     # Where the depth of a press is unknown, its prediction is kept.
     known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
-    presses = model.scaler.training_presses(features, positions_mm, known)
-    max_failures, residual_network = len(model.interval_factors) - 1, model.residual_network
-    weights = fine_tune(model.weights, presses, model.table, max_failures, rng)
-    if model.bayes is not None:
-        residual_network = fine_tune(residual_network, presses, model.table, max_failures, rng, model.bayes)
-    return replace(model, weights=weights, residual_network=residual_network)
+    presses = model.scaler.training_presses(features, positions_mm, known, model.rate_hz)
+    phases = PHASES[features.seen.shape[1]]
+    networks = {
+        name: fine_tune(weights, presses, model.table, model.max_failures, rng, phases[name])
+        for name, weights in model.networks.items()
+    }
+    residual_network = model.residual_network
+    if model.bayes:
+        phase = CORRECTED if features.seen.shape[1] else phases["press"]
+        residual_network = fine_tune(
+            residual_network, presses, model.table, model.max_failures, rng, phase, model.bayes
+        )
+    return replace(model, networks=networks, residual_network=residual_network)
 
 
 def fit_correction(
@@ -214,10 +222,10 @@ def _transform(parameters: Array) -> tuple[Array, Array, Array]:
 def _corrected(model: LocalizerModel, parameters: Array) -> LocalizerModel:
     gains, rotation, shift = _transform(parameters)
     names = ("mean_v", "scale_v", "history_mean_v")
-    bayes = model.bayes and model.bayes.transformed(rotation, shift)
+    bayes = tuple(stage.transformed(rotation, shift) for stage in model.bayes)
     return replace(
         model,
-        weights=_transformed_weights(model.weights, rotation, shift),
+        networks={name: _transformed_weights(each, rotation, shift) for name, each in model.networks.items()},
         bayes=bayes,
         residual_network=_transformed_weights(model.residual_network, rotation, np.zeros(2)) if bayes else {},
         scaler=replace(model.scaler, **{name: gains[:, None] * getattr(model.scaler, name) for name in names}),

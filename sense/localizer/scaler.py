@@ -124,7 +124,7 @@ class FeatureScaler:
         return scaler, scaler.scale(response.table)
 
     def n_inputs(self, method: str, n_timed: int) -> int:
-        """Return D, the inputs of a network: features and, of method "ensemble", the masks of C fibres and K windows."""
+        """Return D, the inputs of a network: features and, of method "ensemble", masks of C fibres and K windows."""
         return self.mean_v.size + (len(self.mean_v) + n_timed if method == "ensemble" else 0)
 
     def transform(self, features: PressFeatures) -> ScaledFeatures:
@@ -151,12 +151,26 @@ class FeatureScaler:
         return targets * self.scale_mm + self.origin_mm
 
     def training_presses(
-        self, features: PressFeatures, positions_mm: Array, measures: Mapping[str, Array] | None = None
+        self,
+        features: PressFeatures,
+        positions_mm: Array,
+        measures: Mapping[str, Array] | None = None,
+        rate_hz: float = np.inf,
     ) -> "TrainingPresses":
-        """Scale features and targets of presses."""
+        """Scale features and targets of presses, which slide in training if the rate of the readings is given."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        now = self._to_now(scaled.seen.shape[1])
-        return TrainingPresses(scaled.inputs, scaled.fibre_mask, scaled.seen, targets, self.depth_gain, *now)
+        now_factor, now_offset = self._to_now(scaled.seen.shape[1])
+        return TrainingPresses(
+            scaled.inputs,
+            scaled.fibre_mask,
+            scaled.seen,
+            targets,
+            depth_gain=self.depth_gain,
+            now_factor=now_factor,
+            now_offset=now_offset,
+            per_mm=1 / self.scale_mm,
+            speed=1 / (self.scale_mm * rate_hz),
+        )
 
     def _to_now(self, n_timed: int) -> tuple[Floats, Floats]:
         """(C, len(NOW), len(DOWN)) factors and offsets that turn scaled windows of `DOWN` into scaled ones of `NOW`."""
@@ -182,6 +196,8 @@ class TrainingPresses(ScaledFeatures):
     # (C, len(NOW), len(DOWN)), which turn scaled windows of `DOWN` into scaled ones of `NOW`
     now_factor: Floats
     now_offset: Floats
+    per_mm: float  # scaled distance of 1 mm
+    speed: float  # scaled distance that 1 mm/s goes from one reading to the next; 0 where presses do not slide
 
 
 def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:

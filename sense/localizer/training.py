@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from threading import Event, Lock
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,13 +23,12 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.networks import fit_batch
 from padforge.sense.arrays import Floats
-from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer, fit_stages, stage_of
-from padforge.sense.localizer.features import DOWN, NOW
-from padforge.sense.localizer.moments import CORRECTED, N_DOWN, PHASES, Phase
+from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
+from padforge.sense.localizer.moments import CORRECTED, PHASES, Phase
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, N_OUTPUTS, Networks, Weights, stack_members
-from padforge.sense.localizer.response_model import interpolate_grid
+from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
-from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs, sample_fibre_dropout
+from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings
 
 WARM_UP = 0.2  # share of the steps in which the learning rate rises
@@ -121,7 +120,6 @@ POSITION_AUGMENTATION, DEPTH_AUGMENTATION = 0.26, 0.3
 MIN_BATCHES, MAX_STEPS, HARDER = 10, 11_000, 2
 """Steps of an epoch at least, and of a training at most; how much longer training takes where depths vary, which is
 harder to learn."""
-NOW_NOISE = 0.05  # of single readings, beside `INPUT_NOISE` of means
 RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
 """Largest size of the network that corrects the Bayesian localizer: larger ones gain nothing."""
 PUBLISHED_HIDDEN = 50  # neurons of the published network, of one tanh layer
@@ -158,10 +156,10 @@ def train_members(
     phases = PHASES[n_timed]
     steps = training_steps(len(presses.inputs), options) * (HARDER if presses.depth_gain else 1)
     length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
-    members, pace_s = max(1, options.members - has_bayes), 0.0
+    members, cores = max(1, options.members - has_bayes), os.cpu_count() or 1
     if time_budget is not None:
         with one_torch_thread():
-            pace_s, cores = _Training(presses, table, options, 0, CORRECTED).measure_pace(), os.cpu_count() or 1
+            pace_s = _Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
         has_bayes = not presses.depth_gain
         members = max(1, min(round(cores * time_budget / (pace_s * MIN_LENGTHS * steps * length)), MAX_MEMBERS))
     bayes = fit_stages(table, presses.inputs, presses.fibre_mask, presses.targets, n_timed) if has_bayes else ()
@@ -171,11 +169,12 @@ def train_members(
     tasks += [("", CORRECTED if n_timed else phases["press"])] * has_bayes
     seeds = [int(seed) for seed in rng.integers(2**63, size=len(tasks))]
     all_steps = [round(steps * phase.length) for _, phase in tasks]
-    seconds: list[float | None] = [None] * len(tasks)
+    totals, seconds = all_steps, list[float | None]([None] * len(tasks))
     if time_budget is not None:
         left = max(0.0, time_budget - (time.monotonic() - begin)) * min(cores, len(tasks))
-        seconds = [left * part / sum(all_steps) for part in all_steps]
-    joint = JointProgress(all_steps if time_budget is None else [max(1, round(each or 0)) for each in seconds], on_progress)
+        in_turn = [left * part / sum(all_steps) for part in all_steps]
+        totals, seconds = [max(1, round(each)) for each in in_turn], list[float | None](in_turn)
+    joint = JointProgress(totals, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
 
     def train(number: int) -> Weights:
@@ -231,96 +230,6 @@ def _loss(error: Tensor) -> Tensor:
     return distance if error.shape[-1] == 2 else distance + MEASURE_WEIGHT * error[..., 2:].abs().sum(dim=-1)
 
 
-class _PressSampler:
-    """Presses at random moments of a phase, whose features follow the response model to other targets."""
-
-    def __init__(
-        self,
-        presses: TrainingPresses,
-        table: Floats,
-        max_failures: int,
-        generator: torch.Generator,
-        phase: Phase,
-        bayes: Sequence[BayesianLocalizer],
-    ) -> None:
-        def tensor(array: Floats) -> Tensor:
-            return torch.from_numpy(array).to(generator.device)
-
-        self.generator = generator
-        x, self.fibre_mask, self.targets = map(tensor, (presses.inputs, presses.fibre_mask, presses.targets))
-        self.fibres, self.depth_gain = x.shape[1], presses.depth_gain
-        self._table, self._max_failures = tensor(table).flatten(2), min(max_failures, self.fibres - 1)
-        self._residual = x - self._expected(self.targets).view_as(x)
-        self._seen, n_timed = tensor(presses.seen), presses.seen.shape[1]
-        self._moments = _Moments(presses, phase, generator) if n_timed else None
-        self._bayes = tuple(stage.map_arrays(tensor) for stage in bayes)
-        self.n_inputs = self.fibres * (x.shape[2] + 1) + n_timed + (N_SUMMARY if bayes else 0)
-
-    def draw(self, batch: int) -> Tensor:
-        """Draw (B,) rows of presses."""
-        return torch.randint(len(self.targets), (batch,), generator=self.generator, device=self.generator.device)
-
-    def normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator, device=self.generator.device)
-
-    def inputs(self, rows: Tensor, targets: Tensor, noise: float) -> tuple[Tensor, Tensor]:
-        """Network inputs (1, B, D), and positions to correct, of presses moved to (B, 2 + T) targets."""
-        residual, seen, bayes = self._residual[rows], self._seen[rows], None
-        features = self._expected(targets).view_as(residual) + residual
-        features += noise * self.normal(*residual.shape)
-        if self._moments is not None:
-            # With a Bayesian localizer a batch is at one moment, of which only one of these is needed.
-            counts = self._moments.draw(1 if self._bayes else len(rows)).expand(len(rows))
-            features, seen = self._moments.at(counts, features, seen)
-        if self._bayes:
-            bayes = self._bayes[stage_of(int(counts[0]) if self._moments else 0, seen.shape[1]) or 0]
-        dropout = sample_fibre_dropout(len(rows), self.fibres, self._max_failures, self.generator)
-        x, position = network_inputs(features, self.fibre_mask[rows] & dropout, seen, bayes)
-        return x[None], position
-
-    def _expected(self, targets: Tensor) -> Tensor:
-        expected = interpolate_grid(self._table, targets[:, :2], torch)
-        return expected if targets.shape[1] == 2 else (1 + self.depth_gain * targets[:, 2:3]) * expected
-
-
-class _Moments:
-    """Random moments of a phase, at which a press is looked at."""
-
-    def __init__(self, presses: TrainingPresses, phase: Phase, generator: torch.Generator) -> None:
-        def tensor(values: Any) -> Tensor:
-            return torch.as_tensor(values, device=generator.device)
-
-        self._generator, self._first, self._shares = generator, phase.first, tensor(phase.shares)
-        self._now_factor, self._now_offset = tensor(presses.now_factor), tensor(presses.now_offset)
-        ends = [end for _, end in DOWN]
-        self._ends = tensor([0, *ends, ends[-1] + 1])
-        self._window = tensor([max(sum(first <= n for first, _ in DOWN) - 1, 0) for n in range(ends[-1])])
-
-    def draw(self, batch: int) -> Tensor:
-        """Draw (B,) numbers of complete windows."""
-        return self._first + torch.multinomial(self._shares, batch, replacement=True, generator=self._generator)
-
-    def at(self, n_complete: Tensor, features: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features (B, C, F + G), and which of their windows are complete (B, K), at earlier moments.
-
-        Where the finger still rests in the pad, it is now where it was in the windows of these readings.
-        """
-        seen = seen & (torch.arange(seen.shape[1], device=seen.device) < n_complete[:, None])
-        begin, end = (self._ends[(n_complete + k).clamp(max=N_DOWN + 1)] for k in (0, 1))
-        share = torch.rand(len(begin), generator=self._generator, device=begin.device)
-        last = begin + (share * (end - begin)).long() - 1
-        held, timed = (n_complete <= N_DOWN)[:, None], seen.shape[1]
-        now = []
-        for back in range(len(NOW)):
-            window = self._window[(last - back).clamp(0, len(self._window) - 1)]
-            value = torch.take_along_dim(features[:, :, :N_DOWN], window[:, None, None], dim=2)[:, :, 0]
-            value = value * self._now_factor[:, back, window].T + self._now_offset[:, back, window].T
-            noise = torch.randn(*value.shape, generator=self._generator, device=begin.device)
-            now.append(torch.where(held, value + NOW_NOISE * noise, features[:, :, timed + back]))
-        parts = features[:, :, :timed], torch.stack(now, dim=2), features[:, :, timed + len(NOW) :]
-        return torch.cat(parts, dim=2), seen
-
-
 class _Training:
     """A network and its loss, on the GPU where there is one."""
 
@@ -335,7 +244,7 @@ class _Training:
     ) -> None:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         generator = torch.Generator(device).manual_seed(seed)
-        self._presses = sampler = _PressSampler(presses, table, options.max_failures, generator, phase, bayes)
+        self._presses = sampler = PressSampler(presses, table, options.max_failures, generator, phase, bayes)
         self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
         self._bounds = targets[:, :3].amin(dim=0), targets[:, :3].amax(dim=0)
         positions = targets[:, :2].unique(dim=0)
@@ -404,7 +313,7 @@ def fine_tune(
     """
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     before, network = EnsembleMlp.from_numpy(weights), EnsembleMlp.from_numpy(weights)
-    sampler = _PressSampler(presses, table, max_failures, generator, phase, bayes)
+    sampler = PressSampler(presses, table, max_failures, generator, phase, bayes)
     share = len(presses.inputs) / (len(presses.inputs) + PRIOR_PRESSES)
 
     def inputs(rows: Tensor, positions: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -280,13 +280,13 @@ class LivePad:
         self._gains = Gains(rig.readings_per_press / rig.rate_hz, channels, rig, rng)
         self._pad, self._contact, self._rig, self._rate_hz = build_pad(pad, rig), contact, rig, rate_hz
         self._depth_mm = max(rig.depths_mm, default=rig.depth_mm)
-        self._cache: dict[tuple[float, float], PressParts[Array]] = {}
+        self._responses: dict[tuple[float, float], PressParts[Array]] = {}  # (1, C) of the deepest press, by position
         self._presses: list[_Press] = []  # the last of them
         self._depth, self._n_read = 0.0, 0
 
     def prepare(self) -> None:
         """Compile and solve what the first press would wait for."""
-        self._response(np.zeros(2))
+        self._solve(np.zeros((1, 2)))
 
     def volts(self, positions_mm: Array, depths_mm: Array) -> Array:
         """Return the readings (R, C), V, at further positions (R, 2) of the tip, from the pad's centre.
@@ -294,6 +294,7 @@ class LivePad:
         Depths (R,) are below the surface, negative above.
         """
         strain = Strain(*np.zeros((3, len(positions_mm), self._divider.channels)))
+        self._solve(positions_mm[depths_mm > 0])
         for row, depth in enumerate(np.maximum(depths_mm / self._depth_mm, 0).tolist()):
             step, self._depth = depth - self._depth, depth
             if not (depth or step):
@@ -301,35 +302,62 @@ class LivePad:
             if depth and step == depth:
                 self._touch(positions_mm[row], (self._n_read + row) / self._rate_hz)
             press, time_s = self._presses[-1], (self._n_read + row) / self._rate_hz
+            moved = np.zeros_like(press.replaced)
             if depth:
-                press.response, press.release_s = self._response(positions_mm[row]), time_s
+                press.release_s = time_s
+                if _rounded(positions_mm[row]) != _rounded(press.position_mm):
+                    moved = self._slide(press, positions_mm[row])
             onset = depth * math.exp((press.touch_s - time_s) / ONSET_S)
             parts = strain_of(scaled(press.response, press.gains), press.replaced, depth, onset, step)
             for part, of_press in zip(strain, parts, strict=True):
                 part[row] = of_press
+            strain.residue[row] -= depth * moved[0]
         self._n_read += len(positions_mm)
         return self._divider(strain)
 
     def _touch(self, position_mm: Array, time_s: float) -> None:
         """Begin a press, which takes away residues of earlier ones."""
-        response = self._response(position_mm)
+        response = self._responses[_rounded(position_mm)]
         press = _Press(position_mm, time_s, time_s, self._gains(1), response, np.zeros_like(response.held))
         self._presses = [*self._presses[-MAX_LAG:], press]
+        press.replaced = self._replaced()
+
+    def _slide(self, press: "_Press", position_mm: Array) -> Array:
+        """Move a press; return which residues (1, C) it takes away there, less those that it gives back.
+
+        A press that slides is at any time like one that was made where it is then; it leaves none on its way.
+        """
+        before = press.replaced
+        press.position_mm, press.response = position_mm, self._responses[_rounded(position_mm)]
+        press.replaced = self._replaced()
+        return press.replaced - before
+
+    def _replaced(self) -> Array:
+        """Return which residues (1, C) the latest press takes away."""
         positions_mm, touch_s, release_s = (
             np.array([getattr(each, name) for each in self._presses])
             for name in ("position_mm", "touch_s", "release_s")
         )
         held = np.concatenate([each.response.held for each in self._presses])
         residues = np.concatenate([each.response.after for each in self._presses])
-        press.replaced = replaced_residues(positions_mm, touch_s, release_s, residues, held, self._rig)[-1:]
+        return replaced_residues(positions_mm, touch_s, release_s, residues, held, self._rig)[-1:]
 
-    def _response(self, position_mm: Array) -> PressParts[Array]:
-        """(1, C) of the deepest press; the tip of an arm at rest stays within hundredths of a millimetre."""
-        x, y = np.round(position_mm, 2).tolist()
-        if (x, y) not in self._cache:
-            position, depth = np.array([[x, y]]), np.array([self._depth_mm])
-            self._cache = {(x, y): resistance_changes(self._pad, position, depth, self._contact, self._rig)}
-        return self._cache[x, y]
+    def _solve(self, positions_mm: Array) -> None:
+        """Compute the responses at positions (n, 2), all at once, in place of earlier ones elsewhere."""
+        new = dict.fromkeys(_rounded(position) for position in positions_mm)
+        if not new.keys() <= self._responses.keys():
+            rounded = np.array(list(new))
+            depths_mm = np.full(len(rounded), self._depth_mm)
+            parts = resistance_changes(self._pad, rounded, depths_mm, self._contact, self._rig)
+            self._responses = {
+                position: PressParts(*(part[row : row + 1] for part in parts)) for row, position in enumerate(new)
+            }
+
+
+def _rounded(position_mm: Array) -> tuple[float, float]:
+    """Round to hundredths of a millimetre, within which the tip of an arm at rest stays."""
+    x, y = np.round(position_mm, 2).tolist()
+    return x, y
 
 
 @dataclass

@@ -27,7 +27,7 @@ from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import split_presses
 from padforge.sense.localizer.evaluation import ACTIVE, distances
 from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
-from padforge.sense.localizer.features import compute_features, interpolate_gaps
+from padforge.sense.localizer.features import N_TIMED, compute_features, interpolate_gaps
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.filters import running_median, total_variation
@@ -130,8 +130,8 @@ def network_inputs(
     if compensation == "windows":
         # principal components, fitted to the training presses; as many as "published" has inputs, else the networks
         # would differ in size
-        inputs = compute_features(readings, down_command, up_command, "press_and_release")
-        windows = inputs.windows.reshape(len(down_command), -1)
+        inputs = compute_features(readings, down_command, up_command)
+        windows = inputs.windows[:, :, :N_TIMED].reshape(len(down_command), -1)
         components = np.linalg.eigh(np.cov(windows[training], rowvar=False))[1]
         return (windows - windows[training].mean(axis=0)) @ components[:, -3 * readings.shape[1] :]
     before, pressed, after = readings[level_indices(len(readings), down_command, up_command).T]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
-from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.features import N_TIMED, compute_features
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
@@ -60,7 +60,8 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     """Split the presses of known position of a recording; maps of their parts are fitted to those in `training`."""
     known = recording.has_position
     down, up, positions_mm = recording.down_command[known], recording.up_command[known], recording.presses_mm[known]
-    inputs = compute_features(recording.readings, down, up, "press_and_release")
+    inputs = compute_features(recording.readings, down, up)
+    timed = inputs.windows[:, :, :N_TIMED]
     valid, positions = inputs.fibre_mask, normalize(positions_mm)[0]
     times_s = recording.times_s[down], recording.times_s[np.minimum(up, len(recording.times_s) - 1)]
     cycle = Cycle(2 * int(np.median(up - down)), recording.rate_hz)
@@ -71,9 +72,9 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     rig = RigSettings(hysteresis_s=hysteresis_s, memory=FIRST_MEMORY, memory_mm=FIRST_MEMORY_MM)
     kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))
     is_held = kernels[0] >= min(HELD, kernels[0].max())
-    pressed = inputs.windows[:, :, is_held].mean(axis=2)
+    pressed = timed[:, :, is_held].mean(axis=2)
     for _ in range(N_ROUNDS):
-        windows = inputs.windows - replaced[:, :, None] * kernels[4]
+        windows = timed - replaced[:, :, None] * kernels[4]
         residual = (windows - smoothed(windows))[training]
         for c in range(valid.shape[1]):
             parts[:, :, c] = _split(windows[:, c], residual[:, c], kernels[:4])
@@ -83,7 +84,7 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
         replaced, kernels = replaced_residues(*presses, rig), part_kernels(cycle, rig)
     pressed = pressed - kernels[4, is_held].mean() * replaced
     held, onset, creep, after = (Responses(positions_mm, part, valid) for part in parts)
-    touch_s = min(_surface_s(positions_mm, inputs.windows, is_held) / recording.rate_hz, MAX_TOUCH_S)
+    touch_s = min(_surface_s(positions_mm, timed, is_held) / recording.rate_hz, MAX_TOUCH_S)
     fitted = {name: getattr(rig, name) for name in BOUNDS} | {"touch_s": touch_s}
     return SplitPresses(PressParts(held, onset, creep, after), Responses(positions_mm, pressed, valid), fitted)
 
@@ -143,7 +144,7 @@ def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:
         strain = superpose_strain(PressParts(*unit[:4]), unit[4], motion)
         readings = Viscoelasticity(cycle.rate_hz, rig)(strain)
         down, up = np.array([cycle.down_index]), np.array([cycle.readings])
-        out.append(compute_features(readings, down, up, "press_and_release").windows[0])
+        out.append(compute_features(readings, down, up).windows[0, :, :N_TIMED])
     return np.mean(out, axis=0)
 
 

@@ -77,13 +77,15 @@ def select_one_depth(recording: Recording) -> Recording:
 def compute_responses(recording: Recording, training: Mask) -> Responses:
     """Compute the responses to all Q presses of known position; history is fitted to those in the mask `training`."""
     known = recording.has_position
-    inputs = compute_features(recording.readings, recording.down_command[known], recording.up_command[known], "causal")
+    down, up = recording.down_command[known], recording.up_command[known]
+    inputs = compute_features(recording.readings, down, up, until=up)
+    pressed = inputs.windows[:, :, : len(DOWN)]
     positions_mm = recording.presses_mm[known]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
-        normalized[training], inputs.windows[training], inputs.history[training], inputs.fibre_mask[training]
+        normalized[training], pressed[training], inputs.history[training], inputs.fibre_mask[training]
     )
-    windows = remove_history(inputs.windows, inputs.history, model.history_coef, model.history_mean_v)
+    windows = remove_history(pressed, inputs.history, model.history_coef, model.history_mean_v)
     return Responses(positions_mm, windows @ HOLD, inputs.fibre_mask)
 
 
