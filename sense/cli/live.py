@@ -190,9 +190,9 @@ class EventPrinter:
 
     def _is_news(self, estimate: "Estimate") -> bool:
         told = self._told
-        if told is not None and told.press == estimate.press and not estimate.final:
-            if not (estimate.is_sharper_than(told) or estimate.has_moved_from(told)):
-                return False
+        is_same = told is not None and told.press == estimate.press and not estimate.final
+        if is_same and not (estimate.is_sharper_than(told) or estimate.has_moved_from(told)):
+            return False
         self._told = estimate
         return True
 

@@ -35,7 +35,7 @@ class ScriptedDetector:
 
     def __init__(self, recording: Recording, delays: tuple[int, int] = (2, 1)) -> None:
         events = (True, delays[0], recording.down_command), (False, delays[1], recording.up_command)
-        self._events = sorted((index + late, down, index) for down, late, at in events for index in at.tolist())
+        self._events = sorted((index + late, index, down) for down, late, at in events for index in at.tolist())
         self._n_readings = 0
 
     def __call__(self, fibres: int) -> "ScriptedDetector":
@@ -44,7 +44,7 @@ class ScriptedDetector:
     def update(self, times_s: np.ndarray, readings: np.ndarray) -> Iterator[PressEvent]:
         self._n_readings += len(times_s)
         while self._events and self._events[0][0] < self._n_readings:
-            _, down, index = self._events.pop(0)
+            _, index, down = self._events.pop(0)
             yield PressEvent(down, index)
 
 
@@ -174,20 +174,26 @@ def test_live_handles_presses_of_any_length_and_distance(recording, hasty, lengt
     assert_as_a_whole(odd, hasty, events)
 
 
-def test_a_press_that_is_detected_late_is_estimated_from_then_on(recording, hasty) -> None:
-    """One that is cut off is known to be so only when the next one is detected."""
+def test_a_press_that_the_next_one_cuts_off_ends_where_that_began(recording, hasty) -> None:
+    """Though it is known only some readings later."""
     part = first_presses(recording, 4)
-    down_command, up_command = part.down_command.copy(), part.up_command.copy()
-    down_command[2] = up_command[1] + 5
-    part = replace(part, down_command=down_command, up_command=up_command)
-    length = int((up_command - down_command)[1])
-    _, events = replay(part, hasty, (3, 1))
-    last = [each for each in events if each.press == 1][-1]
-    assert (last.final, last.since, last.readings) == (True, "lift", 5)
-    _, events = replay(part, hasty, (length + 2, 0))  # after its release
-    assert [each.since for each in events if each.press == 1] == ["touch"] * 0 + ["lift"] * sum(
-        each.press == 1 for each in events
-    )
+    down_command = part.down_command.copy()
+    down_command[2] = part.up_command[1] + 5
+    part = replace(part, down_command=down_command)
+    live, events = replay(part, hasty, (3, 1))
+    *_, before, last = (each for each in events if each.press == 1)
+    assert (before.final, before.readings, last.final, last.since, last.readings) == (False, 8, True, "lift", 5)
+    assert events[events.index(last) + 1].press == 2
+    assert_as_a_whole(part, hasty, [last])
+    assert [each.press for each in live.presses] == [0, 1, 2, 3]
+
+
+def test_a_tap_that_its_release_shows_is_estimated_from_then_on(recording, hasty) -> None:
+    part = first_presses(recording, 1)
+    part = replace(part, up_command=part.down_command + 5)
+    _, events = replay(part, hasty, (8, 3))
+    assert [(each.since, each.readings) for each in events] == [("lift", n) for n in range(4, RELEASE + 1)]
+    assert_as_a_whole(part, hasty, events)
 
 
 def test_radii_shrink_as_a_press_goes_on(recording, localizer) -> None:
