@@ -48,7 +48,7 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
     padforge sense calibrate out/pad/recording --time-budget 600
 
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
-    error_map.png and error_by_loss.png.
+    error_map.png, error_by_loss.png and error_by_moment.png.
     """
     from padforge.design.common.files import locked_folder
     from padforge.sense.localizer.evaluation import calibration_lines

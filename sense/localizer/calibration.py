@@ -134,7 +134,8 @@ def fit_recording(
     features = compute_features(readings, *commands, is_published=is_published)
 
     def at(n_complete: int, presses: Indices) -> PressFeatures:
-        return compute_features(readings, *commands, complete_at(n_complete, *commands))[presses]
+        until = complete_at(n_complete, *commands)
+        return compute_features(readings, *commands, until, history=features.history)[presses]
 
     origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
     data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)

@@ -1,6 +1,6 @@
 """Evaluation of a localizer: errors for every set of failed fibres and by position, and coverage of its radii."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, isnan
 from typing import Any
@@ -12,8 +12,7 @@ from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import DOWN, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import MOMENTS, Moment
-from padforge.sense.localizer.scaler import ScaledFeatures
+from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/3"
@@ -36,7 +35,7 @@ class Evaluation:
         by_subset: mean error of each set of failed fibres.
         by_position: rows of `errors_by_position`.
         by_moment: rows of `errors_by_moment`.
-        focus: how a press is localized while it is read, see `touch_in_focus`.
+        focus: how a press is localized while it is read, see `errors_by_moment`.
         idle_share: of each fibre, see `idle_share`.
         test: true and predicted positions, depths and forces, with all fibres.
         provenance: of the localizer, and the kind of the recording.
@@ -99,8 +98,7 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         test_presses=len(test),
         by_subset=by_subset,
         by_position=errors_by_position(prediction.positions_mm, positions_mm),
-        by_moment=errors_by_moment(model, recording, test, levels),
-        focus=touch_in_focus(model, recording, test, distances(prediction.positions_mm, positions_mm)),
+        **errors_by_moment(model, recording, test, levels),
         idle_share=idle_share(recording).tolist(),
         test={
             "press": test.tolist(),
@@ -161,59 +159,48 @@ def errors_by_loss(
 
 def errors_by_moment(
     model: LocalizerModel, recording: Recording, presses: Indices, levels: Iterable[int]
-) -> list[dict[str, Any]]:
+) -> dict[str, Any]:
     """Return the errors of presses at `MOMENTS`, while they are read, for up to `MOMENT_SETS` sets of failed fibres.
 
-    Rows are as those of `error_row`, with "since" touch or lift, "readings" since then, and "time_s". There are none of
-    a localizer that knows whole presses only.
+    "by_moment" has rows as those of `error_row`, with "since" touch or lift, "readings" since then, and "time_s".
+    "focus" is how the press of the median error is localized: "press", "pressed_mm", and "moments" with "since",
+    "time_s", "predicted_mm" and "r90_mm". Both are empty of a localizer that knows whole presses only.
     """
     if model.features != "windows":
-        return []
-    positions_mm = recording.presses_mm[presses]
-    measures = {name: values[presses] for name, values in recording.measures.items()}
-    rows = []
-    for moment, features in _features_by_moment(model, recording, presses):
-        for n_failed in levels:
-            subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)
-            predictions = [model.predict_features(features, subset) for subset in subsets]
-            time_s = round(moment.readings / recording.rate_hz, 3)
-            at = {"since": moment.since, "readings": moment.readings, "time_s": time_s}
-            rows.append(at | error_row(n_failed, predictions, positions_mm, measures))
-    return rows
-
-
-def _features_by_moment(
-    model: LocalizerModel, recording: Recording, presses: Indices
-) -> Iterator[tuple[Moment, ScaledFeatures]]:
+        return {"by_moment": [], "focus": {}}
     from padforge.sense.signals.press_detection import first_readings  # compiled kernels take long to import
 
     commands = recording.down_command, recording.up_command
     touched = first_readings(recording.readings, recording.times_s, *commands)
+    positions_mm = recording.presses_mm[presses]
+    measures = {name: values[presses] for name, values in recording.measures.items()}
+    history, rows, intact = model.raw_features(recording).history, [], []
     for moment in MOMENTS:
-        yield moment, model.scaled_features(recording, moment.until(touched, recording.up_command))[presses]
-
-
-def touch_in_focus(model: LocalizerModel, recording: Recording, presses: Indices, errors_mm: Array) -> dict[str, Any]:
-    """Return how one of the presses is localized while it is read: that of the median of their final errors (Q,).
-
-    It is its number, "press", "pressed_mm", and "moments" with "since", "time_s", "predicted_mm" and "r90_mm"; {} of a
-    localizer that knows whole presses only.
-    """
-    if model.features != "windows":
-        return {}
-    press = presses[[int(np.argsort(errors_mm)[len(errors_mm) // 2])]]
-    moments = []
-    for moment, features in _features_by_moment(model, recording, press):
-        predicted = model.predict_features(features)
-        moments.append(
-            {
-                "since": moment.since,
-                "time_s": round(moment.readings / recording.rate_hz, 3),
-                "predicted_mm": predicted.positions_mm[0].tolist(),
-                "r90_mm": float(predicted.r90_mm[0]),
-            }
-        )
-    return {"press": int(press[0]), "pressed_mm": recording.presses_mm[press[0]].tolist(), "moments": moments}
+        until = moment.until(touched, recording.up_command)
+        features = model.scaler.transform(model.raw_features(recording, until, history)[presses])
+        at = {
+            "since": moment.since,
+            "readings": moment.readings,
+            "time_s": round(moment.readings / recording.rate_hz, 3),
+        }
+        intact.append((at, model.predict_features(features)))
+        for n_failed in levels:
+            subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)
+            predictions = [model.predict_features(features, subset) for subset in subsets]
+            rows.append(at | error_row(n_failed, predictions, positions_mm, measures))
+    errors = distances(intact[-1][1].positions_mm, positions_mm)
+    press = int(np.argsort(errors)[len(errors) // 2])
+    moments = [
+        {
+            "since": at["since"],
+            "time_s": at["time_s"],
+            "predicted_mm": predicted.positions_mm[press].tolist(),
+            "r90_mm": float(predicted.r90_mm[press]),
+        }
+        for at, predicted in intact
+    ]
+    focus = {"press": int(presses[press]), "pressed_mm": positions_mm[press].tolist(), "moments": moments}
+    return {"by_moment": rows, "focus": focus}
 
 
 def error_row(

@@ -155,12 +155,15 @@ class LocalizerModel(LocalizerDocument):
         """The Bayesian localizers and the network that corrects them."""
         return self.bayes, self.residual_network
 
-    def raw_features(self, recording: Recording, until: Indices | None = None) -> PressFeatures:
+    def raw_features(
+        self, recording: Recording, until: Indices | None = None, history: Array | None = None
+    ) -> PressFeatures:
         """Return the features of every press, V.
 
         Args:
             recording: of a pad with the fibres and the rate of the training.
             until: (Q,) first readings that are not looked at; None for all up to the next press.
+            history: of the same presses, if it was computed before.
 
         Raises:
             InputError: another pad, or a localizer that was fitted to arrays.
@@ -170,7 +173,7 @@ class LocalizerModel(LocalizerDocument):
         check_type("recording", recording, Recording)
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         commands = recording.down_command, recording.up_command
-        return compute_features(recording.readings, *commands, until, self.features == "published")
+        return compute_features(recording.readings, *commands, until, self.features == "published", history)
 
     def scaled_features(self, recording: Recording, until: Indices | None = None) -> ScaledFeatures:
         """Return the scaled features of every press.
