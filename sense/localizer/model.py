@@ -29,8 +29,8 @@ from padforge.sense.localizer.features import (
     compute_features,
 )
 from padforge.sense.localizer.model_files import check_arrays, check_same_pad, files_of
-from padforge.sense.localizer.moments import N_DOWN, PHASES, count_complete
-from padforge.sense.localizer.network import RESIDUAL, Networks, Weights, check_weights, predict
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, count_complete
+from padforge.sense.localizer.network import RESIDUAL, Networks, Sliding, Weights, check_weights, predict
 from padforge.sense.localizer.response_model import GRID_CELLS
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.recording.recording import Recording
@@ -112,7 +112,6 @@ class LocalizerDocument:
     # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the expected error to the
     # standard deviation, to the radii of 50 and 90 %, and to the r90 of T measures, from presses never trained on
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
-    slide_ratio: Annotated[float, Field(gt=0, le=1e9)]  # see `network.predict`; 1e9 where nothing follows a finger
     training_recording_sha256: Digest
     split: Split = "random"  # how the test presses of the training were held back
     test: tuple[Annotated[int, Field(ge=0)], ...] = ()
@@ -154,6 +153,11 @@ class LocalizerModel(LocalizerDocument):
     def corrected(self) -> tuple[tuple[BayesianLocalizer, ...], Weights]:
         """The Bayesian localizers and the network that corrects them."""
         return self.bayes, self.residual_network
+
+    @property
+    def sliding(self) -> Sliding | None:
+        """How a finger that slides is followed; None where none is."""
+        return Sliding(*self.scaler.to_now(N_TIMED)) if FOLLOWING in self.networks else None
 
     def raw_features(
         self, recording: Recording, until: Indices | None = None, history: Array | None = None
@@ -229,7 +233,7 @@ class LocalizerModel(LocalizerDocument):
         for first in range(0, len(presses), chunk):
             rows = slice(first, first + chunk)
             inputs = presses.inputs[rows], fibre_mask[rows], presses.seen[rows]
-            parts.append(predict(self.networks, *inputs, *self.corrected, self.slide_ratio))
+            parts.append(predict(self.networks, *inputs, *self.corrected, self.sliding))
         empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
         empties = empty, empty, np.empty(0, bool)
         targets, std, slid = (np.concatenate(part) for part in zip(empties, *parts, strict=True))

@@ -59,6 +59,7 @@ PHASES: Mapping[int, Mapping[str, Phase]] = {
 """Networks by K, the number of windows that are complete one after the other: all of them, those of the touch alone, or
 none, if features know no moment. The last one that is trained for a moment answers."""
 FOLLOWING = "touched"  # the network that follows a finger which slides; others know fingers at rest alone
+SOON = 5  # complete windows soon after the touch: where a finger was then shows whether it slid later
 CORRECTED = Phase(N_DOWN + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """When the Bayesian localizer answers, with the network that corrects it."""
 

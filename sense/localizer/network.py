@@ -6,15 +6,18 @@ position (and depth, force) and the logarithms of their expected absolute errors
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer, stage_of
+from padforge.sense.localizer.features import NOW
 from padforge.sense.localizer.model_files import check_arrays
-from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, count_complete
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, count_complete
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
@@ -113,12 +116,11 @@ def predict(
     seen: Mask,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
-    slide_ratio: float = np.inf,
+    sliding: "Sliding | None" = None,
 ) -> tuple[Floats, Floats, Mask]:
-    """Predict presses at any moments.
+    """Predict presses at any moments; those of a finger that has slid by the network that follows it.
 
-    A finger has slid where the network that follows it is farther from the others than `slide_ratio` times its own
-    standard deviation; then it is believed. Other arguments are as in `predict_members`.
+    Arguments are as in `predict_members`.
 
     Returns:
         (Q, N) scaled targets and their standard deviations, 0 before the first moment, and (Q,) whether it has slid.
@@ -132,25 +134,48 @@ def predict(
             rows = n_complete == count
             inputs = features[rows], fibre_mask[rows], seen[rows]
             targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
-    rows = np.flatnonzero(n_complete >= N_DOWN) if FOLLOWING in networks else np.empty(0, np.int64)
     slid = np.zeros(len(seen), bool)
-    if len(rows) and slide_ratio < np.inf:
-        following = follow(networks, features[rows], fibre_mask[rows], seen[rows])
-        far = slide_ratios(targets[rows], *following) > slide_ratio
-        slid[rows[far]] = True
-        targets[slid], std[slid] = (part[far] for part in following)
+    rows = np.flatnonzero(n_complete >= N_DOWN)
+    if sliding is not None and len(rows):
+        following = sliding.follow(networks[FOLLOWING], features[rows], fibre_mask[rows], seen[rows])
+        slid[rows] = following.moved > sliding.least
+        targets[slid], std[slid] = (part[slid[rows]] for part in following[:2])
     return targets, std, slid
 
 
-def follow(networks: Networks, features: Floats, fibre_mask: Mask, seen: Mask) -> tuple[Floats, Floats]:
-    """Return what the network that follows a finger predicts of where it was last: (Q, N) targets and deviations."""
-    seen = seen & (np.arange(seen.shape[1]) < N_DOWN)
-    return combine_members(forward(networks[FOLLOWING], network_inputs(features, fibre_mask, seen)))
+class Followed(NamedTuple):
+    """Where a finger was last, by the network that follows it."""
+
+    targets: Floats  # (Q, N), scaled
+    std: Floats  # (Q, N)
+    moved: Floats  # (Q,) distance from where it was soon after the touch, in standard deviations then
 
 
-def slide_ratios(targets: Floats, followed: Floats, std: Floats) -> Floats:
-    """Return the (Q,) distances of targets (Q, N) from those of `follow`, in its standard deviations."""
-    return np.hypot(*(targets - followed)[:, :2].T) / np.maximum(np.hypot(*std[:, :2].T), 1e-9)
+@dataclass(frozen=True)
+class Sliding:
+    """How a finger that slides is told from one that rests."""
+
+    least: float  # `Followed.moved` from which on it slides
+    # (C, len(NOW), len(DOWN)), see `FeatureScaler.to_now`
+    now_factor: Floats
+    now_offset: Floats
+
+    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, seen: Mask) -> Followed:
+        """Follow the finger of presses (Q, C, F + G) that are read to their end."""
+        windows, n_timed = np.arange(seen.shape[1]), seen.shape[1]
+        targets, std = combine_members(
+            forward(weights, network_inputs(features, fibre_mask, seen & (windows < N_DOWN)))
+        )
+        soon = features.copy()
+        for k in range(len(NOW)):
+            window = SOON - 1 - k
+            now = features[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
+            soon[:, :, n_timed + k] = now
+        before, before_std = combine_members(
+            forward(weights, network_inputs(soon, fibre_mask, seen & (windows < SOON)))
+        )
+        moved = np.hypot(*(targets - before)[:, :2].T) / np.maximum(np.hypot(*before_std[:, :2].T), np.float32(1e-9))
+        return Followed(targets, std, moved)
 
 
 def combine_members(outputs: Floats) -> tuple[Floats, Floats]:

@@ -76,10 +76,10 @@ def test_a_finger_that_slides_is_followed(localizer: LocalizerModel) -> None:
     recording, last = strokes.recording, strokes.positions_mm[:, -1]
     down, up = recording.down_command - 2, recording.up_command
 
-    def error(slide_ratio: float) -> float:
+    def error(least_slide: float | None) -> float:
         features = localizer.scaler.transform(compute_features(recording.readings, down, up, up))
-        predicted = replace(localizer, slide_ratio=slide_ratio).predict_features(features)
+        predicted = replace(localizer, least_slide=least_slide).predict_features(features)
         return float(distances(predicted.positions_mm, last).mean())
 
-    assert error(1e-3) < 0.7 * error(1e9)
-    assert error(localizer.slide_ratio) < error(1e9)
+    assert error(1e-3) < 0.7 * error(None)
+    assert error(localizer.least_slide) < error(None)
