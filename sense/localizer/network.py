@@ -138,9 +138,13 @@ def predict(
     rows = np.flatnonzero(n_complete >= N_DOWN)
     if sliding is not None and len(rows):
         following = sliding.follow(networks[FOLLOWING], features[rows], fibre_mask[rows], seen[rows])
-        slid[rows] = following.moved > sliding.least
+        slid[rows] = following.moved > LEAST_SLIDE
         targets[slid], std[slid] = (part[slid[rows]] for part in following[:2])
     return targets, std, slid
+
+
+LEAST_SLIDE = 3.0
+"""`Followed.moved` from which on a finger is believed to slide: of presses at rest, hardly one has it."""
 
 
 class Followed(NamedTuple):
@@ -153,27 +157,27 @@ class Followed(NamedTuple):
 
 @dataclass(frozen=True)
 class Sliding:
-    """How a finger that slides is told from one that rests."""
+    """How a finger that slides is followed."""
 
-    least: float  # `Followed.moved` from which on it slides
     # (C, len(NOW), len(DOWN)), see `FeatureScaler.to_now`
     now_factor: Floats
     now_offset: Floats
 
     def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, seen: Mask) -> Followed:
         """Follow the finger of presses (Q, C, F + G) that are read to their end."""
-        windows, n_timed = np.arange(seen.shape[1]), seen.shape[1]
-        targets, std = combine_members(
-            forward(weights, network_inputs(features, fibre_mask, seen & (windows < N_DOWN)))
-        )
+        n_timed = seen.shape[1]
+
+        def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
+            inputs = network_inputs(features, fibre_mask, seen & (np.arange(n_timed) < n_complete))
+            return combine_members(forward(weights, inputs))
+
+        targets, std = predict_from(features, N_DOWN)
         soon = features.copy()
         for k in range(len(NOW)):
             window = SOON - 1 - k
             now = features[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
             soon[:, :, n_timed + k] = now
-        before, before_std = combine_members(
-            forward(weights, network_inputs(soon, fibre_mask, seen & (windows < SOON)))
-        )
+        before, before_std = predict_from(soon, SOON)
         moved = np.hypot(*(targets - before)[:, :2].T) / np.maximum(np.hypot(*before_std[:, :2].T), np.float32(1e-9))
         return Followed(targets, std, moved)
 
