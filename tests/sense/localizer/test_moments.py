@@ -56,7 +56,7 @@ def test_phases_cover_every_number_of_complete_windows_once(n_timed: int) -> Non
 
 
 def test_answering_adds_the_bayesian_localizer_after_the_release() -> None:
-    networks = dict.fromkeys(PHASES[N_TIMED], {})
+    networks = {name: {} for name in PHASES[N_TIMED]}
     names = [answering(networks, count, N_TIMED, True) for count in range(N_TIMED + 1)]
     plain = [[], *[["touched"]] * (N_DOWN - 1), ["settled"], *[["released"]] * len(UP)]
     assert names == [each + [RESIDUAL] * (count in CORRECTED) for count, each in enumerate(plain)]
