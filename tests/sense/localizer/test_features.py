@@ -87,7 +87,9 @@ def test_compute_features_ignores_readings_after_the_moment(until: int, press: i
     before = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[[press]]
     readings[moments[press] :] = 99
     after = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[[press]]
-    assert all(np.array_equal(one, other) for one, other in zip(vars(after).values(), vars(before).values(), strict=True))
+    assert all(
+        np.array_equal(one, other) for one, other in zip(vars(after).values(), vars(before).values(), strict=True)
+    )
 
 
 @pytest.mark.parametrize("is_published", [False, True])
