@@ -359,10 +359,10 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
         "half_size_mm": (2,),
     }
     shapes = {f"scaler.{name}": (getattr(scaler, name).shape, size) for name, size in expected.items()}
-    levels = read.interval_factors.shape[1:2]
+    levels = [max(size, 1) for size in read.interval_factors.shape[1:2]]
     shapes["interval_factors"] = read.interval_factors.shape, (n_timed + 1, *levels, 3 + len(names))
     for name, (size, wanted) in shapes.items():
-        if size != wanted or 0 in size[:2]:
+        if size != wanted or 0 in size[:1]:
             raise InputError(f"{where}: {name} has shape {size}, expected {wanted} of features {read.features}")
     if len(set(read.test)) != len(read.test):
         raise InputError(f"{where}: test names a press twice, expected different ones")
