@@ -51,7 +51,7 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
     error_map.png, error_by_loss.png and error_by_moment.png.
     """
     from padforge.design.common.files import locked_folder
-    from padforge.sense.localizer.evaluation import calibration_lines
+    from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
     from padforge.sense.report.calibration import calibrate_into
     from padforge.sense.settings import LocalizerSettings
 
@@ -61,7 +61,7 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
         settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
         with common.progress_bar("training") as show:
             document = calibrate_into(presses, folder, settings, on_progress=show, **run)
-    common.show_result(document, calibration_lines(document), as_json)
+    common.show_result(document, [*calibration_lines(document), *moment_lines(document["by_moment"])], as_json)
 
 
 @click.command()
@@ -84,7 +84,8 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
     localizer = LocalizerModel.load(model)
     levels = range(min(max_failures, localizer.fibres - 1) + 1)
     document = evaluation.evaluate(localizer, read_recording(recording), levels).to_dict()
-    common.show_result(document, evaluation.calibration_lines(document), as_json)
+    lines = [*evaluation.calibration_lines(document), *evaluation.moment_lines(document["by_moment"])]
+    common.show_result(document, lines, as_json)
 
 
 def _parse_moment(context: click.Context, param: click.Parameter, value: str | None) -> tuple[str, float] | None:

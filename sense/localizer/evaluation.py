@@ -330,7 +330,6 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
         if names[0] in rows[0]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
-    lines += moment_lines(document["by_moment"])
     return [*lines, BUILT_PAD] if is_simulated else lines
 
 

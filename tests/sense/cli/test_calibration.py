@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from padforge.sense.localizer import training
+from padforge.sense.localizer.moments import MOMENTS
 
 
 def files_in(folder: str) -> dict[str, bytes]:
@@ -72,8 +73,8 @@ def test_evaluate_lists_errors_of_depth_and_force(padforge_sense, deep_localizer
     depth = lines.index("error of depth in mm")
     means = [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]]
     assert means == [round(row["depth_mean_mm"], 2) for row in rows]
-    # two lines, a row for each number of failed fibres, and one on what a simulated error is
-    assert lines.index("error of force in N") == depth + 4 == len(lines) - 5
+    # two lines, a row for each number of failed fibres, one on what a simulated error is, and those by moment
+    assert lines.index("error of force in N") == depth + 4 == len(lines) - 5 - 2 - len(MOMENTS)
 
 
 def test_a_drifted_pad_is_followed_into_a_new_model(few, monkeypatch: pytest.MonkeyPatch) -> None:
