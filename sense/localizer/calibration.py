@@ -22,7 +22,7 @@ from padforge.sense.localizer.bayes import N_SUMMARY
 from padforge.sense.localizer.evaluation import Evaluation, conformal, evaluate, held_back_presses
 from padforge.sense.localizer.features import MODULATED, FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import complete_at, count_complete
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, complete_at, count_complete
 from padforge.sense.localizer.network import (
     MAX_LOG_ERROR,
     MIN_LOG_ERROR,
@@ -31,7 +31,10 @@ from padforge.sense.localizer.network import (
     Weights,
     answering,
     check_weights,
+    follow,
+    predict,
     predict_members,
+    slide_ratios,
 )
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
 from padforge.sense.recording.recording import Recording
@@ -45,6 +48,8 @@ MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
+TAKEN_FOR_SLIDING, NEVER_SLID = 0.01, 1e9
+"""Share of presses at rest that may be taken for a finger that slid; `slide_ratio` of a model that follows none."""
 INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 8
 """Sets of failed fibres of a size that intervals are calibrated on, at most: of one moment, or of each of several."""
 
@@ -129,7 +134,8 @@ def fit_recording(
     features = compute_features(readings, *commands, is_published=is_published)
 
     def at(n_complete: int, presses: Indices) -> PressFeatures:
-        return compute_features(readings, *commands, complete_at(n_complete, *commands))[presses]
+        until = complete_at(n_complete, *commands)
+        return compute_features(readings, *commands, until, history=features.history)[presses]
 
     origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
     data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
@@ -181,6 +187,7 @@ def fit_model(
         features=data.feature_set,
         interval_factors=np.ones((n_timed + 1, 1, 3 + len(measures))),
         rate_hz=data.rate_hz,
+        slide_ratio=NEVER_SLID,
         training_recording_sha256=data.sha256,
     )
     if data.at is None:
@@ -205,7 +212,7 @@ def calibrate_uncertainty(
     are as in `evaluation.conformal`.
     """
     if model.method == "ensemble":
-        model = _calibrate_scales(model, moments, positions_mm, levels)
+        model = _calibrate_slide_ratio(_calibrate_scales(model, moments, positions_mm, levels), moments)
     plain, n_sets = replace(model, interval_factors=np.ones_like(model.interval_factors)), INTERVAL_SUBSETS
     if len(moments) > 1:
         n_sets = MOMENT_SUBSETS
@@ -268,6 +275,18 @@ def _calibrate_scales(
 
     networks = {name: scaled(name, weights) for name, weights in model.networks.items()}
     return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network))
+
+
+def _calibrate_slide_ratio(model: LocalizerModel, moments: Sequence[ScaledFeatures]) -> LocalizerModel:
+    """Set `slide_ratio` so that few presses at rest are believed to slide, of all that are read to their end."""
+    if FOLLOWING not in model.networks:
+        return model
+    ratios = []
+    for presses in moments[N_DOWN - 1 :]:
+        inputs = presses.inputs, presses.fibre_mask, presses.seen
+        targets, _, _ = predict(model.networks, *inputs, *model.corrected)
+        ratios.append(slide_ratios(targets, *follow(model.networks, *inputs)))
+    return replace(model, slide_ratio=float(max(np.quantile(np.concatenate(ratios), 1 - TAKEN_FOR_SLIDING), 1e-3)))
 
 
 def check_trained(

@@ -65,12 +65,14 @@ def compute_features(
     up_command: Indices,
     until: Indices | None = None,
     is_published: bool = False,
+    history: Array | None = None,
 ) -> PressFeatures:
     """Compute the features of every press from (R, C) readings, V, NaN where missing.
 
     Commands are the (Q,) first readings after the probe was sent down, and after it was sent up. A press is looked at
     up to before the reading `until` (Q,), to its end and to the next press if it is None. `is_published` asks for the
-    published running medians, which know no such moment.
+    published running medians, which know no such moment. `history` is that of the presses, if it was computed before:
+    it takes longest.
     """
     filled = interpolate_gaps(readings)
     _, next_begin = _neighbours(down_command, up_command, len(readings))
@@ -82,7 +84,8 @@ def compute_features(
         return PressFeatures(medians, empty[0], fibre_mask, empty[1])
     windows = window_means(filled, down_command, up_command, until)
     seen = complete_windows(down_command, up_command, until)
-    return PressFeatures(windows, compute_history(filled, down_command), fibre_mask, seen)
+    history = compute_history(filled, down_command) if history is None else history
+    return PressFeatures(windows, history, fibre_mask, seen)
 
 
 def valid_fibres(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Mask:

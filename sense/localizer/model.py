@@ -29,7 +29,7 @@ from padforge.sense.localizer.features import (
     compute_features,
 )
 from padforge.sense.localizer.model_files import check_arrays, check_same_pad, files_of
-from padforge.sense.localizer.moments import PHASES, count_complete
+from padforge.sense.localizer.moments import N_DOWN, PHASES, count_complete
 from padforge.sense.localizer.network import RESIDUAL, Networks, Weights, check_weights, predict
 from padforge.sense.localizer.response_model import GRID_CELLS
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
@@ -112,6 +112,7 @@ class LocalizerDocument:
     # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the expected error to the
     # standard deviation, to the radii of 50 and 90 %, and to the r90 of T measures, from presses never trained on
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
+    slide_ratio: Annotated[float, Field(gt=0, le=1e9)]  # see `network.predict`; 1e9 where nothing follows a finger
     training_recording_sha256: Digest
     split: Split = "random"  # how the test presses of the training were held back
     test: tuple[Annotated[int, Field(ge=0)], ...] = ()
@@ -154,12 +155,15 @@ class LocalizerModel(LocalizerDocument):
         """The Bayesian localizers and the network that corrects them."""
         return self.bayes, self.residual_network
 
-    def raw_features(self, recording: Recording, until: Indices | None = None) -> PressFeatures:
+    def raw_features(
+        self, recording: Recording, until: Indices | None = None, history: Array | None = None
+    ) -> PressFeatures:
         """Return the features of every press, V.
 
         Args:
             recording: of a pad with the fibres and the rate of the training.
             until: (Q,) first readings that are not looked at; None for all up to the next press.
+            history: of the same presses, if it was computed before.
 
         Raises:
             InputError: another pad, or a localizer that was fitted to arrays.
@@ -169,7 +173,7 @@ class LocalizerModel(LocalizerDocument):
         check_type("recording", recording, Recording)
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         commands = recording.down_command, recording.up_command
-        return compute_features(recording.readings, *commands, until, self.features == "published")
+        return compute_features(recording.readings, *commands, until, self.features == "published", history)
 
     def scaled_features(self, recording: Recording, until: Indices | None = None) -> ScaledFeatures:
         """Return the scaled features of every press.
@@ -225,11 +229,12 @@ class LocalizerModel(LocalizerDocument):
         for first in range(0, len(presses), chunk):
             rows = slice(first, first + chunk)
             inputs = presses.inputs[rows], fibre_mask[rows], presses.seen[rows]
-            parts.append(predict(self.networks, *inputs, *self.corrected))
+            parts.append(predict(self.networks, *inputs, *self.corrected, self.slide_ratio))
         empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
-        targets, std = (np.concatenate(part) for part in zip((empty, empty), *parts, strict=True))
+        empties = empty, empty, np.empty(0, bool)
+        targets, std, slid = (np.concatenate(part) for part in zip(empties, *parts, strict=True))
         n_complete, level = count_complete(presses.seen), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
-        factors = self.interval_factors[n_complete, level]
+        factors = self.interval_factors[np.where(slid, N_DOWN - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
         is_complete = n_complete > 0 if presses.seen.shape[1] else np.ones(len(presses), bool)

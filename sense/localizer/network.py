@@ -14,7 +14,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer, stage_of
 from padforge.sense.localizer.model_files import check_arrays
-from padforge.sense.localizer.moments import PHASES, count_complete
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, count_complete
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
@@ -76,7 +76,7 @@ RESIDUAL = "residual"
 
 def answering(networks: Networks, n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
     """Return the names of the networks that answer when so many of K windows are complete, in their order."""
-    names = [name for name in networks if n_complete in PHASES[n_timed][name]]
+    names = [name for name, phase in PHASES[n_timed].items() if n_complete in phase and name in networks][-1:]
     return [*names, RESIDUAL] if has_bayes and stage_of(n_complete, n_timed) is not None else names
 
 
@@ -113,21 +113,44 @@ def predict(
     seen: Mask,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
-) -> tuple[Floats, Floats]:
-    """Return (Q, N) targets and their standard deviations, scaled, for presses at any moments; 0 before the first one.
+    slide_ratio: float = np.inf,
+) -> tuple[Floats, Floats, Mask]:
+    """Predict presses at any moments.
 
-    Arguments are as in `predict_members`.
+    A finger has slid where the network that follows it is farther from the others than `slide_ratio` times its own
+    standard deviation; then it is believed. Other arguments are as in `predict_members`.
+
+    Returns:
+        (Q, N) scaled targets and their standard deviations, 0 before the first moment, and (Q,) whether it has slid.
     """
     n_complete = count_complete(seen)
-    last, *_ = (weights["last.w"] for weights in networks.values())
-    n_targets = last.shape[2] if "hidden.w" not in next(iter(networks.values())) else last.shape[2] // 2
+    first = next(iter(networks.values()))
+    n_targets = first["last.w"].shape[2] // (2 if "hidden.w" in first else 1)
     targets, std = np.zeros((2, len(seen), n_targets), np.float32)
     for count in np.unique(n_complete).tolist():
         if count or not seen.shape[1]:
             rows = n_complete == count
             inputs = features[rows], fibre_mask[rows], seen[rows]
             targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
-    return targets, std
+    rows = np.flatnonzero(n_complete >= N_DOWN) if FOLLOWING in networks else np.empty(0, np.int64)
+    slid = np.zeros(len(seen), bool)
+    if len(rows) and slide_ratio < np.inf:
+        following = follow(networks, features[rows], fibre_mask[rows], seen[rows])
+        far = slide_ratios(targets[rows], *following) > slide_ratio
+        slid[rows[far]] = True
+        targets[slid], std[slid] = (part[far] for part in following)
+    return targets, std, slid
+
+
+def follow(networks: Networks, features: Floats, fibre_mask: Mask, seen: Mask) -> tuple[Floats, Floats]:
+    """Return what the network that follows a finger predicts of where it was last: (Q, N) targets and deviations."""
+    seen = seen & (np.arange(seen.shape[1]) < N_DOWN)
+    return combine_members(forward(networks[FOLLOWING], network_inputs(features, fibre_mask, seen)))
+
+
+def slide_ratios(targets: Floats, followed: Floats, std: Floats) -> Floats:
+    """Return the (Q,) distances of targets (Q, N) from those of `follow`, in its standard deviations."""
+    return np.hypot(*(targets - followed)[:, :2].T) / np.maximum(np.hypot(*std[:, :2].T), 1e-9)
 
 
 def combine_members(outputs: Floats) -> tuple[Floats, Floats]:
