@@ -190,11 +190,12 @@ class EventPrinter:
 
     def _is_news(self, estimate: "Estimate") -> bool:
         told = self._told
-        is_same = told is not None and told.press == estimate.press and not estimate.final
-        if is_same and not (estimate.is_sharper_than(told) or estimate.has_moved_from(told)):
-            return False
-        self._told = estimate
-        return True
+        if told is not None and told.press == estimate.press:
+            is_news = estimate.final or estimate.is_sharper_than(told) or estimate.has_moved_from(told)
+        else:
+            is_news = True
+        self._told = estimate if is_news else told
+        return is_news
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:
