@@ -10,7 +10,7 @@ import numpy as np
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.features import DOWN, interpolate_gaps, window_means
+from padforge.sense.localizer.features import DOWN, compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.recording import Recording
@@ -177,7 +177,8 @@ def errors_by_moment(
     history, rows, intact = model.raw_features(recording).history, [], []
     for moment in MOMENTS:
         until = moment.until(touched, recording.up_command)
-        features = model.scaler.transform(model.raw_features(recording, until, history)[presses])
+        raw = compute_features(recording.readings, *commands, until, history=history)
+        features = model.scaler.transform(raw[presses])
         at = {
             "since": moment.since,
             "readings": moment.readings,

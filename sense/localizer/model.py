@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 from padforge.design.common.files import read_json, reraise_write_error, write_text
 from padforge.design.common.validation import InputError, check_type, short_repr
-from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, STAGES, BayesianLocalizer
 from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.features import (
@@ -159,27 +159,27 @@ class LocalizerModel(LocalizerDocument):
         """How a finger that slides is followed; None where none is."""
         return Sliding(*self.scaler.to_now(N_TIMED)) if FOLLOWING in self.networks else None
 
-    def raw_features(
-        self, recording: Recording, until: Indices | None = None, history: Array | None = None
-    ) -> PressFeatures:
+    def raw_features(self, recording: Recording, until: ArrayLike | None = None) -> PressFeatures:
         """Return the features of every press, V.
 
         Args:
             recording: of a pad with the fibres and the rate of the training.
             until: (Q,) first readings that are not looked at; None for all up to the next press.
-            history: of the same presses, if it was computed before.
 
         Raises:
-            InputError: another pad, or a localizer that was fitted to arrays.
+            InputError: another pad, a localizer that was fitted to arrays, or `until` is no reading for each press.
         """
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
         check_type("recording", recording, Recording)
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         commands = recording.down_command, recording.up_command
-        return compute_features(recording.readings, *commands, until, self.features == "published", history)
+        end = None if until is None else np.asarray(until)
+        if end is not None and (end.dtype.kind not in "iu" or end.shape != commands[0].shape):
+            raise InputError(f"until is {short_repr(until)}, expected an index for each of {len(commands[0])} presses")
+        return compute_features(recording.readings, *commands, end, self.features == "published")
 
-    def scaled_features(self, recording: Recording, until: Indices | None = None) -> ScaledFeatures:
+    def scaled_features(self, recording: Recording, until: ArrayLike | None = None) -> ScaledFeatures:
         """Return the scaled features of every press.
 
         Args:
@@ -193,7 +193,7 @@ class LocalizerModel(LocalizerDocument):
         recording: Recording,
         failed: ArrayLike = (),
         fibre_mask: Mask | None = None,
-        until: Indices | None = None,
+        until: ArrayLike | None = None,
     ) -> Localization:
         """Predict the position of every press of a recording.
 

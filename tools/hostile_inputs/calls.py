@@ -45,7 +45,6 @@ def sound() -> dict[str, Any]:
         "twin": design.Twin.load("pad/twin.json"),
         "recording": recording,
         "localizer": sense.LocalizerModel.load(Path("pad")),
-        "localizers": [sense.LocalizerModel.load(Path("pad"))],
         "model": sense.HealthModel.load(Path("pad")),
         "health": sense.HealthModel.load(Path("pad"), DETECTED),
         "options": sense.LocalizerSettings(members=1, hidden=8, layers=1, epochs=2, batch=64, max_failures=2),
@@ -85,7 +84,6 @@ def sound() -> dict[str, Any]:
 def _elsewhere(found: dict[str, Any]) -> dict[tuple[str, str], Any]:
     """Arguments that suit where a name means something else than elsewhere."""
     return {
-        ("padforge.sense.Live", "localizers"): found["localizers"],
         ("padforge.design.search", "pad"): design.PadSettings(grid=1),
         ("padforge.design.search", "search"): found["search"],
         ("padforge.design.search", "contact"): found["contact"],
@@ -126,7 +124,7 @@ def functions() -> dict[str, Callable[..., Any]]:
         "PressDetector": lambda: sense.PressDetector(4),
         "RunningMedian": lambda: sense.RunningMedian(4, 5),
         "TotalVariation": lambda: sense.TotalVariation(4, 2.0),
-        "Live": lambda: sense.Live(sound()["localizers"], sound()["health"], 4, 13.3),
+        "Live": lambda: sense.Live(sound()["localizer"], sound()["health"], 4, 13.3),
         "FaultMonitor": lambda: sense.FaultMonitor(sound()["model"]),
         "Spec": lambda: design.Spec({}),
         **{name: lambda key=key: sound()[key] for name, key in _OF_CLASS.items()},
