@@ -25,11 +25,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SPEEDS_MM_S = (0.0, 5.0, 10.0, 20.0, 50.0)
-N_STROKES = 200  # of each speed
 
 
 def strokes_study(
-    pads: Mapping[str, Morphology], *, contact: Contact | None = None, presses: int = 1500, seed: int = 0
+    pads: Mapping[str, Morphology],
+    *,
+    contact: Contact | None = None,
+    presses: int = 1500,
+    strokes: int = 200,
+    options: LocalizerSettings | None = None,
+    seed: int = 0,
 ) -> Study:
     """Follow strokes by localizers that were trained on presses of the same simulated pads.
 
@@ -37,31 +42,36 @@ def strokes_study(
         pads: the pads, by label.
         contact: how they are pressed; `Contact()` if None.
         presses: in the recording of the training.
+        strokes: of each speed.
+        options: of the training; the defaults if None.
         seed: of every random choice.
     """
     contact = contact or Contact()
     rig = RigSettings(presses=presses, seed=seed)
-    tasks = [Task(label, partial(_follow_strokes, pad, contact, rig)) for label, pad in pads.items()]
+    options = (options or LocalizerSettings()).model_copy(update={"seed": seed})
+    tasks = [Task(label, partial(_follow_strokes, pad, contact, rig, strokes, options)) for label, pad in pads.items()]
     settings = {
         "pads": describe_pads(pads),
         "contact": contact.model_dump(mode="json"),
         "presses": presses,
         "speeds_mm_s": list(SPEEDS_MM_S),
-        "strokes": N_STROKES,
+        "strokes": strokes,
+        "localizer": options.model_dump(mode="json"),
         "seed": seed,
     }
     return Study("strokes", "A finger that slides", settings, tasks, partial(_conclude, list(pads), rig), _draw)
 
 
-def _follow_strokes(pad: Morphology, contact: Contact, rig: RigSettings) -> State:
+def _follow_strokes(
+    pad: Morphology, contact: Contact, rig: RigSettings, n_strokes: int, options: LocalizerSettings
+) -> State:
     """Return the errors (speeds, N, T), mm, at each reading of strokes, whether they are within r90, and of the end."""
     recording = simulate(pad, rig, contact)
-    options = LocalizerSettings(seed=rig.seed)
     model = fit_recording(recording, np.arange(rig.presses), options, np.random.default_rng(rig.seed))
     errors, within, lifted = [], [], []
     for number, speed in enumerate(SPEEDS_MM_S):
         rng = np.random.default_rng([rig.seed, number])
-        strokes = simulate_strokes(pad, rig, contact, speed, N_STROKES, rng)
+        strokes = simulate_strokes(pad, rig, contact, speed, n_strokes, rng)
         recorded = strokes.recording
         # As a command comes before its touch, which a stroke begins with.
         down_command = recorded.down_command - round(TOUCH_DELAY_S * rig.rate_hz)
@@ -72,7 +82,7 @@ def _follow_strokes(pad: Morphology, contact: Contact, rig: RigSettings) -> Stat
             errors.append(error)
             within.append(error <= predicted.r90_mm)
         lifted.append(distances(predict(None).positions_mm, strokes.positions_mm[:, -1]))
-    shape = len(SPEEDS_MM_S), -1, N_STROKES
+    shape = len(SPEEDS_MM_S), -1, n_strokes
     return {
         "errors": np.array(errors).reshape(shape),
         "within": np.array(within).reshape(shape),
