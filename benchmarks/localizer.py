@@ -1,7 +1,7 @@
-"""Test error of localizers against training time on a simulated recording, for two sets of features.
+"""Test error of localizers against training time on a simulated recording, for two sets of features of whole presses.
 
 The published network is trained by Levenberg-Marquardt, as published, by L-BFGS and by Adam; the masked network, which
-works with failed fibres as well, as in a calibration. All train on the same presses.
+works with failed fibres as well and, of windows, at any moment, as in a calibration. All train on the same presses.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -19,8 +19,8 @@ from padforge.design.networks import fit_batch, initial_weights
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.features import compute_features
-from padforge.sense.localizer.network import combine_members, predict_members
-from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses
+from padforge.sense.localizer.network import predict
+from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, TrainingPresses
 from padforge.sense.localizer.training import MIN_BATCHES, train_members
 from padforge.sense.localizer.training import PUBLISHED_HIDDEN as HIDDEN
 from padforge.sense.recording.recording import Recording
@@ -34,8 +34,8 @@ ITERATIONS = (30, 100, 300)
 PASSES = (30, 100, 300)
 """Passes of Adam through batches of BATCH presses."""
 STEPS = (50, 200, 800, 3200)
-"""Steps of the masked networks."""
-FEATURES = ("published", "press_and_release")
+"""Steps of the masked networks, of a phase of length 1."""
+FEATURES = ("published", "windows")
 MARQUARDT = ("published",)
 """Features for Levenberg-Marquardt: with F times as many, each step takes F^2 to F^3 as long."""
 BATCH, ADAM_RATE = 128, 3e-3
@@ -48,13 +48,13 @@ def trials() -> Iterator[BenchTrial]:
         for features in FEATURES:
             yield from _trainings(features)
         # the time of a prediction does not depend on the training
-        press = _scaled(FEATURES[0])[2][:1].reshape(1, -1).astype(np.float64)
+        press = _flat(_scaled(FEATURES[0])[2])[:1]
         rng = np.random.default_rng(0)
         published = _PublishedNetwork(rng.standard_normal((10, press.size)), rng.standard_normal((10, 2)))
         yield BenchTrial("one press", "published", 0, partial(published, press))
-        _, table, inputs, targets = _scaled(FEATURES[-1])
-        masked = _train_masked(inputs[:-TEST], targets[:-TEST], table, 1)
-        press = inputs[:1].reshape(1, -1).astype(np.float64)
+        _, table, presses, _ = _scaled(FEATURES[-1])
+        masked = _train_masked(presses, table, 1)
+        press = _flat(presses)[:1]
         yield BenchTrial("one press", "ensemble", 0, partial(masked, press))
 
 
@@ -65,31 +65,37 @@ def recorded() -> Recording:
 
 
 def _trainings(features: str) -> Iterator[BenchTrial]:
-    scaling, table, inputs, targets = _scaled(features)
-    flat = inputs.reshape(len(inputs), -1).astype(np.float64)
-    x, y = flat[:-TEST], targets[:-TEST].astype(np.float64)
+    scaling, table, presses, test = _scaled(features)
+    x, y = _flat(presses), presses.targets.astype(np.float64)
 
     def evaluate(predict: Predict) -> Mapping[str, float]:
-        error_mm = scaling.positions_mm(predict(flat[-TEST:]).astype(np.float32)) - recorded().presses_mm[-TEST:]
+        error_mm = scaling.positions_mm(predict(_flat(test)).astype(np.float32)) - recorded().presses_mm[-TEST:]
         return {"error": float(np.hypot(*error_mm.T).mean())}
 
     ways: dict[str, tuple[tuple[int, ...], Callable[[int], Predict]]] = {
         "LM": (EPOCHS if features in MARQUARDT else (), partial(_train_marquardt, x, y)),
         "L-BFGS": (ITERATIONS, partial(_train_lbfgs, x, y)),
         "Adam": (PASSES, partial(_train_adam, x, y)),
-        "ensemble": (STEPS, partial(_train_masked, inputs[:-TEST], targets[:-TEST], table)),
+        "ensemble": (STEPS, partial(_train_masked, presses, table)),
     }
     for way, (sizes, train) in ways.items():
         for size in sizes:
             yield BenchTrial(features, way, size, partial(train, size), evaluate)
 
 
-def _scaled(features: str) -> tuple[FeatureScaler, Floats, Floats, Floats]:
-    """Return the scaling and the table of the training presses, and the inputs and targets of all presses."""
-    recording = recorded()
-    raw = compute_features(recording.readings, recording.down_command, recording.up_command, features)
-    scaling, table = FeatureScaler.fit(raw[:-TEST], recording.presses_mm[:-TEST])
-    return scaling, table, scaling.transform(raw).inputs, scaling.scale_targets(recording.presses_mm)
+def _scaled(features: str) -> tuple[FeatureScaler, Floats, TrainingPresses, ScaledFeatures]:
+    """Return the scaling and the table of the training presses, these presses, and those of the test."""
+    recording, is_published = recorded(), features == "published"
+    commands = recording.down_command, recording.up_command
+    raw = compute_features(recording.readings, *commands, is_published=is_published)
+    training = raw[:-TEST], recording.presses_mm[:-TEST]
+    scaling, table = FeatureScaler.fit(*training)
+    presses = scaling.training_presses(*training, rate_hz=recording.rate_hz)
+    return scaling, table, presses, scaling.transform(raw[-TEST:])
+
+
+def _flat(presses: ScaledFeatures) -> Array:
+    return presses.inputs.reshape(len(presses), -1).astype(np.float64)
 
 
 class _PublishedNetwork:
@@ -139,21 +145,17 @@ def _train_adam(x: Array, y: Array, passes: int) -> Predict:
     return network
 
 
-def _train_masked(inputs: Floats, targets: Floats, table: Floats, steps: int) -> Predict:
-    presses = TrainingPresses(inputs, np.ones(inputs.shape[:2], dtype=bool), targets)
-    batches = max(MIN_BATCHES, len(inputs) // settings.LocalizerSettings().batch)
+def _train_masked(presses: TrainingPresses, table: Floats, steps: int) -> Predict:
+    batches = max(MIN_BATCHES, len(presses) // settings.LocalizerSettings().batch)
     options = settings.LocalizerSettings(epochs=-(-steps // batches))
     trained = train_members(presses, table, options, np.random.default_rng(0), ignore_progress)
 
-    def predict(x: Array) -> Array:
-        features = x.reshape(len(x), *inputs.shape[1:]).astype(np.float32)
-        mask = np.ones(features.shape[:2], dtype=bool)
-        members = predict_members(
-            trained.weights, features, mask, bayes=trained.bayes, residual_network=trained.residual_network
-        )
-        return combine_members(members)[0].astype(np.float64)
+    def positions(x: Array) -> Array:
+        features = x.reshape(len(x), *presses.inputs.shape[1:]).astype(np.float32)
+        fibre_mask, seen = (np.ones((len(x), each.shape[1]), bool) for each in (presses.fibre_mask, presses.seen))
+        return predict(trained.networks, features, fibre_mask, seen, *trained[1:])[0].astype(np.float64)
 
-    return predict
+    return positions
 
 
 BENCH = Bench(

@@ -1,7 +1,7 @@
 """`padforge sense live`: presses are localized while they happen, and shown and sent at once."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +17,7 @@ from padforge.sense.cli.rig import rig_option
 if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel
     from padforge.sense.live.outputs import OutputStream
-    from padforge.sense.live.pipeline import Event
+    from padforge.sense.live.pipeline import Estimate, Event
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.devices import Board
     from padforge.sense.rig.streams import ReadingStream
@@ -30,15 +30,7 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
 @rig_option
 @click.option("--replay", metavar="RECORDING", type=click.Path(path_type=Path), help="Replay a recording.")
 @click.option("--speed", type=click.FloatRange(min=0.01), default=1.0, show_default=True, help="Speed of --replay.")
-@click.option(
-    "--model",
-    "models",
-    type=FOLDER,
-    multiple=True,
-    default=("out/pad",),
-    show_default=True,
-    help="Folder that calibrate wrote; repeat the option for a second model that answers earlier, or better.",
-)
+@click.option("--model", type=FOLDER, default="out/pad", show_default=True, help="Folder that calibrate wrote.")
 @click.option(
     "--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Port of the page; 0: any."
 )
@@ -58,7 +50,7 @@ def live(
     rig: str,
     replay: Path | None,
     speed: float,
-    models: tuple[Path, ...],
+    model: Path,
     port: int,
     spec: Path | None,
     as_json: bool,
@@ -81,7 +73,11 @@ def live(
 
     Anyone in the network who knows the token can watch, and nothing is encrypted.
 
-    A faulty fibre is masked from then on, if the folder of the first model has a health model. Ctrl-C ends it.
+    Every reading from the touch to the end of the release gives a position with radii that hold at that moment. Where
+    the output is no terminal, a line says when a press begins, its radius has shrunk by a quarter, the finger has moved
+    by more than that, and the press is over; with --json there is a line for every reading.
+
+    A faulty fibre is masked from then on, if the folder of the model has a health model. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
     from padforge.sense.formats.import_export import open_recording
@@ -90,19 +86,19 @@ def live(
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.streams import stream_recording
 
-    localizers = [LocalizerModel.load(model) for model in models]
+    localizer = LocalizerModel.load(model)
     with ExitStack() as stack:
         if replay is None:
-            stream, mirrored = _stream_rig(stack, rig, models[0], localizers[0], spec)
+            stream, mirrored = _stream_rig(stack, rig, model, localizer, spec)
         else:
             recording = open_recording(replay)
             stream, mirrored = stream_recording(recording, speed), recording.mirrored
-        pipeline = Live(localizers, _load_health(models[0]), stream.fibres, stream.rate_hz)
+        pipeline = Live(localizer, _load_health(model), stream.fibres, stream.rate_hz)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
         outputs, builder = _open_outputs(stack, stream, **output), MessageBuilder(pipeline, mirrored)
-        draw = None if as_json else stack.enter_context(redrawn_lines())
-        scaler, title = localizers[0].scaler, f"{replay or f'{rig} rig'}, {models[0]}"
+        draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
+        scaler, title = localizer.scaler, f"{replay or f'{rig} rig'}, {model}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
         pad = {"title": title, "centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
 
@@ -116,7 +112,7 @@ def live(
                 view = pad | pipeline.view() | {"ended": ""}
                 page.show(view)
                 if draw is None:
-                    _echo_events(events, as_json)
+                    printer.print(events)
                 else:
                     draw(view_lines(view))
                 if outputs:
@@ -172,13 +168,33 @@ def _load_health(model: Path) -> "HealthModel | None":
     return FaultDetector.load(model).live_model_
 
 
-def _echo_events(events: "Sequence[Event]", as_json: bool) -> None:
-    from padforge.sense.live.pipeline import Estimate
+class EventPrinter:
+    """Print events: all of them as JSON, or as text those estimates that say more than the last of their press."""
 
-    for event in events:
-        values = event.to_dict() if isinstance(event, Estimate) else asdict(event)
-        # `click.echo` flushes, so that each line appears at once
-        click.echo(json.dumps({"event": type(event).__name__.lower()} | values) if as_json else event.text)
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self._told: Estimate | None = None
+
+    def print(self, events: "Iterable[Event]") -> None:
+        """Print events, one a line."""
+        from padforge.sense.live.pipeline import Estimate
+
+        for event in events:
+            is_estimate = isinstance(event, Estimate)
+            # `click.echo` flushes, so that each line appears at once
+            if self._as_json:
+                values = event.to_dict() if is_estimate else asdict(event)
+                click.echo(json.dumps({"event": type(event).__name__.lower()} | values))
+            elif not is_estimate or self._is_news(event):
+                click.echo(event.text)
+
+    def _is_news(self, estimate: "Estimate") -> bool:
+        told = self._told
+        is_same = told is not None and told.press == estimate.press and not estimate.final
+        if is_same and not (estimate.is_sharper_than(told) or estimate.has_moved_from(told)):
+            return False
+        self._told = estimate
+        return True
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:

@@ -48,7 +48,7 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
     padforge sense calibrate out/pad/recording --time-budget 600
 
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
-    error_map.png and error_by_loss.png.
+    error_map.png, error_by_loss.png and error_by_moment.png.
     """
     from padforge.design.common.files import locked_folder
     from padforge.sense.localizer.evaluation import calibration_lines
@@ -87,17 +87,40 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
     common.show_result(document, evaluation.calibration_lines(document), as_json)
 
 
+def _parse_moment(context: click.Context, param: click.Parameter, value: str | None) -> tuple[str, float] | None:
+    if value is None:
+        return None
+    match = re.fullmatch(r"(?:(end)|(lift\+)?(\d{1,4}(?:\.\d{1,6})?)s)", value)
+    if match is None:
+        raise click.BadParameter(f"got {value!r}, expected as 0.3s, end or lift+0.25s")
+    return ("lift", 0.0) if match[1] else ("lift" if match[2] else "touch", float(match[3]))
+
+
 @click.command()
 @model_option
 @recording_argument
 @fibres_option("--exclude-fibres", "Fibres to mask, numbered from 1.")
+@click.option(
+    "--at",
+    "moment",
+    metavar="MOMENT",
+    callback=_parse_moment,
+    help="What is known then: 0.3s after the touch, end of the press, or lift+0.25s; all of it by default.",
+)
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option
-def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: Path | None) -> None:
+def locate(
+    model: Path,
+    recording: Path,
+    exclude_fibres: tuple[int, ...],
+    moment: "tuple[str, float] | None",
+    out: Path | None,
+) -> None:
     """Predict the position of every press of RECORDING and its uncertainty; true positions are not needed.
 
     \b
     padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
+    padforge sense locate --model out/pad out/later/recording --at 0.3s
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
@@ -107,7 +130,8 @@ def locate(model: Path, recording: Path, exclude_fibres: tuple[int, ...], out: P
     from padforge.sense.localizer.model import write_localization
 
     file = out or common.pad_folder(recording) / "places.csv"
-    localization, faults, _ = predict_despite_faults(model, read_recording(recording), exclude_fibres)
+    opened = read_recording(recording)
+    localization, faults, _ = predict_despite_faults(model, opened, exclude_fibres, moment)
     for fault in faults:
         click.echo(f"{fault.text}; masked from press {fault.since} on", err=True)
     write_localization(localization, file)

@@ -12,8 +12,9 @@ import click
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
+    from padforge.sense.arrays import Indices
     from padforge.sense.health.fault_detector import FaultDetector, FibreFault
-    from padforge.sense.localizer.model import Localization
+    from padforge.sense.localizer.model import Localization, LocalizerModel
     from padforge.sense.recording.recording import Recording
 
 
@@ -84,9 +85,12 @@ def recording_line(recording: "Recording", out: Path) -> str:
 
 
 def predict_despite_faults(
-    model: Path, recording: "Recording", failed: Sequence[int] = ()
+    model: Path, recording: "Recording", failed: Sequence[int] = (), moment: tuple[str, float] | None = None
 ) -> "tuple[Localization, list[FibreFault], FaultDetector | None]":
-    """Localize all presses without some fibres by number, and without a faulty one from where it is detected."""
+    """Localize all presses without some fibres by number, and without a faulty one from where it is detected.
+
+    `moment` is "touch" or "lift" and s since then, by what is known then; None for whole presses.
+    """
     from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel
 
@@ -95,7 +99,21 @@ def predict_despite_faults(
     excluded = fibre_indices(failed, localizer.fibres)
     faults = detector.predict(recording) if detector else []
     fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
-    return localizer.predict(recording, excluded, fibre_mask), faults, detector
+    until = None if moment is None else _until(localizer, recording, *moment)
+    return localizer.predict(recording, excluded, fibre_mask, until), faults, detector
+
+
+def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time_s: float) -> "Indices":
+    """Return the first readings (Q,) of presses that are not known at a moment."""
+    from padforge.sense.localizer.moments import Moment
+    from padforge.sense.signals.press_detection import first_readings
+
+    if localizer.features != "windows":
+        raise InputError(f"--at is given: the localizer is of method {localizer.method}, expected ensemble")
+    readings = round(time_s * recording.rate_hz)
+    moment = Moment("lift", readings) if since == "lift" else Moment("touch", max(readings, 1))
+    commands = recording.down_command, recording.up_command
+    return moment.until(first_readings(recording.readings, recording.times_s, *commands), recording.up_command)
 
 
 @contextmanager

@@ -181,6 +181,8 @@ the preset `published`, the objects are those of the paper, of sizes K and shape
 _force = "Depth and force of a press from the signals that localize it, as a tool presses the layer of [contact]."
 _shape = "Which object was pressed, from the signals that localize it: a dome, a ball, a finger or a flat end."
 _multicontact = "Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9)."
+_strokes = "Follow a finger that slides over simulated pads, by localizers trained on single presses of them."
+_add_study("strokes", "strokes", _strokes, "optimised")
 _add_study("sensitivity", "sensitivity", _sensitivity, "square")
 _add_study("force", "indentation", _force, "square random-5")
 _add_study("shape", "indentation", _shape, "random-5")

@@ -23,12 +23,12 @@ from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live
 
-FORMAT = "padforge-live/2"
+FORMAT = "padforge-live/3"
 MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behind is disconnected
 MAX_SUBSCRIBERS = 32
 SEND_TIMEOUT_S = 10.0  # a subscriber that receives nothing for this time is disconnected
 MAX_COMMANDS = 16  # of a page that wait to be read: a button may be hit again and again
-TOUCH_UNITS = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm"}
+TOUCH_UNITS = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm", "final": ""}
 """Values of a touch that OSC and LSL send, with their units."""
 _OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
 
@@ -100,7 +100,7 @@ def _touch_message(estimate: Estimate, z_sign: float) -> Message:
     covariance[14] = UNKNOWN_VARIANCE if depth_r90_mm is None else (depth_r90_mm / 1000 / Z90) ** 2
     position = {"x": estimate.x_mm / 1000, "y": estimate.y_mm / 1000, "z": 0.0 + z_sign * depth_mm / 1000}
     pose = {"position": position, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
-    msg = {"header": _header(estimate.time_s), "pose": {"pose": pose, "covariance": covariance}}
+    msg = {"header": _header(estimate.now_s), "pose": {"pose": pose, "covariance": covariance}}
     return Message(TOUCHES, msg, {"event": "touch", **estimate.to_dict()})
 
 
@@ -235,7 +235,7 @@ def _values(message: Message) -> list[Any]:
     if message.topic == READINGS:
         return [math.nan if value is None else value for value in pad["volts"]]
     if message.topic == TOUCHES:
-        return [pad[name] for name in TOUCH_UNITS]
+        return [int(pad[name]) if name == "final" else pad[name] for name in TOUCH_UNITS]
     return [pad["pressed"]] if message.topic == PRESSED else list(pad["states"])
 
 

@@ -1,41 +1,64 @@
 """The pipeline behind `padforge sense live`: from readings as they arrive to the position of each press.
 
-Blocks of readings of any size go in; events come out: the position of a press, first from the few readings that one
-localizer needs, refined by others that need more; and faulty fibres, which are masked from the next press on.
+Blocks of readings of any size go in; events come out: the position of a press at every reading from its touch until
+its release is complete, with radii that hold at that moment; and faulty fibres, which are masked from the next press
+on.
 """
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from math import hypot
+from typing import Any, Literal
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
+from padforge.design.common.validation import InputError, check_float, check_int, check_type
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
-from padforge.sense.localizer.features import DOWN, FEATURES, REST, UP, compute_features
+from padforge.sense.localizer.features import (
+    DOWN,
+    MEDIAN,
+    MEDIAN_OFFSET,
+    MODULATED,
+    REST,
+    UP,
+    PressFeatures,
+    complete_windows,
+    compute_features,
+    compute_history,
+    interpolate_gaps,
+    mean_at_rest,
+    valid_fibres,
+    windows_from_rest,
+)
 from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.scaler import ScaledFeatures
-from padforge.sense.rig.streams import HISTORY, RingBuffer
+from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
 MAX_SHOWN = 12  # latest presses that are shown
-OPENING = DOWN[-1][1]  # readings after `down_command` that features look at; until `up_command`, they look at no more
+MAX_TRACK = 64  # latest places of the press under way that are shown
+SHARPER = 0.75  # share of its radius from which on an estimate is worth telling again
+LEAD = MEDIAN_OFFSET + MEDIAN // 2  # readings before `down_command` that features look at, their history aside
+OPENING = DOWN[-1][1]  # readings after `down_command` that features look at
+LATEST = 20  # readings before the moment, or the release, that are kept of a press that is held for longer
 RELEASE = max(UP[-1][1], RELEASED)  # readings after `up_command` with which a press is complete
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The position of a press, estimated by one localizer."""
+    """The position of a press, estimated at one moment."""
 
     press: int  # index, from 0
     time_s: float  # of its touch, by the clock of the readings
-    features: str  # of the localizer
-    final: bool  # whether no other localizer will refine it
+    now_s: float  # of the latest reading that it looks at
+    since: Literal["touch", "lift"]  # whether the finger still rested, by what was known
+    readings: int  # that it looks at since the touch showed, or since the lift
+    since_s: float  # from the touch, or the lift, to the latest reading
+    final: bool  # whether it is the last of the press
     x_mm: float
     y_mm: float
     std_x_mm: float
@@ -55,11 +78,24 @@ class Estimate:
         return depth + ("" if self.force_n is None else f", {self.force_n:.1f} ± {self.force_r90_n:.1f} N")
 
     @property
+    def moment_text(self) -> str:
+        return f"{self.since_s:.2f} s after the {self.since}"
+
+    @property
     def text(self) -> str:
         return (
             f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, within {self.r50_mm:.1f} mm at 50 %, "
-            f"{self.r90_mm:.1f} mm at 90 %{self.measures_text} ({self.features})"
+            f"{self.r90_mm:.1f} mm at 90 %{self.measures_text} ({self.moment_text})"
         )
+
+    def has_moved_from(self, earlier: "Estimate") -> bool:
+        """Return whether the finger is so far from where it was that no error explains it."""
+        distance = hypot(self.x_mm - earlier.x_mm, self.y_mm - earlier.y_mm)
+        return distance > max(self.r90_mm, earlier.r90_mm)
+
+    def is_sharper_than(self, earlier: "Estimate") -> bool:
+        """Return whether its radius is smaller by a quarter or more."""
+        return self.r90_mm <= SHARPER * earlier.r90_mm
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON, without what was not learnt."""
@@ -78,76 +114,71 @@ class BufferedPress:
     touched: int  # first reading that shows it
     down_command: int  # first reading after the probe was sent down, or would have been
     previous_end: int  # `up_command` of the press before, < `down_command`
-    rest: Array  # (C,) V before it
+    rest: Array  # (1, C) V before it
+    history: Array  # (1, C, J) V, see `PressFeatures`
     up_command: int | None = None  # first reading after the probe was sent up; None while it is held
-    n_estimates: int = 0  # number of localizers that have estimated its position
+    up_s: float = 0.0  # its time
     _opening: Array | None = None
 
-    def release(self, up_command: int) -> None:
+    def release(self, up_command: int, buffer: RingBuffer) -> None:
         """End the press, one reading after its begin at the earliest."""
         self.up_command = max(up_command, self.down_command + 1)
-
-    def end_of(self, features: str) -> int | None:
-        """Return the index after the last reading that `features` need; None while that is not known."""
-        after_down, after_up = FEATURES[features].readings_needed
-        if after_up:
-            return None if self.up_command is None else self.up_command + after_up
-        end = self.down_command + after_down
-        return end if self.up_command is None else min(end, self.up_command)
+        last = min(self.up_command, buffer.end - 1)
+        self.up_s = float(buffer.rows(last, last + 1)[0, 0])
 
     def store_opening(self, buffer: RingBuffer) -> None:
-        """Copy the readings before it and its first ones once they have arrived: it may be held for hours."""
-        if self._opening is None and self.up_command is None and buffer.end >= self.down_command + OPENING:
-            self._opening = buffer.rows(self.down_command - HISTORY, self.down_command + OPENING)[:, 1:].copy()
+        """Copy its first readings, and those just before it, once they have arrived: it may be held for hours."""
+        if self._opening is None and buffer.end >= self.down_command + OPENING:
+            self._opening = buffer.rows(self.down_command - LEAD, self.down_command + OPENING)[:, 1:].copy()
 
-    def excerpt(self, buffer: RingBuffer, end: int) -> tuple[Array, int, int, int]:
-        """Return its readings before index `end`, without those in its middle that no features look at.
+    def excerpt(self, buffer: RingBuffer, until: int) -> tuple[Array, int, int, int]:
+        """Return its readings before index `until`, without those in its middle that no features look at.
 
-        And the indices in them of its commands, and of the end of the press before.
+        And the indices in them of its commands, and of the end of the press before. A press that is held has
+        `up_command` at their end.
         """
-        up_command = end if self.up_command is None else min(self.up_command, end)
-        if self._opening is None or up_command <= self.down_command + OPENING:
-            readings = buffer.rows(self.down_command - HISTORY, end)[:, 1:]
-            down = len(readings) - (end - self.down_command)
-            up = down + up_command - self.down_command
+        up_command = until if self.up_command is None else min(self.up_command, until)
+        opened = min(self.down_command + OPENING, until)
+        latest = max(up_command - LATEST, opened)
+        if self._opening is None:
+            opening = buffer.rows(self.down_command - LEAD, opened)[:, 1:]
         else:
-            readings = np.concatenate([self._opening, buffer.rows(up_command, end)[:, 1:]])
-            up = len(self._opening)
-            down = up - OPENING
-        return readings, down, up, max(down - (self.down_command - self.previous_end), 0)
+            opening = self._opening[: len(self._opening) + opened - (self.down_command + OPENING)]
+        first = opened - len(opening)
+        readings = np.concatenate([opening, buffer.rows(latest, until)[:, 1:]])
+        up = up_command - first - (latest - opened)
+        return readings, self.down_command - first, up, max(self.previous_end - first, 0)
 
 
 class Live:
     """Follow the readings of a pad. Memory is bounded, however long it runs and a press is held.
 
     Args:
-        localizers: of the pad, at least one; the one that needs the fewest readings answers first.
+        localizer: of the pad.
         health: of the pad; None to look for no faults.
         fibres: number of fibres that are read.
         rate_hz: readings per second.
 
     Attributes:
         presses: the latest estimate of each of the last presses, oldest first.
+        track: estimates of the latest press at the last places that it has moved to, oldest first.
         faults: all faults so far, oldest first.
 
     Raises:
-        InputError: no localizer, or a model of a pad with other fibres or of another rate.
+        InputError: a localizer that was fitted to arrays, or a model of a pad with other fibres or of another rate.
     """
 
-    def __init__(
-        self, localizers: Sequence[LocalizerModel], health: HealthModel | None, fibres: int, rate_hz: float
-    ) -> None:
+    def __init__(self, localizer: LocalizerModel, health: HealthModel | None, fibres: int, rate_hz: float) -> None:
         fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
         rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        if not isinstance(localizers, Sequence) or not localizers:
-            raise InputError(f"localizers are {short_repr(localizers)}, expected at least one")
-        for model in localizers:
-            check_same_pad(check_type("localizers", model, LocalizerModel), "the localizer", fibres, rate_hz)
+        check_same_pad(check_type("localizer", localizer, LocalizerModel), "the localizer", fibres, rate_hz)
+        if localizer.features == "array":
+            raise InputError("the localizer was fitted to arrays of features, expected one that was fitted to readings")
         self._monitor = None if health is None else FaultMonitor(health)
         if health is not None:
             check_same_pad(health, "health", fibres, rate_hz)
-        self._localizers = sorted(localizers, key=lambda model: FEATURES[model.features].readings_needed[::-1])
-        scaler, n_windows = self._localizers[-1].scaler, FEATURES[self._localizers[-1].features].n_windows
+        self._localizer, scaler = localizer, localizer.scaler
+        n_windows = scaler.mean_v.shape[1] - (len(MODULATED) if localizer.features == "windows" else 0)
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
         self._response_v = np.where(response_v > 0, response_v, 1.0)  # that a press goes up to
         self._detector = PressDetector(fibres)
@@ -155,6 +186,7 @@ class Live:
         self._press: BufferedPress | None = None
         self._n_presses = self._previous_end = 0
         self.presses: deque[Estimate] = deque(maxlen=MAX_SHOWN)
+        self.track: deque[Estimate] = deque(maxlen=MAX_TRACK)
         self.faults: list[FibreFault] = []
 
     @property
@@ -192,7 +224,7 @@ class Live:
                     events += self._begin(event.reading)
                 elif self._press is not None:
                     command = self._buffer.command_index(event.reading, RELEASE_DELAY_S)
-                    self._press.release(max(command, self._press.touched))
+                    self._press.release(max(command, self._press.touched), self._buffer)
             events += self._advance()
         return events
 
@@ -201,12 +233,13 @@ class Live:
 
         Returns:
             "pressed"; "fibres", for each its "swing" (deviation from its rest in units of its typical response, None
-            without a reading) and "state"; "presses": `Estimate.to_dict` with "measures_text" and "text"; "faults":
-            a line each.
+            without a reading) and "state"; "presses": `Estimate.to_dict` with "measures_text", "moment_text" and
+            "text"; "track": places [x, y] of the latest press in mm, more than one if the finger has moved; "faults": a
+            line each.
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
-            rest = self._buffer.rest(end) if self._press is None else self._press.rest
+            rest = self._buffer.rest(end) if self._press is None else self._press.rest[0]
             swings = (self._buffer.rows(end - 1, end)[0, 1:] - rest) / self._response_v
         return {
             "pressed": self.pressed,
@@ -215,8 +248,10 @@ class Live:
                 for swing, state in zip(swings.tolist(), self._states(np.isnan(swings)), strict=True)
             ],
             "presses": [
-                press.to_dict() | {"measures_text": press.measures_text, "text": press.text} for press in self.presses
+                press.to_dict() | {name: getattr(press, name) for name in ("measures_text", "moment_text", "text")}
+                for press in self.presses
             ],
+            "track": [[place.x_mm, place.y_mm] for place in self.track],
             "faults": [fault.text for fault in self.faults],
         }
 
@@ -230,59 +265,88 @@ class Live:
 
     def _begin(self, touched: int) -> list[Event]:
         """Begin a press, after the press before has given all that is still to come of it."""
+        touched = max(touched, self._buffer.end - SLACK)  # an unclear change may be seen to be a touch hours later
         down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
+        if self._press is not None and self._press.up_command is not None:
+            down_command = max(down_command, self._press.up_command + 1)
         events = self._advance(down_command)
         down_command = max(down_command, self._previous_end + 1)
         time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])
-        rest = self._buffer.rest(down_command)
-        self._press = BufferedPress(self._n_presses, time_s, touched, down_command, self._previous_end, rest)
+        readings = interpolate_gaps(self._buffer.rows(down_command - HISTORY, self._buffer.end)[:, 1:])
+        first = self._buffer.end - len(readings)
+        down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
+        rest, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
+        self._press = BufferedPress(
+            self._n_presses, time_s, touched, down_command, self._previous_end, rest=rest, history=history
+        )
+        self.track.clear()
         self._n_presses += 1
         return events
 
     def _advance(self, cut: int | None = None) -> list[Event]:
-        """Return the events that the readings so far allow, or all of a press that the next one cuts off at `cut`."""
+        """Return the events at the latest reading, or the last of a press that the next one cuts off at `cut`."""
         press, now = self._press, self._buffer.end
         if press is None:
             return []
         if cut is not None:
             now = max(cut, press.down_command + 1)
             if press.up_command is None:
-                press.release(cut)
+                press.release(cut, self._buffer)
         press.store_opening(self._buffer)
+        end = None if press.up_command is None else press.up_command + RELEASE
+        is_complete = end is not None and (now >= end or cut is not None)
+        until = now if end is None else min(now, end)
         events: list[Event] = []
-        for localizer in self._localizers[press.n_estimates :]:
-            end = press.end_of(localizer.features)
-            if end is None or (end > now and cut is None):
-                break
-            press.n_estimates += 1
-            events.append(self._estimate(press, localizer, min(end, now)))
-        if press.up_command is not None and (now >= press.up_command + RELEASE or cut is not None):
-            events += self._check_fibres(press, min(press.up_command + RELEASE, now))
+        if is_complete or self._localizer.features == "windows":  # the published features are those of a whole press
+            events.append(self._estimate(press, until, is_complete))
+        if press.up_command is not None and is_complete:
+            events += self._check_fibres(press, until)
             self._previous_end, self._press = press.up_command, None
         return events
 
-    def _estimate(self, press: BufferedPress, localizer: LocalizerModel, end: int) -> Estimate:
-        readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)
-        downs, ups = [down_command], [up_command]
-        if previous_end > 0:  # a stand-in for the press before, so that the rest of this one reaches back no further
-            downs, ups = [previous_end - 1, *downs], [previous_end, *ups]
-        features = compute_features(readings, np.array(downs), np.array(ups), localizer.features)[-1:]
-        scaled = localizer.scaler.transform(features)
+    def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:
+        scaled = self._localizer.scaler.transform(self._features(press, until))
         fibre_mask = scaled.fibre_mask.copy()
         fibre_mask[:, list(self.failed)] = False
-        result = localizer.predict_features(ScaledFeatures(scaled.inputs, fibre_mask))
+        result = self._localizer.predict_features(ScaledFeatures(scaled.inputs, fibre_mask, scaled.seen))
         numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
         measures = {
             column: float(values[0])
             for name, measure in result.measures.items()
             for column, values in zip(MEASURE_COLUMNS[name], (measure.values, measure.r90), strict=True)
         }
-        final, failed = localizer is self._localizers[-1], tuple(np.flatnonzero(~fibre_mask[0]).tolist())
-        estimate = Estimate(press.number, press.time_s, localizer.features, final, *numbers, failed=failed, **measures)
-        if self.presses and self.presses[-1].press == press.number:
+        now_s = float(self._buffer.rows(until - 1, until)[0, 0])
+        if press.up_command is None or until <= press.up_command:
+            moment = "touch", until - press.touched, now_s - press.time_s
+        else:
+            moment = "lift", until - press.up_command, now_s - press.up_s
+        failed = tuple(np.flatnonzero(~fibre_mask[0]).tolist())
+        estimate = Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, failed=failed, **measures)
+        self._show(estimate)
+        return estimate
+
+    def _features(self, press: BufferedPress, until: int) -> PressFeatures:
+        """Return what `compute_features` would of all readings before `until`."""
+        readings, down, up, previous_end = press.excerpt(self._buffer, until)
+        if self._localizer.features == "published":
+            downs, ups = [down], [up]
+            if previous_end > 0:  # a stand-in for the press before: the rest of this one reaches back no further
+                downs, ups = [previous_end - 1, down], [previous_end, up]
+            return compute_features(readings, np.array(downs), np.array(ups), is_published=True)[-1:]
+        moment = np.array([down]), np.array([up]), np.array([len(readings)])
+        windows = windows_from_rest(interpolate_gaps(readings), press.rest, *moment)
+        return PressFeatures(windows, press.history, valid_fibres(readings, *moment), complete_windows(*moment))
+
+    def _show(self, estimate: Estimate) -> None:
+        """Show an estimate in place of the one before of the same press, and where the finger has moved."""
+        if self.presses and self.presses[-1].press == estimate.press:
             self.presses.pop()
         self.presses.append(estimate)
-        return estimate
+        if self.track and not estimate.has_moved_from(self.track[-1]):
+            if not estimate.is_sharper_than(self.track[-1]):
+                return
+            self.track.pop()  # the same place, better known
+        self.track.append(estimate)
 
     def _check_fibres(self, press: BufferedPress, end: int) -> list[FibreFault]:
         """Return the faults that a complete press brings to light."""

@@ -31,7 +31,7 @@ MIN_VARIANCE = 1e-4  # of scaled features, which are about 1
 PRIOR_WEIGHT = 0.05
 """Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold."""
 GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2  # steps, and the longest, in units of the scaled position
-MIN_STD = 1e-2  # smallest standard deviation on the grid, a seventh of a cell
+MIN_STD = 1e-2  # smallest standard deviation on the grid, a tenth of a cell
 N_SUMMARY = 9
 """Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
 MIN_EXPONENT = -60.0  # smaller exponents count for nothing, and their exponential takes ten times as long

@@ -45,7 +45,7 @@ MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
-INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 8
+INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 4
 """Sets of failed fibres of a size that intervals are calibrated on, at most: of one moment, or of each of several."""
 
 
@@ -129,7 +129,8 @@ def fit_recording(
     features = compute_features(readings, *commands, is_published=is_published)
 
     def at(n_complete: int, presses: Indices) -> PressFeatures:
-        return compute_features(readings, *commands, complete_at(n_complete, *commands))[presses]
+        until = complete_at(n_complete, *commands)
+        return compute_features(readings, *commands, until, history=features.history)[presses]
 
     origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
     data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
@@ -231,12 +232,12 @@ def _n_levels(options: LocalizerSettings, fibres: int) -> int:
 def _calibrate_scales(
     model: LocalizerModel, moments: Sequence[ScaledFeatures], positions_mm: Array, levels: int
 ) -> LocalizerModel:
-    """Scale the expected errors of the members to those on presses never trained on, so that their weights are right.
+    """Scale the expected errors of the positions of members to those on presses never trained on.
 
-    The Bayesian localizer is overconfident of few or badly placed presses: those of training are augmented by the same
-    response that it predicts them by.
+    Then the weights of the members are right. The Bayesian localizer is overconfident of few or badly placed presses:
+    those of training are augmented by the same response that it predicts them by.
     """
-    targets = model.scaler.scale_targets(positions_mm)
+    targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
     ratios: dict[str, list[Array]] = {}
     for n_complete, presses in enumerate(moments, int(len(moments) > 1)):
@@ -245,7 +246,7 @@ def _calibrate_scales(
             fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
             inputs = presses.inputs[rows], fibre_mask, presses.seen[rows]
             outputs = predict_members(model.networks, *inputs, *model.corrected)
-            predicted, log_error = np.split(outputs, 2, axis=2)
+            predicted, log_error = (each[:, :, :2] for each in np.split(outputs, 2, axis=2))
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
             ratio = (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)
             names = answering(model.networks, n_complete, presses.seen.shape[1], bool(model.bayes))
@@ -263,7 +264,8 @@ def _calibrate_scales(
         if name not in log_scales:
             return weights
         bias = weights["last.b"].copy()
-        bias[:, :, bias.shape[2] // 2 :] += log_scales[name][:, None, None]
+        of_position = slice(bias.shape[2] // 2, bias.shape[2] // 2 + 2)
+        bias[:, :, of_position] += log_scales[name][:, None, None]
         return {**weights, "last.b": bias}
 
     networks = {name: scaled(name, weights) for name, weights in model.networks.items()}

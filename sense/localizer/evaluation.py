@@ -12,12 +12,14 @@ from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import DOWN, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-calibration/2"
+FORMAT = "padforge-calibration/3"
 BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.93 / 1.16 / 1.51 / 2.25 mm"
 """What a simulated error is, beside the errors of the published recording with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position
+MOMENT_SETS = 3  # sets of failed fibres of a size that each moment is evaluated with, at most
 ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 
@@ -32,6 +34,8 @@ class Evaluation:
         test_presses: their number.
         by_subset: mean error of each set of failed fibres.
         by_position: rows of `errors_by_position`.
+        by_moment: rows of `errors_by_moment`.
+        focus: how a press is localized while it is read, see `errors_by_moment`.
         idle_share: of each fibre, see `idle_share`.
         test: true and predicted positions, depths and forces, with all fibres.
         provenance: of the localizer, and the kind of the recording.
@@ -44,6 +48,8 @@ class Evaluation:
     test_presses: int
     by_subset: list[dict[str, Any]]
     by_position: list[dict[str, Any]]
+    by_moment: list[dict[str, Any]]
+    focus: dict[str, Any]
     idle_share: list[float]
     test: dict[str, Any]
     provenance: dict[str, Any]
@@ -92,6 +98,7 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         test_presses=len(test),
         by_subset=by_subset,
         by_position=errors_by_position(prediction.positions_mm, positions_mm),
+        **errors_by_moment(model, recording, test, levels),
         idle_share=idle_share(recording).tolist(),
         test={
             "press": test.tolist(),
@@ -148,6 +155,52 @@ def errors_by_loss(
             for subset, each in zip(subsets, predictions, strict=True)
         ]
     return rows, by_subset
+
+
+def errors_by_moment(
+    model: LocalizerModel, recording: Recording, presses: Indices, levels: Iterable[int]
+) -> dict[str, Any]:
+    """Return the errors of presses at `MOMENTS`, while they are read, for up to `MOMENT_SETS` sets of failed fibres.
+
+    "by_moment" has rows as those of `error_row`, with "since" touch or lift, "readings" since then, and "time_s".
+    "focus" is how the press of the median error is localized: "press", "pressed_mm", and "moments" with "since",
+    "time_s", "predicted_mm" and "r90_mm". Both are empty of a localizer that knows whole presses only.
+    """
+    if model.features != "windows":
+        return {"by_moment": [], "focus": {}}
+    from padforge.sense.signals.press_detection import first_readings  # compiled kernels take long to import
+
+    commands = recording.down_command, recording.up_command
+    touched = first_readings(recording.readings, recording.times_s, *commands)
+    positions_mm = recording.presses_mm[presses]
+    measures = {name: values[presses] for name, values in recording.measures.items()}
+    history, rows, intact = model.raw_features(recording).history, [], []
+    for moment in MOMENTS:
+        until = moment.until(touched, recording.up_command)
+        features = model.scaler.transform(model.raw_features(recording, until, history)[presses])
+        at = {
+            "since": moment.since,
+            "readings": moment.readings,
+            "time_s": round(moment.readings / recording.rate_hz, 3),
+        }
+        intact.append((at, model.predict_features(features)))
+        for n_failed in levels:
+            subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)
+            predictions = [model.predict_features(features, subset) for subset in subsets]
+            rows.append(at | error_row(n_failed, predictions, positions_mm, measures))
+    errors = distances(intact[-1][1].positions_mm, positions_mm)
+    press = int(np.argsort(errors)[len(errors) // 2])
+    moments = [
+        {
+            "since": at["since"],
+            "time_s": at["time_s"],
+            "predicted_mm": predicted.positions_mm[press].tolist(),
+            "r90_mm": float(predicted.r90_mm[press]),
+        }
+        for at, predicted in intact
+    ]
+    focus = {"press": int(presses[press]), "pressed_mm": positions_mm[press].tolist(), "moments": moments}
+    return {"by_moment": rows, "focus": focus}
 
 
 def error_row(
@@ -277,4 +330,21 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
         if names[0] in rows[0]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
+    lines += moment_lines(document["by_moment"])
     return [*lines, BUILT_PAD] if is_simulated else lines
+
+
+def moment_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Format the errors by moment as a table, with a column for each number of failed fibres."""
+    if not rows:
+        return []
+    levels = sorted({row["n_failed"] for row in rows})
+    heads = "".join(f"  {n_failed} failed  in r90" for n_failed in levels)
+    title = "mean error in mm while a press is read, by time since the touch and since the lift"
+    lines = [title, f"since   time s{heads}"]
+    for first in range(0, len(rows), len(levels)):
+        row = rows[first]
+        at_moment = rows[first : first + len(levels)]
+        cells = "".join(f" {each['mean_mm']:9.2f} {each['within_r90']:7.1%}" for each in at_moment)
+        lines.append(f"{row['since']:<7} {row['time_s']:6.2f}{cells}")
+    return lines

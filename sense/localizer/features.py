@@ -65,26 +65,34 @@ def compute_features(
     up_command: Indices,
     until: Indices | None = None,
     is_published: bool = False,
+    history: Array | None = None,
 ) -> PressFeatures:
     """Compute the features of every press from (R, C) readings, V, NaN where missing.
 
     Commands are the (Q,) first readings after the probe was sent down, and after it was sent up. A press is looked at
     up to before the reading `until` (Q,), to its end and to the next press if it is None. `is_published` asks for the
-    published running medians, which know no such moment.
+    published running medians, which know no such moment. `history` is that of the presses, if it was computed before:
+    it takes longest.
     """
     filled = interpolate_gaps(readings)
     _, next_begin = _neighbours(down_command, up_command, len(readings))
     until = next_begin if until is None else np.clip(until, down_command + 1, next_begin)
-    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + UP[-1][1])
-    counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
-    fibre_mask = counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
+    fibre_mask = valid_fibres(readings, down_command, up_command, until)
     if is_published:
         medians = _running_medians(filled, down_command, up_command)
         empty = np.empty((*fibre_mask.shape, 0)), np.empty((len(medians), 0), bool)
         return PressFeatures(medians, empty[0], fibre_mask, empty[1])
     windows = window_means(filled, down_command, up_command, until)
     seen = complete_windows(down_command, up_command, until)
-    return PressFeatures(windows, compute_history(filled, down_command), fibre_mask, seen)
+    history = compute_history(filled, down_command) if history is None else history
+    return PressFeatures(windows, history, fibre_mask, seen)
+
+
+def valid_fibres(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Mask:
+    """Return (Q, C) which fibres gave enough readings of the presses, from the rest before them to `until` (Q,)."""
+    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + UP[-1][1])
+    counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
+    return counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
 
 
 def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
@@ -113,7 +121,19 @@ def interpolate_gaps(readings: Array) -> Array:
 def window_means(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Array:
     """Return (Q, C, F) means over the windows `DOWN`, `UP` and `NOW` of a press, V, less the mean at rest before it."""
     previous_end, _ = _neighbours(down_command, up_command, len(readings))
-    rest = _gather(readings, down_command, REST, previous_end, down_command).mean(axis=1)
+    rest = mean_at_rest(readings, down_command, previous_end)
+    return windows_from_rest(readings, rest, down_command, up_command, until)
+
+
+def mean_at_rest(readings: Array, down_command: Indices, previous_end: Indices) -> Array:
+    """Return (Q, C) means before the presses, V, back to the ends (Q,) of the presses before them at most."""
+    return _gather(readings, down_command, REST, previous_end, down_command).mean(axis=1)
+
+
+def windows_from_rest(
+    readings: Array, rest: Array, down_command: Indices, up_command: Indices, until: Indices
+) -> Array:
+    """Return the windows of `window_means`, measured from the known rest (Q, C)."""
     held = np.minimum(up_command, until)
     places = [(down_command, window, held) for window in DOWN] + [(up_command, window, until) for window in UP]
     places += [(held, window, held) for window in NOW]

@@ -29,8 +29,8 @@ from padforge.sense.localizer.features import (
     compute_features,
 )
 from padforge.sense.localizer.model_files import check_arrays, check_same_pad, files_of
-from padforge.sense.localizer.moments import PHASES, count_complete
-from padforge.sense.localizer.network import RESIDUAL, Networks, Weights, check_weights, predict
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, count_complete
+from padforge.sense.localizer.network import RESIDUAL, Networks, Sliding, Weights, check_weights, predict
 from padforge.sense.localizer.response_model import GRID_CELLS
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.recording.recording import Recording
@@ -154,12 +154,20 @@ class LocalizerModel(LocalizerDocument):
         """The Bayesian localizers and the network that corrects them."""
         return self.bayes, self.residual_network
 
-    def raw_features(self, recording: Recording, until: Indices | None = None) -> PressFeatures:
+    @property
+    def sliding(self) -> Sliding | None:
+        """How a finger that slides is followed; None where none is."""
+        return Sliding(*self.scaler.to_now(N_TIMED)) if FOLLOWING in self.networks else None
+
+    def raw_features(
+        self, recording: Recording, until: Indices | None = None, history: Array | None = None
+    ) -> PressFeatures:
         """Return the features of every press, V.
 
         Args:
             recording: of a pad with the fibres and the rate of the training.
             until: (Q,) first readings that are not looked at; None for all up to the next press.
+            history: of the same presses, if it was computed before.
 
         Raises:
             InputError: another pad, or a localizer that was fitted to arrays.
@@ -169,7 +177,7 @@ class LocalizerModel(LocalizerDocument):
         check_type("recording", recording, Recording)
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         commands = recording.down_command, recording.up_command
-        return compute_features(recording.readings, *commands, until, self.features == "published")
+        return compute_features(recording.readings, *commands, until, self.features == "published", history)
 
     def scaled_features(self, recording: Recording, until: Indices | None = None) -> ScaledFeatures:
         """Return the scaled features of every press.
@@ -225,11 +233,12 @@ class LocalizerModel(LocalizerDocument):
         for first in range(0, len(presses), chunk):
             rows = slice(first, first + chunk)
             inputs = presses.inputs[rows], fibre_mask[rows], presses.seen[rows]
-            parts.append(predict(self.networks, *inputs, *self.corrected))
+            parts.append(predict(self.networks, *inputs, *self.corrected, self.sliding))
         empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
-        targets, std = (np.concatenate(part) for part in zip((empty, empty), *parts, strict=True))
+        empties = empty, empty, np.empty(0, bool)
+        targets, std, slid = (np.concatenate(part) for part in zip(empties, *parts, strict=True))
         n_complete, level = count_complete(presses.seen), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
-        factors = self.interval_factors[n_complete, level]
+        factors = self.interval_factors[np.where(slid, N_DOWN - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
         is_complete = n_complete > 0 if presses.seen.shape[1] else np.ones(len(presses), bool)
@@ -350,10 +359,10 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
         "half_size_mm": (2,),
     }
     shapes = {f"scaler.{name}": (getattr(scaler, name).shape, size) for name, size in expected.items()}
-    levels = read.interval_factors.shape[1:2]
+    levels = [max(size, 1) for size in read.interval_factors.shape[1:2]]
     shapes["interval_factors"] = read.interval_factors.shape, (n_timed + 1, *levels, 3 + len(names))
     for name, (size, wanted) in shapes.items():
-        if size != wanted or 0 in size[:2]:
+        if size != wanted or 0 in size[:1]:
             raise InputError(f"{where}: {name} has shape {size}, expected {wanted} of features {read.features}")
     if len(set(read.test)) != len(read.test):
         raise InputError(f"{where}: test names a press twice, expected different ones")

@@ -6,18 +6,41 @@ number says how far it is. Each phase has a network of its own, as one for all o
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
 
 from padforge.sense.arrays import Indices, Mask
 from padforge.sense.localizer.features import DOWN, N_TIMED, UP
 
 
 @dataclass(frozen=True)
+class Moment:
+    """A time in a press: so many readings after the first that shows it, or after the probe was sent up."""
+
+    since: Literal["touch", "lift"]
+    readings: int
+
+    def until(self, touched: Indices, up_command: Indices) -> Indices:
+        """Return the first readings (Q,) of presses that are not looked at; `touched` (Q,) are those that show them."""
+        return np.minimum(touched + self.readings, up_command) if self.since == "touch" else up_command + self.readings
+
+
+MOMENTS = (
+    *(Moment("touch", readings) for readings in (1, 2, 3, 4, 6, 9, 12)),
+    *(Moment("lift", readings) for readings in (0, 1, 2, 3, 5, 8, 15)),
+)
+"""Moments at which a localizer is evaluated."""
+
+
+@dataclass(frozen=True)
 class Phase:
-    """Numbers of complete windows, from `first` on, at which a network answers, and how it is trained."""
+    """Numbers of complete windows, from `first` on, that a network is trained for, and how."""
 
     first: int
     shares: tuple[float, ...]  # of the training that looks at each of these numbers
     length: float = 1.0  # of the training
+    sliding: float = 0.0  # share of presses in it that slide
 
     def __contains__(self, n_complete: object) -> bool:
         return isinstance(n_complete, int) and self.first <= n_complete < self.first + len(self.shares)
@@ -26,15 +49,17 @@ class Phase:
 N_DOWN = len(DOWN)
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
-        "touched": Phase(1, (0.05, 0.12, 0.27, 0.16, 0.12, 0.1, 0.09, 0.09), 1.5),
+        "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.6, sliding=0.3),
         "settled": Phase(N_DOWN, (1.0,), 1.3),
         "released": Phase(N_DOWN + 1, (*(0.5 / (len(UP) - 1),) * (len(UP) - 1), 0.5), 1.8),
     },
-    N_DOWN: {"held": Phase(1, (*(0.5 / (N_DOWN - 1),) * (N_DOWN - 1), 0.5))},
+    N_DOWN: {"held": Phase(1, (*(0.5 / (N_DOWN - 1),) * (N_DOWN - 1), 0.5), sliding=0.2)},
     0: {"press": Phase(0, (1.0,))},
 }
 """Networks by K, the number of windows that are complete one after the other: all of them, those of the touch alone, or
-none, if features know no moment."""
+none, if features know no moment. The last one that is trained for a moment answers."""
+FOLLOWING = "touched"  # the network that follows a finger which slides; others know fingers at rest alone
+SOON = 5  # complete windows soon after the touch: where a finger was then shows whether it slid later
 CORRECTED = Phase(N_DOWN + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """When the Bayesian localizer answers, with the network that corrects it."""
 

@@ -6,15 +6,18 @@ position (and depth, force) and the logarithms of their expected absolute errors
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer, stage_of
+from padforge.sense.localizer.features import NOW
 from padforge.sense.localizer.model_files import check_arrays
-from padforge.sense.localizer.moments import PHASES, count_complete
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, count_complete
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
@@ -76,7 +79,7 @@ RESIDUAL = "residual"
 
 def answering(networks: Networks, n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
     """Return the names of the networks that answer when so many of K windows are complete, in their order."""
-    names = [name for name in networks if n_complete in PHASES[n_timed][name]]
+    names = [name for name, phase in PHASES[n_timed].items() if n_complete in phase and name in networks][-1:]
     return [*names, RESIDUAL] if has_bayes and stage_of(n_complete, n_timed) is not None else names
 
 
@@ -113,21 +116,70 @@ def predict(
     seen: Mask,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
-) -> tuple[Floats, Floats]:
-    """Return (Q, N) targets and their standard deviations, scaled, for presses at any moments; 0 before the first one.
+    sliding: "Sliding | None" = None,
+) -> tuple[Floats, Floats, Mask]:
+    """Predict presses at any moments; those of a finger that has slid by the network that follows it.
 
     Arguments are as in `predict_members`.
+
+    Returns:
+        (Q, N) scaled targets and their standard deviations, 0 before the first moment, and (Q,) whether it has slid.
     """
     n_complete = count_complete(seen)
-    last, *_ = (weights["last.w"] for weights in networks.values())
-    n_targets = last.shape[2] if "hidden.w" not in next(iter(networks.values())) else last.shape[2] // 2
+    first = next(iter(networks.values()))
+    n_targets = first["last.w"].shape[2] // (2 if "hidden.w" in first else 1)
     targets, std = np.zeros((2, len(seen), n_targets), np.float32)
     for count in np.unique(n_complete).tolist():
         if count or not seen.shape[1]:
             rows = n_complete == count
             inputs = features[rows], fibre_mask[rows], seen[rows]
             targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
-    return targets, std
+    slid = np.zeros(len(seen), bool)
+    rows = np.flatnonzero(n_complete >= N_DOWN)
+    if sliding is not None and len(rows):
+        following = sliding.follow(networks[FOLLOWING], features[rows], fibre_mask[rows], seen[rows])
+        slid[rows] = following.moved > LEAST_SLIDE
+        targets[slid], std[slid] = (part[slid[rows]] for part in following[:2])
+    return targets, std, slid
+
+
+LEAST_SLIDE = 3.0
+"""`Followed.moved` from which on a finger is believed to slide: of presses at rest, hardly one has it."""
+
+
+class Followed(NamedTuple):
+    """Where a finger was last, by the network that follows it."""
+
+    targets: Floats  # (Q, N), scaled
+    std: Floats  # (Q, N)
+    moved: Floats  # (Q,) distance from where it was soon after the touch, in standard deviations then
+
+
+@dataclass(frozen=True)
+class Sliding:
+    """How a finger that slides is followed."""
+
+    # (C, len(NOW), len(DOWN)), see `FeatureScaler.to_now`
+    now_factor: Floats
+    now_offset: Floats
+
+    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, seen: Mask) -> Followed:
+        """Follow the finger of presses (Q, C, F + G) that are read to their end."""
+        n_timed = seen.shape[1]
+
+        def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
+            inputs = network_inputs(features, fibre_mask, seen & (np.arange(n_timed) < n_complete))
+            return combine_members(forward(weights, inputs))
+
+        targets, std = predict_from(features, N_DOWN)
+        soon = features.copy()
+        for k in range(len(NOW)):
+            window = SOON - 1 - k
+            now = features[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
+            soon[:, :, n_timed + k] = now
+        before, before_std = predict_from(soon, SOON)
+        moved = np.hypot(*(targets - before)[:, :2].T) / np.maximum(np.hypot(*before_std[:, :2].T), np.float32(1e-9))
+        return Followed(targets, std, moved)
 
 
 def combine_members(outputs: Floats) -> tuple[Floats, Floats]:

@@ -20,7 +20,6 @@ from padforge.sense.localizer.scaler import TrainingPresses
 from padforge.sense.localizer.torch_network import network_inputs, sample_fibre_dropout
 
 NOW_NOISE = 0.05  # of single readings, beside that of means
-SLIDING = 0.25  # share of presses that slide
 SPEEDS_MM_S = 2.0, 60.0  # range of their speeds, logarithmically uniform
 LONGER = 40  # readings beyond `DOWN` for which a finger slides
 RESIDUAL_MM = 10.0  # distance over which what a press leaves unexplained becomes another
@@ -49,6 +48,7 @@ class PressSampler:
         self._bayes = tuple(stage.map_arrays(self._tensor) for stage in bayes)
         self.n_inputs = self.fibres * (x.shape[2] + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
         self._first, self._shares = phase.first, self._tensor(phase.shares)
+        self._sliding = phase.sliding if presses.speed else 0.0
         self._speed, self._per_mm = presses.speed, presses.per_mm
         self._now_factor, self._now_offset = self._tensor(presses.now_factor), self._tensor(presses.now_offset)
         ends = [end for _, end in DOWN]
@@ -98,8 +98,7 @@ class PressSampler:
         windows = self._window[(last[:, None] - back).clamp(0, len(self._window) - 1)]
         now = torch.take_along_dim(features[:, :, :N_DOWN], windows[:, None], dim=2)
         is_mapped = counts <= N_DOWN
-        if self._speed and SLIDING:
-            n_sliding = round(SLIDING * len(counts))
+        if n_sliding := round(self._sliding * len(counts)):
             is_mapped = is_mapped | (torch.arange(len(counts), device=self._device) < n_sliding)
             sliding = slice(n_sliding)
             down, of_now = self._slide(last[sliding], windows[sliding], residual[sliding], targets[sliding])

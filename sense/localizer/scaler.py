@@ -159,7 +159,7 @@ class FeatureScaler:
     ) -> "TrainingPresses":
         """Scale features and targets of presses, which slide in training if the rate of the readings is given."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        now_factor, now_offset = self._to_now(scaled.seen.shape[1])
+        now_factor, now_offset = self.to_now(scaled.seen.shape[1])
         return TrainingPresses(
             scaled.inputs,
             scaled.fibre_mask,
@@ -172,8 +172,8 @@ class FeatureScaler:
             speed=1 / (self.scale_mm * rate_hz),
         )
 
-    def _to_now(self, n_timed: int) -> tuple[Floats, Floats]:
-        """(C, len(NOW), len(DOWN)) factors and offsets that turn scaled windows of `DOWN` into scaled ones of `NOW`."""
+    def to_now(self, n_timed: int) -> tuple[Floats, Floats]:
+        """Return factors and offsets that turn scaled windows of `DOWN` into `NOW`; shapes (C, len(NOW), len(DOWN))."""
         now = slice(n_timed, n_timed + len(NOW))
         down = slice(len(DOWN) if n_timed else 0)
         scale = self.scale_v[:, None, down] / self.scale_v[:, now, None]

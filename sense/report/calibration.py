@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
-from padforge.design.common.plotting import INK, add_caption, new_figure, save_figure
+from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new_figure, save_figure, style_axes
 from padforge.design.common.profiling import stage
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError
@@ -22,8 +24,10 @@ from padforge.sense.studies.fibre_loss import draw_errors_by_loss
 
 _log = logging.getLogger(__name__)
 
+BY_MOMENT = "error_by_moment.png"  # where the localizer knows moments
 FILES = (
     *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
+    BY_MOMENT,
     *sorted(HEALTH_FILES),
 )
 """Names of all files of a calibration; those of health where it can be learnt."""
@@ -70,7 +74,8 @@ def calibrate_into(
         except InputError as error:
             detector = None
             _log.warning("the health of the fibres is not monitored: %s", error)
-    with atomic_files(out, without=HEALTH_FILES) as folder:  # those of an earlier calibration must not stay
+    # Those of an earlier calibration must not stay.
+    with atomic_files(out, without={*HEALTH_FILES, BY_MOMENT}) as folder:
         localizer.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone
         if detector:
@@ -81,6 +86,8 @@ def calibrate_into(
             figure, axes = new_figure(6.0, 4.4)
             draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
             save_figure(figure, folder / "error_by_loss.png")
+            if evaluation.by_moment:
+                draw_errors_by_moment(evaluation, folder / BY_MOMENT)
     return evaluation.to_dict()
 
 
@@ -101,4 +108,38 @@ def draw_error_map(evaluation: Evaluation, path: Path) -> None:
     title = f"{len(errors)} presses never trained on: mean error {errors.mean():.2f} mm\n"
     axes.set_title(title, loc="left", color=INK, fontsize=11)
     add_caption(axes, "dot: true position; line: to the prediction")
+    save_figure(figure, path)
+
+
+def draw_errors_by_moment(evaluation: Evaluation, path: Path) -> None:
+    """Draw the error while a press is read, by time since touch and since lift, and how one comes into focus."""
+    figure = Figure(figsize=(11.0, 4.0), layout="constrained")
+    touch, lift, focus = figure.subplots(1, 3)
+    for axes in (touch, lift, focus):
+        style_axes(axes)
+    for axes, since in ((touch, "touch"), (lift, "lift")):
+        for n_failed in sorted({row["n_failed"] for row in evaluation.by_moment}):
+            rows = [row for row in evaluation.by_moment if (row["since"], row["n_failed"]) == (since, n_failed)]
+            times_s, means = [row["time_s"] for row in rows], [row["mean_mm"] for row in rows]
+            colour, label = CURVES[n_failed % len(CURVES)], f"{n_failed} failed"
+            axes.plot(times_s, means, "o-", color=colour, ms=3.5, lw=1.4, label=label)
+        axes.set_yscale("log")
+        axes.set(xlabel=f"since the {since} (s)", ylabel="mean error (mm)")
+        axes.yaxis.set_major_formatter("{x:g}")
+    lift.sharey(touch)
+    touch.legend(frameon=False, fontsize=8)
+    touch.set_title("Error while a press is read", loc="left", color=INK, fontsize=11)
+    x, y = evaluation.focus["pressed_mm"]
+    moments = evaluation.focus["moments"]
+    for number, moment in enumerate(moments):
+        share = (number + 1) / len(moments)
+        style = {"fill": False, "ec": INK, "lw": 0.6 + share, "alpha": 0.15 + 0.85 * share}
+        focus.add_patch(Circle(moment["predicted_mm"], moment["r90_mm"], **style))
+    focus.plot(*np.array([moment["predicted_mm"] for moment in moments]).T, "-", color=FAINT, lw=0.8)
+    focus.plot(x, y, "+", color=ALARM, ms=9, mew=1.6)
+    focus.set_aspect("equal")
+    focus.autoscale_view()
+    focus.set(xlabel="x (mm)", ylabel="y (mm)")
+    focus.set_title("A touch comes into focus", loc="left", color=INK, fontsize=11)
+    add_caption(focus, "circles of 90 %, later ones darker; cross: true position")
     save_figure(figure, path)

@@ -90,6 +90,7 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         ),
         table(head, errors),
         *_measure_errors(rows),
+        *_moment_errors(folder, document.get("by_moment", [])),
         *(
             [paragraph(f"Errors are {BUILT_PAD} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses.")]
             * simulated
@@ -114,6 +115,25 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     ]
     section = PageSection("Calibration", body, results)
     return [section, *([] if (folder / "fibre_loss.json").exists() else fibre_loss_sections(folder, document))]
+
+
+def _moment_errors(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Write a table of the errors while a press is read, by time and failed fibres, and their figure."""
+    if not rows:
+        return []
+    levels = sorted({row["n_failed"] for row in rows})
+    cells = []
+    for first in range(0, len(rows), len(levels)):
+        of_moment = rows[first : first + len(levels)]
+        errors = [cell for row in of_moment for cell in (f"{row['mean_mm']:.2f}", f"{row['within_r90']:.1%}")]
+        cells.append([of_moment[0]["since"], f"{of_moment[0]['time_s']:.2f}", *errors])
+    head = ["since", "time (s)", *(name for level in levels for name in (f"{level} failed (mm)", "in r90"))]
+    caption = "Error by time since the touch and since the lift, and a touch that comes into focus."
+    return [
+        heading("While a press is read"),
+        table(head, cells),
+        figures([(folder / "error_by_moment.png", caption)]),
+    ]
 
 
 def _measure_errors(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -100,6 +100,21 @@ def estimate_commands(presses: Presses, times_s: Array) -> tuple[Indices, Indice
     return np.maximum(down_command, np.concatenate([[0], up_command[:-1]]) + 1), up_command
 
 
+def first_readings(readings: Array, times_s: Array, down_command: Indices, up_command: Indices) -> Indices:
+    """Return the first readings (Q,) that show commanded presses; where none is detected, one that usually does."""
+    touched = detect_presses(readings, times_s).touched
+    usual = np.searchsorted(times_s, times_s[down_command] + TOUCH_DELAY_S)
+    if len(touched):
+        nearest = touched[_nearest(touched, down_command)]
+        usual = np.where((nearest >= down_command - MAX_LEAD) & (nearest < up_command), nearest, usual)
+    return np.minimum(usual, up_command)
+
+
+def _nearest(touched: Indices, down_command: Indices) -> Indices:
+    """(Q,) index of the detected press that each commanded one may be."""
+    return np.minimum(np.searchsorted(touched, down_command - MAX_LEAD), len(touched) - 1)
+
+
 def align_to_detected(
     readings: Array, times_s: Array, down_command: Indices, up_command: Indices
 ) -> tuple[Indices, Indices]:
@@ -113,7 +128,7 @@ def align_to_detected(
     downs, ups = estimate_commands(presses, times_s)
     if len(downs) == 0:
         return down_command, up_command
-    nearest = np.minimum(np.searchsorted(presses.touched, down_command - MAX_LEAD), len(downs) - 1)
+    nearest = _nearest(presses.touched, down_command)
     touched, released = presses.touched[nearest], presses.released[nearest]
     next_down = np.append(down_command[1:], len(readings))
     is_same = (touched >= down_command - MAX_LEAD) & (touched < up_command)

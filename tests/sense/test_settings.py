@@ -26,7 +26,6 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
     assert {key: rig[key] for key in expected} == expected
     chosen = {
         "method": "ensemble",
-        "features": "press_and_release",
         "split": "random",
         "test_share": 0.15,
         "max_failures": 3,

@@ -10,9 +10,10 @@ from unittest.mock import Mock
 import pytest
 
 from padforge.sense import Recording
-from padforge.sense.cli.live import view_lines
+from padforge.sense.cli.live import EventPrinter, view_lines
 from padforge.sense.live import outputs
 from padforge.sense.live.outputs import LivePage
+from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.virtual import virtual_pad
@@ -43,16 +44,22 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
     assert not [key for key in told[0] if key.startswith(("depth", "force"))]
-    assert [each["press"] for each in told] == list(range(len(told)))
-    assert 38 <= len(told) <= 40
+    final = [each["press"] for each in told if each["final"]]
+    assert final == list(range(len(final)))
+    assert 38 <= len(final) <= 40
+    assert len(told) > 20 * len(final)  # every reading
     assert {view["mirrored"] for view in views} == {True}
     assert [view["ended"] for view in views][-2:] == ["", "ended"]
     assert names_in_view("live.html") <= views[-1].keys()
     code, plain, _ = replay()
     assert code == 0, err
     first = told[0]
-    assert plain.splitlines()[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
-    assert len(plain.splitlines()) == len(told)
+    lines = plain.splitlines()
+    assert lines[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
+    assert lines[0].endswith(f"({first['since_s']:.2f} s after the touch)")
+    assert 2 * len(final) <= len(lines) < 12 * len(final)
+    last = [line.split(":")[0] for line in lines if line.endswith("after the lift)")]
+    assert set(last) == {f"press {press}" for press in final}
 
 
 def test_live_sends_to_tcp_and_osc(replay) -> None:
@@ -88,6 +95,18 @@ def test_live_shows_a_rig_until_it_ends(padforge_sense, model, views, monkeypatc
     assert {view["mirrored"] for view in views} == {True}
 
 
+def test_printed_estimates_say_more_than_those_before(capsys: pytest.CaptureFixture[str]) -> None:
+    printer = EventPrinter(as_json=False)
+    for now_s, x_mm, r90_mm, final in (
+        *[(0.0, 0.0, 8.0, False), (0.1, 1.0, 6.5, False), (0.2, 1.0, 6.0, False), (0.3, 6.9, 4.0, False)],
+        *[(0.4, 11.0, 4.0, False), (0.5, 14.9, 4.0, False), (0.6, 15.1, 4.0, False), (0.7, 15.1, 4.0, True)],
+    ):
+        moment = ("touch", 1, now_s, final, x_mm, 0.0, 1.0, 1.0, 1.0, r90_mm, ())
+        printer.print([Estimate(0, 0.0, now_s, *moment)])
+    shown = [line.rpartition("(")[2][:4] for line in capsys.readouterr().out.splitlines()]
+    assert shown == ["0.00", "0.20", "0.30", "0.40", "0.60", "0.70"]
+
+
 def test_live_lines_number_fibres_from_one() -> None:
     fibres = [{"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (None, "dead"))]
     lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "faults": ["fibre 2 was dead"]})
@@ -103,9 +122,9 @@ def test_live_shows_depth_and_force_of_models_that_estimate_them(
     first_presses(deep_recording, 40).save("rec", {})
     words = ("live", "--replay", "rec", "--speed", "1e6", "--port", "0", "--model", "deep")
     told = [json.loads(line) for line in padforge_sense(*words, "--json")[1].splitlines()]
-    deep = [each["depth_mm"] for each in told]
+    deep = [each["depth_mm"] for each in told if each["final"]]
     assert 0 < min(deep) < 2 < 4 < max(deep) < 6
     assert all(each["force_r90_n"] > 0 and each["depth_r90_mm"] > 0 for each in told)
     assert {view["mirrored"] for view in views} == {False}
     first = padforge_sense(*words)[1].splitlines()[0]
-    assert f"{deep[0]:.1f} ± {told[0]['depth_r90_mm']:.1f} mm deep, {told[0]['force_n']:.1f} ± " in first
+    assert f"{told[0]['depth_mm']:.1f} ± {told[0]['depth_r90_mm']:.1f} mm deep, {told[0]['force_n']:.1f} ± " in first

@@ -28,7 +28,7 @@ from padforge.sense.live.outputs import FORMAT, JsonLines, LslOutput, Message, M
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
 
-POSITION = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "failed": []}
+POSITION = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "final": True, "failed": []}
 TOUCH = Message(TOUCHES, {}, {"event": "touch", **POSITION})
 READING = Message(READINGS, {}, {"event": "readings", "time_s": 0.5, "volts": [1.0, None]})
 STATES = Message(HEALTH, {}, {"event": "health", "time_s": 0.0, "states": ["sound", "stuck"]})
@@ -38,7 +38,7 @@ PROTOCOL = Path(__file__).parents[3] / "docs" / "live-protocol.md"
 
 
 def pipeline_of(localizer: LocalizerModel, recording: Recording) -> Live:
-    return Live([localizer], None, recording.fibres, recording.rate_hz)
+    return Live(localizer, None, recording.fibres, recording.rate_hz)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,9 @@ def test_build_gives_every_reading_and_press_as_operations_of_rosbridge(messages
 
 def test_touch_messages_are_metres_with_variances(messages) -> None:
     touches = of_topic(TOUCHES, messages)
-    assert [message.pad["press"] for message in touches] == list(range(len(touches)))
+    final = [message.pad["press"] for message in touches if message.pad["final"]]
+    assert final == list(range(len(final)))
+    assert {message.pad["since"] for message in touches} == {"touch", "lift"}
     for message in touches:
         pose, pad = message.msg["pose"], message.pad
         position, covariance = pose["pose"]["position"], pose["covariance"]
@@ -80,13 +82,13 @@ def test_touch_messages_are_metres_with_variances(messages) -> None:
         assert variances == pytest.approx((pad["std_x_mm"] ** 2, pad["std_y_mm"] ** 2))
         assert (position["z"], covariance[14]) == (0, -1)  # depth was not learnt
         stamp = message.msg["header"]["stamp"]
-        assert stamp["sec"] + stamp["nanosec"] * 1e-9 == pytest.approx(pad["time_s"], abs=1e-9)
+        assert stamp["sec"] + stamp["nanosec"] * 1e-9 == pytest.approx(pad["now_s"], abs=1e-9)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer, mirrored: bool) -> None:
     """From above, y of the plan runs up and x to the right, or to the left if mirrored; depth runs away from above."""
-    estimate = Estimate(0, 1.5, "press_and_release", True, 3, 4, 1, 1, 1, 2, (), depth_mm=2.5, depth_r90_mm=0.5)
+    estimate = Estimate(0, 1.5, 2.0, "touch", 7, 0.5, True, 3, 4, 1, 1, 1, 2, (), depth_mm=2.5, depth_r90_mm=0.5)
     builder = MessageBuilder(pipeline_of(localizer, brief), mirrored)
     (touch,) = of_topic(TOUCHES, list(builder.build(brief.times_s[:1], brief.readings[:1], [estimate])))
     pose = touch.msg["pose"]
@@ -203,7 +205,7 @@ def test_osc_sends_numbers() -> None:
                 osc.send(message)
         received = [OscMessage(receiver.recv(4096)) for _ in range(4)]
     assert [each.address for each in received] == [TOUCHES, PRESSED, HEALTH, READINGS]
-    assert [each.params for each in received[:3]] == [[4, 1.5, -2.25, 0.5, 1.0], [True], ["sound", "stuck"]]
+    assert [each.params for each in received[:3]] == [[4, 1.5, -2.25, 0.5, 1.0, 1], [True], ["sound", "stuck"]]
     np.testing.assert_array_equal(received[3].params, [1.0, np.nan])
 
 
@@ -241,4 +243,4 @@ print(readings.pull_sample(timeout=20)[0], touches.pull_sample(timeout=20)[0])
 """
     monkeypatch.setenv("LSLAPICFG", str(tmp_path / "lsl.cfg"))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert done.stdout.splitlines() == ["fibre 1 V 13.0 2", "[1.0, nan] [4.0, 1.5, -2.25, 0.5, 1.0]"], done.stderr
+    assert done.stdout.splitlines() == ["fibre 1 V 13.0 2", "[1.0, nan] [4.0, 1.5, -2.25, 0.5, 1.0, 1.0]"], done.stderr

@@ -29,8 +29,11 @@ VIEW = {
         {"swing": None, "state": HOSTILE},
     ],
     "presses": [
-        {"press": 7 + k, "x_mm": 1.0 + k, "y_mm": -2.0, "r50_mm": 1.5, "r90_mm": 3.0, "final": k == 0} for k in (0, 1)
+        {"press": 7 + k, "x_mm": 1.0 + k, "y_mm": -2.0, "r50_mm": 1.5, "r90_mm": 3.0, "final": k == 0}
+        | {"measures_text": "", "moment_text": "0.30 s after the touch"}
+        for k in (0, 1)
     ],
+    "track": [[1.0, -12.0], [1.0, -7.0]],
     "faults": [HOSTILE],
 }
 
@@ -179,13 +182,17 @@ def test_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     browser.wait_for("document.querySelectorAll('.fibre').length == 3")
     text = browser.ask("document.body.innerText")
     assert "2.0, -2.0 mm" in text
-    assert "press 8: within 1.5 mm at 50 %, 3.0 mm at 90 %, to be refined" in text
+    assert "press 8: within 1.5 mm at 50 %, 3.0 mm at 90 %, 0.30 s after the touch" in text
     assert text.count(HOSTILE) == 3
     assert ("fibre 1" in text, "fibre 3" in text, "fibre 0" in text) == (True, True, False)
     assert browser.ask("document.images.length") == 0
     count = "document.querySelectorAll('{}').length"
     assert [browser.ask(count.format(f"#pad .{name}")) for name in ("trail", "r50", "r90", "early")] == [1, 1, 1, 1]
     # The pad is 40 mm wide and as wide on the page as its edge; y goes up.
+    points = browser.ask("document.querySelector('#pad .track').getAttribute('points')").split()
+    assert len(points) == 3  # the track, and where the finger is now
+    x, y = (float(part) for part in points[-1].split(","))
+    assert [x, y] == browser.ask("['cx', 'cy'].map(name => +document.querySelector('.position').getAttribute(name))")
     edge, latest, before = (box_of(browser, f"#pad .{part}") for part in ("edge", "r90", "trail"))
     assert latest[2] / edge[2] == pytest.approx(2 * 3.0 / 40)
     assert (latest[0] - before[0]) / edge[2] == pytest.approx(1 / 40)

@@ -1,5 +1,6 @@
-"""The live pipeline gives what the same readings give as a whole recording."""
+"""The live pipeline gives at every reading what the readings up to it give as a whole recording."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -13,9 +14,8 @@ from hypothesis import strategies as st
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate
 from padforge.sense.health.fault_detector import FibreFault
-from padforge.sense.live.pipeline import Estimate, Live
-from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.rig.streams import HISTORY, SLACK
+from padforge.sense.live.pipeline import MAX_TRACK, RELEASE, Estimate, Live
+from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.signals.press_detection import PressEvent
 from tests.sense.conftest import QUICK
 from tests.sense.live.conftest import first_presses
@@ -35,7 +35,7 @@ class ScriptedDetector:
 
     def __init__(self, recording: Recording, delays: tuple[int, int] = (2, 1)) -> None:
         events = (True, delays[0], recording.down_command), (False, delays[1], recording.up_command)
-        self._events = sorted((index + late, down, index) for down, late, at in events for index in at.tolist())
+        self._events = sorted((index + late, index, down) for down, late, at in events for index in at.tolist())
         self._n_readings = 0
 
     def __call__(self, fibres: int) -> "ScriptedDetector":
@@ -44,7 +44,7 @@ class ScriptedDetector:
     def update(self, times_s: np.ndarray, readings: np.ndarray) -> Iterator[PressEvent]:
         self._n_readings += len(times_s)
         while self._events and self._events[0][0] < self._n_readings:
-            _, down, index = self._events.pop(0)
+            _, index, down = self._events.pop(0)
             yield PressEvent(down, index)
 
 
@@ -65,22 +65,27 @@ class ScriptedMonitor:
 
 @pytest.fixture(scope="module")
 def trained(brief: Recording) -> Callable[[str], LocalizerModel]:
-    """Hardly trained localizers by their features, whose positions depend on every reading that they look at."""
+    """Hardly trained localizers by their method, whose positions depend on every reading that they look at."""
 
     @cache
-    def train(features: str) -> LocalizerModel:
-        options = {"features": features, "members": 1, "hidden": 16, "epochs": 1}
+    def train(method: str) -> LocalizerModel:
+        options = {"method": method, "members": 1, "hidden": 16, "epochs": 1}
         return calibrate(brief, QUICK.model_copy(update=options))[0]
 
     return train
 
 
+@pytest.fixture(scope="module")
+def hasty(trained: Callable[[str], LocalizerModel]) -> LocalizerModel:
+    return trained("ensemble")
+
+
 def replay(
-    recording: Recording, models: Sequence[LocalizerModel], delays: tuple[int, int] = (2, 1), cuts: Sequence[int] = ()
+    recording: Recording, model: LocalizerModel, delays: tuple[int, int] = (2, 1), cuts: Sequence[int] = ()
 ) -> tuple[Live, list[Any]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(recording, delays))
-        live = Live(models, None, recording.fibres, recording.rate_hz)
+        live = Live(model, None, recording.fibres, recording.rate_hz)
     events = []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
         events += live.feed(times_s, readings)
@@ -91,29 +96,71 @@ def positions(estimates: Sequence[Estimate]) -> np.ndarray:
     return np.array([[each.x_mm, each.y_mm] for each in estimates])
 
 
-@pytest.mark.parametrize("features", ["press_and_release", "causal", "onset", "published"])
+def moments(recording: Recording, estimates: Sequence[Estimate]) -> np.ndarray:
+    """The first readings that estimates do not look at."""
+    return np.searchsorted(recording.times_s, [each.now_s for each in estimates]) + 1
+
+
+def assert_as_a_whole(recording: Recording, model: LocalizerModel, estimates: Sequence[Estimate], **predict) -> None:
+    """Estimates are what the whole recording gives at their moments, with lifts that were not yet known left out."""
+    until, press = moments(recording, estimates), np.array([each.press for each in estimates])
+    ranks, seen = [], Counter()
+    for each in estimates:
+        ranks.append(seen[each.press])
+        seen[each.press] += 1
+    for rank in set(ranks):
+        rows = np.flatnonzero(np.array(ranks) == rank)
+        untils, up_command = recording.down_command + 1, recording.up_command.copy()
+        untils[press[rows]] = until[rows]
+        held = np.array([row for row in rows if estimates[row].since == "touch"], dtype=int)
+        up_command[press[held]] = np.maximum(up_command[press[held]], until[held])
+        expected = model.predict(replace(recording, up_command=up_command), until=untils, **predict)
+        alike = [estimates[row] for row in rows]
+        np.testing.assert_allclose(positions(alike), expected.positions_mm[press[rows]], atol=1e-3)
+        np.testing.assert_allclose([each.r90_mm for each in alike], expected.r90_mm[press[rows]], rtol=1e-3)
+
+
 @pytest.mark.parametrize("delays", [(0, 0), (2, 1), (6, 3)])
-def test_live_estimates_are_those_of_the_whole_recording(recording, trained, features: str, delays) -> None:
-    part, localizer = first_presses(recording, 60), trained(features)
-    _, events = replay(part, [localizer], delays)
-    expected = localizer.predict(part)
+def test_live_estimates_are_those_of_the_whole_recording(recording, hasty, delays: tuple[int, int]) -> None:
+    part = first_presses(recording, 12)
+    _, events = replay(part, hasty, delays)
+    until = moments(part, events)
+    for press in range(11):
+        estimates = [each for each in events if each.press == press]
+        down, up = int(part.down_command[press]), int(part.up_command[press])
+        end = min(up + RELEASE, int(part.down_command[press + 1]))
+        assert [each.final for each in estimates] == [False] * (len(estimates) - 1) + [True]
+        np.testing.assert_array_equal(
+            until[[each.press == press for each in events]], np.arange(down + delays[0] + 1, end + 1)
+        )
+        np.testing.assert_allclose([each.time_s for each in estimates], part.times_s[down])
+        for each, index in zip(estimates, range(down + delays[0], end), strict=True):
+            first = down if index < up + delays[1] else up
+            assert each.since == ("touch" if first == down else "lift")
+            assert each.readings == index - first + 1
+            assert each.since_s == pytest.approx(part.times_s[index] - part.times_s[first])
+    assert_as_a_whole(part, hasty, events)
+
+
+def test_published_localizer_answers_once_a_press_is_over(recording, trained) -> None:
+    part, localizer = first_presses(recording, 60), trained("published")
+    _, events = replay(part, localizer)
     assert [each.press for each in events] == list(range(len(events)))
     assert len(events) >= 59  # the last press is complete only with readings that show so
-    np.testing.assert_allclose(positions(events), expected.positions_mm[: len(events)], atol=1e-3)
-    np.testing.assert_allclose([each.r90_mm for each in events], expected.r90_mm[: len(events)], rtol=1e-3)
-    np.testing.assert_allclose([each.time_s for each in events], part.times_s[part.down_command[: len(events)]])
+    assert all(each.final and each.since == "lift" for each in events)
+    assert_as_a_whole(part, localizer, events)
 
 
 @settings(max_examples=15)
 @given(st.lists(st.integers(0, 8 * 40), max_size=6))
-def test_live_events_do_not_depend_on_blocks(recording, trained, cuts: list[int]) -> None:
-    part, models = first_presses(recording, 8), [trained(name) for name in ("press_and_release", "onset")]
-    assert replay(part, models, cuts=sorted(cuts))[1] == replay(part, models)[1]
+def test_live_events_do_not_depend_on_blocks(recording, hasty, cuts: list[int]) -> None:
+    part = first_presses(recording, 8)
+    assert replay(part, hasty, cuts=sorted(cuts))[1] == replay(part, hasty)[1]
 
 
 @settings(max_examples=30)
 @given(st.lists(st.integers(1, 45), min_size=14, max_size=14))
-def test_live_handles_presses_of_any_length_and_distance(recording, trained, lengths: list[int]) -> None:
+def test_live_handles_presses_of_any_length_and_distance(recording, hasty, lengths: list[int]) -> None:
     """Down to presses of one reading, and such that follow at once."""
     part = first_presses(recording, 12)
     edges = 12 + np.cumsum(lengths)
@@ -121,48 +168,84 @@ def test_live_handles_presses_of_any_length_and_distance(recording, trained, len
     edges = edges[: len(edges) // 2 * 2]
     down_command, up_command = edges[::2], edges[1::2]
     odd = Recording(part.readings, part.times_s, part.presses_mm[: len(down_command)], down_command, up_command)
-    _, events = replay(odd, [trained("press_and_release")], delays=(0, 0))
-    np.testing.assert_allclose(positions(events), trained("press_and_release").predict(odd).positions_mm, atol=1e-3)
+    _, events = replay(odd, hasty, delays=(0, 0))
+    final = [each for each in events if each.final]
+    np.testing.assert_allclose(positions(final), hasty.predict(odd).positions_mm, atol=1e-3)
+    assert_as_a_whole(odd, hasty, events)
 
 
-def test_live_estimates_early_and_refines(recording, trained) -> None:
-    names = ("press_and_release", "onset", "causal")
-    live, events = replay(first_presses(recording, 6), [trained(name) for name in names])
-    order = [(0, "onset"), (0, "causal"), (0, names[0]), (1, "onset"), (1, "causal"), (1, names[0])]
-    assert [(each.press, each.features) for each in events[:6]] == order
-    assert all(each.final == (each.features == names[0]) for each in events)
-    assert [each.press for each in live.presses] == [0, 1, 2, 3, 4, 5]
+def test_a_press_that_the_next_one_cuts_off_ends_where_that_began(recording, hasty) -> None:
+    """Though it is known only some readings later."""
+    part = first_presses(recording, 4)
+    down_command = part.down_command.copy()
+    down_command[2] = part.up_command[1] + 5
+    part = replace(part, down_command=down_command)
+    live, events = replay(part, hasty, (3, 1))
+    *_, before, last = (each for each in events if each.press == 1)
+    assert (before.final, before.readings, last.final, last.since, last.readings) == (False, 8, True, "lift", 5)
+    assert events[events.index(last) + 1].press == 2
+    assert_as_a_whole(part, hasty, [last])
+    assert [each.press for each in live.presses] == [0, 1, 2, 3]
 
 
-def test_live_handles_a_press_that_is_held_for_hours(recording, trained) -> None:
-    part, held = first_presses(recording, 110), 105
-    # So long that old readings are dropped for the second time within the press.
-    n_extra = 3 * (HISTORY + SLACK) - int(part.down_command[107]) - 5
-    at = int(part.up_command[held]) - 2
-    readings = np.insert(part.readings, at, np.repeat(part.readings[at : at + 1], n_extra, axis=0), axis=0)
-    later = np.arange(110) > held
-    commands = part.down_command + n_extra * later, part.up_command + n_extra * (later | (np.arange(110) == held))
-    long = Recording(readings, np.arange(len(readings)) / part.rate_hz, part.presses_mm, *commands)
-    localizer = trained("press_and_release")
-    _, events = replay(long, [localizer])
-    np.testing.assert_allclose(positions(events)[held:109], localizer.predict(long).positions_mm[held:109], atol=1e-3)
+def test_a_tap_that_its_release_shows_is_estimated_from_then_on(recording, hasty) -> None:
+    part = first_presses(recording, 1)
+    part = replace(part, up_command=part.down_command + 5)
+    _, events = replay(part, hasty, (8, 3))
+    assert [(each.since, each.readings) for each in events] == [("lift", n) for n in range(4, RELEASE + 1)]
+    assert_as_a_whole(part, hasty, events)
 
 
-def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, trained, monkeypatch) -> None:
-    part, localizer, monitor = first_presses(recording, 12), trained("press_and_release"), ScriptedMonitor()
+def test_radii_shrink_as_a_press_goes_on(recording, localizer) -> None:
+    _, events = replay(first_presses(recording, 30), localizer)
+    by_moment = {
+        (since, readings): np.mean([e.r90_mm for e in events if (e.since, e.readings) == (since, readings)])
+        for since, readings in (("touch", 3), ("touch", 20), ("lift", RELEASE))
+    }
+    first, settled, last = by_moment.values()
+    assert first > settled > last
+    inside = [
+        np.hypot(e.x_mm - recording.presses_mm[e.press, 0], e.y_mm - recording.presses_mm[e.press, 1]) < e.r90_mm
+        for e in events
+    ]
+    assert np.mean(inside) > 0.7  # at any moment
+
+
+def test_live_handles_a_press_that_is_held_for_hours(recording, hasty, monkeypatch) -> None:
+    """So long that old readings are dropped for the second time within the press."""
+    history, slack, held = 300, 200, 5
+    for module in ("rig.streams", "live.pipeline"):
+        monkeypatch.setattr(f"padforge.sense.{module}.HISTORY", history)
+        monkeypatch.setattr(f"padforge.sense.{module}.SLACK", slack)
+    part = first_presses(recording, 6)
+    assert part.down_command[held] < history
+    n_extra, at = 5 * (history + slack), int(part.up_command[held]) - 2
+    wander = np.random.default_rng(1).normal(0, 3e-3, (n_extra, part.fibres)).cumsum(axis=0) / 10
+    readings = np.insert(part.readings, at, part.readings[at] + wander, axis=0)
+    up_command = part.up_command + n_extra * (np.arange(6) == held)
+    times_s = np.arange(len(readings)) / part.rate_hz
+    long = Recording(readings, times_s, part.presses_mm, part.down_command, up_command)
+    _, events = replay(long, hasty)
+    estimates = [each for each in events if each.press == held]
+    assert len(estimates) == up_command[held] - part.down_command[held] - 2 + RELEASE
+    assert_as_a_whole(long, hasty, [*estimates[:60], *estimates[60:-60:60], *estimates[-60:]])
+    assert len({each.x_mm for each in estimates}) > n_extra / 2  # where the finger is now may change
+
+
+def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monkeypatch) -> None:
+    part, monitor = first_presses(recording, 12), ScriptedMonitor()
     down_command, up_command = part.down_command.copy(), part.up_command.copy()
     down_command[8], up_command[8] = up_command[7] + 4, up_command[7] + 20  # soon after the one before
     part = replace(part, down_command=down_command, up_command=up_command)
     monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live([localizer], localizer, part.fibres, part.rate_hz)  # a stand-in for health, of the same pad
+    live = Live(hasty, hasty, part.fibres, part.rate_hz)  # a stand-in for health, of the same pad
     events = live.feed(part.times_s, part.readings)
     fault = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
     estimates = [event for event in events if isinstance(event, Estimate)]
-    assert [event.press for event in events[:fault]] == [0, 1, 2, 3, 4, 5]
-    assert [each.failed for each in estimates] == [()] * 6 + [(1,)] * (len(estimates) - 6)
-    expected = localizer.predict(part, (1,)).positions_mm
-    np.testing.assert_allclose(positions(estimates)[6:], expected[6 : len(estimates)], atol=1e-3)
+    assert (events[fault - 1].press, events[fault - 1].final, events[fault + 1].press) == (5, True, 6)
+    assert all(each.failed == (() if each.press < 6 else (1,)) for each in estimates)
+    assert_as_a_whole(part, hasty, estimates[fault:], failed=(1,))
     view = live.view()
     assert [fibre["state"] for fibre in view["fibres"]] == ["sound", "no_response", "sound", "sound"]
     assert view["faults"] == [live.faults[0].text]
@@ -173,23 +256,24 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, trained, mo
         np.testing.assert_array_equal(readings, part.readings[first:end])
 
 
-def test_live_without_readings_says_anywhere(recording, trained) -> None:
-    part, scaler = first_presses(recording, 3), trained("press_and_release").scaler
+def test_live_without_readings_says_anywhere(recording, hasty) -> None:
+    part, scaler = first_presses(recording, 3), hasty.scaler
     readings = part.readings.copy()
     readings[int(part.down_command[1]) - 12 :] = np.nan
-    live, events = replay(replace(part, readings=readings), [trained("press_and_release")])
-    assert events[1].failed == (0, 1, 2, 3)
-    assert (events[1].x_mm, events[1].y_mm) == pytest.approx(tuple(scaler.origin_mm))
-    assert events[1].r90_mm > scaler.scale_mm
+    live, events = replay(replace(part, readings=readings), hasty)
+    for estimate in (each for each in events if each.press == 1):
+        assert estimate.failed == (0, 1, 2, 3)
+        assert (estimate.x_mm, estimate.y_mm) == pytest.approx(tuple(scaler.origin_mm))
+        assert estimate.r90_mm > scaler.scale_mm
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
 
 
-def test_view_follows_the_pad(recording, trained, monkeypatch) -> None:
+def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
     part = first_presses(recording, 3)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live([trained("press_and_release")], None, part.fibres, part.rate_hz)
+    live = Live(hasty, None, part.fibres, part.rate_hz)
     missing = [{"swing": None, "state": "missing"}] * 4
-    assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "faults": []}
+    assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "track": [], "faults": []}
     down, up = int(part.down_command[0]) + 15, int(part.up_command[0]) + 18
     swings = []
     for first, end in ((0, 15), (15, down), (down, up)):
@@ -198,13 +282,41 @@ def test_view_follows_the_pad(recording, trained, monkeypatch) -> None:
         assert live.pressed == (end == down)
     assert swings[0] < 0.1 < 0.3 < swings[1]
     assert swings[2] < 0.75 * swings[1]  # what remains of a press is half of it
+    (press,) = live.view()["presses"]
+    assert press["moment_text"] == f"{press['since_s']:.2f} s after the lift"
+    assert press["text"].endswith(f" mm at 90 % ({press['moment_text']})")
 
 
-def test_live_refuses_what_does_not_fit(recording, trained) -> None:
-    localizer = trained("press_and_release")
+def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monkeypatch) -> None:
+    """It moves by 1 mm a reading, known to 8 mm at first and then to 2 mm."""
+    part = first_presses(recording, 2)
+    up_command = part.up_command.copy()
+    up_command[0] = part.down_command[1] - 2
+    path = iter(range(1000))
+
+    def predict_features(model, presses) -> Localization:
+        x = next(path)
+        r90 = np.array([8.0 if x == 0 else 2.0])
+        return Localization(np.array([[float(x), 0.0]]), np.ones((1, 2)), r90 / 2, r90)
+
+    monkeypatch.setattr(LocalizerModel, "predict_features", predict_features)
+    part = replace(part, up_command=up_command)
+    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
+    live, next_down = Live(hasty, None, part.fibres, part.rate_hz), int(part.down_command[1])
+    live.feed(part.times_s[:next_down], part.readings[:next_down])
+    track = live.view()["track"]
+    assert 1 < len(track) <= MAX_TRACK
+    assert track == [[1.0 + 3 * k, 0.0] for k in range(len(track))]
+    live.feed(part.times_s[next_down:][:3], part.readings[next_down:][:3])
+    assert len(live.view()["track"]) == 1  # of the next press
+
+
+def test_live_refuses_what_does_not_fit(recording, hasty) -> None:
     with pytest.raises(InputError, match="within 25%"):
-        Live([localizer], None, 4, 20.0)
-    live = Live([localizer], None, 4, localizer.rate_hz)
+        Live(hasty, None, 4, 20.0)
+    with pytest.raises(InputError, match="fitted to arrays"):
+        Live(replace(hasty, features="array"), None, 4, hasty.rate_hz)
+    live = Live(hasty, None, 4, hasty.rate_hz)
     live.feed(recording.times_s[:9], recording.readings[:9])
     with pytest.raises(InputError, match=r"times begin at .* later than"):
         live.feed(recording.times_s[8:12], recording.readings[8:12])

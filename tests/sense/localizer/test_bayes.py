@@ -8,7 +8,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.bayes import N_SUMMARY, PRIOR_WEIGHT, BayesianLocalizer
+from padforge.sense.localizer.bayes import (
+    COARSENING,
+    N_SUMMARY,
+    PRIOR_WEIGHT,
+    STAGES,
+    BayesianLocalizer,
+    fit_stages,
+    stage_of,
+)
+from padforge.sense.localizer.features import N_FEATURES, N_TIMED, NOW
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Response = Callable[[np.ndarray], np.ndarray]
@@ -110,7 +119,7 @@ def test_predict_spreads_over_positions_of_equal_response() -> None:
 
 def test_grid_positions_stand_for_their_cells() -> None:
     """A fibre without noise that gives the position itself: what blurs it is where in its cell a press lies."""
-    axis, nodes = np.linspace(-1, 1, SIDE), np.linspace(-1, 1, (SIDE + 1) // 2)
+    axis, nodes = np.linspace(-1, 1, SIDE), np.linspace(-1, 1, (SIDE - 1) // COARSENING + 1)
     table = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)[:, :, None]
     rng = np.random.default_rng(0)
     positions = rng.uniform(-1, 1, (PRESSES, 2))
@@ -172,3 +181,30 @@ def test_transformed_can_be_repeated(fitted_waves: Fitted) -> None:
     moved, as_before = bayes.transformed(turn, shift).transformed(turn, shift).predict(inputs[:30], fibre_mask)
     np.testing.assert_allclose(moved, (place @ turn.T + shift) @ turn.T + shift, atol=1e-6)
     assert np.array_equal(summary, as_before)
+
+
+def test_fit_stages_know_only_what_is_complete() -> None:
+    """Neither later windows nor those of now move the position that a stage finds; the last one uses every window."""
+    rng = np.random.default_rng(0)
+    grid = np.linspace(-1, 1, SIDE)
+    at = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    slopes = rng.standard_normal((2, 2 * N_FEATURES))
+    table = (at @ slopes).reshape(SIDE, SIDE, 2, N_FEATURES).astype(np.float32)
+    places = rng.uniform(-1, 1, (200, 2))
+    inputs = (places @ slopes).reshape(200, 2, N_FEATURES) + NOISE * rng.standard_normal((200, 2, N_FEATURES))
+    fibre_mask = np.ones((200, 2), dtype=bool)
+    stages = fit_stages(table, inputs, fibre_mask, places, N_TIMED)
+    assert len(stages) == len(STAGES)
+    for n_complete, stage in zip(STAGES, stages, strict=True):
+        spoilt = inputs.copy()
+        spoilt[:, :, n_complete : N_TIMED + len(NOW)] = 77.0
+        found, _ = stage.predict(spoilt, fibre_mask)
+        assert np.array_equal(found, stage.predict(inputs, fibre_mask)[0])
+        spoilt[:, :, n_complete - 1] = 77.0
+        assert not np.array_equal(found, stage.predict(spoilt, fibre_mask)[0])
+    assert len(fit_stages(table, inputs, fibre_mask, places, 0)) == 1
+
+
+def test_stage_of_is_the_latest_that_is_complete() -> None:
+    assert [stage_of(count, N_TIMED) for count in range(N_TIMED + 1)] == [None] * 12 + [0, 1, 2, 3, 3, 4]
+    assert stage_of(0, 0) == 0

@@ -10,7 +10,6 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, recalibrate
 from padforge.sense.localizer import training
-from padforge.sense.localizer.features import FEATURES
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.response_model import ResponseModel
 from padforge.sense.settings import LocalizerSettings
@@ -48,10 +47,11 @@ def worst(seed: int, recording: Recording) -> Recording:
 
 
 def require_finite(localizer: LocalizerModel, recording: Recording, document: Any = ()) -> None:
-    found = localizer.predict(recording)
-    assert np.isfinite(np.column_stack([found.positions_mm, found.std_mm, found.r50_mm, found.r90_mm])).all()
-    assert (found.std_mm > 0).all()
-    assert (found.r50_mm > 0).all()
+    for readings in (0, 3, 20, 22, None):
+        found = localizer.predict(recording, until=None if readings is None else recording.down_command + readings)
+        assert np.isfinite(np.column_stack([found.positions_mm, found.std_mm, found.r50_mm, found.r90_mm])).all()
+        assert (found.std_mm > 0).all()
+        assert (found.r50_mm > 0).all()
     json.dumps(document, allow_nan=False)
 
 
@@ -61,11 +61,11 @@ def test_predict_and_evaluate_stay_finite(localizer: LocalizerModel, brief: Reco
     require_finite(localizer, one, evaluate(localizer, one, (0, 3)).to_dict() if one.has_position.any() else ())
 
 
-@pytest.mark.parametrize(("seed", "features"), enumerate([*FEATURES, *FEATURES]))
-def test_calibrate_learns_or_refuses(brief: Recording, seed: int, features: str) -> None:
+@pytest.mark.parametrize(("seed", "method"), enumerate([*["ensemble"] * 6, *["published"] * 2]))
+def test_calibrate_learns_or_refuses(brief: Recording, seed: int, method: str) -> None:
     one = worst(seed, brief)
     try:
-        localizer, evaluation = calibrate(one, TINY.model_copy(update={"features": features}))
+        localizer, evaluation = calibrate(one, TINY.model_copy(update={"method": method}))
     except InputError:
         return
     require_finite(localizer, one, evaluation.to_dict())

@@ -1,4 +1,4 @@
-"""Features of presses: where windows lie, that they stay within press and fibre, and how they are scaled."""
+"""Features of presses: where windows lie, that they stay within press, moment and fibre, and how they are scaled."""
 
 from dataclasses import replace
 
@@ -7,10 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.features import FEATURES, PressFeatures, compute_features, interpolate_gaps
+from padforge.sense.localizer.features import (
+    DOWN,
+    N_HISTORY,
+    N_TIMED,
+    NOW,
+    UP,
+    PressFeatures,
+    compute_features,
+    interpolate_gaps,
+)
 from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
+N_WINDOWS = N_TIMED + len(NOW)
 DOWN_COMMAND = 40 * np.arange(PRESSES) + 20
 UP_COMMAND = DOWN_COMMAND + 20
 
@@ -19,57 +29,87 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((40 * PRESSES, FIBRES))
 
 
-def windows_of(readings: np.ndarray, features: str) -> np.ndarray:
-    return compute_features(readings, DOWN_COMMAND, UP_COMMAND, features).windows
+def windows_of(readings: np.ndarray, is_published: bool, until: int | None = None) -> np.ndarray:
+    moments = None if until is None else DOWN_COMMAND + until
+    return compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments, is_published).windows
 
 
 def test_compute_features_takes_means_and_medians() -> None:
     """Of noise; and of a ramp that counts itself, with a press from 5000 to 5020 and its rest 5.5 before it."""
     readings = noise()
-    found, rest = windows_of(readings, "press_and_release")[2], readings[90:100].mean(axis=0)
+    found, rest = windows_of(readings, False)[2], readings[90:100].mean(axis=0)
     assert np.allclose(found[:, 7], readings[112:116].mean(axis=0) - rest)
     assert np.allclose(found[:, 9 + 6], readings[129:134].mean(axis=0) - rest)
     expected = [np.median(readings[at - 7 : at + 8], axis=0) for at in (90, 110, 130)]
-    assert np.allclose(windows_of(readings, "published")[2], np.stack(expected, axis=1))
+    assert np.allclose(windows_of(readings, True)[2], np.stack(expected, axis=1))
     ramp = np.arange(5100.0)[:, None]
     down_command, up_command = np.array([5000]), np.array([5020])
     down = [1, 2, 3, 4, 5, 6.5, 9.5, 13.5, 17.5]
     up = [20, 21, 22, 23, 24.5, 27, 31, 36.5]
+    now = [19, 18]
     past = [-1.5, -4, -8, -13, -17, -19.5, -25.5, -35.5, -45.5, -55.5, -70.5, -90.5, -110.5, -140.5]
     slow = [-402, -2010]
-    for features, windows in (("press_and_release", down + up), ("causal", down), ("onset", down[:6])):
-        found = compute_features(ramp, down_command, up_command, features)
-        np.testing.assert_allclose(found.windows[0, 0], np.array(windows) + 5.5)
-        np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
-    np.testing.assert_allclose(
-        compute_features(ramp, down_command, up_command, "published").windows[0, 0], [4990 - 0, 5010, 5030]
-    )
+    found = compute_features(ramp, down_command, up_command)
+    np.testing.assert_allclose(found.windows[0, 0], np.array(down + up + now) + 5.5)
+    np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
+    assert found.seen.all()
+    published = compute_features(ramp, down_command, up_command, is_published=True)
+    np.testing.assert_allclose(published.windows[0, 0], [4990, 5010, 5030])
+    assert (published.history.shape, published.seen.shape) == ((1, 1, 0), (1, 0))
 
 
-@pytest.mark.parametrize(
-    ("name", "end"), [("press_and_release", 140), ("published", 140), ("causal", 120), ("onset", 108)]
-)
-def test_compute_features_stays_within_press_and_fibre(name: str, end: int) -> None:
-    """Up to the next press; without the release, up to its end; early, of the first 8 readings alone."""
+@pytest.mark.parametrize(("until", "now"), [(1, [0, 0]), (2, [1, 0]), (9, [8, 7]), (20, [19, 18]), (29, [19, 18])])
+def test_compute_features_says_where_the_finger_is_now(until: int, now: list[int]) -> None:
+    """The latest readings before the moment; once the press has ended, the last of it. Of a ramp that counts itself."""
+    ramp = np.arange(5100.0)[:, None]
+    found = compute_features(ramp, np.array([5000]), np.array([5020]), np.array([5000 + until]))
+    np.testing.assert_allclose(found.windows[0, 0, N_TIMED:], np.array(now) + 5.5)
+    assert found.seen.sum() == sum(end <= until for _, end in DOWN) + sum(20 + end <= until for _, end in UP)
+
+
+@pytest.mark.parametrize(("is_published", "until", "end"), [(False, None, 140), (True, None, 140), (False, 6, 106)])
+def test_compute_features_stays_within_press_and_fibre(is_published: bool, until: int | None, end: int) -> None:
+    """Up to the next press, or up to the moment."""
     readings, press = noise(), 2
-    before = windows_of(readings, name)
+    before = windows_of(readings, is_published, until)
     readings[:, 1] = noise(1)[:, 1]
-    after = windows_of(readings, name)
+    after = windows_of(readings, is_published, until)
     assert np.array_equal(after[:, [0, 2]], before[:, [0, 2]])
     assert not np.array_equal(after[:, 1], before[:, 1])
     readings[:80] = readings[end:] = 99
-    assert np.array_equal(windows_of(readings, name)[press], after[press])
+    assert np.array_equal(windows_of(readings, is_published, until)[press], after[press])
 
 
-@pytest.mark.parametrize("name", FEATURES)
+@settings(max_examples=30)
+@given(until=st.integers(1, 60), press=st.integers(0, PRESSES - 1))
+def test_compute_features_ignores_readings_after_the_moment(until: int, press: int) -> None:
+    readings, moments = noise(), DOWN_COMMAND + until
+    before = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[[press]]
+    readings[moments[press] :] = 99
+    after = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[[press]]
+    assert all(
+        np.array_equal(one, other) for one, other in zip(vars(after).values(), vars(before).values(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("is_published", [False, True])
 @settings(max_examples=20)
-@given(gaps=st.lists(st.integers(1, 30), min_size=2, max_size=20), after=st.integers(0, 30))
-def test_compute_features_takes_presses_of_any_length(name: str, gaps: list[int], after: int) -> None:
+@given(
+    gaps=st.lists(st.integers(1, 30), min_size=2, max_size=20),
+    after=st.integers(0, 30),
+    until=st.none() | st.integers(-9, 60),
+)
+def test_compute_features_takes_presses_of_any_length(
+    is_published: bool, gaps: list[int], after: int, until: int | None
+) -> None:
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     readings = np.random.default_rng(0).uniform(1, 2, (edges[-1] + after, 2))
-    found = compute_features(readings, edges[::2], edges[1::2], name)
-    assert found.windows.shape == (len(edges) // 2, 2, FEATURES[name].n_windows)
-    assert found.history.shape == (len(edges) // 2, 2, FEATURES[name].n_history)
+    moments = None if until is None else edges[::2] + until
+    found = compute_features(readings, edges[::2], edges[1::2], moments, is_published)
+    presses = len(edges) // 2
+    assert found.windows.shape == (presses, 2, 3 if is_published else N_WINDOWS)
+    assert found.history.shape == (presses, 2, 0 if is_published else N_HISTORY)
+    assert found.seen.shape == (presses, 0 if is_published else N_TIMED)
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
     assert found.fibre_mask.all()
@@ -84,24 +124,31 @@ def test_interpolate_gaps_fills_gaps_only() -> None:
     assert np.array_equal(filled[:3, 1], np.repeat(readings[3, 1], 3))
     there = ~np.isnan(holed)
     assert np.array_equal(filled[there], readings[there])
-    assert compute_features(holed, DOWN_COMMAND, UP_COMMAND, "press_and_release").fibre_mask.all()
+    assert compute_features(holed, DOWN_COMMAND, UP_COMMAND).fibre_mask.all()
 
 
 @pytest.mark.parametrize(
-    ("features", "first", "end"),
-    [("press_and_release", -10, 40), ("causal", -10, 20), ("onset", -10, 20), ("published", -10, 40)],
+    ("is_published", "until", "first", "end"),
+    [(False, None, -10, 40), (False, 20, -10, 20), (False, 6, -10, 6), (True, None, -10, 40)],
 )
-def test_fibre_mask_needs_three_quarters_of_readings(features: str, first: int, end: int) -> None:
+def test_fibre_mask_needs_three_quarters_of_readings(
+    is_published: bool, until: int | None, first: int, end: int
+) -> None:
     """Press 2 is sent down at 100 and up at 120; the last readings that count are what is missing."""
+
+    def computed(readings: np.ndarray) -> PressFeatures:
+        moments = None if until is None else DOWN_COMMAND + until
+        return compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments, is_published)
+
     most = (end - first) // 4
     for missing, there in ((most, True), (most + 1, False)):
         for begin in (100 + first, 100 + end - missing):
             readings = noise()
             readings[begin : begin + missing, 1] = np.nan
-            assert compute_features(readings, DOWN_COMMAND, UP_COMMAND, features).fibre_mask[2, 1] == there
+            assert computed(readings).fibre_mask[2, 1] == there
     readings = noise()
     readings[50 : 100 + first, 1] = readings[100 + end : 140, 1] = readings[:, 2] = np.nan
-    found = compute_features(readings, DOWN_COMMAND, UP_COMMAND, features)
+    found = computed(readings)
     assert found.fibre_mask[2].tolist() == [True, True, False]
     assert np.isfinite(found.windows).all()
 
@@ -114,9 +161,8 @@ def made(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
     fibre_mask = np.ones((presses, FIBRES), dtype=bool)
     fibre_mask[::4, 2] = False
     windows[::4, 2] = 1e3
-    return PressFeatures(windows, np.empty((presses, FIBRES, 0)), fibre_mask), rng.uniform(
-        (-20, 0), (30, 10), (presses, 2)
-    )
+    features = PressFeatures(windows, np.empty((presses, FIBRES, 0)), fibre_mask, np.empty((presses, 0), dtype=bool))
+    return features, rng.uniform((-20, 0), (30, 10), (presses, 2))
 
 
 def test_scaler_standardizes_features_and_positions() -> None:

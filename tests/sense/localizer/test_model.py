@@ -26,7 +26,6 @@ from padforge.sense.localizer.model import (
     write_localization,
 )
 from padforge.sense.localizer.model_files import ModelFiles, files_of
-from padforge.sense.localizer.scaler import ScaledFeatures
 from tools.kills import killed
 
 
@@ -36,7 +35,7 @@ def test_predict_ignores_failed_fibres(localizer: LocalizerModel, recording: Rec
     spoilt[:, 1] = np.nan
     masked = localizer.predict_features(presses, [1])
     assert np.array_equal(
-        localizer.predict_features(ScaledFeatures(spoilt, presses.fibre_mask), [1]).positions_mm, masked.positions_mm
+        localizer.predict_features(replace(presses, inputs=spoilt), [1]).positions_mm, masked.positions_mm
     )
     assert not np.array_equal(masked.positions_mm, localizer.predict_features(presses).positions_mm)
     readings = np.array(recording.readings)
@@ -68,6 +67,36 @@ def test_predict_widens_radii_with_fewer_fibres(localizer: LocalizerModel, recor
     assert localizer.predict_features(presses[:0]).positions_mm.shape == (0, 2)
 
 
+@pytest.mark.parametrize("until", [1, 2, 4, 9, 19, 20, 21, 23, 28, 39])
+def test_predict_at_a_moment_is_that_of_a_recording_cut_off_there(
+    localizer: LocalizerModel, recording: Recording, until: int
+) -> None:
+    press = 100
+    moments = recording.down_command + until
+    end, kept = int(moments[press]), slice(press + 1)
+    presses = {name: getattr(recording, name)[kept] for name in ("presses_mm", "down_command", "up_command")}
+    presses["up_command"] = np.minimum(presses["up_command"], end)
+    cut = localizer.predict(Recording(recording.readings[:end], recording.times_s[:end], **presses))
+    readings = np.array(recording.readings)
+    readings[end:] = np.random.default_rng(0).uniform(0, 5, readings[end:].shape)
+    for found in (recording, replace(recording, readings=readings)):
+        whole = localizer.predict(found, until=moments)
+        np.testing.assert_allclose(whole.positions_mm[press], cut.positions_mm[press], atol=1e-4)
+        np.testing.assert_allclose(whole.r90_mm[press], cut.r90_mm[press], rtol=1e-4)
+
+
+def test_predict_takes_presses_at_several_moments(localizer: LocalizerModel, recording: Recording) -> None:
+    """Each press is predicted as if all of them were at its moment; at the last one, as without one."""
+    lengths = np.random.default_rng(0).integers(0, 41, len(recording.down_command))
+    mixed = localizer.predict(recording, until=recording.down_command + lengths)
+    for length in (0, 3, 20, 24, 40):
+        alike = localizer.predict(recording, until=recording.down_command + length)
+        rows = lengths == length
+        np.testing.assert_allclose(mixed.positions_mm[rows], alike.positions_mm[rows], atol=1e-4)
+        np.testing.assert_allclose(mixed.r90_mm[rows], alike.r90_mm[rows], rtol=1e-4)
+    np.testing.assert_allclose(alike.positions_mm, localizer.predict(recording).positions_mm, atol=1e-4)
+
+
 def test_predict_refuses_unknown_fibres_and_other_pads(localizer: LocalizerModel, recording: Recording) -> None:
     presses = localizer.scaled_features(recording)
     for failed, message in (([4], "failed is .4., expected indices of fibres, 0 to 3"), (range(4), "all 4 fibres")):
@@ -94,7 +123,7 @@ def test_predict_gives_intervals_of_depth_and_force(deep_localizer: LocalizerMod
     np.testing.assert_allclose(whole["force_n"].values, 3 * whole["depth_mm"].values, atol=2)
     assert (whole["depth_mm"].r90 > 0).all()
     assert fewer["depth_mm"].r90.mean() > whole["depth_mm"].r90.mean()
-    blind = ScaledFeatures(presses.inputs, np.zeros_like(presses.fibre_mask))
+    blind = replace(presses, fibre_mask=np.zeros_like(presses.fibre_mask))
     depth = deep_localizer.predict_features(blind).measures["depth_mm"]
     assert depth.values == pytest.approx(2.75, abs=0.05)
     assert depth.r90 == pytest.approx(2.25, abs=0.05)
@@ -124,13 +153,20 @@ def test_write_localization_writes_one_line_a_press(tmp_path: Path) -> None:
 Change = Callable[[Any], dict[str, Any]]
 
 
+def changed_networks(localizer: LocalizerModel, change: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+    """Its networks, of which that of one phase is changed."""
+    return {"networks": {**localizer.networks, "settled": change(localizer.networks["settled"])}}
+
+
 @pytest.mark.parametrize(
     ("path", "value", "named"),
     [
-        ("features", "published", r"scaler\.mean_v"),
+        ("features", "published", "expected both published or neither"),
+        ("features", "array", r"scaler\.history_coef"),
         ("method", "published", "force_n of method published"),
         ("interval_factors.0", [1.0, 1.0], "interval_factors"),
-        ("interval_factors.0.0", -1.0, "interval_factors"),
+        ("interval_factors", [[]] * 18, r"interval_factors has shape .18, 0."),
+        ("interval_factors.0.0.0", -1.0, "interval_factors"),
         ("scaler.history_coef.0.0", [1.0], r"scaler\.history_coef"),
         ("scaler.scale_v.0.0", 0.0, "scale_v"),
         ("scaler.mean_v.0.0", np.nan, "mean_v"),
@@ -139,7 +175,7 @@ Change = Callable[[Any], dict[str, Any]]
         *(("test", value, "test") for value in ([-1], [True], [3, 3])),
         ("more", 1, "more"),
         ("scaler.measures", [{"name": "force_n", "origin": 1.0, "scale": 1.0}], "force_n of method ensemble"),
-        ("scaler.measures", [], "interval_factors has shape .4, 5."),
+        ("scaler.measures", [], "interval_factors has shape .18, 4, 5."),
     ],
 )
 def test_load_refuses_documents_out_of_range(
@@ -158,16 +194,19 @@ def test_load_refuses_documents_out_of_range(
 @pytest.mark.parametrize(
     "change",
     [
-        lambda of: {"weights": of.weights | {"first.w": of.weights["first.w"] + np.float32(1e30)}},
-        lambda of: {"weights": of.weights | {"hidden.b": of.weights["hidden.b"].astype(np.float64)}},
-        lambda of: {"weights": {name: weight for name, weight in of.weights.items() if name != "last.w"}},
+        lambda of: changed_networks(of, lambda weights: weights | {"first.w": weights["first.w"] + np.float32(1e30)}),
+        lambda of: changed_networks(of, lambda weights: weights | {"hidden.b": weights["hidden.b"].astype(np.float64)}),
+        lambda of: changed_networks(of, lambda weights: {"last.w": weights["last.w"]}),
+        lambda of: changed_networks(of, lambda weights: {}),
+        lambda of: {"networks": of.networks | {"later": of.networks["released"]}},
         lambda of: {"residual_network": {name: weight * np.nan for name, weight in of.residual_network.items()}},
-        lambda of: {"bayes": replace(of.bayes, grid=of.bayes.grid[1:])},
-        lambda of: {"bayes": replace(of.bayes, linearization=-of.bayes.linearization)},
+        lambda of: {"bayes": of.bayes[:-1]},
+        lambda of: {"bayes": (*of.bayes[:-1], replace(of.bayes[-1], grid=of.bayes[-1].grid[1:]))},
+        lambda of: {"bayes": (*of.bayes[:-1], replace(of.bayes[-1], linearization=-of.bayes[-1].linearization))},
     ],
 )
 def test_load_refuses_arrays_of_other_documents(localizer: LocalizerModel, tmp_path: Path, change: Change) -> None:
-    assert localizer.bayes is not None
+    assert localizer.bayes
     replace(localizer, **change(localizer)).save(tmp_path)
     with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
         LocalizerModel.load(tmp_path)
@@ -190,6 +229,14 @@ def test_save_keeps_every_bit(
     loaded.save(tmp_path / "again")
     for name in ("localizer.json", "localizer.safetensors"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
+
+
+def test_load_refuses_files_of_before(localizer: LocalizerModel, tmp_path: Path) -> None:
+    localizer.save(tmp_path)
+    text = (tmp_path / "localizer.json").read_text()
+    (tmp_path / "localizer.json").write_text(text.replace("padforge-localizer/4", "padforge-localizer/3"))
+    with pytest.raises(InputError, match="padforge-localizer/3"):
+        LocalizerModel.load(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["localizer.json", "localizer.safetensors"])
@@ -217,7 +264,7 @@ def test_load_refuses_damaged_bytes(
 def test_save_that_fails_changes_nothing(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    other = replace(localizer, weights={name: weight + 1 for name, weight in localizer.weights.items()})
+    other = replace(localizer, table=localizer.table + 1)
     for value in (np.nan, object()):
         with pytest.raises(InputError, match="cannot be written as JSON"):
             replace(other, provenance={"note": value}).save(tmp_path)

@@ -13,12 +13,14 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer import training
 from padforge.sense.localizer.evaluation import distances
+from padforge.sense.localizer.features import N_TIMED
 from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.moments import PHASES
 from padforge.sense.localizer.recalibration import CrossValidation, fit_correction, recalibrate
 from padforge.sense.localizer.response_model import interpolate_grid
-from padforge.sense.localizer.scaler import TrainingPresses
 from padforge.sense.localizer.training import fine_tune
 from tests.helpers.door import called
+from tests.helpers.presses import training_presses
 
 ANGLE, SHIFT = np.deg2rad(3.0), np.array([1.5, -1.0])
 GAINS = np.array([0.8, 1.2, 1.1, 0.9])
@@ -105,7 +107,8 @@ def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: 
     same, repeated = recalibrate(replace(localizer, recalibrated_by=("of before",)), known_only(pad, NEW))
     assert same.recalibrated_by == ("of before", *now.recalibrated_by)
     assert repeated == result
-    assert all(np.array_equal(same.weights[name], now.weights[name]) for name in now.weights)
+    for name, weights in now.networks.items():
+        assert all(np.array_equal(same.networks[name][part], weights[part]) for part in weights)
     with pytest.raises(InputError, match="recalibrated by"):
         evaluate(now, known_only(pad, NEW))
 
@@ -147,18 +150,20 @@ def test_fine_tune_weighs_new_presses_and_ignores_masked_fibres(localizer, recor
     targets = localizer.scaler.scale_targets(recording.presses_mm[NEW])
     spoilt, dead = presses.inputs.copy(), presses.fibre_mask.copy()
     spoilt[:, 1], dead[:, 1] = np.nan, False
-    samples = TrainingPresses(spoilt, dead, targets)
-    weights = fine_tune(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
+    samples = training_presses(spoilt, dead, targets, N_TIMED)
+    network, phase = localizer.networks["released"], PHASES[N_TIMED]["released"]
+    weights = fine_tune(network, samples, localizer.table, 2, np.random.default_rng(0), phase)
     assert all(np.isfinite(weight).all() for weight in weights.values())
-    assert not np.array_equal(weights["last.w"], localizer.weights["last.w"])
+    assert not np.array_equal(weights["last.w"], network["last.w"])
     places = localizer.scaler.scale_targets(recording.presses_mm[NEW] + 3.0)
-    samples = TrainingPresses(presses.inputs, presses.fibre_mask, places)
+    samples = training_presses(presses.inputs, presses.fibre_mask, places, N_TIMED)
+    alone = replace(localizer, bayes=(), residual_network={})
     shifts = []
     for old in (0.0, 1e18):
         monkeypatch.setattr(training, "PRIOR_PRESSES", old)
-        now = fine_tune(localizer.weights, samples, localizer.table, 2, np.random.default_rng(0))
-        found = replace(localizer, weights=now, bayes=None, residual_network={}).predict_features(presses).positions_mm
-        plain = replace(localizer, bayes=None, residual_network={}).predict_features(presses).positions_mm
+        now = fine_tune(network, samples, localizer.table, 2, np.random.default_rng(0), phase)
+        changed = replace(alone, networks={**localizer.networks, "released": now})
+        found, plain = (each.predict_features(presses).positions_mm for each in (changed, alone))
         shifts.append((found - plain).mean())
     assert shifts[0] > 0.03
     assert abs(shifts[1]) < 0.2 * shifts[0]

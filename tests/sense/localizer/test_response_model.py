@@ -8,11 +8,13 @@ from hypothesis import strategies as st
 from padforge.sense.localizer.response_model import (
     GRID_CELLS,
     RIDGE_HISTORY,
+    RIDGE_MODULATION,
     ResponseModel,
     interpolate_grid,
     remove_history,
 )
-from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
+from padforge.sense.localizer.scaler import leave_one_out_residuals
+from tests.helpers.presses import training_presses
 
 FIBRES, PASTS, WINDOWS, FEW, PRESSES = 2, 3, 4, 1500, 9000
 Made = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -30,7 +32,7 @@ def made() -> Made:
     rng = np.random.default_rng(0)
     places = rng.uniform(-1, 1, (PRESSES, 2))
     history = rng.standard_normal((PRESSES, FIBRES, PASTS)) * [1.0, 0.1, 10.0] + 2
-    memory = rng.standard_normal((FIBRES, PASTS, WINDOWS)) * np.array([1.0, 10.0, 0.1])[:, None]
+    memory = rng.standard_normal((FIBRES, PASTS, WINDOWS)) * np.array([0.3, 3.0, 0.03])[:, None]
     windows = answer(places) + np.einsum("qcj,cjf->qcf", history - history.mean(axis=0), memory)
     return places, windows + 0.05 * rng.standard_normal(windows.shape), history, memory
 
@@ -73,7 +75,7 @@ def test_fit_recovers_sensitivity_modulation_and_depth() -> None:
     assert shown.shape == (FEW, FIBRES, WINDOWS + len(phases))
     rested, left = shown[:, 0, WINDOWS:].T
     assert np.corrcoef(rested, history[:, 0, 0])[0, 1] > 0.95
-    assert rested.std() == pytest.approx(FEW / (FEW + RIDGE_HISTORY) * 0.3, rel=0.15)
+    assert rested.std() == pytest.approx(FEW / (FEW + RIDGE_MODULATION) * 0.3, rel=0.15)
     assert np.corrcoef(left, history[:, 0, 1])[0, 1] > 0.8
     assert np.abs(shown[:, 1, WINDOWS:]).max() < 0.1
     rng = np.random.default_rng(0)
@@ -128,7 +130,7 @@ def test_leave_one_out_residuals_are_those_of_fits_without_them() -> None:
     places, windows = pressed()
     fibre_mask = np.ones((90, FIBRES), dtype=bool)
     table = table_of(places, windows)
-    presses = TrainingPresses(windows.astype(np.float32), fibre_mask, places.astype(np.float32))
+    presses = training_presses(windows, fibre_mask, places)
     flat = table.reshape(*table.shape[:2], -1)
     rest = leave_one_out_residuals(presses, table).inputs - interpolate_grid(flat, places).reshape(windows.shape)
     for press in (0, 4, 17):
@@ -141,5 +143,5 @@ def test_leave_one_out_residuals_are_those_of_fits_without_them() -> None:
     # What no table expects is left as it was.
     more = np.pad(windows, ((0, 0), (0, 0), (0, 1)), constant_values=0.7).astype(np.float32)
     padded = np.pad(table, ((0, 0), (0, 0), (0, 0), (0, 1)))
-    found = leave_one_out_residuals(TrainingPresses(more, fibre_mask, places.astype(np.float32)), padded).inputs
+    found = leave_one_out_residuals(training_presses(more, fibre_mask, places), padded).inputs
     assert np.array_equal(found[:, :, -1], more[:, :, -1])

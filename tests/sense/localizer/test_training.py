@@ -9,25 +9,29 @@ from hypothesis import strategies as st
 from padforge.benchmarks import harness
 from padforge.benchmarks import localizer as bench
 from padforge.design.common.progress import ignore_progress
-from padforge.sense.localizer import network, torch_network, training
+from padforge.sense.localizer import network, press_sampler, torch_network, training
+from padforge.sense.localizer.features import N_FEATURES, N_TIMED
+from padforge.sense.localizer.moments import CORRECTED, N_DOWN, PHASES
 from padforge.sense.localizer.response_model import interpolate_grid
-from padforge.sense.localizer.scaler import TrainingPresses
 from padforge.sense.localizer.torch_network import EnsembleMlp, sample_fibre_dropout
-from padforge.sense.settings import Features
 from padforge.sense.settings import LocalizerSettings as Options
+from tests.helpers.presses import training_presses
 
 
 @settings(max_examples=5)
-@given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4))
-def test_forward_agrees_with_torch(seed: int, layers: int) -> None:
+@given(seed=st.integers(0, 2**32 - 1), layers=st.integers(1, 4), n_timed=st.integers(0, 5))
+def test_forward_agrees_with_torch(seed: int, layers: int, n_timed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    ensemble = EnsembleMlp.random(3 * 5 + 3, 4, Options(layers=layers, hidden=24), generator)
+    ensemble = EnsembleMlp.random(3 * 5 + 3 + n_timed, 4, Options(layers=layers, hidden=24), generator)
     features = torch.randn(7, 3, 5, generator=generator)
     fibre_mask = torch.rand(7, 3, generator=generator) < 0.6
-    x, _ = torch_network.network_inputs(features, fibre_mask, None)
+    seen = torch.rand(7, n_timed, generator=generator) < 0.6
+    x, _ = torch_network.network_inputs(features, fibre_mask, seen, None)
     expected = ensemble(x[None]).detach().numpy()
     weights = {name: weight.detach().numpy() for name, weight in ensemble.named_parameters()}
-    outputs = network.forward(weights, network.network_inputs(features.numpy(), fibre_mask.numpy()))
+    inputs = network.network_inputs(features.numpy(), fibre_mask.numpy(), seen.numpy())
+    np.testing.assert_array_equal(inputs, x.numpy())
+    outputs = network.forward(weights, inputs)
     assert outputs.dtype == np.float32
     np.testing.assert_allclose(outputs, expected, atol=2e-5)
     torch.testing.assert_close(EnsembleMlp.from_numpy(weights)(x[None]), ensemble(x[None]))
@@ -86,14 +90,14 @@ def test_train_members_reflects_augmented_positions_at_the_edge(monkeypatch: pyt
     Four positions share 1 x 1.2, and so are sqrt(1.2 / 4) apart.
     """
     corners = np.tile(np.array([[-0.5, -0.6], [-0.5, 0.6], [0.5, -0.6], [0.5, 0.6]], dtype=np.float32), (64, 1))
-    presses = TrainingPresses(np.zeros((256, 1, 1), np.float32), np.ones((256, 1), bool), corners)
+    presses = training_presses(np.zeros((256, 1, 1)), np.ones((256, 1), bool), corners)
     augmented: list[torch.Tensor] = []
 
     def spy(table: torch.Tensor, positions: torch.Tensor, xp: object) -> torch.Tensor:
         augmented.append(positions)
         return interpolate_grid(table, positions, xp)
 
-    monkeypatch.setattr(training, "interpolate_grid", spy)
+    monkeypatch.setattr(press_sampler, "interpolate_grid", spy)
     monkeypatch.setattr(training, "AUGMENTATION", 0.1)
     options = Options(members=1, hidden=8, layers=1, max_failures=0, batch=256, epochs=1)
     table = np.zeros((3, 3, 1, 1), np.float32)
@@ -103,16 +107,23 @@ def test_train_members_reflects_augmented_positions_at_the_edge(monkeypatch: pyt
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
 
 
-@pytest.mark.parametrize(("features", "longer"), [("press_and_release", 1), ("causal", 2), ("onset", 2)])
-def test_train_members_takes_longer_without_the_release(features: Features, longer: int) -> None:
+@pytest.mark.parametrize(("n_timed", "members"), [(N_TIMED, 2), (N_TIMED, 1), (N_DOWN, 1), (0, 2)])
+def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: int) -> None:
+    """And, as the last of several members, one that corrects the Bayesian localizers."""
     rng = np.random.default_rng(0)
-    positions = rng.uniform(-1, 1, (40, 2)).astype(np.float32)
-    table = rng.standard_normal((5, 5, 2, 3)).astype(np.float32)
-    presses = TrainingPresses(np.zeros((40, 2, 3), np.float32), np.ones((40, 2), bool), positions)
-    options = Options(features=features, hidden=8, layers=1, epochs=3, batch=16)
+    table = rng.standard_normal((5, 5, 2, N_FEATURES)).astype(np.float32)
+    positions = rng.uniform(-1, 1, (40, 2))
+    presses = training_presses(np.zeros((40, 2, N_FEATURES)), np.ones((40, 2), bool), positions, n_timed)
+    options = Options(hidden=8, layers=1, epochs=3, batch=16, members=members)
     totals: set[int] = set()
-    training.train_members(presses, table, options, rng, lambda done, total, what: totals.add(total))
-    assert totals == {longer * options.members * 3 * training.MIN_BATCHES}
+    trained = training.train_members(presses, table, options, rng, lambda done, total, what: totals.add(total))
+    phases = PHASES[n_timed]
+    lengths = [phase.length for phase in phases.values()] + [CORRECTED.length] * (members > 1)
+    assert totals == {sum(round(3 * training.MIN_BATCHES * length) for length in lengths)}
+    assert list(trained.networks) == list(phases)
+    for weights in trained.networks.values():
+        network.check_weights(weights, 2 * (N_FEATURES + 1) + n_timed, "ensemble")
+    assert bool(trained.bayes) == bool(trained.residual_network) == (members > 1)
 
 
 @pytest.mark.parametrize(("capabilities", "tolerance"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0)])
@@ -135,7 +146,7 @@ def test_forward_bfloat16_is_near_single_precision(
 @pytest.mark.slow
 def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"PRESSES": 150, "TEST": 30, "EPOCHS": (1, 3), "ITERATIONS": (3, 20), "PASSES": (1,), "STEPS": (3,)}
-    for name, value in (small | {"HIDDEN": 6, "FEATURES": ("published", "press_and_release")}).items():
+    for name, value in (small | {"HIDDEN": 6, "FEATURES": ("published", "windows")}).items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     bench.recorded.cache_clear()

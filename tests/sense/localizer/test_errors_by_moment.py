@@ -1,0 +1,86 @@
+"""Errors while a press is read, and a finger that slides."""
+
+import numpy as np
+import pytest
+
+from padforge.design import Contact, Morphology
+from padforge.sense import Evaluation, Recording, RigSettings
+from padforge.sense.localizer import network
+from padforge.sense.localizer.evaluation import distances, moment_lines
+from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.signals.press_detection import detect_presses, first_readings
+from padforge.sense.simulation.strokes import simulate_strokes
+
+PAD = Morphology.random(2, knots=3, seed=5)  # of the recording
+
+
+def test_the_error_falls_while_a_press_is_read(calibrated: tuple[LocalizerModel, Evaluation]) -> None:
+    _, evaluation = calibrated
+    rows = evaluation.by_moment
+    levels = len(evaluation.errors)
+    assert len(rows) == len(MOMENTS) * levels
+    intact = [row for row in rows if row["n_failed"] == 0]
+    assert [(row["since"], row["readings"]) for row in intact] == [(each.since, each.readings) for each in MOMENTS]
+    means = [row["mean_mm"] for row in intact]
+    assert means[0] > means[3] > evaluation.errors[0]["mean_mm"]
+    assert abs(means[-1] / evaluation.errors[0]["mean_mm"] - 1) < 0.25
+    assert all(row["within_r90"] > 0.7 for row in rows)
+    lines = moment_lines(rows)
+    assert len(lines) == 2 + len(MOMENTS)
+    assert "3 failed" in lines[1]
+
+
+def test_a_touch_in_focus_is_one_of_the_test(
+    calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
+) -> None:
+    model, evaluation = calibrated
+    focus = evaluation.focus
+    assert focus["press"] in model.test
+    assert focus["pressed_mm"] == recording.presses_mm[focus["press"]].tolist()
+    radii = [moment["r90_mm"] for moment in focus["moments"]]
+    assert radii[0] > radii[-1]
+
+
+def test_rows_are_those_of_predictions_until_a_moment(
+    calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
+) -> None:
+    model, evaluation = calibrated
+    test, positions_mm = np.array(model.test), recording.presses_mm
+    commands = recording.down_command, recording.up_command
+    touched = first_readings(recording.readings, recording.times_s, *commands)
+    for moment in (MOMENTS[2], MOMENTS[9]):
+        predicted = model.predict(recording, until=moment.until(touched, recording.up_command))
+        mean = distances(predicted.positions_mm[test], positions_mm[test]).mean()
+        row = next(
+            row for row in evaluation.by_moment if (row["since"], row["readings"]) == (moment.since, moment.readings)
+        )
+        assert row["mean_mm"] == np.float64(mean).round(12) or abs(row["mean_mm"] - mean) < 1e-9
+
+
+def test_first_readings_are_those_of_the_detector_or_the_usual_ones(recording: Recording) -> None:
+    commands = recording.down_command, recording.up_command
+    touched = first_readings(recording.readings, recording.times_s, *commands)
+    assert ((touched >= recording.down_command - 2) & (touched <= recording.up_command)).all()
+    assert np.isin(touched, detect_presses(recording.readings, recording.times_s).touched).mean() > 0.8
+    silent = first_readings(np.zeros_like(recording.readings), recording.times_s, *commands)
+    assert np.array_equal(
+        np.unique(silent - recording.down_command), np.unique(np.clip(silent - recording.down_command, 1, 4))
+    )
+
+
+def test_a_finger_that_slides_is_followed(localizer: LocalizerModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a network that was trained on presses alone; one that knows fingers at rest only stays behind."""
+    strokes = simulate_strokes(PAD, RigSettings(presses=300, seed=1), Contact(), 15.0, 60, np.random.default_rng(0))
+    recording, last = strokes.recording, strokes.positions_mm[:, -1]
+    down, up = recording.down_command - 2, recording.up_command
+
+    def error(least_slide: float) -> float:
+        monkeypatch.setattr(network, "LEAST_SLIDE", least_slide)
+        features = localizer.scaler.transform(compute_features(recording.readings, down, up, up))
+        return float(distances(localizer.predict_features(features).positions_mm, last).mean())
+
+    usual = network.LEAST_SLIDE
+    assert error(0.0) < 0.7 * error(np.inf)
+    assert error(usual) < error(np.inf)

@@ -1,0 +1,65 @@
+"""Moments of a press: which windows are complete before a reading, and that one network answers at each of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from padforge.sense.localizer.features import DOWN, N_TIMED, UP, complete_windows
+from padforge.sense.localizer.moments import CORRECTED, N_DOWN, PHASES, complete_at, count_complete
+from padforge.sense.localizer.network import RESIDUAL, answering
+
+
+def completed(down: int, up: int, until: int) -> list[bool]:
+    """Window by window: all its readings are before `until`, those of the release after one of it at least."""
+    of_touch = [until > up or all(down + n < until for n in range(*window)) for window in DOWN]
+    return of_touch + [until > up and all(up + n < until for n in range(*window)) for window in UP]
+
+
+@given(
+    down=st.integers(0, 5000),
+    length=st.integers(1, 60),
+    until=st.integers(-5, 120),
+)
+def test_complete_windows_counts_readings(down: int, length: int, until: int) -> None:
+    up = down + length
+    seen = complete_windows(np.array([down]), np.array([up]), np.array([down + until]))
+    assert seen[0].tolist() == completed(down, up, down + until)
+    assert seen[0].tolist() == sorted(seen[0].tolist(), reverse=True)  # one after the other
+    assert count_complete(seen) == seen.sum()
+
+
+@pytest.mark.parametrize(("length", "until", "expected"), [(5, 5, 4), (5, 6, 10), (1, 1, 0), (1, 2, 10), (30, 30, 9)])
+def test_a_short_press_has_all_of_its_touch_once_it_has_ended(length: int, until: int, expected: int) -> None:
+    seen = complete_windows(np.array([100]), np.array([100 + length]), np.array([100 + until]))
+    assert count_complete(seen).tolist() == [expected]
+
+
+@given(count=st.integers(1, N_TIMED), length=st.integers(DOWN[-1][1], 60))
+def test_complete_at_is_the_first_reading_with_so_many_windows(count: int, length: int) -> None:
+    down, up = np.array([0, 400]), np.array([length, 400 + length])
+    at = complete_at(count, down, up)
+    assert count_complete(complete_windows(down, up, at)).tolist() == [count] * 2
+    assert (count_complete(complete_windows(down, up, at - 1)) < count).all()
+
+
+@pytest.mark.parametrize("n_timed", PHASES)
+def test_phases_cover_every_number_of_complete_windows_once(n_timed: int) -> None:
+    phases = PHASES[n_timed].values()
+    for count in range(n_timed > 0, n_timed + 1):
+        assert sum(count in phase for phase in phases) == 1
+    assert not any(count in phase for count in (-1, n_timed + 1) for phase in phases)
+    assert not any(0 in phase for phase in phases) or not n_timed
+    for phase in (*phases, CORRECTED):
+        assert sum(phase.shares) == pytest.approx(1)
+        assert min(phase.shares) > 0
+
+
+def test_answering_adds_the_bayesian_localizer_after_the_release() -> None:
+    networks = {name: {} for name in PHASES[N_TIMED]}
+    names = [answering(networks, count, N_TIMED, True) for count in range(N_TIMED + 1)]
+    plain = [[], *[["touched"]] * (N_DOWN - 1), ["settled"], *[["released"]] * len(UP)]
+    assert names == [each + [RESIDUAL] * (count in CORRECTED) for count, each in enumerate(plain)]
+    assert [answering(networks, count, N_TIMED, False) for count in range(N_TIMED + 1)] == plain
+    assert answering({"press": {}}, 0, 0, True) == ["press", RESIDUAL]
+    assert answering({"held": {}}, N_DOWN, N_DOWN, False) == ["held"]
