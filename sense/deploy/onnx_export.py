@@ -31,8 +31,8 @@ from padforge.sense.localizer.bayes import PREFIX, STAGES, BayesianLocalizer
 from padforge.sense.localizer.features import Window, compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
-from padforge.sense.localizer.moments import PHASES, complete_at
-from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, complete_at
+from padforge.sense.localizer.network import LEAST_SLIDE, MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
 from padforge.sense.recording.recording import Recording
@@ -176,6 +176,8 @@ class _LocalizerModule(nn.Module):
         self.features = _FeatureModule(model)
         self.networks = nn.ModuleDict({name: EnsembleMlp.from_numpy(each) for name, each in model.networks.items()})
         self.bayes = _BayesModule(*model.corrected) if model.bayes else None
+        for name, array in zip(("now_factor", "now_offset"), scaler.to_now(features.N_TIMED), strict=True):
+            self.register_buffer(name, torch.from_numpy(array))
         self.scale_mm, self.measures = scaler.scale_mm, scaler.measures
         units = [self.scale_mm] * 3 + [measure.scale for measure in self.measures]
         self.register_buffer("interval_factors", torch.from_numpy(model.interval_factors * units).float())
@@ -188,8 +190,11 @@ class _LocalizerModule(nn.Module):
         n_complete = seen.sum(dim=1)
         x, _ = network_inputs(scaled, fibre_mask, seen, None)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
-        n_failed = (~fibre_mask).sum(dim=1)
-        factors = self.interval_factors[n_complete, torch.clamp(n_failed, max=self.interval_factors.shape[1] - 1)]
+        *followed, moved = self._follow(scaled, fibre_mask, seen)
+        slid = (n_complete >= N_DOWN) & (moved > LEAST_SLIDE)
+        targets, std = (torch.where(slid[:, None], *pair) for pair in zip(followed, (targets, std), strict=True))
+        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_DOWN - 1, n_complete)
+        factors = self.interval_factors[moment, torch.clamp(n_failed, max=self.interval_factors.shape[1] - 1)]
         blind = ~fibre_mask.any(dim=1) | (n_complete == 0)  # which may be anywhere
         radius = torch.linalg.vector_norm(std[:, :2], dim=1)
 
@@ -221,6 +226,24 @@ class _LocalizerModule(nn.Module):
         is_corrected = (n_complete >= STAGES[0])[:, None]
         targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
         return targets, std
+
+    def _follow(self, scaled: Tensor, fibre_mask: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`Sliding.follow`."""
+        network, n_timed = self.networks[FOLLOWING], features.N_TIMED
+
+        def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
+            x, _ = network_inputs(scaled, fibre_mask, seen & (torch.arange(n_timed) < n_complete), None)
+            return _combine_members(network(x.expand(network.n_members, -1, -1)))
+
+        targets, std = predict_from(scaled, N_DOWN)
+        now = [
+            scaled[:, :, SOON - 1 - k] * self.now_factor[:, k, SOON - 1 - k] + self.now_offset[:, k, SOON - 1 - k]
+            for k in range(len(features.NOW))
+        ]
+        rest = scaled[:, :, n_timed + len(now) :]
+        soon, soon_std = predict_from(torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), rest], dim=2), SOON)
+        distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
+        return targets, std, distance / torch.clamp(expected, min=1e-9)
 
 
 def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
