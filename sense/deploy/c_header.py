@@ -1,6 +1,6 @@
 """`localizer.h`: a student network as one C99 file, rendered from the template `localizer.h.j2`.
 
-The student is a small network distilled from the localizer, for what a microcontroller knows at the end of a press.
+The student is a small network distilled from the localizer, for what a microcontroller knows at any moment of a press.
 Knowledge distillation (Hinton et al. 2015, "Distilling the knowledge in a neural network"): the targets are halfway
 between the true positions and those that the localizer, the teacher, predicts.
 """
@@ -21,15 +21,14 @@ from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.deploy import streaming
-from padforge.sense.deploy.streaming import CODE_BYTES, N_LAYERS, MemoryBudget, ThresholdDetector
+from padforge.sense.deploy.streaming import CODE_BYTES, N_LAYERS, N_WINDOWS, MemoryBudget, ThresholdDetector
 from padforge.sense.localizer import model as localizer_model
 from padforge.sense.localizer import network
 from padforge.sense.localizer import scaler as feature_scaler
 from padforge.sense.localizer.calibration import (
     CALIBRATION_SHARE,
-    calibrate_intervals,
+    calibrate_uncertainty,
     check_trained,
-    fit_recording,
     split_presses,
     split_unseen,
 )
@@ -52,19 +51,25 @@ LINE = 118  # characters
 class StudentNetwork:
     """What `localizer.h` holds."""
 
-    model: LocalizerModel  # one member, of the features of `stream_presses`; int8 weights are dequantized in it
+    model: LocalizerModel  # one network, of the features of `stream_presses`; int8 weights are dequantized in it
     detector: ThresholdDetector
     quantized: bool  # to int8
 
     @property
+    def weights(self) -> Weights:
+        """Of its network, which answers at every moment."""
+        (weights,) = self.model.networks.values()
+        return weights
+
+    @property
     def hidden(self) -> int:
         """Neurons of a layer."""
-        return self.model.weights["first.w"].shape[2]
+        return self.weights["first.w"].shape[2]
 
     @property
     def table_bytes(self) -> int:
         """Bytes of flash beside the code."""
-        n_measures, n_levels = len(self.model.scaler.measures), len(self.model.interval_factors)
+        n_measures, n_levels = len(self.model.scaler.measures), self.model.max_failures + 1
         return streaming.table_bytes(self.model.fibres, n_measures, n_levels, self.hidden, self.quantized)
 
     @property
@@ -75,7 +80,10 @@ class StudentNetwork:
     def predict(
         self, readings: Array, pressed: Mask | None = None, failed: tuple[int, ...] = ()
     ) -> tuple[streaming.StreamedPresses, Localization]:
-        """Detect and localize presses as `localizer.h` does; `pressed` (R,) is None for the detector to decide."""
+        """Detect presses and localize them with every estimate, as `localizer.h` does.
+
+        `pressed` (R,) is None for the detector to decide.
+        """
         fibre_mask = ~np.isin(np.arange(self.model.fibres), failed)
         presses = streaming.stream_presses(readings, self.detector, pressed, fibre_mask)
         scaled = self.model.scaler.transform(presses.features)
@@ -120,7 +128,7 @@ def distill(
     options: LocalizerSettings,
     on_progress: OnProgress = ignore_progress,
 ) -> StudentNetwork:
-    """Train a student as large as the budget allows, on presses of known position.
+    """Train a student as large as the budget allows, on presses of known position at random moments.
 
     Every press is used with the features of its command and, where the detector finds it, with those of its detection.
     Raises InputError if the budget is too small, there are too few presses, or the training diverged.
@@ -131,51 +139,55 @@ def distill(
     detector = ThresholdDetector.fit(recording, training)
     shares = split_presses(len(training), options.split, CALIBRATION_SHARE["ensemble"], rng, min_training=2)
     training, calibration = (training[share] for share in shares)
-    n_measures, n_levels = len(teacher.scaler.measures), len(teacher.interval_factors)
+    n_measures, n_levels = len(teacher.scaler.measures), teacher.max_failures + 1
     hidden = streaming.max_hidden(teacher.fibres, n_measures, n_levels, budget)
-    commanded = streaming.commanded_features(recording)
     detected = streaming.stream_presses(recording.readings, detector)
-    press = streaming.match_presses(recording, detected.down_command)
-    matched = np.flatnonzero(np.isin(press, training))
-    features = commanded[training] + detected.features[matched]
+    press, at_end = streaming.match_presses(recording, detected.down_command), detected.features[detected.last]
+    matched = np.flatnonzero(np.isin(press, training) & at_end.seen.all(axis=1))
+    features = streaming.commanded_features(recording)[training] + at_end[matched]
     positions_mm, measures = _distillation_targets(recording, teacher, np.concatenate([training, press[matched]]))
     scaler, table = FeatureScaler.fit(features, positions_mm, measures)
     size = {"members": 1, "hidden": hidden, "layers": N_LAYERS, "max_failures": n_levels - 1}
-    # `train_members` lengthens the training of other features by a factor of its own.
-    length = {"epochs": EPOCHS_FACTOR * options.epochs, "features": "press_and_release"}
-    options = options.model_copy(update=size | length)
-    presses = scaler.training_presses(features, positions_mm, measures)
+    options = options.model_copy(update=size | {"epochs": EPOCHS_FACTOR * options.epochs})
+    presses = scaler.training_presses(features, positions_mm, measures, recording.rate_hz)
     with one_torch_thread():
-        weights = train_members(presses, table, options, rng, on_progress).weights
-    check_trained(weights, {}, scaler, options)
+        networks = train_members(presses, table, options, rng, on_progress).networks
+    check_trained(networks, {}, scaler, options, N_WINDOWS)
     model = LocalizerModel(
-        weights=quantize(weights) if budget.quantized else weights,
+        networks={name: quantize(each) if budget.quantized else each for name, each in networks.items()},
         scaler=scaler,
         table=table,
         method="ensemble",
-        features="causal",
-        interval_factors=np.ones((1, 3 + n_measures)),
+        features="windows",
+        interval_factors=np.ones((N_WINDOWS + 1, 1, 3 + n_measures)),
         rate_hz=recording.rate_hz,
         training_recording_sha256=recording.digest,
     )
-    scaled, positions_mm = scaler.transform(commanded[calibration]), recording.presses_mm[calibration]
+    moments = [
+        scaler.transform(streaming.commanded_features(recording, n_complete)[calibration])
+        for n_complete in range(1, N_WINDOWS + 1)
+    ]
     true_measures = {name: recording.measures[name][calibration] for name in measures}
-    factors = calibrate_intervals(model, scaled, positions_mm, n_levels, true_measures)
-    return StudentNetwork(replace(model, interval_factors=factors), detector, budget.quantized)
+    model = calibrate_uncertainty(model, moments, recording.presses_mm[calibration], n_levels, true_measures)
+    return StudentNetwork(model, detector, budget.quantized)
 
 
 def evaluate_student(
-    student: StudentNetwork, references: Sequence[LocalizerModel], recording: Recording, test: Indices
+    student: StudentNetwork, teacher: LocalizerModel, recording: Recording, test: Indices
 ) -> dict[str, Any]:
-    """Evaluate a student, and localizers to compare it with, on presses of known position.
+    """Evaluate a student and its teacher on presses of known position.
 
-    "errors" are by "header" and the features of the localizers, a row a number of failed fibres; "n_false" counts
-    false detections after those presses, each up to the next; "detected_mean_mm" is None if none is detected.
+    "errors" are by "header" at the end of the press, and of the teacher "at the end" and of the "whole press" with the
+    readings after it, a row a number of failed fibres; "n_false" counts false detections after those presses, each up
+    to the next; "detected_mean_mm" is None if none is detected.
     """
     positions_mm, model = recording.presses_mm[test], student.model
-    compared = {"header": (model, model.scaler.transform(streaming.commanded_features(recording)[test]))}
-    compared |= {each.features: (each, each.scaled_features(recording)[test]) for each in references}
-    levels = range(len(model.interval_factors))
+    compared = {
+        "header": (model, model.scaler.transform(streaming.commanded_features(recording)[test])),
+        "at the end": (teacher, teacher.scaled_features(recording, recording.up_command)[test]),
+        "whole press": (teacher, teacher.scaled_features(recording)[test]),
+    }
+    levels = range(model.max_failures + 1)
     errors = {
         name: errors_by_loss(each.fibres, levels, partial(each.predict_features, features), positions_mm)[0]
         for name, (each, features) in compared.items()
@@ -183,7 +195,8 @@ def evaluate_student(
     presses, prediction = student.predict(recording.readings)
     press = streaming.match_presses(recording, presses.down_command)
     detected = np.flatnonzero(np.isin(press, test))
-    distance = distances(prediction.positions_mm[detected], recording.presses_mm[press[detected]])
+    at_end = prediction.positions_mm[presses.last[detected]]
+    distance = distances(at_end, recording.presses_mm[press[detected]])
     return {
         "errors": errors,
         "n_detected": len(detected),
@@ -242,14 +255,7 @@ def export_header(
     check_same_pad(teacher, "the localizer", recording.fibres, recording.rate_hz)
     training, test = split_unseen(recording, teacher, options)
     student = distill(recording, teacher, training, budget, options, on_progress)
-    references = [teacher]
-    if teacher.features != "causal":  # a localizer of its size that, as the student, needs no readings after a press
-        max_failures = len(teacher.interval_factors) - 1
-        update = {"features": "causal", "method": "ensemble", "max_failures": max_failures}
-        causal, rng = options.model_copy(update=update), np.random.default_rng(options.seed)
-        with one_torch_thread():
-            references = [fit_recording(recording, training, causal, rng, on_progress), teacher]
-    evaluation = evaluate_student(student, references, recording, test)
+    evaluation = evaluate_student(student, teacher, recording, test)
     about = [
         f"by padforge {version('padforge')}, of localizer.json with SHA-256",
         digest,
@@ -283,8 +289,8 @@ def render_header(student: StudentNetwork, budget: MemoryBudget, about: Sequence
 
 
 def _tables(student: StudentNetwork) -> dict[str, Any]:
-    scaler, weights = student.model.scaler, student.model.weights
-    units = [scaler.scale_mm] * 3 + [measure.scale for measure in scaler.measures]
+    scaler, weights = student.model.scaler, student.weights
+    units = [scaler.scale_mm] * 2 + [measure.scale for measure in scaler.measures]
     tables: dict[str, Any] = {
         "rates": streaming.RATES,
         "inverse_noise": student.detector.inverse_noise,
@@ -292,7 +298,7 @@ def _tables(student: StudentNetwork) -> dict[str, Any]:
         "scale": scaler.scale_v,
         "history_coef": scaler.history_coef,
         "history_mean": scaler.history_mean_v,
-        "interval_factors": student.model.interval_factors * units,
+        "interval_factors": student.model.interval_factors[1:, :, 1:] * units,  # of the radii, not of the deviation
     }
     names = ["first", *(f"hidden_{number}" for number in range(N_LAYERS)), "last"]
     layers = [weights["first.w"], *weights["hidden.w"], weights["last.w"]]

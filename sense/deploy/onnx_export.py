@@ -1,12 +1,15 @@
 """`localizer.onnx`: the localizer as one graph, from readings and the commands of presses to positions and radii.
 
-The graph is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian localizer with the
-rest of padforge. It is written only if onnxruntime computes from it what the localizer predicts.
+The graph takes the readings so far and finds out which windows of each press are complete, so that it answers at every
+reading of a press. It is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian
+localizers with the rest of padforge. As a graph has no branches, all of them are evaluated, and those for the moment of
+each press selected. It is written only if onnxruntime computes from it what the localizer predicts.
 """
 
 import io
 import json
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -24,23 +27,24 @@ from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer import features
-from padforge.sense.localizer.bayes import BayesianLocalizer
+from padforge.sense.localizer.bayes import PREFIX, STAGES, BayesianLocalizer
 from padforge.sense.localizer.features import Window, compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
-from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, complete_at
+from padforge.sense.localizer.network import LEAST_SLIDE, MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-onnx/3"
+FORMAT = "padforge-onnx/4"
 OPSET = 18  # of the operators: ONNX 1.13, 2022
 MAX_DIFFERENCE_MM = 1e-4
 """A graph whose positions differ more from those of its localizer is not written."""
 N_TRIALS, TRIAL_READINGS = 64, 40
 """Presses that are made up to test a graph where there is no recording, and readings from one to the next."""
 INPUTS = {
-    "readings": "V, (R, C): one row a reading, one column a fibre, none missing",
+    "readings": "V, (R, C): one row a reading so far, one column a fibre, none missing",
     "down_command": "(Q,), ascending: row of the first reading after the probe was sent down",
     "up_command": "(Q,): row of the first reading after it was sent up; R where there is none yet",
     "fibre_mask": "(Q, C): which fibres count in each press",
@@ -80,38 +84,37 @@ class _FeatureModule(nn.Module):
 
     def __init__(self, model: LocalizerModel) -> None:
         super().__init__()
-        self.kind, scaler = features.FEATURES[model.features], model.scaler
         for name in ("mean_v", "scale_v", "history_coef", "history_mean_v"):
-            self.register_buffer(name, torch.from_numpy(getattr(scaler, name)))
+            self.register_buffer(name, torch.from_numpy(getattr(model.scaler, name)))
 
-    def forward(self, readings: Tensor, down_command: Tensor, up_command: Tensor) -> Tensor:
-        """Return (Q, C, F + G) scaled features."""
+    def forward(self, readings: Tensor, down_command: Tensor, up_command: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (Q, C, F + G) scaled features, and (Q, K) which windows are complete."""
         n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
         previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
-        next_begin = torch.cat([down_command[1:], n_readings])
+        until = torch.cat([down_command[1:], n_readings])
+        held = torch.minimum(up_command, until)
 
-        def gather(origin: Tensor, window: Window, low: Tensor, high: Tensor) -> Tensor:
+        def mean(origin: Tensor, window: Window, low: Tensor, high: Tensor) -> Tensor:
             index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
-            return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)]
+            return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
 
-        if not self.kind.n_history:  # the published running medians
-            half = -(features.MEDIAN // 2), features.MEDIAN // 2 + 1
-            before = _median(gather(down_command - features.MEDIAN_OFFSET, half, previous_end, down_command))
-            within = _median(gather(down_command + features.MEDIAN_OFFSET, half, down_command, up_command))
-            after = _median(gather(up_command + features.MEDIAN_OFFSET, half, down_command, next_begin))
-            return self._scale(torch.stack([before, within, after], dim=2))
-        means = [gather(down_command, each, down_command, up_command).mean(dim=1) for each in self.kind.down]
-        means += [gather(up_command, each, down_command, next_begin).mean(dim=1) for each in self.kind.up]
-        rest = gather(down_command, features.REST, previous_end, down_command).mean(dim=1)
-        windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(self.kind.phases)))
+        means = [mean(down_command, each, down_command, held) for each in features.DOWN]
+        means += [mean(up_command, each, down_command, until) for each in features.UP]
+        means += [mean(held, each, down_command, held) for each in features.NOW]
+        rest = mean(down_command, features.REST, previous_end, down_command)
+        windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(features.MODULATED)))
         history = _history(readings, down_command) - self.history_mean_v
         effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
-        if effect.shape[2] < windows.shape[2]:  # a scaler without modulations of the sensitivity
-            windows = windows[:, :, : effect.shape[2]]
-        return self._scale(windows - effect)
+        scaled = torch.clip((windows - effect - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()
+        return scaled, _complete_windows(down_command, up_command, until)
 
-    def _scale(self, windows: Tensor) -> Tensor:
-        return torch.clip((windows - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()
+
+def _complete_windows(down_command: Tensor, up_command: Tensor, until: Tensor) -> Tensor:
+    """(Q, K), as `features.complete_windows`."""
+    down_end, up_end = (torch.tensor([end for _, end in each]) for each in (features.DOWN, features.UP))
+    released = (until > up_command)[:, None]
+    down = (down_command[:, None] + down_end <= until[:, None]) | released
+    return torch.cat([down, released & (up_command[:, None] + up_end <= until[:, None])], dim=1)
 
 
 def _median(values: Tensor) -> Tensor:
@@ -137,17 +140,44 @@ def _history(readings: Tensor, down_command: Tensor) -> Tensor:
     return torch.stack(means, dim=2) - mean(features.REST)[:, :, None]
 
 
+class _BayesModule(nn.Module):
+    """The Bayesian localizers with the network that corrects them, in torch."""
+
+    def __init__(self, stages: Sequence[BayesianLocalizer], residual_network: Weights) -> None:
+        super().__init__()
+        self.residual, self.n_stages = EnsembleMlp.from_numpy(residual_network), len(stages)
+        for number, stage in enumerate(stages):
+            for name, array in stage.to_arrays(number).items():  # single precision is exact, and half the size
+                self.register_buffer(name.replace(".", "_"), torch.from_numpy(array))
+
+    def forward(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> Tensor:
+        """Return (1, Q, 4) outputs of presses whose features are scaled and whose network inputs are x."""
+        position, summary = self._predict(0, scaled, fibre_mask)
+        for number in range(1, self.n_stages):
+            later = self._predict(number, scaled, fibre_mask)
+            is_later = (n_complete >= STAGES[number])[:, None]
+            position, summary = (torch.where(is_later, *pair) for pair in zip(later, (position, summary), strict=True))
+        corrected = self.residual(torch.cat([x, summary], dim=1)[None])
+        return corrected + functional.pad(position, (0, 2))
+
+    def _predict(self, number: int, scaled: Tensor, fibre_mask: Tensor) -> tuple[Tensor, Tensor]:
+        names = (f"{PREFIX}{number}.{each.name}".replace(".", "_") for each in fields(BayesianLocalizer))
+        stage = BayesianLocalizer(*(getattr(self, name).double() for name in names))
+        position, summary = stage.predict(scaled.double(), fibre_mask, _Traceable())
+        return position.float(), summary.float()
+
+
 class _LocalizerModule(nn.Module):
     """`LocalizerModel.predict` of an ensemble in torch, from `INPUTS` to `OUTPUTS`."""
 
     def __init__(self, model: LocalizerModel) -> None:
         super().__init__()
         scaler = model.scaler
-        self.features, self.members = _FeatureModule(model), EnsembleMlp.from_numpy(model.weights)
-        self.residual = EnsembleMlp.from_numpy(model.residual_network) if model.bayes is not None else None
-        if model.bayes is not None:
-            for each in fields(model.bayes):  # single precision is exact, and half the size
-                self.register_buffer(each.name, torch.from_numpy(getattr(model.bayes, each.name).astype(np.float32)))
+        self.features = _FeatureModule(model)
+        self.networks = nn.ModuleDict({name: EnsembleMlp.from_numpy(each) for name, each in model.networks.items()})
+        self.bayes = _BayesModule(*model.corrected) if model.bayes else None
+        for name, array in zip(("now_factor", "now_offset"), scaler.to_now(features.N_TIMED), strict=True):
+            self.register_buffer(name, torch.from_numpy(array))
         self.scale_mm, self.measures = scaler.scale_mm, scaler.measures
         units = [self.scale_mm] * 3 + [measure.scale for measure in self.measures]
         self.register_buffer("interval_factors", torch.from_numpy(model.interval_factors * units).float())
@@ -156,18 +186,16 @@ class _LocalizerModule(nn.Module):
     def forward(
         self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
     ) -> tuple[Tensor, ...]:
-        scaled = self.features(readings, down_command, up_command)
-        x, _ = network_inputs(scaled, fibre_mask, None)
-        outputs = self.members(x.expand(self.members.n_members, -1, -1))
-        if self.residual is not None:
-            bayes = BayesianLocalizer(*(getattr(self, each.name).double() for each in fields(BayesianLocalizer)))
-            position, summary = bayes.predict(scaled.double(), fibre_mask, _Traceable())
-            corrected = self.residual(torch.cat([x, summary.float()], dim=1)[None])
-            outputs = torch.cat([outputs, corrected + functional.pad(position.float(), (0, 2))])
-        targets, std = _combine_members(outputs)
-        n_failed = (~fibre_mask).sum(dim=1)
-        factors = self.interval_factors[torch.clamp(n_failed, max=len(self.interval_factors) - 1)]
-        blind = ~fibre_mask.any(dim=1)  # which may be anywhere
+        scaled, seen = self.features(readings, down_command, up_command)
+        n_complete = seen.sum(dim=1)
+        x, _ = network_inputs(scaled, fibre_mask, seen, None)
+        targets, std = self._predict(scaled, fibre_mask, x, n_complete)
+        *followed, moved = self._follow(scaled, fibre_mask, seen)
+        slid = (n_complete >= N_DOWN) & (moved > LEAST_SLIDE)
+        targets, std = (torch.where(slid[:, None], *pair) for pair in zip(followed, (targets, std), strict=True))
+        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_DOWN - 1, n_complete)
+        factors = self.interval_factors[moment, torch.clamp(n_failed, max=self.interval_factors.shape[1] - 1)]
+        blind = ~fibre_mask.any(dim=1) | (n_complete == 0)  # which may be anywhere
         radius = torch.linalg.vector_norm(std[:, :2], dim=1)
 
         def unless_blind(value: Tensor, otherwise: float) -> Tensor:
@@ -183,6 +211,39 @@ class _LocalizerModule(nn.Module):
             values.append(unless_blind(targets[:, 2 + column], 0.0) * measure.scale + measure.origin)
             values.append(unless_blind(factors[:, 3 + column] * std[:, 2 + column], measure.scale))
         return tuple(values)
+
+    def _predict(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (Q, N) targets and their standard deviations, as `network.predict`."""
+        outputs: Any = 0.0
+        for name, phase in PHASES[features.N_TIMED].items():
+            network = self.networks[name]
+            answers = (n_complete >= phase.first) & (n_complete < phase.first + len(phase.shares))
+            outputs = torch.where(answers[:, None], network(x.expand(network.n_members, -1, -1)), outputs)
+        combined = _combine_members(outputs)
+        if self.bayes is None:
+            return combined
+        corrected = _combine_members(torch.cat([outputs, self.bayes(scaled, fibre_mask, x, n_complete)]))
+        is_corrected = (n_complete >= STAGES[0])[:, None]
+        targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
+        return targets, std
+
+    def _follow(self, scaled: Tensor, fibre_mask: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`Sliding.follow`."""
+        network, n_timed = self.networks[FOLLOWING], features.N_TIMED
+
+        def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
+            x, _ = network_inputs(scaled, fibre_mask, seen & (torch.arange(n_timed) < n_complete), None)
+            return _combine_members(network(x.expand(network.n_members, -1, -1)))
+
+        targets, std = predict_from(scaled, N_DOWN)
+        now = [
+            scaled[:, :, SOON - 1 - k] * self.now_factor[:, k, SOON - 1 - k] + self.now_offset[:, k, SOON - 1 - k]
+            for k in range(len(features.NOW))
+        ]
+        rest = scaled[:, :, n_timed + len(now) :]
+        soon, soon_std = predict_from(torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), rest], dim=2), SOON)
+        distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
+        return targets, std, distance / torch.clamp(expected, min=1e-9)
 
 
 def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -247,9 +308,9 @@ class OnnxReport:
     @property
     def text(self) -> str:
         return (
-            f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses with up to {self.max_failures} failed "
-            f"fibres: positions within {1e3 * self.position_difference_mm:.2f} µm of the localizer's, "
-            f"radii within {1e3 * self.r90_difference_mm:.2f} µm"
+            f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses and at every moment of one, with up to "
+            f"{self.max_failures} failed fibres: positions within {1e3 * self.position_difference_mm:.2f} µm of the "
+            f"localizer's, radii within {1e3 * self.r90_difference_mm:.2f} µm"
         )
 
 
@@ -257,11 +318,13 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
     """Write a localizer, whose `localizer.json` has the SHA-256 `digest`, as an ONNX graph.
 
     It is tested on the presses of a recording, or on made-up ones. Raises InputError for a localizer of the published
-    method, a recording of another pad or rate, or a path that cannot be written; Fault if positions differ by more than
-    MAX_DIFFERENCE_MM.
+    method or of arrays, a recording of another pad or rate, or a path that cannot be written; Fault if positions differ
+    by more than MAX_DIFFERENCE_MM.
     """
     if model.method != "ensemble":
         raise InputError(f"the localizer is of method {model.method}, expected ensemble: calibrate again")
+    if model.features != "windows":
+        raise InputError(f"the localizer is of features {model.features}, expected windows: calibrate on a recording")
     if recording is not None:
         check_same_pad(model, "the localizer", recording.fibres, recording.rate_hz)
         trial = recording.readings, recording.down_command, recording.up_command
@@ -276,7 +339,7 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
         )
     with atomic_file(path) as temporary:
         temporary.write_bytes(content)
-    return OnnxReport(len(content), len(trial[1]), len(model.interval_factors) - 1, positions, radii)
+    return OnnxReport(len(content), len(trial[1]), model.max_failures, positions, radii)
 
 
 def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
@@ -294,18 +357,27 @@ def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
 def _compare(
     model: LocalizerModel, content: bytes, readings: Array, down_command: Indices, up_command: Indices
 ) -> tuple[float, float]:
-    """Return the largest differences of positions and of radii, mm."""
+    """Return the largest differences of positions and of radii, mm, of whole presses and at every moment of one."""
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    presses = model.scaler.transform(compute_features(readings, down_command, up_command, model.features))
-    inputs = {"readings": interpolate_gaps(readings), "down_command": down_command, "up_command": up_command}
+    filled, last, with_previous = interpolate_gaps(readings), slice(-1, None), slice(-2, None)
+    commands = down_command, up_command
+    # The readings after the last press may end before all of its windows are complete.
+    ends = {min(int(complete_at(n, *commands)[-1]), len(readings)) for n in range(1, features.N_TIMED + 1)}
+    trials = [(slice(None), compute_features(readings, *commands), filled, *commands)]
+    for end in sorted(end for end in ends if end > down_command[-1] + 1):
+        until = np.full(len(down_command), end)
+        so_far = filled[:end], down_command[with_previous], np.minimum(up_command, end)[with_previous]
+        trials.append((last, compute_features(readings, *commands, until)[with_previous], *so_far))
     rng, differences = np.random.default_rng(0), []
-    for n_failed in range(len(model.interval_factors)):
-        # In every press another random set of fibres is masked.
-        fibre_mask = presses.fibre_mask & (rng.random(presses.fibre_mask.shape).argsort(axis=1) >= n_failed)
-        expected = model.predict_features(replace(presses, fibre_mask=fibre_mask))
-        outputs = session.run(["positions_mm", "r90_mm"], inputs | {"fibre_mask": fibre_mask})
-        positions_mm, r90_mm = map(np.asarray, outputs)
-        distance = np.hypot(*(positions_mm - expected.positions_mm).T)
-        differences.append((distance.max(), np.abs(r90_mm - expected.r90_mm).max()))
+    for rows, raw, *arguments in trials:
+        presses = model.scaler.transform(raw)
+        for n_failed in range(model.max_failures + 1):
+            # In every press another random set of fibres is masked.
+            fibre_mask = presses.fibre_mask & (rng.random(presses.fibre_mask.shape).argsort(axis=1) >= n_failed)
+            expected = model.predict_features(replace(presses, fibre_mask=fibre_mask))
+            inputs = dict(zip(INPUTS, (*arguments, fibre_mask), strict=True))
+            positions_mm, r90_mm = map(np.asarray, session.run(["positions_mm", "r90_mm"], inputs))
+            distance = np.hypot(*(positions_mm - expected.positions_mm).T)
+            differences.append((distance[rows].max(), np.abs(r90_mm - expected.r90_mm)[rows].max()))
     positions, radii = np.max(differences, axis=0)
     return float(positions), float(radii)

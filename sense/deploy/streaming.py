@@ -1,7 +1,8 @@
 """What a microcontroller computes of each reading, up to its network; `localizer.h` does the same in float32.
 
 All memory is fixed: a ring holds the latest readings, and exponential moving averages of each fibre, of several time
-constants, stand for the history before. They lag LAG readings behind, as a touch is detected only after it began.
+constants, stand for the history before. They lag LAG readings behind, as a touch is detected only after it began. The
+windows of a press are kept as they are complete, so that it may last, and its position is estimated at every reading.
 
 The detector of touches is simpler than `signals.press_detection` on purpose: fixed in size, and to be read in C.
 """
@@ -15,18 +16,19 @@ from numpy.typing import NDArray
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Indices, Mask
-from padforge.sense.localizer.features import DOWN, REST, PressFeatures, interpolate_gaps
+from padforge.sense.localizer.features import DOWN, NOW, REST, PressFeatures, interpolate_gaps
+from padforge.sense.localizer.moments import count_complete
 from padforge.sense.recording.recording import Recording
 
-RING = 32  # readings stored, a power of two: the rest before a press and PRESS of it
+RING = 32  # readings stored, a power of two: the rest before a press, and what of it was read before it is detected
 LAG = 8  # readings by which the averages lag; a touch must be detected sooner
 SETTLING = 3  # readings after a release in which the baseline is the reading, and no touch is detected
 BASELINE_RATE = 0.125  # weight of a new reading in the baseline while the pad is free
 RELEASE_SHARE = 0.5  # of the largest deviation; below it the press has ended
 MAX_PRESS = 1024  # readings; what lasts longer is a new rest
-N_REST, PRESS = -REST[0], DOWN[-1][1]  # readings before a press that its rest is the mean of, and readings of it used
+N_REST = -REST[0]  # readings before a press that its rest is the mean of
 TIME_CONSTANTS = (2, 4, 8, 16, 32, 64, 128, 512, 2048)  # of the averages, readings
-N_WINDOWS, N_HISTORY = len(DOWN), len(TIME_CONSTANTS)
+N_WINDOWS, N_FEATURES, N_HISTORY = len(DOWN), len(DOWN) + len(NOW), len(TIME_CONSTANTS)
 RATES = (1 / np.array(TIME_CONSTANTS)).astype(np.float32)  # weight of a new reading in each average
 
 N_LAYERS = 3  # residual layers of a student
@@ -39,9 +41,10 @@ THRESHOLDS = np.geomspace(5, 5e4, 41)  # that the detector is tried with
 SCORE_TOLERANCE = 2e-3  # a score so much below the best one counts as good
 MIN_NOISE = 0.01  # noise of a fibre, at least, as a share of its response to presses
 
-PRESSED, SUSPECTED, DOWN_COMMAND, UP_COMMAND, PREVIOUS_END, ESTIMATED, TOUCHED = range(7)
+PRESSED, SUSPECTED, DOWN_COMMAND, UP_COMMAND, PREVIOUS_END, TOUCHED, N_COMPLETE, N_ESTIMATES = range(8)
 """State of the pad: is it pressed, did the last reading exceed the threshold, the readings with which the press began
-and ended and the press before it ended, is its position estimated, and the reading at which it was detected."""
+and ended and the press before it ended, the reading at which it was detected, how many windows of it are complete, and
+how often its position was estimated."""
 
 kernel = njit(cache=True, error_model="numpy", nogil=True)
 
@@ -54,46 +57,70 @@ def _run_stream(
     rates: Any,
     inverse_noise: Any,
     detector: Any,
-    windows: Any,
+    rest_length: int,
+    down: Any,
+    now: Any,
     edges: Any,
+    moments: Any,
     features: Any,
     valid: Any,
-) -> int:
-    """Fill `edges` (R, 3), `features` (R, C, K + J) and `valid` (R, C) of every press, and return how many there are.
+) -> tuple[int, int]:
+    """Fill `edges` of every press, and a row of the others for every estimate; return how many there are of both.
 
-    `pressed` is empty for the detector to decide; `detector` holds its threshold and delay, and `windows` (1 + K, 2)
-    the rest before a press and the windows of it.
+    `pressed` is empty for the detector to decide; `detector` holds its threshold and delay, and `down` (K, 2) and `now`
+    the windows. `edges` (R, 2) are the first reading of a press and the first after it, `moments` (R, 3) the press, the
+    reading and the number of complete windows of an estimate, `features` (R, C, F + J) and `valid` (R, C) what it uses.
     """
     n_readings, n_fibres = readings.shape
+    n_windows, n_features = len(down), len(down) + len(now)
     ring = np.zeros((RING, n_fibres), np.float32)
-    averages = np.zeros((2, n_fibres, len(rates)), np.float32)  # now, and when the press began
+    averages = np.zeros((n_fibres, len(rates)), np.float32)
+    history = np.zeros((n_fibres, len(rates)), np.float32)  # the averages when the press began, from its rest
+    rest = np.zeros(n_fibres, np.float32)
+    windows = np.zeros((n_fibres, n_windows), np.float32)  # of the press, as far as they are complete
     levels = np.zeros((2, n_fibres), np.float32)  # baseline, and the largest deviation of the press
     max_square = np.zeros(1, np.float32)
     missing = np.zeros(n_fibres, np.int64)
-    pad = np.zeros(7, np.int64)
-    n_presses = 0
+    pad = np.zeros(8, np.int64)
+    n_presses = n_estimates = 0
     for n in range(n_readings):
-        _ingest(n, readings[n], ring, averages[0], levels[0], missing, rates)
+        _ingest(n, readings[n], ring, averages, levels[0], missing, rates)
         if len(pressed):
             change = _follow(n, pressed[n], pad)
         else:
             change = _detect(n, ring[n % RING], fibre_mask, inverse_noise, detector, levels, max_square, pad)
         if change > 0:
             missing[:] = 0
-            pad[ESTIMATED], pad[TOUCHED] = 0, n
-            _store_history(n, ring, averages, rates, pad)
+            pad[TOUCHED], pad[N_COMPLETE], pad[N_ESTIMATES] = n, 0, 0
+            _store_begin(n, rest_length, ring, averages, rates, pad, rest, history)
         ended = change < 0
-        if pad[ESTIMATED] == 0 and (ended or (pad[PRESSED] == 1 and n >= pad[DOWN_COMMAND] + windows[-1, 1] - 1)):
-            pad[ESTIMATED] = 1
-            edges[n_presses, 0], edges[n_presses, 1], edges[n_presses, 2] = pad[DOWN_COMMAND], n, n_readings
-            end = n if ended else n + 1
+        if pad[PRESSED] == 0 and not ended:
+            continue
+        end = n if ended else n + 1
+        while pad[N_COMPLETE] < n_windows and (ended or pad[DOWN_COMMAND] + down[pad[N_COMPLETE], 1] <= end):
+            k = pad[N_COMPLETE]
             for c in range(n_fibres):
-                valid[n_presses, c] = 4 * missing[c] <= n - pad[TOUCHED]
-                _compute_features(c, end, ring, averages[1, c], pad, windows, features[n_presses, c])
+                windows[c, k] = _window_mean(c, pad[DOWN_COMMAND], down[k], end, ring, pad) - rest[c]
+            pad[N_COMPLETE] += 1
+        if pad[N_COMPLETE] == 0:
+            continue
+        if pad[N_ESTIMATES] == 0:
+            edges[n_presses, 0], edges[n_presses, 1] = pad[DOWN_COMMAND], n_readings
             n_presses += 1
-        if ended and n_presses > 0:
-            edges[n_presses - 1, 2] = pad[UP_COMMAND]
-    return n_presses
+        pad[N_ESTIMATES] += 1
+        if ended:
+            edges[n_presses - 1, 1] = n
+        moments[n_estimates, 0], moments[n_estimates, 1], moments[n_estimates, 2] = n_presses - 1, n, pad[N_COMPLETE]
+        for c in range(n_fibres):
+            out = features[n_estimates, c]
+            valid[n_estimates, c] = 4 * missing[c] <= n - pad[TOUCHED]
+            out[:n_windows] = windows[c]
+            out[pad[N_COMPLETE] : n_windows] = 0
+            for k in range(len(now)):
+                out[n_windows + k] = _window_mean(c, end, now[k], end, ring, pad) - rest[c]
+            out[n_features:] = history[c]
+        n_estimates += 1
+    return n_presses, n_estimates
 
 
 @kernel
@@ -168,33 +195,30 @@ def _detect(
 
 
 @kernel
-def _store_history(n: int, ring: Any, averages: Any, rates: Any, pad: Any) -> None:
-    """Bring the averages up to the begin of the press, and store them."""
-    for c in range(averages.shape[1]):
+def _store_begin(
+    n: int, rest_length: int, ring: Any, averages: Any, rates: Any, pad: Any, rest: Any, history: Any
+) -> None:
+    """Store the rest before the press, and the averages, brought up to its begin, from that rest."""
+    first = max(pad[DOWN_COMMAND] - rest_length, pad[PREVIOUS_END])
+    for c in range(len(rest)):
+        total = np.float32(0)
+        for i in range(first, pad[DOWN_COMMAND]):
+            total += ring[i % RING, c]
+        rest[c] = total / np.float32(pad[DOWN_COMMAND] - first)
         for j in range(len(rates)):
-            level = averages[0, c, j]
+            level = averages[c, j]
             for i in range(max(n - LAG + 1, 0), pad[DOWN_COMMAND]):
                 level += rates[j] * (ring[i % RING, c] - level)
-            averages[1, c, j] = level
+            history[c, j] = level - rest[c]
 
 
 @kernel
-def _compute_features(c: int, end: int, ring: Any, history: Any, pad: Any, windows: Any, out: Any) -> None:
-    """Compute the windows of a fibre from the readings of the press before `end`, and its history."""
-    down_command, n_windows = pad[DOWN_COMMAND], len(windows) - 1
-    first = max(down_command + windows[0, 0], pad[PREVIOUS_END])
+def _window_mean(c: int, origin: int, window: Any, end: int, ring: Any, pad: Any) -> Any:
+    """Return the mean of a fibre over a window; what is not of the press before `end` repeats the nearest reading."""
     total = np.float32(0)
-    for i in range(first, down_command):
-        total += ring[i % RING, c]
-    rest = total / np.float32(down_command - first)
-    for k in range(n_windows):
-        low, high = windows[k + 1, 0], windows[k + 1, 1]
-        total = np.float32(0)
-        for i in range(down_command + low, down_command + high):
-            total += ring[max(min(i, end - 1), down_command) % RING, c]
-        out[k] = total / np.float32(high - low) - rest
-    for j in range(len(history)):
-        out[n_windows + j] = history[j] - rest
+    for i in range(origin + window[0], origin + window[1]):
+        total += ring[max(min(i, end - 1), pad[DOWN_COMMAND]) % RING, c]
+    return total / np.float32(window[1] - window[0])
 
 
 @dataclass(frozen=True)
@@ -220,7 +244,7 @@ class ThresholdDetector:
         """Choose the threshold of the best F1 score on presses, by index; noise is that of successive differences."""
         steps = np.abs(np.diff(interpolate_gaps(recording.readings), axis=0))
         noise = 1.4826 * np.sqrt(0.5) * np.median(steps, axis=0)  # median of the absolute difference to std
-        response = commanded_features(recording).windows[training, :, -1]
+        response = commanded_features(recording).windows[training, :, N_WINDOWS - 1]
         noise = np.maximum(noise, MIN_NOISE * np.sqrt(np.square(response).mean(axis=0)))
         noise = np.where(noise > 0, noise, np.inf)
         scores, delays = [], []
@@ -240,12 +264,24 @@ class ThresholdDetector:
 
 @dataclass(frozen=True)
 class StreamedPresses:
-    """Q presses as they are detected reading by reading."""
+    """P presses as they are detected reading by reading, and Q estimates of their positions, in their order."""
 
-    down_command: Indices  # (Q,) first reading of each
-    estimated: Indices  # (Q,) reading with which its position is estimated
-    ended: Indices  # (Q,) first reading after it; R if it has not ended
-    features: PressFeatures
+    down_command: Indices  # (P,) first reading of each press
+    ended: Indices  # (P,) first reading after it; R if it has not ended
+    press: Indices  # (Q,) press of each estimate
+    reading: Indices  # (Q,) latest reading that it knows; `ended` of the press for its final estimate
+    features: PressFeatures  # of the estimates
+
+    @property
+    def last(self) -> Indices:
+        """(P,) the last estimate of each press, which is the final one where the press has ended."""
+        return np.searchsorted(self.press, np.arange(len(self.down_command)), side="right") - 1
+
+    def at(self, n_complete: int) -> Indices:
+        """(P,) the first estimate of each press with so many windows complete, or the last where it has fewer."""
+        too_early = count_complete(self.features.seen) < n_complete
+        n_before = np.bincount(self.press[too_early], minlength=len(self.down_command))
+        return np.minimum(np.searchsorted(self.press, np.arange(len(self.down_command))) + n_before, self.last)
 
 
 def stream_presses(
@@ -253,23 +289,29 @@ def stream_presses(
 ) -> StreamedPresses:
     """Process (R, C) readings as a microcontroller does; `pressed` (R,) is None for the detector to decide."""
     n_readings, n_fibres = readings.shape
-    edges = np.empty((n_readings, 3), np.int64)
-    features = np.empty((n_readings, n_fibres, N_WINDOWS + N_HISTORY), np.float32)
+    edges, moments = np.empty((n_readings, 2), np.int64), np.empty((n_readings, 3), np.int64)
+    features = np.empty((n_readings, n_fibres, N_FEATURES + N_HISTORY), np.float32)
     valid = np.empty((n_readings, n_fibres), bool)
-    n_presses = _run_stream(
+    n_presses, n_estimates = _run_stream(
         np.ascontiguousarray(readings, np.float32),
         np.zeros(0, bool) if pressed is None else pressed,
         np.ones(n_fibres, bool) if fibre_mask is None else fibre_mask,
         RATES,
         detector.inverse_noise,
         np.array([detector.threshold, detector.delay], np.float32),
-        np.array([REST, *DOWN]),
+        N_REST,
+        np.array(DOWN),
+        np.array(NOW),
         edges,
+        moments,
         features,
         valid,
     )
-    windows, history = np.split(features[:n_presses].astype(np.float64), [N_WINDOWS], axis=2)
-    return StreamedPresses(*edges[:n_presses].T.copy(), PressFeatures(windows, history, valid[:n_presses].copy()))
+    windows, history = np.split(features[:n_estimates].astype(np.float64), [N_FEATURES], axis=2)
+    press, reading, n_complete = moments[:n_estimates].T.copy()
+    seen = np.arange(N_WINDOWS) < n_complete[:, None]
+    estimated = PressFeatures(windows, history, valid[:n_estimates].copy(), seen)
+    return StreamedPresses(*edges[:n_presses].T.copy(), press, reading, estimated)
 
 
 def commanded_presses(recording: Recording) -> Mask:
@@ -281,18 +323,23 @@ def commanded_presses(recording: Recording) -> Mask:
     return pressed[:-1]
 
 
-def commanded_features(recording: Recording) -> PressFeatures:
-    """Return the features of every press as commanded; one that the readings end too soon for has no valid fibre."""
+def commanded_features(recording: Recording, n_complete: int | None = None) -> PressFeatures:
+    """Return the features of every press as commanded, when so many windows of it are complete, or at its end if None.
+
+    One that the readings end too soon for has no valid fibre.
+    """
     unused = ThresholdDetector(np.full(recording.fibres, np.inf), np.inf, 0)
     presses = stream_presses(recording.readings, unused, commanded_presses(recording))
-    rows = np.searchsorted(recording.down_command, presses.down_command)
+    features = presses.features[presses.last if n_complete is None else presses.at(n_complete)]
+    read = count_complete(features.seen) >= (n_complete or N_WINDOWS)
+    rows = np.searchsorted(recording.down_command, presses.down_command[read])
 
     def of_all(values: NDArray[Any]) -> NDArray[Any]:
         out = np.zeros((len(recording.down_command), *values.shape[1:]), values.dtype)
         out[rows] = values
         return out
 
-    return PressFeatures(*map(of_all, vars(presses.features).values()))
+    return PressFeatures(*map(of_all, vars(features[read]).values()))
 
 
 def match_presses(recording: Recording, down_command: Indices) -> Indices:
@@ -317,19 +364,19 @@ class MemoryBudget:
 
 def table_bytes(n_fibres: int, n_measures: int, n_levels: int, hidden: int, quantized: bool) -> int:
     """Return the bytes of a student's tables; intervals are calibrated for `n_levels` numbers of failed fibres."""
-    n_inputs, n_outputs = n_fibres * (N_WINDOWS + 1), 2 * (2 + n_measures)
+    n_inputs, n_outputs = n_fibres * (N_FEATURES + 1) + N_WINDOWS, 2 * (2 + n_measures)
     weights = n_inputs * hidden + N_LAYERS * hidden * hidden + hidden * n_outputs
     biases = (N_LAYERS + 1) * hidden + n_outputs
     network = weights + 8 * biases if quantized else 4 * (weights + biases)  # int8: each bias comes with a scale
-    scaler = n_fibres * (2 * N_WINDOWS + N_HISTORY * (1 + N_WINDOWS))
-    return network + 4 * (scaler + n_fibres + N_HISTORY + n_levels * (3 + n_measures))
+    scaler = n_fibres * (2 * N_FEATURES + N_HISTORY * (1 + N_FEATURES))
+    return network + 4 * (scaler + n_fibres + N_HISTORY + N_WINDOWS * n_levels * (2 + n_measures))
 
 
 def state_bytes(n_fibres: int, n_measures: int, hidden: int) -> int:
     """Return the bytes of `localizer_state`, at most."""
-    n_inputs, n_outputs = n_fibres * (N_WINDOWS + 1), 2 * (2 + n_measures)
-    floats = n_fibres * (RING + 2 * N_HISTORY + 2) + n_inputs + 2 * hidden + n_outputs
-    return 4 * floats + 7 * n_fibres + SCALAR_BYTES
+    n_inputs, n_outputs = n_fibres * (N_FEATURES + 1) + N_WINDOWS, 2 * (2 + n_measures)
+    floats = n_fibres * (RING + 2 * N_HISTORY + 3 + N_WINDOWS) + n_inputs + 2 * hidden + n_outputs
+    return 4 * floats + 5 * n_fibres + SCALAR_BYTES
 
 
 def max_hidden(n_fibres: int, n_measures: int, n_levels: int, budget: MemoryBudget) -> int:

@@ -26,7 +26,10 @@ SHORT = QUICK.model_copy(update={"epochs": 4})
 
 
 class Output(NamedTuple):
-    """Output of the C program: bytes of state and tables; a row an event: n, kind, x, y, r50, r90, n_failed, ..."""
+    """Output of the C program: bytes of state and tables; a row an event.
+
+    Its columns are n, kind, x, y, r50, r90, n_failed, n_readings, is_final, and depth and force where they are there.
+    """
 
     state: int
     tables: int
@@ -63,7 +66,8 @@ def student(recording: Recording, localizer: LocalizerModel) -> StudentNetwork:
 @pytest.fixture(scope="session")
 def quantized(student: StudentNetwork) -> StudentNetwork:
     """The same in int8."""
-    return replace(student, model=replace(student.model, weights=quantize(student.model.weights)), quantized=True)
+    networks = {name: quantize(weights) for name, weights in student.model.networks.items()}
+    return replace(student, model=replace(student.model, networks=networks), quantized=True)
 
 
 @pytest.fixture(scope="session")
@@ -87,7 +91,7 @@ def build_program(
         lines = subprocess.run([path, mask], input=rows, capture_output=True, check=True).stdout.split(b"\n")
         state, tables = map(int, lines[0].split())
         events = np.array([line.split() for line in lines[1:-1]], float)
-        return Output(state, tables, events if len(events) else np.empty((0, 7)))
+        return Output(state, tables, events if len(events) else np.empty((0, 9)))
 
     return run
 

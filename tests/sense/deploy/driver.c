@@ -19,7 +19,8 @@ int main(int argc, char **argv) {
     const int events = held < 0.0f ? localizer_reading(&pad, row, (float)n, &touch)
                                   : localizer_reading_held(&pad, row, (float)n, held > 0.5f, &touch);
     if (events) {
-      printf("%ld %d %.9g %.9g %.9g %.9g %d", n, events, touch.x_mm, touch.y_mm, touch.r50_mm, touch.r90_mm, touch.n_failed);
+      printf("%ld %d %.9g %.9g %.9g %.9g %d %ld %d", n, events, touch.x_mm, touch.y_mm, touch.r50_mm, touch.r90_mm,
+             touch.n_failed, (long)touch.n_readings, touch.is_final);
 #ifdef DEPTH
       printf(" %.9g %.9g %.9g %.9g", touch.depth_mm, touch.depth_r90_mm, touch.force_n, touch.force_r90_n);
 #endif

@@ -35,11 +35,14 @@ MAX_RATIO_BEFORE_RELEASE = 2.2  # and of a student that does not see the release
 
 
 def check_twin(output: Output, twin: tuple, failed: tuple[int, ...] = ()) -> None:
-    """Check that a program gives the presses of its twin, with the same readings and positions."""
+    """Check that a program estimates at the same readings as its twin, and the same positions."""
     presses, prediction = twin
     masked = ~presses.features.fibre_mask | np.isin(np.arange(4), failed)
     assert np.isfinite(output.events).all()
-    assert np.array_equal(output.positions[:, 0], presses.estimated)
+    assert np.array_equal(output.positions[:, 0], presses.reading)
+    is_final = presses.reading == presses.ended[presses.press]
+    n_readings = presses.reading + 1 - is_final - presses.down_command[presses.press]
+    assert np.array_equal(output.positions[:, 7:9], np.column_stack([n_readings, is_final]))
     assert np.hypot(*(output.positions[:, 2:4] - prediction.positions_mm).T).max(initial=0) < TOLERANCE_MM
     radii = np.column_stack([prediction.r50_mm, prediction.r90_mm])
     np.testing.assert_allclose(output.positions[:, 4:6], radii, rtol=1e-4)
@@ -52,7 +55,7 @@ def test_header_gives_positions_of_the_twin_within_its_budget(weights: str, reco
     pressed, run = commanded_presses(recording), build_program(student, tmp_path)
     for failed in ((), (1,), (0, 2), (0, 1, 2), (0, 1, 2, 3)):
         output = run(recording.readings, pressed, failed)
-        assert len(output.positions) == 300
+        assert output.positions[:, 8].sum() == 300
         check_twin(output, student.predict(recording.readings, pressed, failed), failed)
         assert output.tables == student.table_bytes <= 40_000 - CODE_BYTES
         assert output.state <= student.state_bytes <= 8_000
@@ -60,11 +63,11 @@ def test_header_gives_positions_of_the_twin_within_its_budget(weights: str, reco
 
 def test_header_detects_presses_of_the_twin(student, program, recording) -> None:
     output, twin = program(recording.readings), student.predict(recording.readings)
-    assert len(twin[0].estimated) >= 290
+    assert len(twin[0].down_command) >= 290
     check_twin(output, twin)
     kinds = output.events[:, 1].astype(int)
     touched, released = output.events[kinds & 1 > 0, 0], output.events[kinds & 4 > 0, 0]
-    assert len(touched) == len(twin[0].estimated)
+    assert len(touched) == len(twin[0].down_command)
     assert np.array_equal(released, twin[0].ended[: len(released)])
     assert (touched[: len(released)] < released).all()
 
@@ -75,7 +78,7 @@ def test_header_gives_depth_and_force(deep_student, deep_recording, tmp_path) ->
     twin = deep_student.predict(deep_recording.readings, pressed)
     check_twin(output, twin)
     measures = [column for each in twin[1].measures.values() for column in (each.values, each.r90)]
-    np.testing.assert_allclose(output.positions[:, 7:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(output.positions[:, 9:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
 
 
 def test_header_writes_whole_rates_as_floats(student) -> None:
@@ -99,11 +102,11 @@ def test_program_of_the_tutorial_prints_touches(student, recording, tmp_path) ->
     lines = subprocess.run([program], input=text, capture_output=True, check=True, text=True).stdout.splitlines()
     numbers = np.array([re.findall(r"-?\d+\.\d", line) for line in lines], float)
     presses, prediction = student.predict(recording.readings)
-    assert len(lines) == len(presses.estimated)
+    assert len(lines) == len(presses.reading)
+    assert sum(line.endswith("released") for line in lines) in (len(presses.ended) - 1, len(presses.ended))
+    np.testing.assert_allclose(numbers[:, 0], recording.times_s[presses.reading], atol=0.052)
     np.testing.assert_allclose(numbers[:, 1:3], prediction.positions_mm, atol=0.052)
     np.testing.assert_allclose(numbers[:, 3], prediction.r90_mm, atol=0.052)
-    late_s = numbers[:, 0] - recording.times_s[presses.down_command]
-    assert -0.06 < late_s.min() <= late_s.max() < 0.8
 
 
 def test_header_survives_the_wrap_of_its_counter(student, recording, tmp_path) -> None:
@@ -137,8 +140,9 @@ def test_student_is_nearly_as_accurate_as_its_teacher(
 ) -> None:
     _, test = split_unseen(recording, localizer, QUICK)
     assert set(test.tolist()) == set(localizer.test)
-    evaluation = evaluate_student(student, [localizer], recording, test)
-    header, teacher = evaluation["errors"]["header"], evaluation["errors"]["press_and_release"]
+    evaluation = evaluate_student(student, localizer, recording, test)
+    header, teacher = evaluation["errors"]["header"], evaluation["errors"]["whole press"]
+    assert list(evaluation["errors"]) == ["header", "at the end", "whole press"]
     assert header[0]["mean_mm"] < MAX_RATIO_BEFORE_RELEASE * teacher[0]["mean_mm"]
     assert [row["n_failed"] for row in header] == [0, 1, 2, 3]
     assert all(0.75 < row["within_r90"] < 1 for row in header)
@@ -147,16 +151,18 @@ def test_student_is_nearly_as_accurate_as_its_teacher(
 
 
 @pytest.mark.slow
-def test_student_is_nearly_as_accurate_as_a_causal_localizer_on_the_published_recording(published: Path) -> None:
+def test_student_is_nearly_as_accurate_as_its_teacher_before_the_release_on_the_published_recording(
+    published: Path,
+) -> None:
     """With 64 KiB of RAM, after a training of the same length."""
     recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 1200)
-    options = LocalizerSettings(members=1, hidden=96, layers=3, epochs=40, batch=128, features="causal", max_failures=1)
+    options = LocalizerSettings(members=1, hidden=96, layers=3, epochs=40, batch=128, max_failures=1)
     localizer, _ = calibrate(recording, options)
     training, test = split_unseen(recording, localizer, options)
     student = distill(recording, localizer, training, MemoryBudget(150_000, 65_536), options)
-    evaluation = evaluate_student(student, [localizer], recording, test)
+    evaluation = evaluate_student(student, localizer, recording, test)
     errors = evaluation["errors"]
-    assert errors["header"][0]["mean_mm"] <= MAX_RATIO * errors["causal"][0]["mean_mm"]
+    assert errors["header"][0]["mean_mm"] <= MAX_RATIO * errors["at the end"][0]["mean_mm"]
     assert evaluation["n_detected"] >= 0.95 * len(test)
     assert evaluation["n_false"] <= 0.03 * len(test)
 
@@ -170,8 +176,8 @@ def test_distill_ignores_test_presses(brief: Recording, localizer: LocalizerMode
     options, budget = QUICK.model_copy(update={"epochs": 2}), MemoryBudget(20_000, 4_000)
     recordings = brief, replace(brief, presses_mm=wrong)
     one, other = (distill(each, localizer, training, budget, options) for each in recordings)
-    for name, weight in one.model.weights.items():
-        assert np.array_equal(weight, other.model.weights[name])
+    for name, weight in one.weights.items():
+        assert np.array_equal(weight, other.weights[name])
     assert np.array_equal(one.model.interval_factors, other.model.interval_factors)
     assert one.detector.threshold == other.detector.threshold
 
@@ -186,8 +192,8 @@ def test_split_leaves_out_presses_that_cannot_test(brief: Recording, localizer: 
 
 
 def test_quantize_is_within_half_a_step(student: StudentNetwork) -> None:
-    quantized = quantize(student.model.weights)
-    for name, weight in student.model.weights.items():
+    quantized = quantize(student.weights)
+    for name, weight in student.weights.items():
         step = np.abs(weight).max(axis=-2, keepdims=True) / 127 if name.endswith(".w") else 0  # biases stay
         assert (np.abs(quantized[name] - weight) <= 0.501 * step).all()
         assert not name.endswith(".w") or (np.abs(np.rint(quantized[name] / step)) <= 127).all()

@@ -59,9 +59,27 @@ def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, record
             np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
 
 
-@pytest.mark.parametrize("features", ["causal", "onset", "published"])
-def test_graph_has_all_kinds_of_features(features: str, brief: Recording, tmp_path: Path) -> None:
-    options = QUICK.model_copy(update={"features": features, "epochs": 2, "members": 1})
+def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recording) -> None:
+    """It is called with the readings so far, from the touch to after the release; first, nothing is known."""
+    readings, down, up = recording.readings, recording.down_command[:6], recording.up_command[:6]
+    so_far = Recording(readings, recording.times_s, recording.presses_mm[:6], down, up)
+    n_complete = []
+    for end in range(down[-1] + 1, up[-1] + 24):
+        expected = localizer.predict(so_far, until=np.full(6, end))
+        n_complete.append(localizer.raw_features(so_far, np.full(6, end)).seen[-1].sum())
+        inputs = {"down_command": down, "up_command": np.minimum(up, end), "fibre_mask": np.ones((6, 4), bool)}
+        positions_mm, std_mm, r90_mm = graph.run(
+            ["positions_mm", "std_mm", "r90_mm"], inputs | {"readings": readings[:end]}
+        )
+        check_positions(positions_mm, expected)
+        np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
+        np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+    assert sorted(set(n_complete)) == list(range(18))
+
+
+def test_graph_of_a_brief_training_is_tested_with_its_recording(brief: Recording, tmp_path: Path) -> None:
+    """Of one member, which has no Bayesian localizers, and with a last press that the recording cuts off."""
+    options = QUICK.model_copy(update={"epochs": 2, "members": 1})
     report = export_onnx(calibrate(brief, options)[0], DIGEST, tmp_path / "l.onnx", brief)
     assert report.position_difference_mm < MAX_DIFFERENCE_MM
     assert report.n_presses == 40
@@ -87,13 +105,17 @@ def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
     assert list(json.loads(metadata["outputs"])) == [each.name for each in model.graph.output]
     assert [each.dim_param for each in model.graph.input[1].type.tensor_type.shape.dim] == ["presses"]
     text = exported[1].text
-    assert text.startswith("1.9 MB, tested on 300 presses with up to 3 failed fibres: positions within ")
+    assert (
+        " MB, tested on 300 presses and at every moment of one, with up to 3 failed fibres: positions within " in text
+    )
 
 
-def test_export_refuses_the_published_method_and_a_graph_that_differs(localizer, tmp_path, monkeypatch) -> None:
+def test_export_refuses_other_localizers_and_a_graph_that_differs(localizer, tmp_path, monkeypatch) -> None:
     path = tmp_path / "l.onnx"
     with pytest.raises(InputError, match="method published, expected ensemble"):
         export_onnx(replace(localizer, method="published"), DIGEST, path)
+    with pytest.raises(InputError, match="of features array, expected windows"):
+        export_onnx(replace(localizer, features="array"), DIGEST, path)
     monkeypatch.setattr(onnx_export, "MAX_DIFFERENCE_MM", 1e-9)
     with pytest.raises(Fault, match="not written, positions by onnxruntime differ"):
         export_onnx(localizer, DIGEST, path)

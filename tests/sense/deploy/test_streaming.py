@@ -11,7 +11,7 @@ from padforge.sense.deploy.streaming import (
     HIDDEN_STEP,
     MAX_PRESS,
     N_REST,
-    PRESS,
+    N_WINDOWS,
     TIME_CONSTANTS,
     MemoryBudget,
     ThresholdDetector,
@@ -23,29 +23,70 @@ from padforge.sense.deploy.streaming import (
     stream_presses,
     table_bytes,
 )
-from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.features import N_TIMED, NOW, compute_features
+from padforge.sense.localizer.moments import complete_at
 
 UNUSED = ThresholdDetector(np.full(4, np.inf), np.inf, 0)
 
 
-def test_stream_presses_as_commanded_gives_the_windows_of_causal_features(recording) -> None:
+def test_stream_presses_as_commanded_gives_the_features_of_every_moment(recording: Recording) -> None:
+    commands = recording.down_command, recording.up_command
     presses = stream_presses(recording.readings, UNUSED, commanded_presses(recording))
-    assert np.array_equal(presses.down_command, recording.down_command)
-    assert np.array_equal(presses.ended, recording.up_command)
-    assert np.array_equal(presses.estimated, recording.down_command + PRESS - 1)
+    assert np.array_equal(presses.down_command, commands[0])
+    assert np.array_equal(presses.ended, commands[1])
+    readings = [np.arange(down + 1, min(up + 1, len(recording.readings))) for down, up in zip(*commands, strict=True)]
+    assert np.array_equal(presses.reading, np.concatenate(readings))
+    assert np.array_equal(presses.press, np.repeat(np.arange(300), [len(each) for each in readings]))
     assert presses.features.fibre_mask.all()
-    expected = compute_features(recording.readings, recording.down_command, recording.up_command, "causal")
-    np.testing.assert_allclose(commanded_features(recording).windows, expected.windows, atol=2e-6)
+    own, numbers = slice(N_WINDOWS), np.arange(300)
+    for n_readings in (2, 3, 7, 9, 16, 19, 20, None):  # of every press so far, to its end if None
+        if n_readings is None:
+            rows, until = presses.last, commands[1]
+        else:
+            rows = np.searchsorted(presses.press, numbers) + n_readings - 2
+            until = presses.reading[rows] + 1
+            assert np.array_equal(presses.press[rows], numbers)
+        expected, features = compute_features(recording.readings, *commands, until), presses.features[rows]
+        assert np.array_equal(features.seen, expected.seen[:, own])
+        seen = features.seen[:, None]
+        np.testing.assert_allclose(features.windows[:, :, own], seen * expected.windows[:, :, own], atol=2e-6)
+        now = slice(N_TIMED, N_TIMED + len(NOW))
+        np.testing.assert_allclose(features.windows[:, :, N_WINDOWS:], expected.windows[:, :, now], atol=2e-6)
+
+
+def test_commanded_features_are_those_when_windows_are_complete(recording: Recording) -> None:
+    commands = recording.down_command, recording.up_command
+    for n_complete in (1, 4, 9):
+        until = complete_at(n_complete, *commands)
+        features = commanded_features(recording, n_complete)
+        expected = compute_features(recording.readings, *commands, until)
+        assert np.array_equal(features.seen, expected.seen[:, :N_WINDOWS])
+        now = expected.windows[:, :, N_TIMED : N_TIMED + len(NOW)]
+        np.testing.assert_allclose(features.windows[:, :, N_WINDOWS:], now, atol=2e-6)
+
+
+def test_stream_presses_keeps_the_windows_of_a_long_press(recording: Recording) -> None:
+    pressed = np.zeros(1000, bool)
+    pressed[100:900] = True
+    presses = stream_presses(recording.readings[:1000], UNUSED, pressed)
+    assert np.array_equal(presses.reading, np.arange(101, 901))
+    used = [*range(N_WINDOWS), *range(N_TIMED, N_TIMED + len(NOW))]
+    for n_readings in (20, 21, 30, 33, 500, 800):
+        features = presses.features[np.array([n_readings - 2])]
+        commands = np.array([100]), np.array([900]), np.array([100 + n_readings])
+        expected = compute_features(recording.readings[:1000], *commands)
+        np.testing.assert_allclose(features.windows, expected.windows[:, :, used], atol=2e-6)
 
 
 def test_history_is_the_averages_at_the_begin_of_the_press(recording: Recording) -> None:
     presses = stream_presses(recording.readings, UNUSED, commanded_presses(recording))
+    history = presses.features.history[presses.last]
     levels = np.repeat(recording.readings[:1, :, None], len(TIME_CONSTANTS), axis=2)[0]
     press = 0
     for n, row in enumerate(recording.readings[: recording.down_command[20]]):
         if n == presses.down_command[press]:
             rest = recording.readings[n - N_REST : n].mean(axis=0)
-            np.testing.assert_allclose(presses.features.history[press], levels - rest[:, None], atol=1e-5)
+            np.testing.assert_allclose(history[press], levels - rest[:, None], atol=1e-5)
             press += 1
         levels += (row[:, None] - levels) / np.array(TIME_CONSTANTS)
     assert press == 20
@@ -58,7 +99,9 @@ def test_stream_presses_handles_short_presses_without_pauses(recording: Recordin
     presses = stream_presses(recording.readings[:200], UNUSED, pressed)
     assert presses.down_command.tolist() == [1, 5, 7, 40, 91]
     assert presses.ended.tolist() == [3, 6, 8, 90, 92]
-    assert presses.estimated.tolist() == [3, 6, 8, 59, 92]
+    assert presses.reading[presses.last].tolist() == [3, 6, 8, 90, 92]
+    assert np.bincount(presses.press).tolist() == [2, 1, 1, 50, 1]
+    assert presses.features.seen[presses.last].all()
     assert np.isfinite(presses.features.windows).all()
     pressed[150:] = True
     assert stream_presses(recording.readings[:200], UNUSED, pressed).ended[-1] == 200
