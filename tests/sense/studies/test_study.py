@@ -17,10 +17,11 @@ from matplotlib.figure import Figure
 
 from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
-from padforge.sense.settings import RigSettings
+from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
 from padforge.sense.studies.multicontact import multicontact_study
+from padforge.sense.studies.strokes import strokes_study
 from padforge.sense.studies.study import (
     ADC_COUNTS,
     Sizes,
@@ -35,6 +36,7 @@ from padforge.sense.studies.study import (
 from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
+TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=16, max_failures=1)
 SMALLEST: dict[str, Callable[[], Study]] = {
     "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
     "drift": lambda: drift.drift_study(
@@ -43,6 +45,7 @@ SMALLEST: dict[str, Callable[[], Study]] = {
     "force": lambda: indentation.force_study(PADS, sizes=Sizes(60, 40, hidden=4, epochs=3)),
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
     "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
+    "strokes": lambda: strokes_study(PADS, presses=40, strokes=3, options=TINY),
     "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
     "sensitivity": lambda: sensitivity.sensitivity_study({"square": PADS["square"]}),
 }
