@@ -314,10 +314,11 @@ def stream_presses(
         valid,
     )
     windows, history = np.split(features[:n_estimates].astype(np.float64), [N_FEATURES], axis=2)
-    *moment, n_complete = moments[:n_estimates].T.copy()
+    press, reading, length, n_complete = moments[:n_estimates].T.copy()
+    down_command, ended = edges[:n_presses].T.copy()
     seen = np.arange(N_WINDOWS) < n_complete[:, None]
     estimated = PressFeatures(windows, history, valid[:n_estimates].copy(), seen)
-    return StreamedPresses(*edges[:n_presses].T.copy(), *moment, estimated)
+    return StreamedPresses(down_command, ended, press, reading, length, estimated)
 
 
 def commanded_presses(recording: Recording) -> Mask:
@@ -337,7 +338,7 @@ def commanded_features(recording: Recording, n_complete: int | None = None) -> P
     unused = ThresholdDetector(np.full(recording.fibres, np.inf), np.inf, 0)
     presses = stream_presses(recording.readings, unused, commanded_presses(recording))
     features = presses.features[presses.last if n_complete is None else presses.at(n_complete)]
-    read = count_complete(features.seen) >= (n_complete or N_WINDOWS)
+    read = np.flatnonzero(count_complete(features.seen) >= (n_complete or N_WINDOWS))
     rows = np.searchsorted(recording.down_command, presses.down_command[read])
 
     def of_all(values: NDArray[Any]) -> NDArray[Any]:
