@@ -273,7 +273,7 @@ def render_header(student: StudentNetwork, budget: MemoryBudget, about: Sequence
         loader=PackageLoader("padforge.sense.deploy", "."), undefined=StrictUndefined, keep_trailing_newline=True
     )
     environment.filters |= {"f": _float, "literal": _literal, "numbers": _numbers}
-    modules = map(vars, (streaming, network, feature_scaler, localizer_model))
+    modules = map(vars, (network, feature_scaler, localizer_model, streaming))  # the features are those of the stream
     constants = {name: value for module in modules for name, value in module.items() if name.isupper()}
     return environment.get_template("localizer.h.j2").render(
         constants | {"WRAP_AT": WRAP_AT, "WRAP_BY": WRAP_BY},

@@ -25,6 +25,7 @@ LAG = 8  # readings by which the averages lag; a touch must be detected sooner
 SETTLING = 3  # readings after a release in which the baseline is the reading, and no touch is detected
 BASELINE_RATE = 0.125  # weight of a new reading in the baseline while the pad is free
 RELEASE_SHARE = 0.5  # of the largest deviation; below it the press has ended
+RELEASE_LAG = 1  # readings that show a release before it is detected; the final estimate does without them
 MAX_PRESS = 1024  # readings; what lasts longer is a new rest
 N_REST = -REST[0]  # readings before a press that its rest is the mean of
 TIME_CONSTANTS = (2, 4, 8, 16, 32, 64, 128, 512, 2048)  # of the averages, readings
@@ -68,8 +69,9 @@ def _run_stream(
     """Fill `edges` of every press, and a row of the others for every estimate; return how many there are of both.
 
     `pressed` is empty for the detector to decide; `detector` holds its threshold and delay, and `down` (K, 2) and `now`
-    the windows. `edges` (R, 2) are the first reading of a press and the first after it, `moments` (R, 3) the press, the
-    reading and the number of complete windows of an estimate, `features` (R, C, F + J) and `valid` (R, C) what it uses.
+    the windows. `edges` (R, 2) are the first reading of a press and the first after it, `moments` (R, 4) of an estimate
+    the press, the reading, and how many readings of the press it uses and windows of it are complete, `features`
+    (R, C, F + J) and `valid` (R, C) what it uses.
     """
     n_readings, n_fibres = readings.shape
     n_windows, n_features = len(down), len(down) + len(now)
@@ -96,7 +98,9 @@ def _run_stream(
         ended = change < 0
         if pad[PRESSED] == 0 and not ended:
             continue
-        end = n if ended else n + 1
+        end = n + 1
+        if ended:
+            end = n if len(pressed) else n - RELEASE_LAG
         while pad[N_COMPLETE] < n_windows and (ended or pad[DOWN_COMMAND] + down[pad[N_COMPLETE], 1] <= end):
             k = pad[N_COMPLETE]
             for c in range(n_fibres):
@@ -110,7 +114,8 @@ def _run_stream(
         pad[N_ESTIMATES] += 1
         if ended:
             edges[n_presses - 1, 1] = n
-        moments[n_estimates, 0], moments[n_estimates, 1], moments[n_estimates, 2] = n_presses - 1, n, pad[N_COMPLETE]
+        moments[n_estimates, 0], moments[n_estimates, 1] = n_presses - 1, n
+        moments[n_estimates, 2], moments[n_estimates, 3] = max(end - pad[DOWN_COMMAND], 0), pad[N_COMPLETE]
         for c in range(n_fibres):
             out = features[n_estimates, c]
             valid[n_estimates, c] = 4 * missing[c] <= n - pad[TOUCHED]
@@ -269,7 +274,8 @@ class StreamedPresses:
     down_command: Indices  # (P,) first reading of each press
     ended: Indices  # (P,) first reading after it; R if it has not ended
     press: Indices  # (Q,) press of each estimate
-    reading: Indices  # (Q,) latest reading that it knows; `ended` of the press for its final estimate
+    reading: Indices  # (Q,) with which it comes; `ended` of the press for its final estimate
+    n_readings: Indices  # (Q,) readings of the press that it uses
     features: PressFeatures  # of the estimates
 
     @property
@@ -289,7 +295,7 @@ def stream_presses(
 ) -> StreamedPresses:
     """Process (R, C) readings as a microcontroller does; `pressed` (R,) is None for the detector to decide."""
     n_readings, n_fibres = readings.shape
-    edges, moments = np.empty((n_readings, 2), np.int64), np.empty((n_readings, 3), np.int64)
+    edges, moments = np.empty((n_readings, 2), np.int64), np.empty((n_readings, 4), np.int64)
     features = np.empty((n_readings, n_fibres, N_FEATURES + N_HISTORY), np.float32)
     valid = np.empty((n_readings, n_fibres), bool)
     n_presses, n_estimates = _run_stream(
@@ -308,10 +314,11 @@ def stream_presses(
         valid,
     )
     windows, history = np.split(features[:n_estimates].astype(np.float64), [N_FEATURES], axis=2)
-    press, reading, n_complete = moments[:n_estimates].T.copy()
+    press, reading, length, n_complete = moments[:n_estimates].T.copy()
+    down_command, ended = edges[:n_presses].T.copy()
     seen = np.arange(N_WINDOWS) < n_complete[:, None]
     estimated = PressFeatures(windows, history, valid[:n_estimates].copy(), seen)
-    return StreamedPresses(*edges[:n_presses].T.copy(), press, reading, estimated)
+    return StreamedPresses(down_command, ended, press, reading, length, estimated)
 
 
 def commanded_presses(recording: Recording) -> Mask:
@@ -331,7 +338,7 @@ def commanded_features(recording: Recording, n_complete: int | None = None) -> P
     unused = ThresholdDetector(np.full(recording.fibres, np.inf), np.inf, 0)
     presses = stream_presses(recording.readings, unused, commanded_presses(recording))
     features = presses.features[presses.last if n_complete is None else presses.at(n_complete)]
-    read = count_complete(features.seen) >= (n_complete or N_WINDOWS)
+    read = np.flatnonzero(count_complete(features.seen) >= (n_complete or N_WINDOWS))
     rows = np.searchsorted(recording.down_command, presses.down_command[read])
 
     def of_all(values: NDArray[Any]) -> NDArray[Any]:

@@ -19,6 +19,7 @@ from padforge.sense.deploy import onnx_export
 from padforge.sense.deploy.onnx_export import FORMAT, MAX_DIFFERENCE_MM, OnnxReport, export_onnx
 from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.network import predict
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import ROOT, tutorial_code
 
@@ -75,6 +76,23 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
         np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
         np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
     assert sorted(set(n_complete)) == list(range(18))
+
+
+def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None:
+    """After the touch of a press come the readings of another one."""
+    readings = np.array(recording.readings)
+    for press in range(0, 298, 2):
+        here, there = (recording.down_command[row] + np.arange(8, 20) for row in (press, press + 1))
+        readings[here] = recording.readings[there]
+    sliding = replace(recording, readings=readings)
+    scaled = localizer.scaled_features(sliding)
+    inputs = scaled.inputs, scaled.fibre_mask, scaled.seen
+    *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, localizer.sliding)
+    assert 20 < slid.sum() < 280
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(sliding, scaled.fibre_mask))
+    expected = localizer.predict_features(scaled)
+    check_positions(positions_mm, expected)
+    np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
 
 def test_graph_of_a_brief_training_is_tested_with_its_recording(brief: Recording, tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ def test_stream_presses_as_commanded_gives_the_features_of_every_moment(recordin
     readings = [np.arange(down + 1, min(up + 1, len(recording.readings))) for down, up in zip(*commands, strict=True)]
     assert np.array_equal(presses.reading, np.concatenate(readings))
     assert np.array_equal(presses.press, np.repeat(np.arange(300), [len(each) for each in readings]))
+    assert np.array_equal(presses.n_readings[presses.last][:-1], (commands[1] - commands[0])[:-1])
     assert presses.features.fibre_mask.all()
     own, numbers = slice(N_WINDOWS), np.arange(300)
     for n_readings in (2, 3, 7, 9, 16, 19, 20, None):  # of every press so far, to its end if None
@@ -45,6 +46,7 @@ def test_stream_presses_as_commanded_gives_the_features_of_every_moment(recordin
         else:
             rows = np.searchsorted(presses.press, numbers) + n_readings - 2
             until = presses.reading[rows] + 1
+            assert (presses.n_readings[rows] == n_readings).all()
             assert np.array_equal(presses.press[rows], numbers)
         expected, features = compute_features(recording.readings, *commands, until), presses.features[rows]
         assert np.array_equal(features.seen, expected.seen[:, own])
