@@ -347,8 +347,9 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
         raise InputError(
             f"{where}: method is {read.method}, features are {read.features}, expected both published or neither"
         )
-    n_features = {"windows": N_FEATURES, "published": 3}.get(read.features, shape[-1])
-    n_history, fibres = N_HISTORY if read.features == "windows" else 0, shape[0] if shape else 0
+    fibres, given = (shape[0], shape[-1]) if shape else (0, 0)
+    n_features = {"windows": N_FEATURES, "published": 3, "array": given}[read.features]
+    n_history = N_HISTORY if read.features == "windows" else 0
     n_timed = N_TIMED if read.features == "windows" else 0
     expected = {
         "mean_v": (fibres, n_features),

@@ -28,7 +28,7 @@ SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64)
 
 
 def same_networks(one: LocalizerModel, other: LocalizerModel) -> bool:
-    pairs = ((one.networks[name], other.networks[name]) for name in one.networks | other.networks)
+    pairs = ((one.networks[name], other.networks[name]) for name in {*one.networks, *other.networks})
     return all(np.array_equal(weights[part], others[part]) for weights, others in pairs for part in weights)
 
 
@@ -251,7 +251,7 @@ def test_calibrate_uncertainty_corrects_overconfidence(recording: Recording, loc
     assert shift[0, 0, 2] == shift[0, 0, 3] == pytest.approx(np.log(50), abs=0.7)
     assert put_right.interval_factors.shape == (N_TIMED + 1, 2, 3)
 
-    presses = vars(moments[-1]).values()
+    presses = moments[-1].inputs, moments[-1].fibre_mask, moments[-1].seen
     before, after = (
         predict_members(each.networks, *presses, *each.corrected)[-1, :, 2:] for each in (proud, put_right)
     )

@@ -84,9 +84,9 @@ def test_compute_features_stays_within_press_and_fibre(is_published: bool, until
 @given(until=st.integers(1, 60), press=st.integers(0, PRESSES - 1))
 def test_compute_features_ignores_readings_after_the_moment(until: int, press: int) -> None:
     readings, moments = noise(), DOWN_COMMAND + until
-    before = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[[press]]
+    before = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[press : press + 1]
     readings[moments[press] :] = 99
-    after = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[[press]]
+    after = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[press : press + 1]
     assert all(
         np.array_equal(one, other) for one, other in zip(vars(after).values(), vars(before).values(), strict=True)
     )

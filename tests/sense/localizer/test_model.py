@@ -170,6 +170,7 @@ def changed_networks(localizer: LocalizerModel, change: Callable[[Any], dict[str
         ("scaler.history_coef.0.0", [1.0], r"scaler\.history_coef"),
         ("scaler.scale_v.0.0", 0.0, "scale_v"),
         ("scaler.mean_v.0.0", np.nan, "mean_v"),
+        *(("scaler.mean_v", value, r"scaler\.mean_v has shape") for value in (1.0, [1.0, 2.0])),
         *(("rate_hz", value, "rate_hz") for value in (0, "13", np.nan)),
         ("scaler.origin_mm", [0.0], "origin_mm"),
         *(("test", value, "test") for value in ([-1], [True], [3, 3])),
