@@ -87,7 +87,7 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None
     sliding = replace(recording, readings=readings)
     scaled = localizer.scaled_features(sliding)
     inputs = scaled.inputs, scaled.fibre_mask, scaled.seen
-    *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, localizer.sliding)
+    *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, sliding=localizer.sliding)
     assert 20 < slid.sum() < 280
     positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(sliding, scaled.fibre_mask))
     expected = localizer.predict_features(scaled)

@@ -114,7 +114,7 @@ def assert_as_a_whole(recording: Recording, model: LocalizerModel, estimates: Se
         held = rows[is_held[rows]]
         up_command[press[held]] = np.maximum(up_command[press[held]], until[held])
         expected = model.predict(replace(recording, up_command=up_command), until=untils, **predict)
-        alike = [estimates[row] for row in rows]
+        alike = [estimates[row] for row in rows.tolist()]
         np.testing.assert_allclose(positions(alike).reshape(-1, 2), expected.positions_mm[press[rows]], atol=1e-3)
         np.testing.assert_allclose([each.r90_mm for each in alike], expected.r90_mm[press[rows]], rtol=1e-3)
 
@@ -242,7 +242,9 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monk
     events = live.feed(part.times_s, part.readings)
     fault = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
     estimates = [event for event in events if isinstance(event, Estimate)]
-    assert (events[fault - 1].press, events[fault - 1].final, events[fault + 1].press) == (5, True, 6)
+    before, after = events[fault - 1], events[fault + 1]
+    assert isinstance(before, Estimate)
+    assert (before.press, before.final, after.press) == (5, True, 6)
     assert all(each.failed == (() if each.press < 6 else (1,)) for each in estimates)
     later = [each for each in estimates if each.press >= 6]
     next_down = np.append(down_command[1:], len(part.readings))[[each.press for each in later]]
