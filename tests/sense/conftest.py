@@ -63,7 +63,7 @@ def deep_recording(once: Once) -> Recording:
 
 @pytest.fixture(scope="session")
 def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[LocalizerModel, Evaluation]:
-    options = QUICK.model_copy(update={"members": 1, "epochs": 40})
+    options = QUICK.model_copy(update={"members": 1, "epochs": 24})
     return once("deeply-calibrated", lambda folder: calibrate(deep_recording, options))
 
 
