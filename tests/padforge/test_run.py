@@ -60,7 +60,7 @@ def test_run_makes_everything(finished: tuple[Path, str]) -> None:
         assert re.fullmatch(rf"padforge-{name}/\d", document["format"])
         assert set(document["provenance"]) >= {"command", "seed", "versions", "inputs"}
     text = (out / "report.html").read_text()
-    assert text.count('src="data:image/') == 7
+    assert text.count('src="data:image/') == 8
     assert "http://" not in text.replace("http://www.w3.org", "")
     for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Provenance"):
         assert f">{heading}</h2>" in text

@@ -62,7 +62,7 @@ def calibration_document() -> dict:
     found = {(): 1.0, (0,): 1.5, (1,): 4.25, (2,): 1.25, (3,): 2.0}
     pairs = {(one, two): found[one,] + found[two,] for two in range(4) for one in range(two)}
     return {
-        "format": "padforge-calibration/2",
+        "format": "padforge-calibration/3",
         **errors(found | pairs),
         "split": "random",
         "test_presses": 12,

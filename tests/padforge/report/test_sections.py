@@ -197,7 +197,7 @@ def test_report_refuses_folder_without_results(tmp_path: Path) -> None:
 DAMAGED = {
     "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}'],
     "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
-    "calibration.json": ['{"format": "padforge-calibration/2", "errors": []}'],
+    "calibration.json": ['{"format": "padforge-calibration/3", "errors": []}'],
     "fibre_loss.json": ['{"format": "padforge-fibre-loss/3", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
     "recording/start.json": ['{"format": "padforge-recording/2", "fibres": 4}'],
     "mould.stl": ["solid nothing"],

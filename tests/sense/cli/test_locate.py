@@ -63,7 +63,7 @@ def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model
 def test_deploy_writes_a_graph(few) -> None:
     code, out, _ = few("deploy", "--model", "model", "rec", "localizer.onnx")
     assert code == 0
-    assert "tested on 60 presses with up to 3 failed fibres: positions within " in out
+    assert "tested on 60 presses and at every moment of one, with up to 3 failed fibres: positions within " in out
     assert out.endswith(" -> localizer.onnx\n")
     assert few("deploy", "--model", "model", "again.onnx")[0] == 0
     assert Path("again.onnx").read_bytes() == Path("localizer.onnx").read_bytes()
@@ -75,7 +75,7 @@ def test_deploy_writes_a_header(few) -> None:
     lines = out.splitlines()
     assert " KiB of 40, 8 of them for code; RAM " in lines[0]
     assert lines[1] == "mean error in mm on 9 presses never trained on"
-    assert lines[2].split() == ["failed", "sets", "header", "causal", "press_and_release"]
+    assert lines[2].split() == ["failed", "sets", "header", "at", "the", "end", "whole", "press"]
     assert [line.split()[:2] for line in lines[3:7]] == [["0", "1"], ["1", "4"], ["2", "6"], ["3", "4"]]
     assert lines[-1] == "localizer -> localizer.h"
     assert "int8_t localizer" not in Path("localizer.h").read_text()

@@ -78,8 +78,7 @@ def test_windows_yet_to_come_have_no_influence(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", range(1, N_DOWN + 1))
-def test_a_resting_finger_is_where_its_latest_windows_were(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    monkeypatch.setattr(press_sampler, "SLIDING", 0.0)
+def test_a_resting_finger_is_where_its_latest_windows_were(count: int) -> None:
     presses, table = made(waves(), 1.0, 0.1)
     rng = np.random.default_rng(2)
     factor, offset = rng.standard_normal((2, FIBRES, len(NOW), N_DOWN)).astype(np.float32)
@@ -108,18 +107,16 @@ def test_a_stroke_may_be_a_press_at_rest(monkeypatch: pytest.MonkeyPatch, name: 
         presses, table = made(0 * waves(), 1.0, 0.0)
     found = []
     for share in (0.0, 1.0):
-        monkeypatch.setattr(press_sampler, "SLIDING", share)
-        found.append(draw(presses, table, PHASES[N_TIMED][name])[1])
+        found.append(draw(presses, table, replace(PHASES[N_TIMED][name], sliding=share))[1])
     np.testing.assert_allclose(found[1], found[0], atol=1e-4)
 
 
 @pytest.mark.parametrize("count", [3, N_DOWN, N_TIMED])
 def test_a_stroke_goes_at_its_speed(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     """All windows respond alike to where the finger is, so they tell where it was; it ends at the target."""
-    monkeypatch.setattr(press_sampler, "SLIDING", 1.0)
     monkeypatch.setattr(press_sampler, "SPEEDS_MM_S", (1.0, 2.0))
     presses, table = made(np.eye(2)[:, :, None] * np.ones(N_FEATURES), 0.0, 0.0)
-    rows, features, _ = draw(presses, table, Phase(count, (1.0,)))
+    rows, features, _ = draw(presses, table, Phase(count, (1.0,), sliding=1.0))
     times = np.array([(first + end - 1) / 2 for first, end in DOWN])[1:count]
     step = np.diff(features[:, :, 1 : min(count, N_DOWN)], axis=2) / np.diff(times[: N_DOWN - 1])
     np.testing.assert_allclose(step, np.broadcast_to(step[:, :, :1], step.shape), atol=1e-4)
