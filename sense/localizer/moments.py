@@ -49,9 +49,9 @@ class Phase:
 N_DOWN = len(DOWN)
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
-        "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.6, sliding=0.3),
+        "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.4, sliding=0.3),
         "settled": Phase(N_DOWN, (1.0,), 1.3),
-        "released": Phase(N_DOWN + 1, (*(0.5 / (len(UP) - 1),) * (len(UP) - 1), 0.5), 1.8),
+        "released": Phase(N_DOWN + 1, (*(0.5 / (len(UP) - 1),) * (len(UP) - 1), 0.5), 1.7),
     },
     N_DOWN: {"held": Phase(1, (*(0.5 / (N_DOWN - 1),) * (N_DOWN - 1), 0.5), sliding=0.2)},
     0: {"press": Phase(0, (1.0,))},

@@ -126,23 +126,24 @@ class PressSampler:
         time = torch.cat([self._middle.expand(batch, -1), end - back], dim=1)
         windows = torch.cat([down.expand(batch, -1), windows], dim=1)
 
-        def distance(lag: float | Tensor) -> Tensor:
+        def distance(time: Tensor) -> Tensor:
             """(B, n, 2) from the targets back to where the finger was, from the touch on."""
-            behind = (end - (time - lag).clamp(min=float(self._middle[1]))).clamp(min=0)
+            behind = (end - time.clamp(min=float(self._middle[1]))).clamp(min=0)
             return behind[:, :, None] * velocity[:, None]
 
-        def response(window: Tensor, lag: float | Tensor) -> Tensor:
-            return self._window_response((targets[:, None, :2] - distance(lag)).clamp(-1, 1), window)
+        def response(window: Tensor, time: Tensor) -> Tensor:
+            return self._window_response((targets[:, None, :2] - distance(time)).clamp(-1, 1), window)
 
-        expected = response(windows.clamp(max=SUDDEN), 0.0)
+        expected = response(windows.clamp(max=SUDDEN), time)
         for later in range(SUDDEN + 1, N_DOWN):
-            window = torch.full_like(windows, later)
-            lag = self._middle[later] - self._middle[SUDDEN]
-            change = response(window, lag) - response(window - 1, lag)
-            expected = expected + torch.where((windows >= later)[:, :, None], change, 0.0)
+            # Windows of `DOWN` before it have not seen the change; those of now may have.
+            behind = time[:, later:] - (self._middle[later] - self._middle[SUDDEN])
+            window = torch.full_like(windows[:, later:], later)
+            change = response(window, behind) - response(window - 1, behind)
+            expected[:, later:] += torch.where((windows[:, later:] >= later)[:, :, None], change, 0.0)
         if self.depth_gain:
             expected = (1 + self.depth_gain * targets[:, None, 2:3]) * expected
-        squared_mm = distance(0.0).square().sum(dim=2) / self._per_mm**2
+        squared_mm = distance(time).square().sum(dim=2) / self._per_mm**2
         correlation = torch.exp(squared_mm / (-2 * RESIDUAL_MM**2))[:, None]
         of_down = residual[:, :, :N_DOWN]
         near, far = (torch.take_along_dim(each, windows[:, None], dim=2) for each in (of_down, of_down.roll(1, 0)))
