@@ -42,11 +42,13 @@ class ResponseModel:
         fibre_mask: Mask,
         relative_depth: Array | None = None,
         phases: Sequence[slice] = (),
+        ridge_history: float = RIDGE_HISTORY,
     ) -> "ResponseModel":
         """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
 
         Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V. `relative_depth` (Q,) is that
         of each press over that of the table; windows of a phase have their sensitivity modulated together.
+        `ridge_history` is the penalty on weights of the history.
         """
         fibres, pasts = history.shape[1:]
         size, n_rbf = windows.shape[2], RBF_SIDE**2
@@ -54,7 +56,7 @@ class ResponseModel:
         history_mean = np.zeros((fibres, pasts))
         history_coef = np.zeros((fibres, pasts, size + len(phases)))
         table = np.zeros((len(grid_rbf), fibres, size + len(phases)))
-        penalty = np.diag(np.repeat([RIDGE_POSITION, RIDGE_HISTORY], [n_rbf, pasts]))
+        penalty = np.diag(np.repeat([RIDGE_POSITION, ridge_history], [n_rbf, pasts]))
         for fibre in np.flatnonzero(fibre_mask.any(axis=0)):
             valid = fibre_mask[:, fibre]
             past, response = history[valid, fibre], windows[valid, fibre]

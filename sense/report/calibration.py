@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
 from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new_figure, save_figure, style_axes
@@ -125,10 +126,14 @@ def draw_errors_by_moment(evaluation: Evaluation, path: Path) -> None:
             axes.plot(times_s, means, "o-", color=colour, ms=3.5, lw=1.4, label=label)
         axes.set_yscale("log")
         axes.set(xlabel=f"since the {since} (s)", ylabel="mean error (mm)")
+    means = [row["mean_mm"] for row in evaluation.by_moment]
+    for axes in (touch, lift):
+        axes.set_ylim(0.9 * min(means), 1.1 * max(means))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
-    lift.sharey(touch)
+        axes.yaxis.set_minor_formatter(NullFormatter())
     touch.legend(frameon=False, fontsize=8)
-    touch.set_title("Error while a press is read", loc="left", color=INK, fontsize=11)
+    touch.set_title("Error while a press is read\n", loc="left", color=INK, fontsize=11)
     x, y = evaluation.focus["pressed_mm"]
     moments = evaluation.focus["moments"]
     for number, moment in enumerate(moments):
@@ -140,6 +145,6 @@ def draw_errors_by_moment(evaluation: Evaluation, path: Path) -> None:
     focus.set_aspect("equal")
     focus.autoscale_view()
     focus.set(xlabel="x (mm)", ylabel="y (mm)")
-    focus.set_title("A touch comes into focus", loc="left", color=INK, fontsize=11)
+    focus.set_title("A touch comes into focus\n", loc="left", color=INK, fontsize=11)
     add_caption(focus, "circles of 90 %, later ones darker; cross: true position")
     save_figure(figure, path)

@@ -20,6 +20,7 @@ FIRST_HELD = 3  # first window of the press that counts as held: the tip has com
 HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(DOWN)], float)
 HOLD /= HOLD.sum()
 """Weights of the windows of a press in its response; shape (9,)."""
+RIDGE_HISTORY = 300.0  # penalty on weights of the history: less than for places, as the responses themselves are wanted
 GP_WIDTHS = (0.4, 0.8)  # standard deviations of the Gaussian kernels that are tried, grid units
 GP_PRESSES = 800
 """Presses that a Gaussian process is fitted to, at most: it takes the eigenvalues of a matrix of that size."""
@@ -83,7 +84,11 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
     positions_mm = recording.presses_mm[known]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
-        normalized[training], pressed[training], inputs.history[training], inputs.fibre_mask[training]
+        normalized[training],
+        pressed[training],
+        inputs.history[training],
+        inputs.fibre_mask[training],
+        ridge_history=RIDGE_HISTORY,
     )
     windows = remove_history(pressed, inputs.history, model.history_coef, model.history_mean_v)
     return Responses(positions_mm, windows @ HOLD, inputs.fibre_mask)
