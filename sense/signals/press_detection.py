@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from padforge.design.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
@@ -48,6 +47,8 @@ class PressDetector:
     """
 
     def __init__(self, fibres: int) -> None:
+        from scipy.special import chdtri  # slow to import, and needed here only
+
         fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
         self._fibres, self._pad = initial_state(fibres)
         self._last_s = -np.inf
