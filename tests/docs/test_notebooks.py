@@ -1,11 +1,14 @@
 """Notebooks are those of their pages, and run."""
 
+import shutil
 from pathlib import Path
 
 import nbformat
 import pytest
 
 from docs import notebooks
+from tests.docs.test_tutorials import followed, needs_unix_shell
+from tests.helpers.once import Once
 
 
 @pytest.mark.parametrize("page", notebooks.PAGES)
@@ -22,8 +25,17 @@ def test_notebook_is_that_of_its_page(page: str) -> None:
 
 
 @pytest.mark.slow
-def test_notebooks_run(tmp_path: Path) -> None:
-    """One after another, in one folder."""
-    for page in notebooks.PAGES:
-        notebooks.run_notebook(notebooks.make_notebook(page), tmp_path)
-    assert (tmp_path / "out" / "pad" / "calibration.json").is_file()
+@needs_unix_shell
+@pytest.mark.parametrize("page", [pytest.param(page, marks=pytest.mark.xdist_group(page)) for page in notebooks.PAGES])
+def test_notebook_runs_in_the_folder_of_its_page(page: str, once: Once, tmp_path: Path) -> None:
+    """Its commands are those of the page, which `test_tutorials.py` runs: here their cells only call padforge."""
+    folder = shutil.copytree(followed(page, once)[0], tmp_path / "followed")
+    notebook = notebooks.make_notebook(page)
+    commands = [cell for cell in notebook.cells if cell.source.startswith("%%sh\n")]
+    for cell in commands:
+        cell.source = "%%sh\npadforge --version"
+    notebooks.run_notebook(notebook, folder)
+    assert [cell.outputs[0].text.split(",")[0] for cell in commands] == ["padforge"] * len(commands)
+    shown = [output.data for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output]
+    assert shown
+    assert all("image/png" in data for data in shown)

@@ -1,5 +1,6 @@
 """Links of the documentation lead somewhere, and no page knows the machine it was written on."""
 
+import json
 import re
 from pathlib import Path
 
@@ -34,3 +35,11 @@ def test_pages_name_no_path_of_a_machine(page: Path) -> None:
     assert str(ROOT) not in text
     assert not re.search(r"(?<![\w.:/])/(work|home|tmp|opt|root|Users|mnt)/", text)
     assert not re.search(r"\b[A-Z]:\\", text)
+
+
+def test_devcontainer_installs_as_the_readme_does_for_development() -> None:
+    """The README's command for tests, with `-e`."""
+    line = re.search(r"<!-- tests -->\n```sh\n(.*) && [^&]*pytest", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert line
+    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8"))
+    assert container["postCreateCommand"] == line[1].replace("'.[test]'", "-e '.[test]'")

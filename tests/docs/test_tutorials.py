@@ -139,8 +139,13 @@ def followed(page: str, once: Once) -> tuple[Path, str]:
     return once(page, make)
 
 
+needs_unix_shell = pytest.mark.skipif(
+    not all(map(shutil.which, ("sh", "awk", "sed"))), reason="needs the tools of a Unix shell"
+)
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not all(map(shutil.which, ("sh", "awk", "sed"))), reason="needs the tools of a Unix shell")
+@needs_unix_shell
 @pytest.mark.parametrize("page", [pytest.param(page, marks=pytest.mark.xdist_group(page)) for page in BASES])
 def test_pages_print_what_they_show(page: str, once: Once) -> None:
     _, wrong = followed(page, once)

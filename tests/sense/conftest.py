@@ -1,6 +1,5 @@
 """A simulated recording and a quickly trained localizer, shared by the tests of sense."""
 
-import fcntl
 import sys
 import tempfile
 import time
@@ -132,6 +131,8 @@ class Robots:
 
 def lock_address(address: str) -> IO[str] | None:
     """The lock on an address; None where another process has it."""
+    import fcntl  # not on Windows, where tests of other parts run
+
     lock = (Path(tempfile.gettempdir()) / f"padforge-ur-{address}.lock").open("w")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
