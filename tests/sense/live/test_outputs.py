@@ -2,6 +2,7 @@
 
 import errno
 import json
+import pickle
 import re
 import socket
 import subprocess
@@ -227,9 +228,10 @@ def test_lsl_streams_readings_and_touches(tmp_path: Path, monkeypatch: pytest.Mo
         LslOutput("\udc80", 2, 13.0)
     (tmp_path / "lsl.cfg").write_text("[multicast]\nResolveScope = machine\n[log]\nlevel = -3\n")
     code = """
+import pickle, sys
 import pylsl
 from padforge.sense.live.outputs import LslOutput
-from tests.sense.live.test_outputs import READING, TOUCH
+reading, touch = pickle.load(sys.stdin.buffer)
 lsl = LslOutput("a pad", 2, 13.0)
 found = [pylsl.resolve_byprop("name", f"a pad {what}", timeout=20)[0] for what in ("readings", "touches")]
 readings, touches = (pylsl.StreamInlet(info) for info in found)
@@ -237,10 +239,12 @@ for inlet in (readings, touches):
     inlet.open_stream(timeout=20)
 channel = readings.info().desc().child("channels").child("channel")
 print(channel.child_value("label"), channel.child_value("unit"), found[0].nominal_srate(), found[0].channel_count())
-lsl.send(READING)
-lsl.send(TOUCH)
+lsl.send(reading)
+lsl.send(touch)
 print(readings.pull_sample(timeout=20)[0], touches.pull_sample(timeout=20)[0])
 """
     monkeypatch.setenv("LSLAPICFG", str(tmp_path / "lsl.cfg"))
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert done.stdout.splitlines() == ["fibre 1 V 13.0 2", "[1.0, nan] [4.0, 1.5, -2.25, 0.5, 1.0, 1.0]"], done.stderr
+    sent = pickle.dumps((READING, TOUCH))
+    done = subprocess.run([sys.executable, "-c", code], input=sent, capture_output=True, timeout=120, check=False)
+    lines = done.stdout.decode().splitlines()
+    assert lines == ["fibre 1 V 13.0 2", "[1.0, nan] [4.0, 1.5, -2.25, 0.5, 1.0, 1.0]"], done.stderr

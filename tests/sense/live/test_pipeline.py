@@ -151,17 +151,17 @@ def test_published_localizer_answers_once_a_press_is_over(recording, trained) ->
 
 
 @settings(max_examples=15)
-@given(st.lists(st.integers(0, 8 * 40), max_size=6))
+@given(st.lists(st.integers(0, 4 * 40), max_size=6))
 def test_live_events_do_not_depend_on_blocks(recording, hasty, cuts: list[int]) -> None:
-    part = first_presses(recording, 8)
+    part = first_presses(recording, 4)
     assert replay(part, hasty, cuts=sorted(cuts))[1] == replay(part, hasty)[1]
 
 
 @settings(max_examples=30)
-@given(st.lists(st.integers(1, 45), min_size=14, max_size=14))
+@given(st.lists(st.integers(1, 45), min_size=8, max_size=8))
 def test_live_handles_presses_of_any_length_and_distance(recording, hasty, lengths: list[int]) -> None:
     """Down to presses of one reading, and such that follow at once."""
-    part = first_presses(recording, 12)
+    part = first_presses(recording, 7)
     edges = 12 + np.cumsum(lengths)
     edges = edges[edges < len(part.readings) - 30]
     edges = edges[: len(edges) // 2 * 2]
