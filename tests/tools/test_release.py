@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import tomllib
 from datetime import date
 from pathlib import Path
 
@@ -92,10 +93,20 @@ def test_cut_is_refused_with_uncommitted_changes(checkout: Path) -> None:
         release.cut(checkout, "0.2.0", DAY)
 
 
-def test_own_files_can_be_released(capsys: pytest.CaptureFixture[str]) -> None:
-    """Their versions agree and something is unreleased; what is not decided is refused in one line."""
+def test_files_of_the_project_agree_on_its_version(tmp_path: Path) -> None:
+    """Apart from placeholders, what was cut of them would have notes."""
     root = Path(release.__file__).parents[1]
-    changelog = (root / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert "- " in release.changelog_sections(release.cut_changelog(changelog, "1000.0.0", DAY))["1000.0.0"]
+    for name in FILES:
+        text = re.sub("|".join(release.PLACEHOLDERS), "true", (root / name).read_text(encoding="utf-8"))
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    version = tomllib.loads((tmp_path / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    changelog = (tmp_path / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert next(iter(release.changelog_sections(changelog))) == "Unreleased"
+    if version not in release.changelog_sections(changelog):  # before the first release
+        (tmp_path / "CHANGELOG.md").write_text(release.cut_changelog(changelog, version, DAY), encoding="utf-8")
+    assert "- " in release.notes(tmp_path, version)
+
+
+def test_command_line_refuses_other_words_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert release.main([]) == 2
     assert capsys.readouterr().err == "release: got no words, allowed are cut VERSION and notes VERSION\n"
