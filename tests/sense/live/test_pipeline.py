@@ -218,7 +218,7 @@ def test_live_handles_a_press_that_is_held_for_hours(recording, hasty, monkeypat
         monkeypatch.setattr(f"padforge.sense.{module}.SLACK", slack)
     part = first_presses(recording, 6)
     assert part.down_command[held] < history
-    n_extra, at = 5 * (history + slack), int(part.up_command[held]) - 2
+    n_extra, at = 3 * (history + slack), int(part.up_command[held]) - 2
     wander = np.random.default_rng(1).normal(0, 3e-3, (n_extra, part.fibres)).cumsum(axis=0) / 10
     readings = np.insert(part.readings, at, part.readings[at] + wander, axis=0)
     up_command = part.up_command + n_extra * (np.arange(6) == held)
