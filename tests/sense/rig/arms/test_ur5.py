@@ -1,8 +1,9 @@
-"""The arm behind the real ur-rtde, against the emulated controller: what it does, and that it rests after a fault."""
+"""The arm behind the real ur-rtde, and behind our URScript program: what it does, and that it rests after a fault."""
 
 import importlib.util
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -16,16 +17,17 @@ import numpy as np
 import pytest
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
-from padforge.sense.rig.arms import ur5
-from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.arms import rtde, ur5
+from padforge.sense.rig.arms.ur5 import UR5, Driver
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
 from padforge.sense.virtual.ur5 import HOME, EmulatedUR5
 
-pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
+ONE_DRIVER = pytest.mark.parametrize("driver", ["urscript"], scope="module")
+"""For what does not depend on the driver."""
 LIMITS = Limits(box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, deadline_s=10)
 LOW: Pose = (*HOME[:2], 40.0, *HOME[3:])
 REST_S = 0.5
@@ -133,9 +135,10 @@ def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure:
     cure()
 
 
-def test_connect_refuses_unavailable_arm(robots: Any, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@ONE_DRIVER
+def test_connect_refuses_unavailable_arm(robots: Any, host: str, driver: Driver) -> None:
     robots.free()
-    with closing(UR5(host)) as arm:
+    with closing(UR5(host, driver)) as arm:
         assert fault_of(arm.connect) == "refused"
         assert fault_of(arm.state) == "lost"
         arm.stop()
@@ -144,14 +147,25 @@ def test_connect_refuses_unavailable_arm(robots: Any, host: str, monkeypatch: py
         refused_until_cured(arm, robot.protective_stop, "protective_stop", robot.clear)
         refused_until_cured(arm, robot.emergency_stop, "emergency_stop", robot.clear)
         arm.connect()
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'"):
-        UR5(host).connect()
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_driver_is_ur_rtde_where_it_is_installed(
+    robots: Any, host: str, monkeypatch: pytest.MonkeyPatch, installed: bool
+) -> None:
+    robots.free()
+    robots.get("cb3")
+    if installed:
+        pytest.importorskip("rtde_control")
+    else:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with closing(UR5(host)) as arm:
+        assert arm.connect()["driver"].startswith("ur-rtde 1" if installed else "URScript")
 
 
 @pytest.mark.slow
-def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, monkeypatch) -> None:
-    with closing(UR5(host)) as arm:
+def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, driver: Driver, monkeypatch) -> None:
+    with closing(UR5(host, driver)) as arm:
         refused_until_cured(arm, lambda: robot.refuse(True), "refused", lambda: robot.refuse(False))
         refused_until_cured(arm, lambda: robot.unplug(True), "refused", lambda: robot.unplug(False))
         monkeypatch.setattr(ur5, "CONNECT_S", 1.0)
@@ -159,11 +173,14 @@ def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, monke
         arm.connect()
 
 
-def test_connect_refuses_arm_in_use_on_this_computer(robot: EmulatedUR5, arm: UR5, address: str) -> None:
+@ONE_DRIVER
+def test_connect_refuses_arm_in_use_on_this_computer(
+    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
+) -> None:
     """Nor looked over by `doctor`; the move that is under way goes on."""
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    (diagnosis,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
+    (diagnosis,) = examine_arm(UR5(address, driver), RigSettings(), time.monotonic, time.sleep)
     assert diagnosis.status == "fail"
     assert "another program on this computer uses the arm" in diagnosis.message
     assert arm.state().moving
@@ -172,21 +189,22 @@ def test_connect_refuses_arm_in_use_on_this_computer(robot: EmulatedUR5, arm: UR
 
 @pytest.mark.slow
 def test_connect_refuses_arm_in_use_by_another_computer(
-    robot: EmulatedUR5, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go(arm, HOME)
     arm.move(LOW, 50, 500)
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # where the child locks: as if it ran on another computer
     with pytest.raises(RigFault, match="a program runs on the arm"):
-        UR5(address).connect()
+        UR5(address, driver).connect()
     assert arm.state().moving
     assert wait_until_still(arm, LIMITS).pose == pytest.approx(LOW, abs=0.1)
     go(arm, HOME)
 
 
-def test_force_is_limited_in_all_directions(robots: Any, host: str) -> None:
+@ONE_DRIVER
+def test_force_is_limited_in_all_directions(robots: Any, host: str, driver: Driver) -> None:
     robot = robots.get("e", surface_mm=100, stiffness_n_mm=2.0, tcp_mm=(0.0, 1.5, 150.0))
-    with closing(UR5(host)) as arm:
+    with closing(UR5(host, driver)) as arm:
         assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
         assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
         arm.move(LOW, 50, 500)
@@ -219,9 +237,16 @@ def signal_worker(name: str) -> Callable[[EmulatedUR5, UR5], None]:
     return send
 
 
+def upload_other_program(robot: EmulatedUR5) -> None:
+    """Another computer sends a program, which replaces the one that moves the arm."""
+    with socket.create_connection((robot.host, rtde.SCRIPT_PORT)) as script:
+        script.sendall(b"def other():\n  while True:\n    sync()\n  end\nend\n")
+
+
 FAULTS: dict[str, tuple[Callable[[EmulatedUR5, UR5], object], str, float, Callable[[EmulatedUR5], object]]] = {
     "protective stop": (lambda robot, arm: robot.protective_stop(), "protective_stop", 0.5, unlock_and_play),
     "stream frozen": (lambda robot, arm: robot.freeze(True), "stale", 1.0, lambda robot: robot.freeze(False)),
+    "other program": (lambda robot, arm: upload_other_program(robot), "lost", 1.0, lambda robot: robot.stop_program()),
     "program stopped": (lambda robot, arm: robot.stop_program(), "lost", 1.0, lambda robot: None),
     "worker killed": (signal_worker("SIGKILL"), "lost stale", 1.5, lambda robot: None),
     "worker hangs": (signal_worker("SIGSTOP"), "lost stale", 1.5, lambda robot: None),
@@ -279,7 +304,7 @@ def test_play_does_not_resume_old_move(robot: EmulatedUR5, arm: UR5) -> None:
 PARENT = f"""
 import sys, time
 from padforge.sense.rig.arms.ur5 import UR5
-arm = UR5(sys.argv[1])
+arm = UR5(*sys.argv[1:])
 arm.connect()
 arm.move({LOW}, 50, 500)
 print("moving", flush=True)
@@ -297,10 +322,12 @@ while True:
         pytest.param("e", "SIGKILL", marks=pytest.mark.slow),
     ],
 )
-def test_arm_rests_after_program_dies_or_is_suspended(robot: EmulatedUR5, arm: UR5, host: str, name: str) -> None:
+def test_arm_rests_after_program_dies_or_is_suspended(
+    robot: EmulatedUR5, arm: UR5, host: str, driver: Driver, name: str
+) -> None:
     go(arm, HOME)
     arm.close()
-    with subprocess.Popen([sys.executable, "-c", PARENT, host], stdout=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen([sys.executable, "-c", PARENT, host, driver], stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         assert program.stdout.readline() == "moving\n"
         time.sleep(0.15)
