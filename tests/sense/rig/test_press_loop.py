@@ -182,6 +182,14 @@ def test_run_stops_and_retreats_at_too_much_force(tmp_path, stays, outcome, end_
     assert arm.pose[2] == pytest.approx(end_mm, abs=2)
 
 
+def test_run_stops_and_retreats_when_the_force_sensor_fails_in_a_press(tmp_path):
+    arm, board, options = rig()
+    arm.hook = lambda arm: setattr(arm, "force_n", None if arm.pose[2] < 48 or arm.force_n is None else 0.0)
+    message = "the arm measures no force any more; allowed 60 N; .*; the tool was lifted off"
+    assert fault_of(tmp_path / "run", arm, board, options, message) == "force"
+    assert arm.pose[2] == 60
+
+
 def both_vanish(arm, board):
     board.lost = arm.time() > 101.1
     arm.lost = arm.stops > 0

@@ -28,7 +28,10 @@ from padforge.sense.virtual.ur5 import HOME, EmulatedUR5
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
 ONE_DRIVER = pytest.mark.parametrize("driver", ["urscript"], scope="module")
 """For what does not depend on the driver."""
-LIMITS = Limits(box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, deadline_s=10)
+LIMITS = Limits(
+    box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, max_force_n=None, deadline_s=10
+)
+FORCE_LIMITS = replace(LIMITS, max_force_n=50.0)
 LOW: Pose = (*HOME[:2], 40.0, *HOME[3:])
 REST_S = 0.5
 LONGEST_CALL_S = 5.0
@@ -208,15 +211,15 @@ def test_force_is_limited_in_all_directions(robots: Any, host: str, driver: Driv
         assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
         assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
         arm.move(LOW, 50, 500)
-        assert fault_of(wait_until_still, arm, LIMITS) == "force"
+        assert fault_of(wait_until_still, arm, FORCE_LIMITS) == "force"
         state = arm.state()
         assert not state.moving
         assert 50 < (state.force_n or 0) < 60
         arm.move(HOME, 1000, 20_000)
-        wait_until_still(arm, replace(LIMITS, max_force_n=None))
+        wait_until_still(arm, LIMITS)
         arm.move((HOME[0] + 80, *HOME[1:]), 40, 500)
         robot.push(60.0)
-        assert fault_of(wait_until_still, arm, LIMITS) == "force"
+        assert fault_of(wait_until_still, arm, FORCE_LIMITS) == "force"
         state = arm.state()
         assert state.pose[0] < HOME[0] + 40
         assert (state.force_n, state.sideways_n) == (0, 60)
