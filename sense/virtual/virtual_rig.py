@@ -36,7 +36,7 @@ def emulate_ur5(
     with (
         EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot,
         _emulate_board(pad, contact, rig, robot.true_poses) as (driver, board),
-        closing(UR5(HOST)) as arm,
+        closing(UR5.from_settings(rig.model_copy(update={"host": HOST}))) as arm,
     ):
         yield arm, driver, robot, board
 

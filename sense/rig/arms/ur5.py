@@ -42,7 +42,7 @@ class RtdeWorker:
 
     def __init__(self, host: str, driver: Driver, retreat: Retreat | None) -> None:
         self._host = host
-        self._retreats = driver == "urscript" and retreat is not None
+        self.retreats = driver == "urscript" and retreat is not None  # by itself, once it hears no more of the worker
         self.fault: RigFault | None = None  # why the worker has ended; None while it runs
         self.latest: ArmState | None = None  # last state of the arm
         self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
@@ -103,7 +103,7 @@ class RtdeWorker:
 
         A program that retreats by itself is left to do so: a stop would end it with the tool on the pad.
         """
-        self.stopped = self.stopped or (not self._retreats and stop_program(self._host, DASHBOARD_S))
+        self.stopped = self.stopped or (not self.retreats and stop_program(self._host, DASHBOARD_S))
         return self.stopped
 
     def _write(self, line: bytes) -> None:
@@ -239,7 +239,8 @@ class UR5:
         except RigFault:
             if not self._abandon():
                 reason = f"the arm {self._host} did not confirm the stop"
-                raise RigFault("lost", reason, "its watchdog stops it within 0.3 s, but look at it") from None
+                lift = " and lifts the tool off" if self._worker.retreats else ""
+                raise RigFault("lost", reason, f"its watchdog stops it within 0.3 s{lift}, but look at it") from None
 
     def close(self) -> None:
         """Stop the arm and close the link; never raises."""

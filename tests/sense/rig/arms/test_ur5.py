@@ -19,6 +19,7 @@ import pytest
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig.arms import rtde, ur5
 from padforge.sense.rig.arms.ur5 import UR5, Driver
+from padforge.sense.rig.arms.urscript import Retreat
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
@@ -358,3 +359,27 @@ def test_stop_works_without_script_connection(robot: EmulatedUR5, arm: UR5) -> N
     robot.drop("script")
     arm.stop()
     assert go(arm, LOW).pose == pytest.approx(LOW)
+
+
+def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: Any, host: str) -> None:
+    """The program on the arm does; a parent that lives on leaves it to do so."""
+    robot = robots.get("e", pose=(*HOME[:2], 120.0, *HOME[3:]), surface_mm=100)
+    with closing(UR5(host, "urscript", Retreat(110.0, *LIMITS.box_mm[:2], 100.0))) as arm:
+        arm.connect()
+        go(arm, (*HOME[:2], 95.0, *HOME[3:]))
+        signal_worker("SIGKILL")(robot, arm)
+        with pytest.raises(RigFault, match="lifts the tool off"):
+            within(REST_S, arm.stop)
+        time.sleep(0.7)
+        assert robot.true_poses(time.monotonic())[0, 2] == pytest.approx(110, abs=0.1)
+        arm.connect()
+        robots.free()
+
+
+@ONE_DRIVER
+def test_connect_refuses_registers_that_another_client_writes(robot: EmulatedUR5, host: str, driver: Driver) -> None:
+    with socket.create_connection((robot.host, rtde.RTDE_PORT)) as other, closing(UR5(host, driver)) as arm:
+        other.sendall(rtde.pack_frame(rtde.INPUTS, b"input_int_register_25"))
+        assert other.recv(100)
+        with pytest.raises(RigFault, match="lets another program write input_int_register_25"):
+            arm.connect()
