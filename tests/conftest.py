@@ -11,10 +11,21 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+import padforge
+
 # a worker a core leaves nothing for the threads that numpy and torch would take besides; said before they are imported
 for library in ("OMP", "OPENBLAS"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # as padforge has it, also where tests load onnxruntime first
+
+# The padforge that is installed is tested, a wheel or a checkout, also by programs that tests start here: the checkout
+# comes last, for the tests themselves and for the benches, of which a wheel has none.
+ROOT = Path(__file__).resolve().parents[1]
+os.environ["PYTHONSAFEPATH"] = "1"
+if str(ROOT) not in sys.path:
+    sys.path.append(str(ROOT))
+if str(ROOT) not in padforge.__path__:
+    padforge.__path__.append(str(ROOT))
 
 # a shell has what runs behind it ignore Ctrl-C, and programs that tests start would inherit that: they never ended
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -26,7 +37,7 @@ hypothesis.settings.load_profile("padforge")
 from tests.helpers import kernels  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
-PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "published"
+PUBLISHED = ROOT.parent / "shared" / "data" / "published"
 
 
 @pytest.hookimpl(optionalhook=True)

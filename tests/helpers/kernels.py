@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
+import padforge
+
 PACKAGES = ("design", "fabricate", "sense")
 
 
 def missing() -> bool:
     """Whether there is a file of kernels of which nothing is kept that is as new."""
-    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
+    folders = [Path(folder) / package for folder in padforge.__path__ for package in PACKAGES]
+    for path in (path for folder in folders for path in folder.rglob("*.py")):
         if b"\n@njit(cache=True" in path.read_bytes():
             cached = (path.parent / "__pycache__").glob(f"{path.stem}.*.nbi")
             if not any(index.stat().st_mtime >= path.stat().st_mtime for index in cached):
@@ -26,7 +28,7 @@ def missing() -> bool:
 
 def compile_all() -> None:
     """Compile in a process of its own, so that nothing is imported before the tests say so."""
-    subprocess.run([sys.executable, "-m", "tests.helpers.kernels"], cwd=ROOT, check=False)
+    subprocess.run([sys.executable, __file__], check=False)
 
 
 def use_kernels() -> None:

@@ -62,13 +62,11 @@ def room(made: Path, tmp_path: Path) -> Path:
 
 
 def start(folder: Path, *arguments: str, limit: int = -1, tied: bool = False) -> subprocess.Popen[str]:
-    root = Path(__file__).resolve().parents[2]
     # Root may write everywhere, unless it starts without that right.
     without = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if tied and os.geteuid() == 0 else []
     return subprocess.Popen(
         [*without, sys.executable, "-c", ENDED, str(limit), *arguments],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(root)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

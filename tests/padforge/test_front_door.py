@@ -1,7 +1,10 @@
 """The front door: what it imports and hands out, the settings it writes, and how it refuses."""
 
+import os
 import subprocess
 import sys
+import sysconfig
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -105,6 +108,25 @@ def test_mistakes_are_refused_in_one_line(tmp_path: Path, settings: str, words: 
     assert said in refused(*words.split(), cwd=tmp_path)
 
 
+def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is refused before anything is written, and the line names the extra."""
+    version = metadata.version
+
+    def version_without_pymoo(name: str) -> str:
+        if name == "pymoo":
+            raise metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(metadata, "version", version_without_pymoo)
+    smallest = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
+    (tmp_path / "pad.toml").write_text(smallest)
+    said = refused("design", "--method", "genetic", cwd=tmp_path)
+    assert said == "padforge: this needs pymoo, which is not installed: pip install 'padforge[genetic]'\n"
+    ended = called("design", cwd=tmp_path)
+    assert ended.code in (0, 1), ended
+    assert (tmp_path / "out" / "pad" / "morphology.json").is_file()
+
+
 def test_readme_names_existing_files() -> None:
     root = Path(__file__).parents[2]
     text = (root / "README.md").read_text()
@@ -134,6 +156,19 @@ def test_settings_have_defaults() -> None:
     assert models.keys() >= pad | mould | {"RigSettings", "LocalizerSettings", "FabricationSettings"}
     for name, package in models.items():
         getattr(package, name)()
+
+
+@pytest.mark.skipif("PADFORGE_WHEEL" not in os.environ, reason="a checkout may be tested, too")
+def test_tests_run_on_the_installed_wheel() -> None:
+    """In this process and in those that it starts; benches come from the checkout, as a wheel has none."""
+    installed = Path(sysconfig.get_path("purelib")) / "padforge"
+    modules = {name: module.__file__ for name, module in sys.modules.items() if name.split(".")[0] == "padforge"}
+    assert len(modules) > 10
+    for name, path in modules.items():
+        assert path is None or name.startswith("padforge.benchmarks") or Path(path).is_relative_to(installed), name
+    code = "import padforge.design.cli; print(padforge.design.cli.__file__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert Path(done.stdout.strip()).parent == installed / "design"
 
 
 def test_stages_have_one_import_name(tmp_path: Path) -> None:

@@ -201,12 +201,12 @@ def test_tracks_dxf_is_same_in_every_process():
         " from padforge.fabricate.outputs import drawings; assert 'ezdxf' not in sys.modules;"
         " sys.stdout.write(drawings.tracks_dxf(Plan(Morphology.random(3, 3, seed=7))))"
     )
-    folder, before = Path(__file__).resolve().parents[3], ezdxf.options.write_fixed_meta_data_for_testing
+    before = ezdxf.options.write_fixed_meta_data_for_testing
     text = tracks_dxf(Plan(PAD))
     assert ezdxf.options.write_fixed_meta_data_for_testing == before
     environment = {**os.environ, "PYTHONHASHSEED": "1"}  # the order of sets of strings
     command = [sys.executable, "-c", script]
-    other = subprocess.run(command, check=True, cwd=folder, env=environment, capture_output=True, text=True)
+    other = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
     assert other.stdout == text
 
 

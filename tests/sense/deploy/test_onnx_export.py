@@ -21,7 +21,7 @@ from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.network import predict
 from tests.sense.conftest import QUICK
-from tests.sense.deploy.conftest import ROOT, tutorial_code
+from tests.sense.deploy.conftest import tutorial_code
 
 DIGEST = "a" * 64
 
@@ -156,5 +156,5 @@ def test_onnxruntime_sends_no_telemetry(tmp_path: Path) -> None:
     """If it does, it leaves a file in the folder for temporary ones."""
     environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
     command = [sys.executable, "-c", "import padforge.sense.deploy.onnx_export"]
-    subprocess.run(command, cwd=ROOT, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
+    subprocess.run(command, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
     assert list(tmp_path.iterdir()) == []

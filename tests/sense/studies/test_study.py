@@ -175,7 +175,6 @@ def test_interrupt_ends_a_study_at_once_and_keeps_finished_tasks(tmp_path: Path)
     command = [sys.executable, "-m", "padforge", "study", "robustness", "square@6", "--presses", "256"]
     study = subprocess.Popen(
         [*command, "--out", str(out)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,

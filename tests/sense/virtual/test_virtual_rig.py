@@ -255,7 +255,6 @@ def test_killed_recording_resumes_to_complete_plan(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     settings = "\n".join(f"{name} = {value}" for name, value in (QUICK | {"rate_hz": 125.0}).items())
     Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{settings}\n", encoding="utf-8")
     words = ["sense", "record", "--virtual-hardware", "--presses", "5", "--out", "run", "--resume"]

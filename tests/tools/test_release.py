@@ -1,0 +1,101 @@
+"""Releases: what is unreleased becomes the section of a version, everywhere or nowhere."""
+
+import re
+import subprocess
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from tools import release
+
+DAY = date(2030, 1, 2)
+OLDER = "# Changelog\n\nIntroduction.\n\n## Unreleased\n\n### Added\n\n- Pads.\n\n## 0.1.0 - 2029-12-31\n\n- Moulds.\n"
+FILES = {
+    "CHANGELOG.md": OLDER,
+    "pyproject.toml": '[project]\nname = "pad"\nversion = "0.1.0"\n# OWNER is a placeholder\ntool = 1\n',
+    "CITATION.cff": "title: pad\nversion: 0.1.0\ndate-released: 2029-12-31\nlicense: MIT\n",
+}
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -q -m Pads"):
+        subprocess.run(["git", *words.split()], cwd=tmp_path, check=True)
+    return tmp_path
+
+
+def texts(folder: Path) -> dict[str, str]:
+    return {name: (folder / name).read_text() for name in FILES}
+
+
+def test_cut_writes_the_version_everywhere_and_returns_its_notes(checkout: Path) -> None:
+    assert release.cut(checkout, "0.2.0", DAY) == "### Added\n\n- Pads."
+    after = texts(checkout)
+    assert after["CHANGELOG.md"] == OLDER.replace("## Unreleased\n", "## Unreleased\n\n## 0.2.0 - 2030-01-02\n")
+    assert after["pyproject.toml"] == FILES["pyproject.toml"].replace("0.1.0", "0.2.0")
+    assert after["CITATION.cff"] == "title: pad\nversion: 0.2.0\ndate-released: 2030-01-02\nlicense: MIT\n"
+    assert release.notes(checkout, "0.2.0") == "### Added\n\n- Pads."
+    with pytest.raises(ValueError, match=r"has version 0\.2\.0, expected is 0\.1\.0"):
+        release.notes(checkout, "0.1.0")
+
+
+def test_first_release_has_the_version_that_the_project_begins_with() -> None:
+    first = release.cut_changelog("## Unreleased\n\n- Pads.\n", "0.1.0", DAY)
+    assert release.changelog_sections(first) == {"Unreleased": "", "0.1.0": "- Pads."}
+
+
+@pytest.mark.parametrize(
+    ("version", "name", "text", "said"),
+    [
+        ("0.2", "", "", "version: got 0.2, allowed is X.Y.Z"),
+        ("0.1.0", "", "", "got 0.1.0, allowed is one above 0.1.0"),
+        ("0.0.10", "", "", "got 0.0.10, allowed is one above 0.1.0"),
+        (
+            "0.2.0",
+            "CHANGELOG.md",
+            "## Unreleased\n\nNothing yet.\n\n## 0.1.0\n\n- Moulds.\n",
+            "nothing under Unreleased",
+        ),
+        (
+            "0.2.0",
+            "pyproject.toml",
+            'version = "0.1.0"\nurl = "https://OWNER"\n',
+            "toml: line 2 has the placeholder OWNER",
+        ),
+        (
+            "0.2.0",
+            "CITATION.cff",
+            "version: 0.1.0\nemail: a@example.org\n",
+            "cff: line 2 has the placeholder example.org",
+        ),
+    ],
+)
+def test_cut_is_refused_and_changes_nothing(checkout: Path, version: str, name: str, text: str, said: str) -> None:
+    if name:
+        (checkout / name).write_text(text)
+        subprocess.run(
+            ["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qam", "-"], cwd=checkout, check=True
+        )
+    before = texts(checkout)
+    with pytest.raises(ValueError, match=re.escape(said)) as error:
+        release.cut(checkout, version, DAY)
+    assert "\n" not in str(error.value)
+    assert texts(checkout) == before
+
+
+def test_cut_is_refused_with_uncommitted_changes(checkout: Path) -> None:
+    (checkout / "new.txt").touch()
+    with pytest.raises(ValueError, match=r"not committed, such as new\.txt"):
+        release.cut(checkout, "0.2.0", DAY)
+
+
+def test_own_files_can_be_released(capsys: pytest.CaptureFixture[str]) -> None:
+    """Their versions agree and something is unreleased; what is not decided is refused in one line."""
+    root = Path(release.__file__).parents[1]
+    changelog = (root / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert "- " in release.changelog_sections(release.cut_changelog(changelog, "1000.0.0", DAY))["1000.0.0"]
+    assert release.main([]) == 2
+    assert capsys.readouterr().err == "release: got no words, allowed are cut VERSION and notes VERSION\n"
