@@ -34,7 +34,7 @@ class BuildByDefault(click.Group):
 
 @click.group(cls=BuildByDefault, subcommand_metavar="[build] MORPHOLOGY | check MESH_OR_MORPHOLOGY  [OPTIONS]")
 def fabricate() -> None:
-    """Turn a morphology into the printable mould of its pad, or check one.
+    """Make the printable mould of a morphology, or check one.
 
     \b
     padforge fabricate MORPHOLOGY                     writes the mould
@@ -120,7 +120,7 @@ def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
 @json_option
 @click.pass_context
 def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, picture: Path | None, as_json: bool) -> None:
-    """Check a mesh, or the mould of a morphology; exit 1 when a check fails.
+    """Check a mesh, or the mould of a morphology. Exit 1 when a check fails.
 
     \b
     padforge fabricate check out/pad/mould.stl

@@ -56,7 +56,7 @@ def live(
     as_json: bool,
     **output: Any,
 ) -> None:
-    """Show touches as they happen, in the terminal and on a page for the browsers of this machine.
+    """Show touches as they happen, in the terminal and a page. It is for the browsers of this machine.
 
     \b
     padforge sense live --model out/pad
@@ -96,9 +96,12 @@ def live(
         pipeline = Live(localizer, _load_health(model), stream.fibres, stream.rate_hz)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
+        if replay is None and rig == "simulated":
+            click.echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
         outputs, builder = _open_outputs(stack, stream, **output), MessageBuilder(pipeline, mirrored)
         draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
-        scaler, title = localizer.scaler, f"{replay or f'{rig} rig'}, {model}"
+        touches = replay or ("simulated touches" if rig == "simulated" else f"{rig} rig")
+        scaler, title = localizer.scaler, f"{touches}, {model}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
         pad = {"title": title, "centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
 

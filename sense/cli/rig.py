@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from padforge.sense.rig.operation import OpenedRig
 
 
+_RIG_SETTINGS = "padforge.sense.settings:RigSettings"
 _RIGS = "simulated, ur5, printer, hand, or an installed arm."
 rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
 _warn = partial(click.echo, err=True)
@@ -37,8 +38,10 @@ virtual_hardware_option = click.option(
     help="morphology.json or published .mat (default: the twin's, or straight fibres; with a real rig, beside --out).",
 )
 @click.option("--twin", type=FILE, help="twin.json of a measured pad; the simulated pad responds like it.")
-@click.option("--presses", type=int, help="Presses to record.")
-@click.option("--plan", help="Positions: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
+@common.setting_option("--presses", _RIG_SETTINGS, int, "Presses to record.")
+@common.setting_option(
+    "--plan", _RIG_SETTINGS, str, "Positions: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm."
+)
 @click.option("--model", type=FOLDER, help="Localizer of an adaptive plan, which presses where it is least certain.")
 @click.option("--dry-run", is_flag=True, help="Move through the whole plan above the pad without touching it.")
 @click.option("--resume", is_flag=True, help="Continue an unfinished recording.")
@@ -61,7 +64,7 @@ def record(
     spec: Path | None,
     out: Path | None,
 ) -> None:
-    """Record presses on a pad, into the folder `recording` beside its morphology.
+    """Record presses on a pad. They go into the folder `recording` beside its morphology.
 
     \b
     padforge sense record --morphology out/pad/morphology.json --presses 1500

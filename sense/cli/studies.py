@@ -23,10 +23,11 @@ DEFAULT_PADS = ("square", "random-5", "optimised")
 
 @click.group()
 def study() -> None:
-    """Reproduce the paper's figures and tables for pads of your own, and go beyond them.
+    """Reproduce the paper's figures and tables for your own pads.
 
     \b
-    padforge study robustness                              square grid, a random pad and an optimised one
+    padforge study robustness                          three pads: square grid,
+                                                       random and optimised
     padforge study robustness square out/pad/morphology.json
     padforge study scaling --jobs 2 --out out/study
 
@@ -105,7 +106,7 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
 )
 @common.spec_option
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
-    """Errors by number of failed fibres, over all sets of them, and error maps (figures 3, 4 and 5).
+    """Errors by number of failed fibres (figures 3 to 5). They are over all sets of these; there are error maps.
 
     \b
     padforge study robustness square random-5 --max-failures 2
@@ -127,7 +128,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 @_command("scaling")
 @click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
 def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
-    """Larger surfaces, with the pads repeated over them as tiles (figures 7 and 8).
+    """Larger surfaces, tiled with the pads (figures 7 and 8).
 
     \b
     padforge study scaling optimised --grids 4,16,64
@@ -145,7 +146,7 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
 
 @_command("drift", "PAD_OR_RECORDING")
 def drift(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Filters and drift compensation, on simulated pads and on recordings; idle shares (figure 12, table III).
+    """Filters and drift compensation (figure 12, table III). They run on simulated pads and on recordings.
 
     \b
     padforge study drift out/pad/recording
@@ -174,14 +175,14 @@ def _add_study(name: str, module: str, text: str, example: str, *, has_contact: 
     _command(name)(common.spec_option(make) if has_contact else make)
 
 
-_sensitivity = """Tools of other radii and other depths, trained with or not (figure 6).
+_sensitivity = """Other tools and depths, trained with or not (figure 6).
 
 They have half to one and a half times the radius and the depth that [contact] states. If [contact] is a shape, as in
 the preset `published`, the objects are those of the paper, of sizes K and shapes D in grid units."""
-_force = "Depth and force of a press from the signals that localize it, as a tool presses the layer of [contact]."
-_shape = "Which object was pressed, from the signals that localize it: a dome, a ball, a finger or a flat end."
-_multicontact = "Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9)."
-_strokes = "Follow a finger that slides over simulated pads, by localizers trained on single presses of them."
+_force = "Depth and force of a press, from the signals. A tool presses the layer of [contact]."
+_shape = "Which object was pressed, from the signals. It is a dome, a ball, a finger or a flat end."
+_multicontact = "Number and positions of contacts at once (figure 9). Of two contacts, either comes first."
+_strokes = "Follow a finger that slides over simulated pads. The localizers are trained on single presses of them."
 _add_study("strokes", "strokes", _strokes, "optimised")
 _add_study("sensitivity", "sensitivity", _sensitivity, "square")
 _add_study("force", "indentation", _force, "square random-5")

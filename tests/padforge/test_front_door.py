@@ -89,8 +89,11 @@ def test_init_writes_published_preset(tmp_path: Path) -> None:
     ("settings", "words", "said"),
     [
         ("", "design check none.json", "none.json"),
-        ("", "design --knots 0", "knots"),
+        ("", "design --knots 0", "Invalid value for '--knots': got 0, input should be greater than or equal to 1"),
+        ("[search]\nknots = 3\n", "design --starts -1 --knots 2", "'--starts': got -1, input should be greater"),
         ("", "fabricate none.mat", "none.mat"),
+        ("", "fabricate pad.toml", "pad.toml: no morphology, allowed are a .json and a published .mat"),
+        ("", "fabricate check pad.csv", "allowed are a mesh .stl or .3mf, a morphology .json or .mat"),
         ("", "sense import none.mat", "none.mat"),
         ("", "sense calibrate none", "none"),
         ("", "report none", "none"),

@@ -43,6 +43,8 @@ deploy --model model l.h                        | l.h: a .h learns from a record
 deploy --model model other l.h                  | readings are of 6 fibres, the localizer was learnt from 4
 deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the smallest localizer of 4 fibres takes
 record --seed 9 --out rec                       | never written over
+record --presses -3 --out rec                   | Invalid value for '--presses': got -3, input should be greater
+record --plan rows --out rec                    | Invalid value for '--plan': got 'rows', expected uniform, grid,
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
 record --twin dead.json                         | twin: none of its channels reads a fibre
