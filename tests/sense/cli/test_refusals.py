@@ -44,6 +44,8 @@ deploy --model model other l.h                  | readings are of 6 fibres, the 
 deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the smallest localizer of 4 fibres takes
 record --seed 9 --out rec                       | never written over
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
+record --mcap --out rec2                        | rec2.mcap: exists, recordings are never written over; choose
+record --mcap --dry-run --virtual-hardware      | --mcap writes what is recorded, and --dry-run keeps nothing
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
@@ -69,6 +71,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """What `few` has, and things that are not what they should be."""
     folder = shutil.copytree(few_presses, tmp_path_factory.mktemp("refused") / "workshop")
     (folder / "noise.mat").write_bytes(b"no matlab" * 100)
+    (folder / "rec2.mcap").write_bytes(b"")
     (folder / "noise.csv").write_text("a,b\n1,2\n")
     for name in ("empty", "mine", "designed"):
         (folder / name).mkdir()
