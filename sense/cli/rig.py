@@ -15,6 +15,7 @@ from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lin
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
+    from padforge.sense.formats.ros_writer import McapFollower
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.doctor import Diagnosis
@@ -45,6 +46,7 @@ virtual_hardware_option = click.option(
 @click.option("--model", type=FOLDER, help="Localizer of an adaptive plan, which presses where it is least certain.")
 @click.option("--dry-run", is_flag=True, help="Move through the whole plan above the pad without touching it.")
 @click.option("--resume", is_flag=True, help="Continue an unfinished recording.")
+@click.option("--mcap", is_flag=True, help="Write OUT.mcap as well, for ROS 2 and Foxglove, whole after every press.")
 @virtual_hardware_option
 @common.seed_option
 @common.spec_option
@@ -59,6 +61,7 @@ def record(
     model: Path | None,
     dry_run: bool,
     resume: bool,
+    mcap: bool,
     virtual_hardware: bool,
     seed: int | None,
     spec: Path | None,
@@ -80,6 +83,8 @@ def record(
     profile, gain and noise are the twin's.
 
     An interrupted recording keeps every finished press; --resume records the others.
+    --mcap writes the file that export would, beside the folder, and resumes it with --resume --mcap; while it
+    is recorded, and after a kill, it holds all finished presses. It needs the extra ros (pip install '.[ros]').
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from padforge.design.settings import PadSettings, read_contact
@@ -101,6 +106,7 @@ def record(
             raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
         folder = common.pad_folder(morphology)
     pad = _load_pad(morphology, settings.section(PadSettings))
+    follower = _make_follower(target, dry_run, resume) if mcap else None
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
     if at_once:
@@ -116,9 +122,29 @@ def record(
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
-        config = RigConfig(pad, read_contact(settings), options, target, command, inputs, pad_settings, folder)
+        contact = read_contact(settings)
+        config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder, follower)
         recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
+    if follower is not None and recording is not None:
+        from padforge.sense.formats.import_export import arm_states, export_file
+
+        export_file(recording, follower.path, states=arm_states(target))
+        click.echo(f"{target} -> {follower.path}")
+
+
+def _make_follower(target: Path, dry_run: bool, resume: bool) -> "McapFollower":
+    """Return what writes the .mcap file beside a recording; raise InputError, before anything moves, if it must not."""
+    from padforge.sense.formats.ros_writer import McapFollower
+    from padforge.sense.recording.run_directory import START
+
+    if dry_run:
+        raise InputError("--mcap writes what is recorded, and --dry-run keeps nothing")
+    named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
+    follower = McapFollower(named.with_name(f"{named.name}.mcap"))
+    if follower.path.exists() and not (resume and (target / START).exists()):
+        raise InputError(f"{follower.path}: exists, recordings are never written over; choose another --out")
+    return follower
 
 
 def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morphology":

@@ -46,6 +46,8 @@ record --seed 9 --out rec                       | never written over
 record --presses -3 --out rec                   | Invalid value for '--presses': got -3, input should be greater
 record --plan rows --out rec                    | Invalid value for '--plan': got 'rows', expected uniform, grid,
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
+record --mcap --out rec2                        | rec2.mcap: exists, recordings are never written over; choose
+record --mcap --dry-run --virtual-hardware      | --mcap writes what is recorded, and --dry-run keeps nothing
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
@@ -71,6 +73,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """What `few` has, and things that are not what they should be."""
     folder = shutil.copytree(few_presses, tmp_path_factory.mktemp("refused") / "workshop")
     (folder / "noise.mat").write_bytes(b"no matlab" * 100)
+    (folder / "rec2.mcap").write_bytes(b"")
     (folder / "noise.csv").write_text("a,b\n1,2\n")
     for name in ("empty", "mine", "designed"):
         (folder / name).mkdir()
