@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from padforge.sense.live.outputs import OutputStream
     from padforge.sense.live.pipeline import Estimate, Event
     from padforge.sense.localizer.model import LocalizerModel
-    from padforge.sense.rig.devices import Board
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
@@ -126,21 +125,14 @@ def _stream_rig(
     stack: ExitStack, rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None
 ) -> "tuple[ReadingStream, bool]":
     """Return the readings of a board, which `stack` closes, and whether the pad lies with its tracks up."""
+    from padforge.sense.live.pad_sensor import open_board
     from padforge.sense.rig.streams import is_pad_mirrored, stream_board
     from padforge.sense.settings import RigSettings
 
     options = load_spec(spec).section(RigSettings)
     mirrored = is_pad_mirrored(model, options)
-    board: Board  # alone, not yet connected: a person presses the pad, not the arm
-    if rig == "simulated":
-        from padforge.sense.virtual.virtual_pad import virtual_pad_of
-
-        board = virtual_pad_of(model)
-    else:
-        from padforge.sense.rig.devices import load_device
-
-        board = load_device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
-    return stream_board(stack.enter_context(closing(board)), localizer.rate_hz), mirrored
+    board = stack.enter_context(closing(open_board(rig, model, options, localizer.fibres)))
+    return stream_board(board, localizer.rate_hz), mirrored
 
 
 def _open_outputs(
@@ -162,13 +154,13 @@ def _open_outputs(
 
 
 def _load_health(model: Path) -> "HealthModel | None":
-    """Load the health model in the folder of a model, if there is one."""
-    from padforge.sense.health.fault_detector import FaultDetector, has_health
+    """Load the health model in the folder of a model, or say that there is none."""
+    from padforge.sense.live.pad_sensor import load_health
 
-    if not has_health(model):
+    health = load_health(model)
+    if health is None:
         click.echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
-        return None
-    return FaultDetector.load(model).live_model_
+    return health
 
 
 class EventPrinter:
