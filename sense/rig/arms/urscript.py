@@ -43,7 +43,7 @@ def padforge():
   global speed = 0.0
   global acceleration = 0.0
 
-  thread move():
+  thread move_to_target():
     movel(target, a=acceleration, v=speed)
     write_output_integer_register(24, 4 * number + {DONE})
     moving = False
@@ -94,7 +94,7 @@ def padforge():
           write_output_integer_register(24, 4 * number + {UNDER_WAY})
           moved = True
           moving = True
-          handle = run move()
+          handle = run move_to_target()
         else:
           write_output_integer_register(24, 4 * number + {REFUSED})
         end

@@ -126,8 +126,10 @@ def test_stop_ends_move_within_half_a_second(robot: EmulatedUR5, arm: UR5) -> No
     assert arm.state().speed_mm_s == 0
 
 
-def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5) -> None:
+def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5, driver: Driver) -> None:
     before = arm.state().pose
+    if driver == "urscript":  # which asks the controller
+        assert fault_of(arm.move, (2000.0, *HOME[1:]), 10, 10) == "refused"
     assert fault_of(arm.move, (*HOME[:5], float("inf")), 10, 10) == "refused"
     assert fault_of(arm.move, HOME, -1, 10) == "refused"
     assert arm.state().pose == before
@@ -377,7 +379,9 @@ def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: An
 
 
 @ONE_DRIVER
-def test_connect_refuses_registers_that_another_client_writes(robot: EmulatedUR5, host: str, driver: Driver) -> None:
+def test_connect_refuses_registers_that_another_client_writes(robots: Any, host: str, driver: Driver) -> None:
+    robots.free()
+    robot = robots.get("cb3")
     with socket.create_connection((robot.host, rtde.RTDE_PORT)) as other, closing(UR5(host, driver)) as arm:
         other.sendall(rtde.pack_frame(rtde.INPUTS, b"input_int_register_25"))
         assert other.recv(100)
