@@ -169,6 +169,7 @@ def test_driver_is_ur_rtde_where_it_is_installed(
         assert arm.connect()["driver"].startswith("ur-rtde 1" if installed else "URScript")
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, driver: Driver, monkeypatch) -> None:
     with closing(UR5(host, driver)) as arm:
@@ -193,6 +194,7 @@ def test_connect_refuses_arm_in_use_on_this_computer(
     arm.stop()
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_arm_in_use_by_another_computer(
     robot: EmulatedUR5, arm: UR5, address: str, driver: Driver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -344,6 +346,7 @@ def test_arm_rests_after_program_dies_or_is_suspended(
     assert start_s < last_motion_s(robot) < start_s + REST_S
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_arm_rests_when_program_stops_asking(robot: EmulatedUR5, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5, "SUPERVISION_S", 0.4)
