@@ -217,7 +217,8 @@ class WorkerProcess:
             raise CommandRejected("refused", "a move is under way", "wait for its end or stop it")
         pose = [*(value / 1e3 for value in pose_mm[:3]), *pose_mm[3:]]  # the arm wants m
         if not control.move(pose, speed_mm_s / 1e3, acceleration_mm_s2 / 1e3):
-            raise CommandRejected("refused", "the arm refused the move", UNLOCK_ADVICE)
+            message = "the arm refused the move: it is stopped, or the pose is beyond its reach or safety limits"
+            raise CommandRejected("refused", message, "look at the pendant")
 
     def _do_stop(self) -> None:
         if control := self._playing():

@@ -168,14 +168,14 @@ class UR5:
         self._move_s = 0.0
 
     @classmethod
-    def from_settings(cls, rig: RigSettings) -> "UR5":
+    def from_settings(cls, rig: RigSettings, driver: Driver | None = None) -> "UR5":
         """Return the arm that `[rig]` names, which retreats if its workspace and the pad's surface are known."""
         if rig.box_mm is None or rig.contact_mm is None:
-            return cls(rig.host)
+            return cls(rig.host, driver)
         x0, x1, y0, y1, _, top = rig.box_mm
         height_mm = min(rig.contact_mm + RETREAT_MM, top)
         sides = (x0 - EDGE_MM, x1 + EDGE_MM), (y0 - EDGE_MM, y1 + EDGE_MM)
-        return cls(rig.host, retreat=Retreat(height_mm, *sides, RETREAT_MM_S))
+        return cls(rig.host, driver, Retreat(height_mm, *sides, RETREAT_MM_S))
 
     def connect(self) -> Mapping[str, Any]:
         """Open the link, ending an earlier one of this object.

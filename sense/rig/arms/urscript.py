@@ -43,7 +43,7 @@ def padforge():
   global speed = 0.0
   global acceleration = 0.0
 
-  thread move():
+  thread move_to_target():
     movel(target, a=acceleration, v=speed)
     write_output_integer_register(24, 4 * number + {DONE})
     moving = False
@@ -94,7 +94,7 @@ def padforge():
           write_output_integer_register(24, 4 * number + {UNDER_WAY})
           moved = True
           moving = True
-          handle = run move()
+          handle = run move_to_target()
         else:
           write_output_integer_register(24, 4 * number + {REFUSED})
         end
@@ -137,7 +137,7 @@ def write_program(number: int, rate_hz: float, retreat: Retreat | None) -> str:
     lift = ""
     if retreat is not None:
         lengths = (retreat.height_mm, *retreat.x_mm, *retreat.y_mm, retreat.speed_mm_s)
-        height, x0, x1, y0, y1, speed = (length / 1e3 for length in lengths)  # URScript wants m
+        height, x0, x1, y0, y1, speed = (f"{length / 1e3:.6f}" for length in lengths)  # URScript wants m
         lift = RETREAT.format(height=height, x0=x0, x1=x1, y0=y0, y1=y1, speed=speed, RETREAT_M_S2=RETREAT_M_S2)
     return PROGRAM.format(
         number=number,
@@ -154,7 +154,10 @@ class UrscriptControl:
     progress_register = PROGRESS_REGISTER
 
     def __init__(self, host: str, retreat: Retreat | None) -> None:
-        """Send the program and wait for its start; OSError or ValueError if it does not."""
+        """Send the program and wait for its start.
+
+        OSError or ValueError if it does not start, or the controller lacks a register or lets another program write it.
+        """
         self.moving = False
         self._answered = threading.Condition()
         self._progress, self._is_stopped = 0, False

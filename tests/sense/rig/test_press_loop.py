@@ -1,7 +1,6 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
 import contextlib
-import importlib.util
 import json
 import os
 import signal
@@ -412,7 +411,6 @@ def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 @pytest.mark.parametrize("slow_s", [0.0, 1.0])
 def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
     robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float

@@ -1,5 +1,6 @@
 """Whole rigs without hardware: real drivers, and emulators that share one simulated pad, through faults and noise."""
 
+import importlib.util
 import json
 import os
 import subprocess
@@ -36,7 +37,6 @@ from padforge.sense.simulation.pad_model import LivePad
 from padforge.sense.virtual import virtual_rig
 from padforge.sense.virtual.printer import EmulatedPrinter
 
-pytest.importorskip("rtde_control")
 pytest.importorskip("serial")
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
@@ -54,11 +54,15 @@ ARM = virtual_rig.ur5_settings(RigSettings.model_validate(QUICK | QUIET), PAD)
 PRINTER = virtual_rig.printer_settings(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
 
 
+BY_URSCRIPT = partial(virtual_rig.emulate_ur5, driver="urscript")
+
+
 class Rig:
     """An emulated rig that lives through several recordings; `robot` is the emulated arm or printer."""
 
     def __init__(self, settings: RigSettings, emulate: Callable[..., Any]) -> None:
         self.settings, self.emulate, self.stack = settings, emulate, ExitStack()
+        self.retreats = importlib.util.find_spec("rtde_control") is None or emulate is BY_URSCRIPT
         self.replace()
 
     def replace(self) -> None:
@@ -95,11 +99,14 @@ class Rig:
         return caught.value, time.monotonic() - moment
 
     def is_at_rest(self) -> bool:
-        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds."""
+        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds.
+
+        An arm that retreats by itself has 2 s more.
+        """
         if isinstance(self.robot, EmulatedPrinter):
             now = time.monotonic()
             return bool(np.ptp(self.robot.true_positions([now, now + 9]), axis=0).max() == 0)
-        time.sleep(0.5)
+        time.sleep(2.5 if self.retreats else 0.5)
         now = time.monotonic()
         a, b = self.robot.true_poses([now - 0.05, now - 0.01])[:, :3]
         return bool(np.linalg.norm(b - a) / 0.04 < 1)
@@ -121,6 +128,7 @@ def quick() -> Iterator[None]:
 
 RIGS = {
     "arm": (ARM, virtual_rig.emulate_ur5),
+    "urscript": (ARM, BY_URSCRIPT),
     "line": (ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), virtual_rig.emulate_ur5),
     "printer": (PRINTER, virtual_rig.emulate_printer),
 }
@@ -204,6 +212,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] 
     ("rig", "presses", "names"),
     [
         ("arm", 9, "protective drop freeze stall unplug emergency restart"),
+        ("urscript", 2, "drop"),
         ("line", 6, "reset columns stall unplug"),
         ("printer", 8, " ".join(name for name in FAULTS if "printer" in name)),
     ],
@@ -222,6 +231,9 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
         if name == "board_of_printer":  # the probe is lifted
             tip = rig.robot.true_positions(time.monotonic())[0] + PRINTER.tcp_mm
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
+        if name == "drop" and rig.retreats:
+            height_mm = rig.robot.true_poses(time.monotonic())[0, 2]
+            assert height_mm == pytest.approx((ARM.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
     rig.record(run, plan, lambda done, of, what: rig.board.garble(1e-3))

@@ -126,8 +126,10 @@ def test_stop_ends_move_within_half_a_second(robot: EmulatedUR5, arm: UR5) -> No
     assert arm.state().speed_mm_s == 0
 
 
-def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5) -> None:
+def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5, driver: Driver) -> None:
     before = arm.state().pose
+    if driver == "urscript":  # which asks the controller
+        assert fault_of(arm.move, (2000.0, *HOME[1:]), 10, 10) == "refused"
     assert fault_of(arm.move, (*HOME[:5], float("inf")), 10, 10) == "refused"
     assert fault_of(arm.move, HOME, -1, 10) == "refused"
     assert arm.state().pose == before
@@ -167,6 +169,7 @@ def test_driver_is_ur_rtde_where_it_is_installed(
         assert arm.connect()["driver"].startswith("ur-rtde 1" if installed else "URScript")
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, driver: Driver, monkeypatch) -> None:
     with closing(UR5(host, driver)) as arm:
@@ -191,6 +194,7 @@ def test_connect_refuses_arm_in_use_on_this_computer(
     arm.stop()
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_arm_in_use_by_another_computer(
     robot: EmulatedUR5, arm: UR5, address: str, driver: Driver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -342,6 +346,7 @@ def test_arm_rests_after_program_dies_or_is_suspended(
     assert start_s < last_motion_s(robot) < start_s + REST_S
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_arm_rests_when_program_stops_asking(robot: EmulatedUR5, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5, "SUPERVISION_S", 0.4)
@@ -377,7 +382,9 @@ def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: An
 
 
 @ONE_DRIVER
-def test_connect_refuses_registers_that_another_client_writes(robot: EmulatedUR5, host: str, driver: Driver) -> None:
+def test_connect_refuses_registers_that_another_client_writes(robots: Any, host: str, driver: Driver) -> None:
+    robots.free()
+    robot = robots.get("cb3")
     with socket.create_connection((robot.host, rtde.RTDE_PORT)) as other, closing(UR5(host, driver)) as arm:
         other.sendall(rtde.pack_frame(rtde.INPUTS, b"input_int_register_25"))
         assert other.recv(100)
