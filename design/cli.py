@@ -34,7 +34,7 @@ twin_option = click.option(
 
 def time_budget_option(text: str) -> Callable[..., Any]:
     """Make the option `--time-budget` with a help text."""
-    return click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help=text)
+    return click.option("--time-budget", type=common.FiniteRange(min=0), metavar="S", help=text)
 
 
 @contextmanager
@@ -250,7 +250,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
 @common.spec_option
 @click.option(
     "--tolerance-mm",
-    type=click.FloatRange(1e-3, 10),
+    type=common.FiniteRange(1e-3, 10),
     default=0.05,
     show_default=True,
     help="Largest distance of fibres and their ends from the drawing.",

@@ -13,7 +13,7 @@ from padforge.design.cli import search_progress, time_budget_option
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
-from padforge.fabricate.cli import formats_option, mould_costs, split_formats
+from padforge.fabricate.cli import formats_option, mould_costs
 from padforge.sense.cli.main import sense as sense_group
 from padforge.sense.cli.studies import study as study_group
 
@@ -149,7 +149,7 @@ def _schema() -> None:
 @common.force_option
 @common.profile_option
 @click.pass_context
-def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **options: Any) -> None:
+def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], out: Path, **options: Any) -> None:
     """Run all stages, from design to report, on the simulated rig.
 
     \b
@@ -167,7 +167,7 @@ def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **o
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
-    run = Run(common.load_spec(spec), out, formats=split_formats(formats), **options)
+    run = Run(common.load_spec(spec), out, formats=formats, **options)
     check_run(run)
     with locked_folder(out):
         code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))

@@ -4,6 +4,7 @@ import atexit
 import functools
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -51,6 +52,17 @@ def out_option(default: str = "", what: str = "Folder for the results", file: bo
         default=default or None,
         help=f"{what} (default: {default or 'in the folder of the pad'}).",
     )
+
+
+class FiniteRange(click.FloatRange):
+    """A range of numbers without NaN and infinity, which click lets through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert the text of an option."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"got {value!r}, expected a finite number", param, ctx)
+        return number
 
 
 def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..., Any]:

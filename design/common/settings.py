@@ -174,15 +174,16 @@ class Spec:
         changes = {key: value for key, value in overrides.items() if value is not None}
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
 
-    def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
+    def replaced(self, tables: Mapping[str, Mapping[str, Any]], source: str = "") -> "Spec":
         """Return these settings with other values in place of theirs.
 
         Args:
             tables: the values, by section and key.
+            source: what errors call the result; as these settings if empty.
         """
-        Spec(tables, self.source)
+        Spec(tables, source := source or self.source)
         names = {*self._tables, *tables}
-        return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
+        return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
     def stated(self, model: type[Settings] | str) -> Mapping[str, Any]:
         """Return what the file states of a section, without defaults and not validated.

@@ -67,5 +67,5 @@ def to_unit(name: str, value: object, depth: int = MAX_DEPTH) -> object:
         return value
     size = units.get(re.sub(_MICRO, "u", match[2].strip()))
     if size is None:
-        raise ValueError(f"expected a number, or text of one with a unit: {', '.join(units)}")
+        raise ValueError(f"expected a number, or a text with one of the units {', '.join(units)}")
     return float(Fraction(match[1]) * size)  # rounded once: 0.2 in is 5.08 mm

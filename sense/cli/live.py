@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import json_option, load_spec, spec_option
+from padforge.design.common.command_line import FiniteRange, json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
 from padforge.sense.cli.options import FOLDER, redrawn_lines
-from padforge.sense.cli.rig import rig_option
+from padforge.sense.cli.rig import check_rig, rig_option
 
 if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel
@@ -28,7 +28,7 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
 @click.command()
 @rig_option
 @click.option("--replay", metavar="RECORDING", type=click.Path(path_type=Path), help="Replay a recording.")
-@click.option("--speed", type=click.FloatRange(min=0.01), default=1.0, show_default=True, help="Speed of --replay.")
+@click.option("--speed", type=FiniteRange(min=0.01), default=1.0, show_default=True, help="Speed of --replay.")
 @click.option("--model", type=FOLDER, default="out/pad", show_default=True, help="Folder that calibrate wrote.")
 @click.option(
     "--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Port of the page; 0: any."
@@ -85,6 +85,7 @@ def live(
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.streams import stream_recording
 
+    check_rig(rig)
     localizer = LocalizerModel.load(model)
     with ExitStack() as stack:
         if replay is None:

@@ -33,7 +33,7 @@ from padforge.sense.cli.options import (
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
 )
 @click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
-@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
+@click.option("--time-budget", type=common.FiniteRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
 @common.out_option()

@@ -31,6 +31,15 @@ virtual_hardware_option = click.option(
 )
 
 
+def check_rig(name: str) -> None:
+    """Raise InputError unless `--rig` names a rig."""
+    from importlib.metadata import entry_points
+
+    names = ["simulated", "hand", *sorted(entry_points(group="padforge.arms").names)]
+    if name not in names:
+        raise InputError(f"--rig is {name!r}, allowed are {', '.join(dict.fromkeys(names))}")
+
+
 @click.command()
 @rig_option
 @click.option(
@@ -94,6 +103,7 @@ def record(
     from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
 
+    check_rig(rig)
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
     target = out or folder / "recording"
     at_once = rig == "simulated" and not virtual_hardware
@@ -112,6 +122,8 @@ def record(
     if at_once:
         if resume or dry_run or model:
             raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
+        if plan == "adaptive":
+            raise InputError("--plan is adaptive, which needs --virtual-hardware or a real rig")
         pressed = like if like and not morphology else pad
         if like and morphology and (ignored := like.ignored_effects()):
             _warn(f"{twin}: {ignored}")
@@ -251,6 +263,7 @@ def doctor(
     from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
 
+    check_rig(rig)
     check_platform()
     settings = common.load_spec(spec)
     pad, options = _load_pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)

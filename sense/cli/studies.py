@@ -1,5 +1,6 @@
 """`padforge study ...`: the paper's figures and tables for any pads, and beyond."""
 
+import math
 import os
 from collections.abc import Callable
 from functools import wraps
@@ -91,6 +92,12 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
     return load_pads(names or default, seed)
 
 
+def _check_square(context: click.Context, param: click.Parameter, value: int) -> int:
+    if math.isqrt(value) ** 2 != value:
+        raise click.BadParameter(f"got {value}, allowed is a square number from 4")
+    return value
+
+
 @_command("robustness")
 @max_failures_option
 @click.option(
@@ -102,7 +109,12 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
     help="Fibres sampled as in the paper, or exact.",
 )
 @click.option(
-    "--presses", type=click.IntRange(4), default=1024, show_default=True, help="Training presses, a square number."
+    "--presses",
+    type=click.IntRange(4),
+    default=1024,
+    show_default=True,
+    callback=_check_square,
+    help="Training presses, a square number.",
 )
 @common.spec_option
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
@@ -140,7 +152,7 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
     except ValueError:
         sizes = ()
     if not sizes or not 2 <= sizes[0] <= sizes[-1] <= 256:
-        raise InputError(f"grids is {grids!r}, expected numbers from 2 to 256 with commas between them")
+        raise InputError(f"--grids is {grids!r}, expected numbers from 2 to 256 with commas between them")
     return scaling_study(_pads(names, seed, ("square", "optimised")), grids=sizes, seed=seed)
 
 

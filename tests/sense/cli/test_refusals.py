@@ -45,6 +45,7 @@ deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the sma
 record --seed 9 --out rec                       | never written over
 record --presses -3 --out rec                   | Invalid value for '--presses': got -3, input should be greater
 record --plan rows --out rec                    | Invalid value for '--plan': got 'rows', expected uniform, grid,
+record --plan adaptive                          | --plan is adaptive, which needs --virtual-hardware or a real rig
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
 record --mcap --out rec2                        | rec2.mcap: exists, recordings are never written over; choose
 record --mcap --dry-run --virtual-hardware      | --mcap writes what is recorded, and --dry-run keeps nothing
@@ -56,7 +57,10 @@ record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, 
 record --rig ur5 {unread} --plan adaptive       | [rig] plan is adaptive, which needs --model
 record --rig hand {straight} --dry-run          | --dry-run and --model need an arm
 doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
-doctor --rig crane                              | arms: got 'crane', allowed are
+doctor --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
+record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
+{live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
+calibrate rec --time-budget nan                 | Invalid value for '--time-budget': got 'nan', expected a finite number
 {live} --model model --port {taken}             | port {taken} of 127.0.0.1: another program uses it
 {live} --model model --replay other             | readings are of 6 fibres, the localizer was learnt from 4
 {live} --model model --rig ur5                  | no board is found
