@@ -132,6 +132,7 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
         plots = [TimeSeriesView(origin=name) for name in ("readings", "pressed")]
         layout = Blueprint(Horizontal(Spatial3DView(origin="pad"), Vertical(*plots, TextLogView(origin="health"))))
         self._stream = rerun.RecordingStream("padforge")
+        self._pressed = False
         with contextlib.ExitStack() as stack:
             try:
                 if target.endswith(".rrd"):
@@ -157,10 +158,13 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
 
         pad = message.pad
         self._stream.set_time("pad_time", duration=pad["now_s"] if message.topic == TOUCHES else pad["time_s"])
-        if message.topic == READINGS:
-            self._stream.log("readings", rerun.Scalars([math.nan if v is None else v for v in pad["volts"]]))
-        elif message.topic == PRESSED:
-            self._stream.log("pressed", rerun.Scalars([float(pad["pressed"])]))
+        if message.topic in (READINGS, PRESSED):
+            if message.topic == READINGS:
+                volts = [math.nan if value is None else value for value in pad["volts"]]
+                self._stream.log("readings", rerun.Scalars(volts))
+            self._pressed = pad.get("pressed", self._pressed)
+            # at every reading, and once more at a change: points are joined by lines, and an edge must not slope
+            self._stream.log("pressed", rerun.Scalars([float(self._pressed)]))
         elif message.topic == TOUCHES:
             z_mm = 1000 * message.msg["pose"]["pose"]["position"]["z"]
             half_mm = [pad["r90_mm"], pad["r90_mm"], THICKNESS_MM / 2]

@@ -129,7 +129,7 @@ def test_rerun_writes_a_file(tmp_path: Path) -> None:
 
     np.testing.assert_array_equal(value("/readings", "Scalars:scalars"), [1.0, np.nan])
     assert value("/readings", "SeriesLines:names", is_static=True) == ["fibre 1", "fibre 2"]
-    assert value("/pressed", "Scalars:scalars") == [1.0]
+    assert chunks["/pressed", False].column("Scalars:scalars").to_pylist() == [[0.0], [1.0]]
     assert value("/health", "TextLog:text") == ["fibre 1: sound, fibre 2: stuck"]
     assert value("/pad/touch", "Ellipsoids3D:centers") == [[1.5, -2.25, -1.0]]
     assert value("/pad/touch", "Ellipsoids3D:half_sizes") == [[1.0, 1.0, 0.5]]
