@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from padforge.design.common.files import atomic_file
 from padforge.design.common.server import HOST
-from padforge.design.common.validation import InputError
+from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.live.outputs import Message
 
@@ -135,14 +135,15 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
         self._pressed = False
         with contextlib.ExitStack() as stack:
             try:
-                if target.endswith(".rrd"):
-                    self._stream.save(stack.enter_context(atomic_file(Path(target))), layout)
+                if Path(target).suffix == ".rrd":
+                    self._stream.save(stack.enter_context(atomic_file(Path(target))))
                 else:
-                    self._stream.connect_grpc(target, default_blueprint=layout)
-            except RuntimeError as error:
+                    self._stream.connect_grpc(target)
+            except (RuntimeError, UnicodeError) as error:
                 expected = "an address like rerun+http://HOST:PORT/proxy, or a file that ends in .rrd"
-                raise InputError(f"--rerun is {target!r}, expected {expected} ({error})") from error
+                raise InputError(f"--rerun is {short_repr(target)}, expected {expected}") from error
             stack.callback(self._stream.disconnect)  # which flushes, before the file gets its name
+            self._stream.send_blueprint(layout)
             area = rerun.Boxes3D(centers=[[*centre_mm, 0.0]], half_sizes=[[*half_mm, 0.0]], colors=[GREY])
             self._stream.log("pad", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
             self._stream.log("pad/area", area, static=True)
