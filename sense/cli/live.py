@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
+RERUN_VIEWER = "rerun+http://127.0.0.1:9876/proxy"  # where a viewer that was started without options listens
 BAR = 12  # characters of a fibre's bar on a terminal, to either side
 
 
@@ -36,6 +37,14 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
 @click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any.")
 @click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address.")
 @click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name.")
+@click.option("--foxglove", type=click.IntRange(0, 65_535), help="Serve Foxglove on this port; 0: any.")
+@click.option(
+    "--rerun",
+    metavar="[TARGET]",
+    is_flag=False,
+    flag_value=RERUN_VIEWER,
+    help="Send to the viewer Rerun: the one here, one by its address rerun+http://..., or into a file .rrd.",
+)
 @click.option(
     "--host",
     default=HOST,
@@ -68,6 +77,7 @@ def live(
     \b
     padforge sense live --tcp 9000                                for programs here: docs/live-protocol.md
     padforge sense live --osc 127.0.0.1:9001 --lsl pad            for music, for labs
+    padforge sense live --foxglove 8765 --rerun                   for viewers of robotics
     padforge sense live --tcp 9000 --host 0.0.0.0 --token WORD    for other machines
 
     Anyone in the network who knows the token can watch, and nothing is encrypted.
@@ -98,12 +108,13 @@ def live(
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
         if replay is None and rig == "simulated":
             click.echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
-        outputs, builder = _open_outputs(stack, stream, **output), MessageBuilder(pipeline, mirrored)
-        draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
         touches = replay or ("simulated touches" if rig == "simulated" else f"{rig} rig")
         scaler, title = localizer.scaler, f"{touches}, {model}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
-        pad = {"title": title, "centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
+        area = {"centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm}
+        outputs, builder = _open_outputs(stack, stream, area, **output), MessageBuilder(pipeline, mirrored)
+        draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
+        pad = {"title": title, **area, "mirrored": mirrored}
 
         @stack.push
         def show_end(kind: object, error: BaseException | None, trace: object) -> None:
@@ -137,10 +148,20 @@ def _stream_rig(
 
 
 def _open_outputs(
-    stack: ExitStack, stream: "ReadingStream", tcp: int | None, osc: str | None, lsl: str | None, host: str, token: str
+    stack: ExitStack,
+    stream: "ReadingStream",
+    area: dict[str, Any],
+    tcp: int | None,
+    osc: str | None,
+    lsl: str | None,
+    foxglove: int | None,
+    rerun: str | None,
+    host: str,
+    token: str,
 ) -> "list[OutputStream]":
     """Open the outputs that were asked for; `stack` closes them."""
     from padforge.sense.live.outputs import JsonLines, LslOutput, OscOutput
+    from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
 
     outputs: list[OutputStream] = []
     if tcp is not None:
@@ -151,6 +172,12 @@ def _open_outputs(
         outputs.append(stack.enter_context(OscOutput(osc)))
     if lsl is not None:
         outputs.append(LslOutput(lsl, stream.fibres, stream.rate_hz))
+    if foxglove is not None:
+        viewer = stack.enter_context(FoxgloveOutput(foxglove, **area))
+        click.echo(f"foxglove: {viewer.url}", err=True)
+        outputs.append(viewer)
+    if rerun is not None:
+        outputs.append(stack.enter_context(RerunOutput(rerun, stream.fibres, **area)))
     return outputs
 
 

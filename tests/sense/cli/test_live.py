@@ -71,6 +71,13 @@ def test_live_sends_to_tcp_and_osc(replay) -> None:
     assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)
 
 
+def test_live_sends_to_viewers(replay) -> None:
+    code, _, err = replay("--foxglove", "0", "--rerun", "pad.rrd")
+    assert code == 0, err
+    assert re.search(r"^foxglove: ws://127\.0\.0\.1:\d+$", err, re.MULTILINE)
+    assert Path("pad.rrd").stat().st_size > 10_000
+
+
 LOST = RigFault("stale", "the board does not send", "reset it")
 
 

@@ -6,7 +6,7 @@ import sys
 import torch
 
 try:
-    import torchvision  # noqa: F401
+    import torchvision  # noqa: F401  # pyright: ignore[reportMissingImports]
 except RuntimeError:  # PyPI's Linux wheel needs CUDA for its operators; LeRobot imports it and calls none of them here
     operators = torch.library.Library("torchvision", "DEF")
     for name in ("nms", "qnms"):

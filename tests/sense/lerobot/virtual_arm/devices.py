@@ -8,7 +8,7 @@ class Device:
     """What both are: calibrated, and connected as they are told."""
 
     is_connected, is_calibrated = False, True
-    action_features = observation_features = dict.fromkeys(("elbow.pos", "wrist.pos"), float)
+    action_features = observation_features = {"elbow.pos": float, "wrist.pos": float}  # noqa: RUF012
     feedback_features: dict[str, type] = {}  # noqa: RUF012
 
     def connect(self, calibrate: bool = True) -> None:
@@ -34,8 +34,9 @@ class VirtualArm(Device, Robot):
     config_class, name = VirtualArmConfig, "virtual_arm"
 
     def __init__(self, config: VirtualArmConfig) -> None:
-        super().__init__(config)
-        self.positions, self.cameras = dict.fromkeys(self.observation_features, config.start), {}
+        super().__init__(config)  # pyright: ignore[reportCallIssue]
+        self.positions = {"elbow.pos": config.start, "wrist.pos": config.start}
+        self.cameras = {}
 
     def get_observation(self) -> dict[str, float]:
         return self.positions
