@@ -27,13 +27,14 @@ BENCHES = {
 @json_option
 @click.pass_context
 def bench(context: click.Context, names: tuple[str, ...], against: Path | None, out: Path, as_json: bool) -> None:
-    """Measure run time against error, beside published and plain implementations.
+    """Compare run time and error with published and plain methods.
 
     \b
     padforge bench                                all benchmarks, some minutes
-    padforge bench contact filter                 some of contact, objective, search, networks, filter,
+    padforge bench contact filter                 some of contact, objective,
+                                                  search, networks, filter,
                                                   localizer, twin, mould
-    padforge bench --against before/bench.json    what is slower or less accurate now, as ratios
+    padforge bench --against before/bench.json    what is slower or worse now
 
     Writes bench.json with all results and their summary, and NAME.png for each.
     """

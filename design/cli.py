@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from padforge.design.objectives.rules import Violation
     from padforge.design.settings import PadSettings
 
+SEARCH = "padforge.design.settings:SearchSettings"
 EDIT_PORT = 8322
 POLL_S = 0.2  # period of checking for Ctrl-C where the system does not wake a waiting thread, s
 MIN_SHOWN_MM = 5e-4  # smallest shift of a fibre's ends that `import` prints, mm
@@ -33,7 +34,7 @@ twin_option = click.option(
 
 def time_budget_option(text: str) -> Callable[..., Any]:
     """Make the option `--time-budget` with a help text."""
-    return click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help=text)
+    return click.option("--time-budget", type=common.FiniteRange(min=0), metavar="S", help=text)
 
 
 @contextmanager
@@ -58,8 +59,8 @@ def search_progress() -> "Iterator[OnProgress]":
     type=click.Choice(["descent", "genetic"]),
     help="descent (by gradients), or genetic (as published, with the published objective).",
 )
-@click.option("--knots", type=int, help="Inner knots per fibre.")
-@click.option("--starts", type=int, help="Random starts of the gradient search.")
+@common.setting_option("--knots", SEARCH, int, "Inner knots per fibre.")
+@common.setting_option("--starts", SEARCH, int, "Random starts of the gradient search.")
 @click.option("--start-from", metavar="random|straight|FILE", help="Initial fibres (default: random).")
 @twin_option
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Device that evaluates the objective.")
@@ -85,16 +86,16 @@ def design(
     as_json: bool,
     **overrides: Any,
 ) -> None:
-    """Optimise the paths of the fibres, or evaluate a finished morphology.
+    """Optimise the paths of the fibres; check, draw or edit them.
 
     \b
-    padforge design                                        into out/pad, with the settings of pad.toml or the defaults
+    padforge design                                   settings: pad.toml
     padforge design --knots 8 --seed 1 --out out/pad
-    padforge design --start-from out/pad/morphology.json   improve a pad
-    padforge design --twin out/pad/twin.json               for the measured contact of a printed pad
-    padforge design check out/pad/morphology.json          exit code 1 if a rule is broken
-    padforge design edit out/pad/morphology.json           edit the paths in a browser
-    padforge design import plan.svg                        import paths from a drawing
+    padforge design --start-from out/pad/morphology.json
+    padforge design --twin out/pad/twin.json          for a printed pad
+    padforge design check out/pad/morphology.json     exit code 1: rule broken
+    padforge design edit out/pad/morphology.json      edit the paths in a browser
+    padforge design import plan.svg                   import them from a drawing
 
     Writes morphology.json, design.json, design.svg and design.png. Exit code 1 if the best pad breaks a rule. Ctrl-C
     stops with the best pad so far (exit code 130); --resume continues from there, also after a kill. A pad from which a
@@ -122,7 +123,7 @@ def design(
 @common.spec_option
 @common.out_option(what="Picture to write, .svg or .png", file=True)
 def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
-    """Draw the plan: fibres, crossings, broken rules and the contact, to scale.
+    """Draw the plan to scale: fibres, crossings, broken rules, contact.
 
     \b
     padforge design show out/pad/morphology.json                  into out/pad/plan.svg
@@ -147,7 +148,7 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
 @common.json_option
 @click.pass_context
 def check(context: click.Context, morphology: Path, spec: Path | None, as_json: bool) -> None:
-    """Check every design rule on the exact curves; exit code 1 if one is broken.
+    """Check every design rule on the exact curves. Exit code 1 if one is broken.
 
     \b
     padforge design check out/pad/morphology.json
@@ -209,7 +210,7 @@ def _load_and_check(
     "--port", type=click.IntRange(0, 65535), default=EDIT_PORT, show_default=True, help="Port of the page; 0: any."
 )
 def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, port: int) -> None:
-    """Edit the paths of fibres in a browser on this machine, with broken rules and ambiguity at every step.
+    """Edit the paths in a browser on this machine. It shows broken rules and ambiguity at every step.
 
     \b
     padforge design edit out/pad/morphology.json     saves to out/pad/morphology-edited.json
@@ -249,7 +250,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
 @common.spec_option
 @click.option(
     "--tolerance-mm",
-    type=click.FloatRange(1e-3, 10),
+    type=common.FiniteRange(1e-3, 10),
     default=0.05,
     show_default=True,
     help="Largest distance of fibres and their ends from the drawing.",
@@ -267,7 +268,7 @@ def import_(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Import the paths of fibres from a drawing (.svg or .dxf), one curve per fibre; exit code 1 if a rule is broken.
+    """Import the paths from a drawing (.svg or .dxf). It has one curve per fibre; exit code 1 if a rule is broken.
 
     \b
     padforge design import plan.svg                      into out/plan/morphology.json

@@ -73,13 +73,15 @@ def read_variants(
             for section, key, value in combination:
                 tables[section][key] = value
             labels = [f"{key} {str(value).strip('()').replace(', ', ' x ')}" for _, key, value in combination]
-            varied_spec = cast_as_contact(spec.replaced(tables), tables["contact"])
+            stated = spec.replaced(tables, f"{spec.source} with --vary" if varied else "")
+            varied_spec = cast_as_contact(stated, tables["contact"])
             variants.append(Variant(", ".join([*source, *labels]) or "defaults", varied_spec))
     folders = [variant.folder.casefold() for variant in variants]  # macOS and Windows ignore case
     if len(set(folders)) < len(folders):
         raise InputError(f"{max(folders, key=folders.count)}: two pads have this name, expected different names")
     if not 2 <= len(variants) <= MAX_VARIANTS:
-        raise InputError(f"there are {len(variants)} pads to compare, allowed are 2 to {MAX_VARIANTS}")
+        advice = "name settings or morphologies, or vary a setting with --vary"
+        raise InputError(f"pads to compare are {len(variants)}, allowed are 2 to {MAX_VARIANTS}: {advice}")
     for variant in variants:  # before minutes are spent on another one
         for model in (PadSettings, SearchSettings, RulesSettings):
             variant.spec.section(model)

@@ -9,6 +9,7 @@ from padforge.design.common import files
 from padforge.design.common.parallel import Checkpoints
 from padforge.design.common.plotting import save_figure
 from padforge.design.common.profiling import stage
+from padforge.design.common.validation import InputError
 from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
@@ -122,6 +123,8 @@ def _read_request(
     if start_from == "straight":
         start = Morphology.straight(pad.layout)
     elif start_from not in (None, "random"):
+        if Path(start_from).suffix.lower() not in (".json", ".mat"):
+            raise InputError(f"--start-from is {start_from}, allowed are random, straight and a .json or .mat")
         start = Morphology.load(start_from)
         inputs.append(Path(start_from))
         overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}

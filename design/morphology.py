@@ -241,8 +241,10 @@ class Morphology:
             InputError: the file is missing, torn, of another kind, or its knots break the rules of the class.
         """
         path = as_path("path", path)
-        is_mat = path.suffix.lower() == ".mat"
-        document = None if is_mat else read_json(path, SQUARE_FORMAT, FORMAT)
+        kind = path.suffix.lower()
+        if kind not in (".json", ".mat"):
+            raise InputError(f"{path}: no morphology, allowed are a .json and a published .mat")
+        document = None if kind == ".mat" else read_json(path, SQUARE_FORMAT, FORMAT)
         try:
             return cls.from_dict(document) if document is not None else cls(_read_published_knots(path))
         except InputError as error:

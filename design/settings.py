@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from padforge.design.common.settings import Settings, Spec, as_tuple, null_as, to_builtins
+from padforge.design.common.units import to_unit
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 
 if TYPE_CHECKING:
@@ -228,7 +230,7 @@ class Contact(Settings, frozen=True):
     length: Literal["manhattan", "euclidean"] = Field(
         default="euclidean", description="length of a fibre element: euclidean, or |dx| + |dy| as published"
     )
-    sensitivity_profile: Annotated[tuple[Point, ...], BeforeValidator(_as_tuples), Field(max_length=64)] = Field(
+    sensitivity_profile: Annotated[tuple[Point, ...], Field(max_length=64), BeforeValidator(_as_tuples)] = Field(
         default=MEASURED_PROFILE, description="measured weight by distance, mm, [[0, 1], ..., [d, 0]], of a profile"
     )
 
@@ -336,6 +338,8 @@ def _fibre_radius_mm(spec: Spec) -> float:
 def _stated_mm(spec: Spec, section: str, key: str, default: float) -> float:
     """Return a length that a section states; the default if it is none: those who own the section refuse it."""
     value = spec.stated(section).get(key, default)
+    with suppress(ValueError):
+        value = to_unit(key, value)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
 
 
@@ -564,7 +568,7 @@ class PadSettings(Settings):
         default="beyond", description='pressed [width, height], mm; half a pitch "beyond" fibres, or between "fibres"'
     )
     keep_out_mm: Annotated[
-        tuple[Annotated[Corners, BeforeValidator(_as_tuples)], ...], BeforeValidator(as_tuple), Field(max_length=64)
+        tuple[Annotated[Corners, BeforeValidator(_as_tuples)], ...], Field(max_length=64), BeforeValidator(as_tuple)
     ] = Field(default=(), description="polygons [[x, y], ...] from the middle, mm, that no fibre enters")
     bent_radius_mm: BentRadius = Field(default=None, description='radius of a cylinder about y it is on, mm, or "flat"')
 

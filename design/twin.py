@@ -267,12 +267,12 @@ class Twin:
         return _profile_contact(self.distance_mm, self.weight)
 
     def ignored_effects(self) -> str | None:
-        """Describe effects measured on this pad that are ignored for any other pad; None if there are none."""
+        """Describe effects measured on this pad that are not those of any other pad; None if there are none."""
         effects = ["the dependence on the angle between fibre and press"] if self.angular_weight is not None else []
         stds = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
         if stds and max(stds) > UNIFORM_SENSITIVITY_STD:
-            effects.append(f"the uneven response along fibres ({np.mean(stds):.0%})")
-        return f"ignored for other pads than the measured one: {' and '.join(effects)}" if effects else None
+            effects.append(f"where along its fibres the response is uneven ({np.mean(stds):.0%})")
+        return f"not carried over to another pad: {' and '.join(effects)}" if effects else None
 
     def as_built_stretch(self, positions_mm: ArrayLike, part: str | None = None) -> Array:
         """Compute the relative stretch of the as-built fibres: signal over planned length.

@@ -14,6 +14,7 @@ from padforge.design.common.command_line import (
     show_result,
     spec_option,
 )
+from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
@@ -34,7 +35,7 @@ class BuildByDefault(click.Group):
 
 @click.group(cls=BuildByDefault, subcommand_metavar="[build] MORPHOLOGY | check MESH_OR_MORPHOLOGY  [OPTIONS]")
 def fabricate() -> None:
-    """Turn a morphology into the printable mould of its pad, or check one.
+    """Make the printable mould of a morphology, or check one.
 
     \b
     padforge fabricate MORPHOLOGY                     writes the mould
@@ -54,12 +55,18 @@ class _FormatsOption(click.Option):
         return super().get_help_record(ctx)
 
 
-formats_option = click.option("--formats", cls=_FormatsOption, default="stl,step,svg,png", show_default=True)
+def _parse_formats(context: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
+    from padforge.fabricate.export import FORMATS
+
+    formats = tuple(name.strip() for name in value.split(",") if name.strip())
+    if unknown := [name for name in formats if name not in FORMATS]:
+        raise click.BadParameter(f"got {unknown[0]!r}, allowed are {', '.join(FORMATS)}")
+    return formats
 
 
-def split_formats(formats: str) -> tuple[str, ...]:
-    """Split the value of `--formats` into names."""
-    return tuple(name.strip() for name in formats.split(",") if name.strip())
+formats_option = click.option(
+    "--formats", cls=_FormatsOption, default="stl,step,svg,png", show_default=True, callback=_parse_formats
+)
 
 
 @fabricate.command()
@@ -69,7 +76,7 @@ def split_formats(formats: str) -> tuple[str, ...]:
 @out_option(what="Folder for the files")
 @json_option
 @profile_option
-def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, as_json: bool) -> None:
+def build(morphology: Path, formats: tuple[str, ...], spec: Path | None, out: Path | None, as_json: bool) -> None:
     """Write the mould of MORPHOLOGY; `build` may be left out.
 
     \b
@@ -90,7 +97,7 @@ def build(morphology: Path, formats: str, spec: Path | None, out: Path | None, a
     folder = out or pad_folder(morphology)
     with locked_folder(folder):
         inputs = [path for path in (morphology, spec) if path]
-        result = build_files(pad, folder, split_formats(formats), settings, inputs)
+        result = build_files(pad, folder, formats, settings, inputs)
     document = result.to_dict()
     show_result(document, mould_lines(document, folder), as_json)
 
@@ -120,7 +127,7 @@ def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
 @json_option
 @click.pass_context
 def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, picture: Path | None, as_json: bool) -> None:
-    """Check a mesh, or the mould of a morphology; exit 1 when a check fails.
+    """Check a mesh, or the mould of a morphology. Exit 1 when a check fails.
 
     \b
     padforge fabricate check out/pad/mould.stl
@@ -132,6 +139,8 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
 
     from .settings import FabricationSettings
 
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise InputError(f"--picture is {picture}, allowed is a name that ends in .png")
     vertices, triangles, findings = check_file(mesh_or_morphology, FabricationSettings.from_spec(load_spec(spec)))
     if picture is not None:
         with atomic_file(picture) as temporary:

@@ -1,4 +1,4 @@
-"""The command line: commands of the stages and of studies, `design compare`, `run`, `init`, `report` and `bench`."""
+"""The command line: the stages, studies, `design compare`, `run`, `init`, `schema`, `report` and `bench`."""
 
 import sys
 from functools import partial
@@ -13,7 +13,7 @@ from padforge.design.cli import search_progress, time_budget_option
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
-from padforge.fabricate.cli import formats_option, mould_costs, split_formats
+from padforge.fabricate.cli import formats_option, mould_costs
 from padforge.sense.cli.main import sense as sense_group
 from padforge.sense.cli.studies import study as study_group
 
@@ -28,7 +28,7 @@ except ModuleNotFoundError as error:
 
     @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
     def bench() -> None:
-        """Compare run time and error with published and plain methods, in a checkout of the repository."""
+        """Compare run time and error with published and plain methods. Runs in a checkout of the repository."""
         raise InputError("bench runs in a checkout of the repository only, whose benchmarks are not installed")
 
 
@@ -50,11 +50,11 @@ def cli(context: click.Context) -> None:
     """From an idea to a calibrated soft strain-sensor pad.
 
     \b
-    padforge run                                     all stages, on built-in defaults, into out/pad
-    padforge design --out out/pad                    optimise the paths of the fibres
-    padforge fabricate out/pad/morphology.json       make the mould
-    padforge sense calibrate out/pad/recording       train a localizer on recorded presses
-    padforge study robustness                        the figures of the paper, for your own pads
+    padforge run                                  all stages, into out/pad
+    padforge design --out out/pad                 optimise the paths of the fibres
+    padforge fabricate out/pad/morphology.json    make the mould
+    padforge sense calibrate out/pad/recording    train a localizer on presses
+    padforge study robustness                     figures of the paper
     """
     context.obj = list(SECTIONS)
 
@@ -79,7 +79,7 @@ def _compare(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Compare pads in a table and a figure: fibres, length, mould, and error with failed fibres.
+    """Compare pads in a table and a figure. Both state the mould, and the error with failed fibres.
 
     \b
     padforge design compare --vary pad.grid=3,4,5 --vary search.knots=6,21
@@ -107,7 +107,7 @@ def _compare(
     " planned.",
 )
 def _init(path: Path, preset: str | None) -> None:
-    """Write a settings file, pad.toml, with every default and a comment on each key.
+    """Write pad.toml with every setting, its default and a comment.
 
     \b
     padforge init
@@ -122,6 +122,23 @@ def _init(path: Path, preset: str | None) -> None:
     click.echo(f"settings -> {path}")
 
 
+@cli.command("schema")
+def _schema() -> None:
+    """Print the JSON Schema of pad.toml, by which editors complete it.
+
+    \b
+    padforge schema > pad.schema.json
+
+    With the line `#:schema ./pad.schema.json` at its top, editors that use Taplo (Even Better TOML in VS Code) complete
+    the keys of a pad.toml, show their meaning and default, and mark what is not allowed.
+    """
+    import json
+
+    from padforge.design.common.settings import settings_schema
+
+    click.echo(json.dumps(settings_schema(section_models()), indent=1))
+
+
 @cli.command("run")
 @common.spec_option
 @formats_option
@@ -132,8 +149,8 @@ def _init(path: Path, preset: str | None) -> None:
 @common.force_option
 @common.profile_option
 @click.pass_context
-def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **options: Any) -> None:
-    """Run all stages: optimise, mould, record presses on the simulated rig, calibrate, report.
+def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], out: Path, **options: Any) -> None:
+    """Run all stages, from design to report, on the simulated rig.
 
     \b
     padforge run
@@ -150,7 +167,7 @@ def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **o
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
-    run = Run(common.load_spec(spec), out, formats=split_formats(formats), **options)
+    run = Run(common.load_spec(spec), out, formats=formats, **options)
     check_run(run)
     with locked_folder(out):
         code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
@@ -163,7 +180,7 @@ def _run(context: click.Context, spec: Path | None, formats: str, out: Path, **o
 @cli.command("report")
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path), default="out/pad")
 def _report(folder: Path) -> None:
-    """Write report.html, one page on all results in the FOLDER of a pad.
+    """Write report.html, a page on all results in a FOLDER.
 
     \b
     padforge report out/pad

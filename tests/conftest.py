@@ -34,9 +34,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("padforge")
 
+from padforge.design.common import compilation  # noqa: E402
 from tests.helpers import kernels  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
+compilation.PATIENCE_S = 3600.0  # what a test compiles is no output of the command that it looks at
 PUBLISHED = ROOT.parent / "shared" / "data" / "published"
 
 

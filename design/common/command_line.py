@@ -4,6 +4,7 @@ import atexit
 import functools
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -12,6 +13,7 @@ from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from itertools import zip_longest
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -50,6 +52,67 @@ def out_option(default: str = "", what: str = "Folder for the results", file: bo
         default=default or None,
         help=f"{what} (default: {default or 'in the folder of the pad'}).",
     )
+
+
+class FiniteRange(click.FloatRange):
+    """A range of numbers without NaN and infinity, which click lets through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert the text of an option."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"got {value!r}, expected a finite number", param, ctx)
+        return number
+
+
+def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..., Any]:
+    """Make an option that takes the place of the setting of its name; its value is checked before anything is done.
+
+    Args:
+        name: of the option, such as `--knots`.
+        section: model of the setting as `module:class`, which is imported where the option is used.
+        kind: type of the value for click.
+        text: help.
+    """
+
+    def check(context: click.Context, param: click.Parameter, value: Any) -> Any:
+        if value is not None:
+            try:
+                resolve_name(section)(**{str(param.name): value})
+            except InputError as error:
+                raise click.BadParameter(str(error).partition(": ")[2]) from error
+        return value
+
+    return click.option(name, type=kind, callback=check, help=text)
+
+
+class SectionedGroup(click.Group):
+    """A group whose help lists its commands under headings, in the order in which they were added."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._headings: dict[str, str] = {}
+        super().__init__(*arguments, **options)
+
+    def add_command(self, cmd: click.Command, name: str | None = None, heading: str = "Commands") -> None:
+        """Add a command.
+
+        Args:
+            cmd: the command.
+            name: its name in this group; that of the command if None.
+            heading: what it is listed under.
+        """
+        super().add_command(cmd, name)
+        self._headings[name or cmd.name or ""] = heading
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands with their short helps."""
+        width = max(map(len, self._headings))
+        limit = formatter.width - 6 - width  # as click counts: indent, gap and margin
+        for heading in dict.fromkeys(self._headings.values()):
+            commands = [(name, self.commands[name]) for name in self._headings if self._headings[name] == heading]
+            rows = [(name.ljust(width), command.get_short_help_str(limit)) for name, command in commands]
+            with formatter.section(heading):
+                formatter.write_dl(rows)
 
 
 def pad_folder(source: Path | None = None) -> Path:

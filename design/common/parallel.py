@@ -8,7 +8,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from hashlib import sha256
@@ -96,6 +96,14 @@ class _DaemonThreads(Executor):
         active_threads.add(thread)
         thread.start()
         return future
+
+
+def makespan(parts: Sequence[float], workers: int) -> float:
+    """Return the time in which workers finish tasks of these lengths, each taking the next one when it is free."""
+    ends = [0.0] * workers
+    for part in parts:
+        ends[ends.index(min(ends))] += part
+    return max(ends)
 
 
 @contextmanager

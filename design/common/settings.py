@@ -5,17 +5,31 @@ import math
 import sys
 import tomllib
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    PlainSerializer,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from padforge.design.common.files import read_bytes
+from padforge.design.common.units import MAX_DEPTH, quantity_pattern, to_unit, units_of
 from padforge.design.common.validation import InputError, check_mapping, check_path, check_type, short_repr
+
+if TYPE_CHECKING:
+    from pydantic import GetJsonSchemaHandler
+    from pydantic_core import CoreSchema
 
 MAX_BYTES = 2**18  # of a settings file
 MAX_DOTS = 200  # in a line: the time to parse a dotted key grows with the square of its parts
-MAX_DEPTH = 6  # of nested lists and tables; more than any setting has, while a list may contain itself
 MAX_ITEMS = 2**17  # of an array: a broadcast one may not fit into memory as a list
 
 
@@ -34,6 +48,11 @@ class Settings(BaseModel):
     @classmethod
     def _without_numpy(cls, values: object) -> object:
         return to_builtins(values)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _convert_units(cls, value: object, info: ValidationInfo) -> object:
+        return to_unit(info.field_name or "", value)
 
     @classmethod
     def section(cls) -> str:
@@ -66,13 +85,25 @@ def as_tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
-def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer]:
+@dataclass(frozen=True)
+class _NullWord:
+    """Annotates a key that is null in JSON Schema as what it is in files."""
+
+    word: str
+
+    def __get_pydantic_json_schema__(self, schema: "CoreSchema", handler: "GetJsonSchemaHandler") -> dict[str, Any]:
+        """Return the JSON Schema of the key, with the word in place of null."""
+        options = handler(schema)["anyOf"]
+        return {"anyOf": [{"const": self.word} if option == {"type": "null"} else option for option in options]}
+
+
+def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer, _NullWord]:
     """Annotate a key that is `word` in files where the model holds None: `Annotated[float | None, *null_as("any")]`."""
 
     def read(value: object) -> object:
         return None if isinstance(value, str) and value == word else value
 
-    return BeforeValidator(read), PlainSerializer(lambda value: word if value is None else value)
+    return BeforeValidator(read), PlainSerializer(lambda value: word if value is None else value), _NullWord(word)
 
 
 class Spec:
@@ -135,23 +166,24 @@ class Spec:
 
         Args:
             model: of the section.
-            **overrides: values that replace those of the file, unless None.
+            **overrides: values that replace those of the file, unless None; errors of these do not name the file.
 
         Raises:
             InputError: an unknown key or a value out of range, with key, value and what is allowed.
         """
         changes = {key: value for key, value in overrides.items() if value is not None}
-        return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]")
+        return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
 
-    def replaced(self, tables: Mapping[str, Mapping[str, Any]]) -> "Spec":
+    def replaced(self, tables: Mapping[str, Mapping[str, Any]], source: str = "") -> "Spec":
         """Return these settings with other values in place of theirs.
 
         Args:
             tables: the values, by section and key.
+            source: what errors call the result; as these settings if empty.
         """
-        Spec(tables, self.source)
+        Spec(tables, source := source or self.source)
         names = {*self._tables, *tables}
-        return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, self.source)
+        return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
     def stated(self, model: type[Settings] | str) -> Mapping[str, Any]:
         """Return what the file states of a section, without defaults and not validated.
@@ -173,29 +205,41 @@ def or_default(
     return (default or model()) if value is None else check_type(name, value, model)
 
 
-def validate(model: type[AnySettings], values: Mapping[str, Any], where: str) -> AnySettings:
-    """Return `model(**values)`; raise the first error of pydantic as an InputError that begins with `where`."""
+def validate(
+    model: type[AnySettings], values: Mapping[str, Any], where: str, overrides: Collection[str] = ()
+) -> AnySettings:
+    """Return `model(**values)`; raise the first error of pydantic as an InputError.
+
+    It begins with `where`, or with the section if it is about one of the keys `overrides`.
+    """
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        raise _to_input_error(error, model, where) from error
+        raise _to_input_error(error, model, where, overrides) from error
 
 
-def _to_input_error(error: ValidationError, model: type[Settings], where: str) -> InputError:
+def _to_input_error(
+    error: ValidationError, model: type[Settings], where: str, overrides: Collection[str] = ()
+) -> InputError:
     first = error.errors()[0]
+    if first["loc"] and first["loc"][0] in overrides:
+        where = f"[{model.section()}]"
+    message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:  # an error of the whole section names its keys itself
-        return InputError(f"{where} {first['msg']}")
+        return InputError(f"{where} {message}")
     key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
     if first["type"] == "extra_forbidden":
         allowed = f", allowed are {', '.join(model.model_fields)}" if len(first["loc"]) == 1 else ""
         return InputError(f"{where} {'.'.join(map(str, first['loc']))}: no such key{allowed}")
-    return InputError(f"{where} {key}: got {short_repr(first['input'])}, {first['msg'].lower()}")
+    message = message[:1].lower() + message[1:]  # units keep their capitals
+    return InputError(f"{where} {key}: got {short_repr(first['input'])}, {message}")
 
 
 def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:
     """Write a `pad.toml` that states every key of `models`, by section, with the descriptions as comments."""
     head = "# padforge settings. Every key is optional; what stands here is the default"
     lines = [f"{head}, or of the preset." if preset else f"{head}."]
+    lines += ['# Numbers are in the units of the comments; text may have another one, such as "0.5 cm" or "20 um".']
     for name, model in models.items():
         lines += ["", f"[{name}]"]
         values = ((preset or {}).get(name) or model()).model_dump()
@@ -203,3 +247,43 @@ def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Se
             value = json.dumps(values[key], ensure_ascii=False)  # which TOML writes alike
             lines.append(f"{key} = {value} ".ljust(36) + f"# {field.description}")
     return "\n".join(lines) + "\n"
+
+
+def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
+    """Return the JSON Schema of a `pad.toml`, by which editors complete and check it.
+
+    It is of draft 7, the latest one that editors for TOML know. What depends on several keys is beyond it.
+
+    Args:
+        models: of the sections, by name.
+    """
+    from pydantic.json_schema import models_json_schema  # takes a while, and one command needs it
+
+    refs, schema = models_json_schema([(model, "validation") for model in models.values()])
+    for model in models.values():
+        table = schema["$defs"][refs[model, "validation"]["$ref"].rpartition("/")[2]]
+        table["description"] = table["description"].partition("\n\n")[0]
+        for key, default in model().model_dump(mode="json").items():
+            described = {"description": model.model_fields[key].description, "default": default}
+            table["properties"][key] = described | _as_in_files(table["properties"][key], key)
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "padforge settings",
+        "type": "object",
+        "additionalProperties": False,
+        "properties": {name: refs[model, "validation"] for name, model in models.items()},
+        **schema,
+    }
+
+
+def _as_in_files(schema: Any, key: str) -> Any:
+    """Return the schema of a key in which a number may have a unit, and a tuple is that of draft 7."""
+    if isinstance(schema, list):
+        return [_as_in_files(item, key) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    dropped, renamed = {"title", "description", "default"}, {"prefixItems": "items"}
+    items = {renamed.get(name, name): _as_in_files(item, key) for name, item in schema.items() if name not in dropped}
+    if items.get("type") == "number" and units_of(key):
+        return {"anyOf": [items, {"type": "string", "pattern": quantity_pattern(key)}]}
+    return items

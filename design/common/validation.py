@@ -46,6 +46,7 @@ class Fault(Exception):  # noqa: N818  of things outside the program, not an err
 
 # distributions by the module they bring, where the names differ
 _DISTRIBUTIONS = {"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"}
+_DISTRIBUTIONS |= {"foxglove": "foxglove-sdk", "rerun": "rerun-sdk"}
 _DISTRIBUTIONS |= dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde")
 
 

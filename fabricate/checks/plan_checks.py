@@ -42,12 +42,15 @@ def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Fin
 
 
 def check_file(source: Path, settings: FabricationSettings = DEFAULTS) -> CheckedMesh:
-    """Run all checks on a mesh file (.stl, .3mf), or on the mould of the morphology in any other file.
+    """Run all checks on a mesh (.stl, .3mf), or on the mould of a morphology (.json, .mat).
 
     Raises:
-        InputError: the file cannot be read, or settings contradict each other.
+        InputError: the file is of another kind or cannot be read, or settings contradict each other.
     """
-    if source.suffix.lower() not in (".stl", ".3mf"):
+    kind = source.suffix.lower()
+    if kind not in (".stl", ".3mf", ".json", ".mat"):
+        raise InputError(f"{source}: no file to check, allowed are a mesh .stl or .3mf, a morphology .json or .mat")
+    if kind in (".json", ".mat"):
         return check_mould(Plan(Morphology.load(source), settings))
     vertices, triangles = read_mesh(source)
     return vertices, triangles, check_triangles(vertices, triangles, settings.printer, settings.mould.min_silicone_mm)

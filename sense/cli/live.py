@@ -9,27 +9,27 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import json_option, load_spec, spec_option
+from padforge.design.common.command_line import FiniteRange, json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
 from padforge.sense.cli.options import FOLDER, redrawn_lines
-from padforge.sense.cli.rig import rig_option
+from padforge.sense.cli.rig import check_rig, rig_option
 
 if TYPE_CHECKING:
     from padforge.sense.health.health_model import HealthModel
     from padforge.sense.live.outputs import OutputStream
     from padforge.sense.live.pipeline import Estimate, Event
     from padforge.sense.localizer.model import LocalizerModel
-    from padforge.sense.rig.devices import Board
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
+RERUN_VIEWER = "rerun+http://127.0.0.1:9876/proxy"  # where a viewer that was started without options listens
 BAR = 12  # characters of a fibre's bar on a terminal, to either side
 
 
 @click.command()
 @rig_option
 @click.option("--replay", metavar="RECORDING", type=click.Path(path_type=Path), help="Replay a recording.")
-@click.option("--speed", type=click.FloatRange(min=0.01), default=1.0, show_default=True, help="Speed of --replay.")
+@click.option("--speed", type=FiniteRange(min=0.01), default=1.0, show_default=True, help="Speed of --replay.")
 @click.option("--model", type=FOLDER, default="out/pad", show_default=True, help="Folder that calibrate wrote.")
 @click.option(
     "--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Port of the page; 0: any."
@@ -37,6 +37,14 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
 @click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any.")
 @click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address.")
 @click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name.")
+@click.option("--foxglove", type=click.IntRange(0, 65_535), help="Serve Foxglove on this port; 0: any.")
+@click.option(
+    "--rerun",
+    metavar="[TARGET]",
+    is_flag=False,
+    flag_value=RERUN_VIEWER,
+    help="Send to the viewer Rerun: the one here, one by its address rerun+http://..., or into a file .rrd.",
+)
 @click.option(
     "--host",
     default=HOST,
@@ -56,7 +64,7 @@ def live(
     as_json: bool,
     **output: Any,
 ) -> None:
-    """Show touches as they happen, in the terminal and on a page for the browsers of this machine.
+    """Show touches as they happen, in the terminal and a page. It is for the browsers of this machine.
 
     \b
     padforge sense live --model out/pad
@@ -69,6 +77,7 @@ def live(
     \b
     padforge sense live --tcp 9000                                for programs here: docs/live-protocol.md
     padforge sense live --osc 127.0.0.1:9001 --lsl pad            for music, for labs
+    padforge sense live --foxglove 8765 --rerun                   for viewers of robotics
     padforge sense live --tcp 9000 --host 0.0.0.0 --token WORD    for other machines
 
     Anyone in the network who knows the token can watch, and nothing is encrypted.
@@ -86,6 +95,7 @@ def live(
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.streams import stream_recording
 
+    check_rig(rig)
     localizer = LocalizerModel.load(model)
     with ExitStack() as stack:
         if replay is None:
@@ -96,11 +106,15 @@ def live(
         pipeline = Live(localizer, _load_health(model), stream.fibres, stream.rate_hz)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
-        outputs, builder = _open_outputs(stack, stream, **output), MessageBuilder(pipeline, mirrored)
-        draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
-        scaler, title = localizer.scaler, f"{replay or f'{rig} rig'}, {model}"
+        if replay is None and rig == "simulated":
+            click.echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
+        touches = replay or ("simulated touches" if rig == "simulated" else f"{rig} rig")
+        scaler, title = localizer.scaler, f"{touches}, {model}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
-        pad = {"title": title, "centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm, "mirrored": mirrored}
+        area = {"centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm}
+        outputs, builder = _open_outputs(stack, stream, area, **output), MessageBuilder(pipeline, mirrored)
+        draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
+        pad = {"title": title, **area, "mirrored": mirrored}
 
         @stack.push
         def show_end(kind: object, error: BaseException | None, trace: object) -> None:
@@ -123,28 +137,31 @@ def _stream_rig(
     stack: ExitStack, rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None
 ) -> "tuple[ReadingStream, bool]":
     """Return the readings of a board, which `stack` closes, and whether the pad lies with its tracks up."""
+    from padforge.sense.live.pad_sensor import open_board
     from padforge.sense.rig.streams import is_pad_mirrored, stream_board
     from padforge.sense.settings import RigSettings
 
     options = load_spec(spec).section(RigSettings)
     mirrored = is_pad_mirrored(model, options)
-    board: Board  # alone, not yet connected: a person presses the pad, not the arm
-    if rig == "simulated":
-        from padforge.sense.virtual.virtual_pad import virtual_pad_of
-
-        board = virtual_pad_of(model)
-    else:
-        from padforge.sense.rig.devices import load_device
-
-        board = load_device("padforge.boards", options.board)(options, options.inputs(localizer.fibres))
-    return stream_board(stack.enter_context(closing(board)), localizer.rate_hz), mirrored
+    board = stack.enter_context(closing(open_board(rig, model, options, localizer.fibres)))
+    return stream_board(board, localizer.rate_hz), mirrored
 
 
 def _open_outputs(
-    stack: ExitStack, stream: "ReadingStream", tcp: int | None, osc: str | None, lsl: str | None, host: str, token: str
+    stack: ExitStack,
+    stream: "ReadingStream",
+    area: dict[str, Any],
+    tcp: int | None,
+    osc: str | None,
+    lsl: str | None,
+    foxglove: int | None,
+    rerun: str | None,
+    host: str,
+    token: str,
 ) -> "list[OutputStream]":
     """Open the outputs that were asked for; `stack` closes them."""
     from padforge.sense.live.outputs import JsonLines, LslOutput, OscOutput
+    from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
 
     outputs: list[OutputStream] = []
     if tcp is not None:
@@ -155,17 +172,23 @@ def _open_outputs(
         outputs.append(stack.enter_context(OscOutput(osc)))
     if lsl is not None:
         outputs.append(LslOutput(lsl, stream.fibres, stream.rate_hz))
+    if foxglove is not None:
+        viewer = stack.enter_context(FoxgloveOutput(foxglove, **area))
+        click.echo(f"foxglove: {viewer.url}", err=True)
+        outputs.append(viewer)
+    if rerun is not None:
+        outputs.append(stack.enter_context(RerunOutput(rerun, stream.fibres, **area)))
     return outputs
 
 
 def _load_health(model: Path) -> "HealthModel | None":
-    """Load the health model in the folder of a model, if there is one."""
-    from padforge.sense.health.fault_detector import FaultDetector, has_health
+    """Load the health model in the folder of a model, or say that there is none."""
+    from padforge.sense.live.pad_sensor import load_health
 
-    if not has_health(model):
+    health = load_health(model)
+    if health is None:
         click.echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
-        return None
-    return FaultDetector.load(model).live_model_
+    return health
 
 
 class EventPrinter:

@@ -33,7 +33,7 @@ from padforge.sense.cli.options import (
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
 )
 @click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
-@click.option("--time-budget", type=click.FloatRange(min=0), metavar="S", help="Train for S seconds.")
+@click.option("--time-budget", type=common.FiniteRange(min=0), metavar="S", help="Train for S seconds.")
 @common.seed_option
 @common.spec_option
 @common.out_option()
@@ -41,7 +41,7 @@ from padforge.sense.cli.options import (
 @common.json_option
 @common.profile_option
 def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: bool, **options: Any) -> None:
-    """Train a localizer on RECORDING, and test it on held-out presses.
+    """Train a localizer on RECORDING. It is tested on held-out presses.
 
     \b
     padforge sense calibrate out/pad/recording --test-split chronological
@@ -71,7 +71,7 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
 @common.json_option
 @common.profile_option
 def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
-    """Evaluate a model on RECORDING for every set of failed fibres.
+    """Evaluate a model on RECORDING, by set of failed fibres.
 
     \b
     padforge sense evaluate --model out/pad out/later/recording --max-failures 1
@@ -117,7 +117,7 @@ def locate(
     moment: "tuple[str, float] | None",
     out: Path | None,
 ) -> None:
-    """Predict the position of every press of RECORDING and its uncertainty; true positions are not needed.
+    """Predict where RECORDING was pressed, with uncertainties. True positions are not needed.
 
     \b
     padforge sense locate --model out/pad out/later/recording --exclude-fibres 1,4 --out places.csv
@@ -145,7 +145,7 @@ def locate(
 @common.json_option
 @click.pass_context
 def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
-    """Detect failed, damaged and drifting fibres of RECORDING, from the readings alone.
+    """Detect failed, damaged and drifting fibres of RECORDING. It needs the readings alone.
 
     \b
     padforge sense health --model out/pad out/later/recording
@@ -188,7 +188,7 @@ def _bytes_option(name: str, default: str, text: str) -> Callable[..., Any]:
 @common.spec_option
 @common.profile_option
 def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize: str | None, spec: Path | None) -> None:
-    """Write the localizer for other machines: OUT is an .onnx, or a .h for microcontrollers.
+    """Write the localizer for other machines. OUT is an .onnx, or a .h for microcontrollers.
 
     \b
     padforge sense deploy --model out/pad localizer.onnx
@@ -243,7 +243,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 @common.force_option
 @common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Adapt a model to a pad that has drifted or was cast again, by 20 to 500 presses at known positions in RECORDING.
+    """Adapt a model to a pad that has drifted or was cast again. RECORDING has 20 to 500 presses at known positions.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
@@ -288,7 +288,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
 def fibre_loss(
     recording: Path, model: Path | None, failed: tuple[int, ...], out: Path | None, as_json: bool, **options: Any
 ) -> None:
-    """Compare one localizer for all failures with networks retrained for every set, and map errors on RECORDING.
+    """Errors on RECORDING with failed fibres, and their maps. One localizer for all failures is compared with
+    networks retrained for every set.
 
     \b
     padforge sense fibre-loss out/pad/recording --model out/pad
@@ -338,7 +339,7 @@ def _write_study(path: Path, document: dict[str, Any], draw: Callable[[Path], No
 @common.out_option()
 @common.json_option
 def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Path | None, as_json: bool) -> None:
-    """Errors by number of training presses, and the error to expect with more of them.
+    """Errors by number of training presses, and with more.
 
     \b
     padforge sense learning-curve out/pad/recording
@@ -377,7 +378,7 @@ def identify(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Identify the twin of a printed pad from RECORDING: fibres as built, wiring, pose and sensitivity profile.
+    """Identify the twin of a printed pad from RECORDING. It has fibres as built, wiring, pose and sensitivity profile.
 
     If [contact] is a layer, its width, squeeze and stretch are measured.
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from padforge.design.common.command_line import out_option, pad_folder
+from padforge.design.common.command_line import SectionedGroup, out_option, pad_folder
 from padforge.sense.cli import localizer, rig
 from padforge.sense.cli.live import live
 from padforge.sense.cli.options import (
@@ -30,8 +30,8 @@ _PATH = click.Path(path_type=Path)
 @click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="Content of columns, datasets or topics.")
 @out_option(what="Folder of the recording; must be new or empty")
 def import_(file: Path, columns: str, out: Path | None) -> None:
-    """Import a recording from FILE: .csv, .tsv, .txt, .h5, .hdf5, .mat, or a ROS 2 bag (.mcap, .db3 or a
-    folder with metadata.yaml). The default folder for NAME.csv is out/NAME/recording.
+    """Import a recording of another program from FILE. This is a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a
+    ROS 2 bag (.mcap, .db3 or a folder with metadata.yaml). The default folder for NAME.csv is out/NAME/recording.
 
     \b
     padforge sense import readings.csv
@@ -88,7 +88,7 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
 @click.option("--format", "kind", type=click.Choice(["lerobot"]), help="Write a folder FILE: a LeRobot dataset v3.0.")
 @click.option("--model", type=FOLDER, help="Folder that calibrate wrote: adds predicted positions and health.")
 def export(recording: Path, file: Path, kind: str | None, model: Path | None) -> None:
-    """Export RECORDING to FILE for other programs: CSV (.csv), HDF5 (.h5) or ROS 2 (.mcap), by its
+    """Export RECORDING to FILE for other programs. FILE is CSV (.csv), HDF5 (.h5) or ROS 2 (.mcap), by its
     extension, or a LeRobot dataset.
 
     \b
@@ -139,9 +139,9 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
     )
 
 
-@click.group()
+@click.group(cls=SectionedGroup)
 def sense() -> None:
-    """Record presses, train a localizer on them and localize new ones.
+    """Record presses, train a localizer on them, localize new ones.
 
     \b
     padforge sense record --morphology out/pad/morphology.json
@@ -150,9 +150,11 @@ def sense() -> None:
     """
 
 
-for _command in (
-    *(import_, export, rig.record, rig.doctor, live),
-    *(localizer.calibrate, localizer.evaluate, localizer.identify, localizer.locate, localizer.health),
-    *(localizer.recalibrate, localizer.fibre_loss, localizer.learning_curve, localizer.deploy),
-):
-    sense.add_command(_command)
+for _heading, _commands in {
+    "Record": (rig.doctor, rig.record, import_, export),
+    "Calibrate": (localizer.calibrate, localizer.evaluate, localizer.recalibrate, localizer.identify),
+    "Use": (live, localizer.locate, localizer.health, localizer.deploy),
+    "Study": (localizer.fibre_loss, localizer.learning_curve),
+}.items():
+    for _command in _commands:
+        sense.add_command(_command, heading=_heading)

@@ -15,18 +15,29 @@ from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lin
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
+    from padforge.sense.formats.ros_writer import McapFollower
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.doctor import Diagnosis
     from padforge.sense.rig.operation import OpenedRig
 
 
+_RIG_SETTINGS = "padforge.sense.settings:RigSettings"
 _RIGS = "simulated, ur5, printer, hand, or an installed arm."
 rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
 _warn = partial(click.echo, err=True)
 virtual_hardware_option = click.option(
     "--virtual-hardware", is_flag=True, help="Run the drivers of the rig on emulated devices, in real time."
 )
+
+
+def check_rig(name: str) -> None:
+    """Raise InputError unless `--rig` names a rig."""
+    from importlib.metadata import entry_points
+
+    names = ["simulated", "hand", *sorted(entry_points(group="padforge.arms").names)]
+    if name not in names:
+        raise InputError(f"--rig is {name!r}, allowed are {', '.join(dict.fromkeys(names))}")
 
 
 @click.command()
@@ -37,11 +48,14 @@ virtual_hardware_option = click.option(
     help="morphology.json or published .mat (default: the twin's, or straight fibres; with a real rig, beside --out).",
 )
 @click.option("--twin", type=FILE, help="twin.json of a measured pad; the simulated pad responds like it.")
-@click.option("--presses", type=int, help="Presses to record.")
-@click.option("--plan", help="Positions: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm.")
+@common.setting_option("--presses", _RIG_SETTINGS, int, "Presses to record.")
+@common.setting_option(
+    "--plan", _RIG_SETTINGS, str, "Positions: uniform, grid, serpentine, adaptive, or a .csv of x_mm,y_mm,depth_mm."
+)
 @click.option("--model", type=FOLDER, help="Localizer of an adaptive plan, which presses where it is least certain.")
 @click.option("--dry-run", is_flag=True, help="Move through the whole plan above the pad without touching it.")
 @click.option("--resume", is_flag=True, help="Continue an unfinished recording.")
+@click.option("--mcap", is_flag=True, help="Write OUT.mcap as well, for ROS 2 and Foxglove, whole after every press.")
 @virtual_hardware_option
 @common.seed_option
 @common.spec_option
@@ -56,12 +70,13 @@ def record(
     model: Path | None,
     dry_run: bool,
     resume: bool,
+    mcap: bool,
     virtual_hardware: bool,
     seed: int | None,
     spec: Path | None,
     out: Path | None,
 ) -> None:
-    """Record presses on a pad, into the folder `recording` beside its morphology.
+    """Record presses on a pad. They go into the folder `recording` beside its morphology.
 
     \b
     padforge sense record --morphology out/pad/morphology.json --presses 1500
@@ -77,6 +92,8 @@ def record(
     profile, gain and noise are the twin's.
 
     An interrupted recording keeps every finished press; --resume records the others.
+    --mcap writes the file that export would, beside the folder, and resumes it with --resume --mcap; while it
+    is recorded, and after a kill, it holds all finished presses. It needs the extra ros (pip install '.[ros]').
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from padforge.design.settings import PadSettings, read_contact
@@ -86,6 +103,7 @@ def record(
     from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
 
+    check_rig(rig)
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
     target = out or folder / "recording"
     at_once = rig == "simulated" and not virtual_hardware
@@ -98,11 +116,14 @@ def record(
             raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
         folder = common.pad_folder(morphology)
     pad = _load_pad(morphology, settings.section(PadSettings))
+    follower = _make_follower(target, dry_run, resume) if mcap else None
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
     if at_once:
         if resume or dry_run or model:
             raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
+        if plan == "adaptive":
+            raise InputError("--plan is adaptive, which needs --virtual-hardware or a real rig")
         pressed = like if like and not morphology else pad
         if like and morphology and (ignored := like.ignored_effects()):
             _warn(f"{twin}: {ignored}")
@@ -113,9 +134,29 @@ def record(
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
-        config = RigConfig(pad, read_contact(settings), options, target, command, inputs, pad_settings, folder)
+        contact = read_contact(settings)
+        config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder, follower)
         recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
+    if follower is not None and recording is not None:
+        from padforge.sense.formats.import_export import arm_states, export_file
+
+        export_file(recording, follower.path, states=arm_states(target))
+        click.echo(f"{target} -> {follower.path}")
+
+
+def _make_follower(target: Path, dry_run: bool, resume: bool) -> "McapFollower":
+    """Return what writes the .mcap file beside a recording; raise InputError, before anything moves, if it must not."""
+    from padforge.sense.formats.ros_writer import McapFollower
+    from padforge.sense.recording.run_directory import START
+
+    if dry_run:
+        raise InputError("--mcap writes what is recorded, and --dry-run keeps nothing")
+    named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
+    follower = McapFollower(named.with_name(f"{named.name}.mcap"))
+    if follower.path.exists() and not (resume and (target / START).exists()):
+        raise InputError(f"{follower.path}: exists, recordings are never written over; choose another --out")
+    return follower
 
 
 def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morphology":
@@ -222,6 +263,7 @@ def doctor(
     from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import RigSettings
 
+    check_rig(rig)
     check_platform()
     settings = common.load_spec(spec)
     pad, options = _load_pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)

@@ -1,5 +1,6 @@
 """`padforge study ...`: the paper's figures and tables for any pads, and beyond."""
 
+import math
 import os
 from collections.abc import Callable
 from functools import wraps
@@ -23,10 +24,11 @@ DEFAULT_PADS = ("square", "random-5", "optimised")
 
 @click.group()
 def study() -> None:
-    """Reproduce the paper's figures and tables for pads of your own, and go beyond them.
+    """Reproduce the paper's figures and tables for your own pads.
 
     \b
-    padforge study robustness                              square grid, a random pad and an optimised one
+    padforge study robustness                          three pads: square grid,
+                                                       random and optimised
     padforge study robustness square out/pad/morphology.json
     padforge study scaling --jobs 2 --out out/study
 
@@ -90,6 +92,12 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
     return load_pads(names or default, seed)
 
 
+def _check_square(context: click.Context, param: click.Parameter, value: int) -> int:
+    if math.isqrt(value) ** 2 != value:
+        raise click.BadParameter(f"got {value}, allowed is a square number from 4")
+    return value
+
+
 @_command("robustness")
 @max_failures_option
 @click.option(
@@ -101,11 +109,16 @@ def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_
     help="Fibres sampled as in the paper, or exact.",
 )
 @click.option(
-    "--presses", type=click.IntRange(4), default=1024, show_default=True, help="Training presses, a square number."
+    "--presses",
+    type=click.IntRange(4),
+    default=1024,
+    show_default=True,
+    callback=_check_square,
+    help="Training presses, a square number.",
 )
 @common.spec_option
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
-    """Errors by number of failed fibres, over all sets of them, and error maps (figures 3, 4 and 5).
+    """Errors by number of failed fibres (figures 3 to 5). They are over all sets of these; there are error maps.
 
     \b
     padforge study robustness square random-5 --max-failures 2
@@ -127,7 +140,7 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 @_command("scaling")
 @click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
 def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
-    """Larger surfaces, with the pads repeated over them as tiles (figures 7 and 8).
+    """Larger surfaces, tiled with the pads (figures 7 and 8).
 
     \b
     padforge study scaling optimised --grids 4,16,64
@@ -139,13 +152,13 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
     except ValueError:
         sizes = ()
     if not sizes or not 2 <= sizes[0] <= sizes[-1] <= 256:
-        raise InputError(f"grids is {grids!r}, expected numbers from 2 to 256 with commas between them")
+        raise InputError(f"--grids is {grids!r}, expected numbers from 2 to 256 with commas between them")
     return scaling_study(_pads(names, seed, ("square", "optimised")), grids=sizes, seed=seed)
 
 
 @_command("drift", "PAD_OR_RECORDING")
 def drift(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Filters and drift compensation, on simulated pads and on recordings; idle shares (figure 12, table III).
+    """Filters and drift compensation (figure 12, table III). They run on simulated pads and on recordings.
 
     \b
     padforge study drift out/pad/recording
@@ -174,14 +187,14 @@ def _add_study(name: str, module: str, text: str, example: str, *, has_contact: 
     _command(name)(common.spec_option(make) if has_contact else make)
 
 
-_sensitivity = """Tools of other radii and other depths, trained with or not (figure 6).
+_sensitivity = """Other tools and depths, trained with or not (figure 6).
 
 They have half to one and a half times the radius and the depth that [contact] states. If [contact] is a shape, as in
 the preset `published`, the objects are those of the paper, of sizes K and shapes D in grid units."""
-_force = "Depth and force of a press from the signals that localize it, as a tool presses the layer of [contact]."
-_shape = "Which object was pressed, from the signals that localize it: a dome, a ball, a finger or a flat end."
-_multicontact = "Positions of two contacts at once, whichever comes first, and the number of contacts (figure 9)."
-_strokes = "Follow a finger that slides over simulated pads, by localizers trained on single presses of them."
+_force = "Depth and force of a press, from the signals. A tool presses the layer of [contact]."
+_shape = "Which object was pressed, from the signals. It is a dome, a ball, a finger or a flat end."
+_multicontact = "Number and positions of contacts at once (figure 9). Of two contacts, either comes first."
+_strokes = "Follow a finger that slides over simulated pads. The localizers are trained on single presses of them."
 _add_study("strokes", "strokes", _strokes, "optimised")
 _add_study("sensitivity", "sensitivity", _sensitivity, "square")
 _add_study("force", "indentation", _force, "square random-5")

@@ -68,23 +68,23 @@ def check_import(path: object, columns: object) -> tuple[Path, str]:
 def parse_columns(text: str, quantities: Sequence[str] = tuple(UNITS)) -> list[ColumnEntry]:
     """Return the entries of a mapping of these quantities, in its order; `fibres` may have several."""
     if len(text) > MAX_CHARACTERS:
-        raise InputError(f"mapping has {len(text)} characters, allowed are {MAX_CHARACTERS}")
+        raise InputError(f"columns have {len(text)} characters, allowed are {MAX_CHARACTERS}")
     entries = [_parse_entry(entry.strip(), quantities) for entry in text.split(",")]
     named = [entry.quantity for entry in entries]
     for quantity in named:
         if quantity != "fibres" and named.count(quantity) > 1:
-            raise InputError(f"mapping {short_repr(text)} names {quantity} twice, expected once")
+            raise InputError(f"columns {short_repr(text)} name {quantity} twice, expected once")
     required = [quantity for quantity in ("time", "fibres") if quantity in quantities]
     for quantity in required:
         if quantity not in named:
             expected = f"expected {' and '.join(required)} in each"
-            raise InputError(f"mapping {short_repr(text)} does not name {quantity}, {expected}")
+            raise InputError(f"columns {short_repr(text)} do not name {quantity}, {expected}")
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
-            raise InputError(f"mapping {short_repr(text)} names one of {one} and {other}, expected both or neither")
+            raise InputError(f"columns {short_repr(text)} name one of {one} and {other}, expected both or neither")
     for one, other in (("x", "positions"), ("press", "down_command")):
         if one in named and other in named:
-            raise InputError(f"mapping {short_repr(text)} names {one} and {other}, expected one of them")
+            raise InputError(f"columns {short_repr(text)} name {one} and {other}, expected one of them")
     return entries
 
 
@@ -95,7 +95,7 @@ def _parse_entry(text: str, quantities: Sequence[str]) -> ColumnEntry:
         name, _, unit = (piece.strip() for piece in name.rpartition(":"))
     if quantity not in quantities or not name:
         raise InputError(
-            f"mapping has {short_repr(text)}, expected QUANTITY=NAME or QUANTITY=NAME:UNIT, "
+            f"columns are {short_repr(text)}, expected QUANTITY=NAME or QUANTITY=NAME:UNIT, "
             f"where QUANTITY is one of {', '.join(quantities)}"
         )
     return ColumnEntry(quantity, name, None if unit is None else _parse_unit(quantity, unit))

@@ -125,36 +125,57 @@ def stamps_at(stamps: Indices, readings: Indices) -> Indices:
     return np.append(stamps, stamps[-1] + interval)[readings]
 
 
-def depths_to_z(recording: Recording, depths_mm: Array) -> Array:
+def depths_to_z(depths_mm: Array, mirrored: bool) -> Array:
     """Return the z of depths below the surface, m; 0 where they are unknown."""
-    return 0 - upward(recording) * np.nan_to_num(depths_mm) / 1000
+    return 0 - upward(mirrored) * np.nan_to_num(depths_mm) / 1000
 
 
-def upward(recording: Recording) -> float:
+def upward(mirrored: bool) -> float:
     """Return the sign of z above the surface, with which x and y of the plan are right-handed."""
-    return -1.0 if recording.mirrored else 1.0
+    return -1.0 if mirrored else 1.0
 
 
 def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
     """Return the topics of a recording that have messages, but for RECORDING."""
     stamps = to_stamps(recording.times_s, epoch_s)
-    down, up = stamps_at(stamps, recording.down_command), stamps_at(stamps, recording.up_command)
-    x_y = recording.presses_mm / 1000
-    covariances = np.zeros((len(down), 36))
-    covariances[np.isnan(recording.depths_mm), DEPTH_VARIANCE] = UNKNOWN_VARIANCE
-    z, reached_z = depths_to_z(recording, recording.depths_mm), depths_to_z(recording, recording.reached_mm)
+    measures = recording.depths_mm, recording.reached_mm, recording.forces_n
+    presses = np.column_stack([recording.presses_mm, recording.down_command, recording.up_command, *measures])
+    topics = press_topics(presses.astype(np.float64), stamps, recording.mirrored)
+    return {READINGS: TopicSeries(stamps, recording.readings), **topics}
+
+
+def press_topics(presses: Array, stamps: Indices, mirrored: bool) -> dict[str, TopicSeries]:
+    """Return the topics of presses that have messages.
+
+    Args:
+        presses: (Q, 7) with Q >= 1, a `Press` of a run directory each.
+        stamps: (R,) of all readings, ns.
+        mirrored: whether the pad lay with its tracks up.
+    """
+    x_mm, y_mm, down_command, up_command, depths_mm, reached_mm, forces_n = presses.T
+    down, up = (stamps_at(stamps, readings.astype(np.int64)) for readings in (down_command, up_command))
+    x_y = x_mm / 1000, y_mm / 1000
+    covariances = np.zeros((len(presses), 36))
+    covariances[np.isnan(depths_mm), DEPTH_VARIANCE] = UNKNOWN_VARIANCE
 
     def at_presses(valid: Mask, *columns: Array) -> TopicSeries:
         return TopicSeries(down[valid], np.column_stack(columns)[valid])
 
     topics = {
-        READINGS: TopicSeries(stamps, recording.readings),
-        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(down), 1))),
-        PLACE: at_presses(recording.has_position, x_y, z, covariances),
-        REACHED: at_presses(~np.isnan(recording.reached_mm), x_y, reached_z),
-        FORCE: at_presses(~np.isnan(recording.forces_n), upward(recording) * recording.forces_n),
+        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(presses), 1))),
+        PLACE: at_presses(~np.isnan(x_mm), *x_y, depths_to_z(depths_mm, mirrored), covariances),
+        REACHED: at_presses(~np.isnan(reached_mm), *x_y, depths_to_z(reached_mm, mirrored)),
+        FORCE: at_presses(~np.isnan(forces_n), upward(mirrored) * forces_n),
     }
     return {topic: series for topic, series in topics.items() if len(series.stamps)}
+
+
+def withdrawn_places(presses: Array, stamps: Indices) -> TopicSeries:
+    """Return PLACE of (Q, 7) presses whose positions turned out to be unknown: NaN in place of those of before."""
+    unknown = np.full((len(presses), 3), np.nan)
+    covariances = np.zeros((len(presses), 36))
+    covariances[:, [0, 7, DEPTH_VARIANCE]] = UNKNOWN_VARIANCE
+    return TopicSeries(stamps_at(stamps, presses[:, 2].astype(np.int64)), np.column_stack([unknown, covariances]))
 
 
 def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float) -> TopicSeries:
@@ -163,7 +184,7 @@ def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float)
     covariances[:, [0, 7]] = (annotations.std_mm / 1000) ** 2
     depth_variances = (annotations.depths_r90_mm / 1000 / Z90) ** 2
     covariances[:, DEPTH_VARIANCE] = np.where(np.isnan(annotations.depths_mm), UNKNOWN_VARIANCE, depth_variances)
-    z = depths_to_z(recording, annotations.depths_mm)
+    z = depths_to_z(annotations.depths_mm, recording.mirrored)
     stamps = stamps_at(to_stamps(recording.times_s, epoch_s), recording.up_command)
     return TopicSeries(stamps, np.column_stack([annotations.positions_mm / 1000, z, covariances]))
 

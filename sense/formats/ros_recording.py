@@ -1,5 +1,8 @@
 """Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics.
 
+An MCAP file that lacks its end, because who wrote it was killed or a copy was broken off, is read as far as its chunks
+are whole, and the recording says so. Otherwise damage is an error.
+
 MCAP is read by the library rosbags, SQLite by the standard library, and neither is trusted: a file may claim anything.
 Messages are read in sequence, whatever an index says; chunks are unpacked to no more than they claim and than
 MAX_CHUNK_BYTES; of a folder only the storage files directly in it are opened; SQLite files are opened read-only, and
@@ -8,14 +11,15 @@ must consist of plain tables that hold no more than the file does.
 
 import re
 import sqlite3
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from heapq import merge
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -53,6 +57,7 @@ from padforge.sense.formats.ros_messages import (
     RawMessages,
     TopicSeries,
 )
+from padforge.sense.formats.ros_writer import load_typestore, write_mcap
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 
@@ -70,6 +75,12 @@ MAX_TOPICS = 10_000
 SUFFIXES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
 """The file that makes a folder a rosbag2 bag."""
+
+_MAGIC = b"\x89MCAP0\r\n"
+_HEADER = struct.Struct("<BQ")  # of a record: opcode and length
+_FOOTER, _FOOTER_BYTES = _HEADER.pack(2, 20), 9 + 20 + len(_MAGIC)
+_DATA_OPCODES = {1, 3, 4, 5, 6, 7, 9, 12, *range(128, 256)}  # of records before the index, and of extensions
+_SCANNED, _MESSAGE, _MIN_MESSAGE, _DATA_END = {3, 4, 6}, 5, 22, 15  # schemas, channels and chunks
 
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
@@ -102,25 +113,26 @@ _TYPES: dict[str, Mapping[str, tuple[str, ...]]] = {
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
-def load_typestore(purpose: str) -> "Typestore":
-    """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[ros]'") from error
-    return get_typestore(Stores.ROS2_HUMBLE)
+class BagContent(NamedTuple):
+    """The topics of a bag that were asked for and have messages, the types of all topics, by name, and what is lost."""
+
+    topics: dict[str, RawMessages]
+    types: dict[str, str]
+    note: dict[str, str]  # NOTE says it, for the source of a recording; empty if nothing is
 
 
-def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> tuple[dict[str, RawMessages], dict[str, str]]:
+def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> BagContent:
     """Read messages of a bag: an .mcap or .db3 file, or a folder of such with METADATA.
 
-    Returns:
-        The topics asked for (by `is_wanted` of their names) that have messages, and the types of all, by name.
+    Args:
+        path: of the file or folder.
+        is_wanted: whether a topic is asked for, by its name.
     """
-    topics, types, n_messages, n_bytes = dict[str, RawMessages](), dict[str, str](), 0, 0
+    topics, types, notes = dict[str, RawMessages](), dict[str, str](), list[str]()
+    n_messages = n_bytes = 0
     for file in _storage_files(path):
         file = check_file(file, MAX_FILE_BYTES)
-        with _one_line_errors(file), closing(_read_storage(file, types, is_wanted)) as messages:
+        with _one_line_errors(file), closing(_read_storage(file, types, notes, is_wanted)) as messages:
             for name, stamp, message in messages:
                 topic = topics.setdefault(name, RawMessages(types[name], [], []))
                 topic.stamps.append(stamp)
@@ -128,7 +140,7 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> tuple[dict[str, Ra
                 n_messages, n_bytes = n_messages + 1, n_bytes + len(message)
                 if n_bytes > MAX_BYTES or n_messages > MAX_MESSAGES:
                     raise InputError(f"the topics read have more than {MAX_MESSAGES} messages or {MAX_BYTES} bytes")
-    return topics, types
+    return BagContent(topics, types, {NOTE: "; ".join(notes)} if notes else {})
 
 
 def _storage_files(path: Path) -> list[Path]:
@@ -164,9 +176,9 @@ def _one_line_errors(path: Path) -> Iterator[None]:
 
 
 def _read_storage(
-    path: Path, types: dict[str, str], is_wanted: Callable[[str], bool]
+    path: Path, types: dict[str, str], notes: list[str], is_wanted: Callable[[str], bool]
 ) -> Generator[tuple[str, int, bytes], None, None]:
-    """Yield topic, stamp and content of the messages asked for, and add the types of all topics."""
+    """Yield topic, stamp and content of the messages asked for; add the types of all topics, and what is lost."""
 
     def is_selected(name: str, msgtype: str, encoding: str) -> bool:
         msgtype = msgtype if msgtype.count("/") == 2 else msgtype.replace("/", "/msg/")  # the short form of ROS 1
@@ -178,18 +190,23 @@ def _read_storage(
             raise InputError(f"topic {short_repr(name)} is written as {short_repr(encoding)}, expected 'cdr'")
         return is_wanted(name)
 
-    return (_read_mcap if path.suffix.lower() == ".mcap" else _read_sqlite)(path, is_selected)
+    return _read_mcap(path, is_selected, notes) if path.suffix.lower() == ".mcap" else _read_sqlite(path, is_selected)
 
 
 def _read_mcap(
-    path: Path, is_selected: Callable[[str, str, str], bool]
+    path: Path, is_selected: Callable[[str, str, str], bool], notes: list[str]
 ) -> Generator[tuple[str, int, bytes], None, None]:
     from rosbags.rosbag2 import storage_mcap
 
     storage = storage_mcap.McapReader(path)
     with _guarded(storage_mcap):
-        storage.open()
+        if lacks_end := _lacks_end(path):
+            storage.bio = path.open("rb")
+        else:
+            storage.open()
         with closing(storage):
+            if lacks_end:
+                notes.append(_recover(storage, path.stat().st_size))
             selected = [
                 connection
                 for connection in storage.connections
@@ -201,6 +218,47 @@ def _read_mcap(
                 yield connection.topic, stamp, message
     if n_messages < n_expected:  # rosbags ends without an error at a record that is longer than its chunk
         raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
+
+
+def _lacks_end(path: Path) -> bool:
+    """Whether an MCAP file ends otherwise than with the footer of its index."""
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            return False  # not one at all
+        file.seek(max(path.stat().st_size - _FOOTER_BYTES, 0))
+        end = file.read()
+    return not (end.startswith(_FOOTER) and end.endswith(_MAGIC))
+
+
+def _recover(storage: Any, size: int) -> str:
+    """Have rosbags read a file of a size without its end, as far as its records are whole; return what is lost."""
+    file, start, end, opcode, n_messages = storage.bio, len(_MAGIC), len(_MAGIC), 0, 0
+    while len(header := _read_at(file, end, _HEADER.size)) == _HEADER.size:
+        opcode, length = _HEADER.unpack(header)
+        after = end + _HEADER.size + length
+        if opcode not in _DATA_OPCODES or after > size or (opcode == _MESSAGE and length < _MIN_MESSAGE):
+            break
+        if opcode in _SCANNED:
+            # A chunk is unpacked here: its length may be right, and its content not written.
+            storage.data_start, storage.data_end = end, after
+            try:
+                storage.meta_scan()
+            except Exception:  # rosbags raises many kinds
+                break
+            n_messages += storage.statistics.message_count
+        n_messages += opcode == _MESSAGE
+        end = after
+    if not n_messages:
+        raise InputError("is cut off before its first whole chunk")
+    storage.data_start, storage.data_end = start, end
+    if opcode == _DATA_END:
+        return "is cut off in its index, and lacks no message"
+    return f"is cut off; read are {end} bytes of whole chunks, {size - end} more are left out"
+
+
+def _read_at(file: BinaryIO, position: int, size: int) -> bytes:
+    file.seek(position)
+    return file.read(size)
 
 
 @contextmanager
@@ -287,13 +345,13 @@ def import_bag(path: str | Path, columns: str = "") -> Recording:
 def _import_exported(store: "Typestore", path: Path) -> Recording:
     """Read a bag that was exported: exactly as it was if all messages still agree, else as the messages say."""
     number_topics = (READINGS, PRESSED, PLACE, REACHED, FORCE)
-    raw, types = read_bag(path, {*number_topics, RECORDING}.__contains__)
+    raw, types, note = read_bag(path, {*number_topics, RECORDING}.__contains__)
     if READINGS not in raw:
         raise InputError(
             f"{path}: has no topic {READINGS}; columns (--columns) say what other topics hold, "
             f"there are {join_names(list(types))}"
         )
-    source = {"kind": "ros", "file": path.name}
+    source = {"kind": "ros", "file": path.name, **note}
     with naming_file(path):
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
@@ -303,8 +361,8 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
         }
         if RECORDING in raw:
             if (recording := _restore(ros_messages.decode_text(store, raw[RECORDING]), topics)) is not None:
-                return recording
-            source[NOTE] = f"was changed since it was exported; {RECORDING} is left out"
+                return replace(recording, source={**recording.source, **note}) if note else recording
+            source.setdefault(NOTE, f"was changed since it was exported; {RECORDING} is left out")
         arrays = _to_arrays(topics)
     return assemble_recording(path, arrays, source)
 
@@ -373,7 +431,7 @@ def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, In
 
 def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
-    raw, types = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
+    raw, types, note = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
     names = list(types)
     with naming_file(path):
         series = [
@@ -394,7 +452,7 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
                 values = np.linalg.norm(values, axis=1, keepdims=True)
             values = values if entry.quantity in ("fibres", "positions") else values[:, 0]
             arrays.append((entry, _hold(topic.stamps, values, clock)))
-    return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns})
+    return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns, **note})
 
 
 def _decode_entry(store: "Typestore", entry: ColumnEntry, name: str, raw: Mapping[str, RawMessages]) -> TopicSeries:
@@ -450,12 +508,11 @@ def export_bag(
     stamps[RECORDING] = stamps[READINGS][:1]
     messages = {RECORDING: [ros_messages.encode_recording(store, recording, epoch_s, messages)], **messages}
     _check_readable(messages)
-    types = {topic: (TOPICS[topic].msgtype, TOPICS[topic].description) for topic in messages}
     in_order = merge(
-        *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in types), key=itemgetter(1)
+        *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in messages), key=itemgetter(1)
     )
     with reraise_write_error(path), atomic_files(path.parent) as folder:
-        bag = write_mcap(folder / f"{UNFINISHED}{path.stem}", store, types, in_order, latched=RECORDING)
+        bag = write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
         bag.replace(folder / path.name)
 
 
@@ -468,45 +525,3 @@ def _check_readable(messages: Mapping[str, Sequence[memoryview]]) -> None:
             f"recording would be {len(read)} messages of {size} bytes, "
             f"allowed in a bag are {MAX_MESSAGES} of {MAX_BYTES}"
         )
-
-
-def write_mcap(
-    folder: Path,
-    store: "Typestore",
-    topics: Mapping[str, tuple[str, str]],
-    messages: Iterable[tuple[str, int, memoryview]],
-    latched: str,
-) -> Path:
-    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return the .mcap file that holds them.
-
-    Topics have a type and a description. The last message of the `latched` one is for those that come later.
-    """
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
-    with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {}
-        for topic, (msgtype, description) in topics.items():
-            writer.set_custom_data(topic, description)
-            connections[topic] = writer.add_connection(
-                topic, msgtype, typestore=store, offered_qos_profiles=[_qos(topic == latched)]
-            )
-        for topic, stamp, message in messages:
-            writer.write(connections[topic], stamp, message)
-    return folder / f"{folder.name}.mcap"
-
-
-def _qos(is_latched: bool) -> Any:
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-
-    never = QosTime(2147483647, 4294967295)
-    return Qos(
-        history=QosHistory.KEEP_LAST,
-        depth=1 if is_latched else 10,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE,
-        deadline=never,
-        lifespan=never,
-        liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=never,
-        avoid_ros_namespace_conventions=False,
-    )

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from padforge.design.common.parallel import one_torch_thread, run_tasks
+from padforge.design.common.parallel import makespan, one_torch_thread, run_tasks
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.networks import fit_batch
 from padforge.sense.arrays import Floats
@@ -171,8 +171,8 @@ def train_members(
     all_steps = [round(steps * phase.length) for _, phase in tasks]
     totals, seconds = all_steps, list[float | None]([None] * len(tasks))
     if time_budget is not None:
-        left = max(0.0, time_budget - (time.monotonic() - begin)) * min(cores, len(tasks))
-        in_turn = [left * part / sum(all_steps) for part in all_steps]
+        remaining_s = max(0.0, time_budget - (time.monotonic() - begin))
+        in_turn = [remaining_s * part / makespan(all_steps, cores) for part in all_steps]
         totals, seconds = [max(1, round(each)) for each in in_turn], list[float | None](in_turn)
     joint = JointProgress(totals, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}

@@ -14,7 +14,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,6 +118,28 @@ def _number(event: Mapping[str, Any], key: str, limit: float, default: object = 
     return float(value)
 
 
+class Follower(Protocol):
+    """Whatever writes a recording in another form while it is recorded; none of its methods raises."""
+
+    def start(self, source: Mapping[str, Any]) -> None:
+        """Note what is recorded."""
+
+    def append(self, rows: Array) -> None:
+        """Add (n, 1 + C) rows of time and volts."""
+
+    def append_states(self, rows: Array) -> None:
+        """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
+
+    def finish(self, number: int, press: Press) -> None:
+        """Add a press that is done; one whose number was there before takes its place."""
+
+    def sync(self) -> None:
+        """Put everything on the disk; only then the journal says that presses are done."""
+
+    def close(self) -> None:
+        """Write no more."""
+
+
 class Recorder:
     """Writes a run directory while it is recorded: append readings, begin a press, finish it, `sync`.
 
@@ -163,6 +185,8 @@ class Recorder:
         self._path, self._blocks, self.fibres = path, blocks, blocks.fibres
         self._journal_bytes = journal_bytes
         self._states: tuple[BlockWriter, BinaryIO] | None = None
+        self._follower: Follower | None = None
+        self._started: Mapping[str, Any] = {}  # entry of the press that has begun
         self._lines: list[str] = []
         self._press, self._is_down = 0, False
         self.done: set[int] = set()
@@ -214,6 +238,17 @@ class Recorder:
         self._press = max(self.done, default=-1) + 1
         return self
 
+    def attach(self, follower: Follower) -> None:
+        """Hand over what was recorded so far, and from now on everything as it is recorded."""
+        follower.start(read_json(self._path / START, FORMAT)["source"])
+        follower.append(read_blocks(self._path / READINGS, self.fibres)[0])
+        if self._states is not None:
+            follower.append_states(read_blocks(self._path / STATES, len(STATE_COLUMNS) - 1)[0])
+        for number, press in read_journal(self._path / JOURNAL).items():
+            follower.finish(number, press)
+        follower.sync()
+        self._follower = follower
+
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
         """Add readings; after an OSError (the disk is full or gone) nothing was added.
 
@@ -229,6 +264,8 @@ class Recorder:
             )
         rows = np.column_stack([times, volts])
         self._blocks.append(rows)
+        if self._follower is not None:
+            self._follower.append(rows)
         self._update_last_time(rows)
         self.n_readings += len(rows)
 
@@ -242,6 +279,8 @@ class Recorder:
             file = (self._path / STATES).open("xb", buffering=0)
             self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
         self._states[0].append(rows)
+        if self._follower is not None:
+            self._follower.append_states(rows)
         self._update_last_time(rows)
 
     def _update_last_time(self, rows: Array) -> None:
@@ -265,7 +304,7 @@ class Recorder:
         number = self._press if press is None else check_int("press", press, 0, MAX_INDEX)
         reading = check_int("reading", reading, 0, MAX_INDEX)
         x, y = (None if np.isnan(value) else value for value in position.tolist())
-        self._write_event("started", number, reading, x_mm=x, y_mm=y, **more)
+        self._started = self._write_event("started", number, reading, x_mm=x, y_mm=y, **more)
         self._press, self._is_down = number, True
 
     def finish(self, reading: int, **more: Any) -> None:
@@ -277,7 +316,9 @@ class Recorder:
         """
         if not self._is_down:
             raise InputError(f"press {self._press} was not begun, so it cannot be finished")
-        self._write_event("done", self._press, check_int("reading", reading, 0, MAX_INDEX), **more)
+        done = self._write_event("done", self._press, check_int("reading", reading, 0, MAX_INDEX), **more)
+        if self._follower is not None:
+            self._follower.finish(self._press, _finished_press(self._started, done))
         self.done.add(self._press)
         self._press, self._is_down = self._press + 1, False
 
@@ -291,12 +332,13 @@ class Recorder:
             self._is_down = False
             self._write_event("aborted", self._press, self.n_readings, reason=reason)
 
-    def _write_event(self, event: str, press: int, reading: int, **more: Any) -> None:
+    def _write_event(self, event: str, press: int, reading: int, **more: Any) -> Mapping[str, Any]:
         document = {"event": event, "press": press, "reading": reading, **more}
         try:
             self._lines.append(json.dumps(document, allow_nan=False) + "\n")
         except (TypeError, ValueError, RecursionError) as error:
             raise InputError(f"press {press}: {short_repr(document)}, expected what JSON can hold") from error
+        return document
 
     def sync(self) -> None:
         """Put everything on the disk: first the readings and states, then the journal about them."""
@@ -305,6 +347,8 @@ class Recorder:
         if self._states is not None:
             self._states[0].flush()
             to_disk(self._states[1].fileno())
+        if self._follower is not None:
+            self._follower.sync()
         lines = "".join(self._lines).encode()
         write_at(self._journal, self._journal_bytes, lines)
         self._journal_bytes += len(lines)
@@ -318,6 +362,8 @@ class Recorder:
         with contextlib.ExitStack() as files:
             for file in (self._journal, self._stream, *(self._states or ())[1:]):
                 files.enter_context(file)
+            if self._follower is not None:
+                files.callback(self._follower.close)
             with contextlib.suppress(*([OSError] if kind else [])):  # do not hide the error under way
                 self.sync()
 

@@ -171,7 +171,9 @@ def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = 
     if not (age := now_s - state.time_s) <= MAX_STATE_AGE_S:
         raise RigFault("stale", f"the arm's last state is {age:.2f} s old; allowed {MAX_STATE_AGE_S:g} s")
     force_n, max_n = state.total_force_n, limits.max_force_n
-    if force_n is not None and max_n is not None and not force_n <= max_n:
+    if max_n is not None and force_n is None:
+        raise RigFault("force", f"the arm measures no force any more; allowed {max_n:g} N", "look at its sensor")
+    if max_n is not None and force_n is not None and not force_n <= max_n:
         raise RigFault("force", f"the force is {force_n:.1f} N; allowed {max_n:g} N")
     depth = -math.inf if limits.contact_mm is None else limits.contact_mm - state.pose[2]
     if not depth <= limits.max_depth_mm + DEPTH_TOLERANCE_MM:
@@ -215,6 +217,8 @@ def retreat(
     tool may stand at the edge of the box. The arm is stopped, and RigFault("force") raised, if it does not decrease.
     """
     state = arm.state()
+    if state.force_n is None:  # the sensor may have failed in a press, and the tool has to come off all the same
+        limits = replace(limits, max_force_n=None)
     if limits.contact_mm is None:
         return
     z, max_n = state.pose[2], limits.max_force_n

@@ -76,7 +76,7 @@ class EmulatedUR5:
         pose_m = np.array(pose) / TO_MM
         self._controller = Controller(series, pose_m, surface_m, stiffness_n_mm * 1e3, time.monotonic(), (x, y, z))
         self.pose_log = PoseLog()  # true poses of the tip
-        self._host = host
+        self.host = host
         self._connections: list[Connection] = []
         self._listeners: dict[str, socket.socket] = {}
         self._frozen = self._unplugged = False
@@ -92,7 +92,7 @@ class EmulatedUR5:
             self._listen()
         except OSError as error:
             self._close_all()
-            message = f"no emulated arm at {self._host}: {error.strerror}"
+            message = f"no emulated arm at {self.host}: {error.strerror}"
             raise RigFault("refused", message, "is there another one?") from error
         self._run_cycle(time.monotonic())  # so that there is a pose from the start on
         self._thread.start()
@@ -138,6 +138,10 @@ class EmulatedUR5:
         """Receive and send nothing, and close no connection: the cable is out."""
         self._unplugged = unplugged
 
+    def popups(self) -> list[str]:
+        """Return what the pendant has shown of programs that are wrong."""
+        return list(self._controller.popups)
+
     def push(self, sideways_n: float) -> None:
         """Push the tool along x with a force from now on."""
         self._controller.sideways_n = sideways_n
@@ -148,7 +152,7 @@ class EmulatedUR5:
 
     def _listen(self) -> None:
         for name, port in PORTS.items():
-            self._listeners[name] = socket.create_server((self._host, port))
+            self._listeners[name] = socket.create_server((self.host, port))
 
     def _refuse(self, refused: bool) -> None:
         for listener in self._listeners.values():
@@ -238,8 +242,8 @@ class EmulatedUR5:
         elif connection.port == "script":
             connection.text += data
             if re.search(rb"(?m)^end\s*\Z", connection.text):
-                connection.text = b""
-                self._do(self._controller.upload)
+                text, connection.text = connection.text.decode(), b""
+                self._do(lambda: self._controller.upload(text))
         else:
             *lines, connection.text = (connection.text + data).split(b"\n")
             for line in lines:
@@ -260,13 +264,19 @@ class EmulatedUR5:
             types = [rtde.variable_type(name) for name in names]
             if kind == rtde.OUTPUTS:
                 connection.outputs = names, [rtde.n_values(name) for name in types], rtde.recipe_layout(types)
-            else:
+            elif "IN_USE" not in (types := [self._claim(connection, name) for name in names]):
                 connection.inputs.append((names, rtde.recipe_layout(types)))
                 answer = bytes([len(connection.inputs)])
             answer += ",".join(types).encode()
         elif kind != rtde.VERSION:
             connection.streaming = kind == rtde.START
         self._answer(connection, rtde.pack_frame(kind, answer))
+
+    def _claim(self, connection: Connection, name: str) -> str:
+        """Return the type of an input, or "IN_USE" if another client writes it."""
+        others = [other for other in self._connections if other is not connection]
+        in_use = any(name in names for other in others for names, _ in other.inputs)
+        return "IN_USE" if in_use else rtde.variable_type(name)
 
     def _do(self, action: Callable[[], None]) -> None:
         """Run an action now, or later if answers are slow."""

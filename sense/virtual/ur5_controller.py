@@ -1,6 +1,7 @@
-"""The emulated UR controller without its sockets: motions, registers, ur-rtde's control program, watchdog and safety.
+"""The emulated UR controller without its sockets: motions, registers, programs, watchdog and safety.
 
-Lengths are m and angles rad, poses and velocities have six numbers. The true poses are logged in mm.
+Of ur-rtde's control program the commands are emulated that our driver uses; any other program is interpreted. Lengths
+are m and angles rad, poses and velocities have six numbers. The true poses are logged in mm.
 """
 
 import threading
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.motion import TrapezoidalProfile
 from padforge.sense.rig.arms.rtde import PAUSED, PLAYING, RUNNING, STOPPED
+from padforge.sense.virtual.urscript_interpreter import Pose, Program, UrscriptError
 
 Series = Literal["cb3", "e"]
 RATES_HZ = {"cb3": 125, "e": 500}
@@ -22,6 +24,9 @@ HALT_M_S2 = 4.0  # deceleration when the controller itself stops the arm
 START_S = 0.02  # from the last byte of a program to its first step
 NORMAL, PROTECTIVE, EMERGENCY = 1 << 0, 1 << 2, 1 << 7
 POWER_OFF = 3
+REACH_M = 0.95  # from the base to the flange, as far as poses are within the safety limits
+N_REGISTERS = 48
+UR_RTDE_PROGRAM = "def rtde_control():"
 
 MOVE_L, STOP, WATCHDOG, GET_TCP, END = 3, 33, 35, 40, 255
 """Commands of ur-rtde's control program that are emulated: those of our driver."""
@@ -122,11 +127,12 @@ class Controller:
     ) -> None:
         """Switch it on at the time `now`, its tool at `pose`, above a springy plane; its height in m and N/m."""
         self.series: Series = series
-        self._tcp = tcp
+        self.tcp, self.now = tcp, now
         self.motion = Motion(pose)
         self._surface, self._stiffness = surface, stiffness
         self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
         self.dashboard_log: list[str] = []
+        self.popups: list[str] = []  # what the pendant shows of programs that are wrong
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -134,9 +140,10 @@ class Controller:
         self.motion = Motion(self.motion.pose)
         self.inputs: defaultdict[str, float] = defaultdict(float)  # registers that clients write
         self.outputs: dict[str, float] = {}  # registers that clients read
-        self._boot = self._now = now
+        self._boot = self.now = now
         self._safety, self._runtime, self._mode = NORMAL, STOPPED, RUNNING
         self._threads: list[Iterator[None]] = []
+        self._program: Iterator[None] = iter(())  # that starts next
         self._program_start: float | None = None
         self._watchdog_s = np.inf
         self._kicked = now
@@ -144,11 +151,11 @@ class Controller:
 
     def tick(self, now: float) -> None:
         """Run one control cycle."""
-        self._now = now
+        self.now = now
         self.motion.update(now)
         if self._program_start is not None and now >= self._program_start:
             self._program_start, self._runtime, self._kicked = None, PLAYING, now
-            self._threads = [self._program()]
+            self._threads = [self._program]
         if self._runtime == PLAYING:
             if now - self._kicked > self._watchdog_s:
                 self.stop_program()
@@ -162,22 +169,31 @@ class Controller:
         if "input_int_register_0" in values:
             self._kicked = now
 
-    def upload(self) -> None:
-        """Take a control program, which replaces a running one."""
-        if self._safety == NORMAL:
-            self.stop_program()
-            self._program_start = self._now + START_S
+    def upload(self, text: str) -> None:
+        """Take a program, which replaces a running one."""
+        if self._safety != NORMAL:
+            return
+        self.stop_program()
+        if UR_RTDE_PROGRAM in text:
+            self._program = self._emulate_ur_rtde()
+        else:
+            try:
+                self._program = self._interpret(text)
+            except UrscriptError as error:
+                self.popups.append(str(error))
+                return
+        self._program_start = self.now + START_S
 
     def stop_program(self) -> None:
         """End the program and brake the arm."""
         self._threads, self._program_start, self._watchdog_s = [], None, np.inf
         self._runtime = STOPPED
-        self.motion.brake(HALT_M_S2, self._now)
+        self.motion.brake(HALT_M_S2, self.now)
 
     def protective_stop(self) -> None:
         """Brake and pause: the program goes on if a person unlocks the arm and presses play."""
         self._safety = PROTECTIVE
-        self.motion.interrupt(HALT_M_S2, self._now)
+        self.motion.interrupt(HALT_M_S2, self.now)
         if self._runtime == PLAYING:
             self._runtime = PAUSED
 
@@ -193,8 +209,8 @@ class Controller:
     def play(self) -> None:
         """Press play, as a person does: a paused program goes on."""
         if self._runtime == PAUSED and self._safety == NORMAL:
-            self._runtime, self._kicked = PLAYING, self._now
-            self.motion.resume(self._now)
+            self._runtime, self._kicked = PLAYING, self.now
+            self.motion.resume(self.now)
 
     def answer_dashboard(self, line: str) -> str:
         """Return the dashboard's answer to a line."""
@@ -220,7 +236,7 @@ class Controller:
         """Return the variables that are not zero, by name."""
         force = np.array([self.sideways_n, 0.0, self.surface_force(), 0.0, 0.0, 0.0])
         return self.outputs | {
-            "timestamp": self._now - self._boot,
+            "timestamp": self.now - self._boot,
             "actual_TCP_pose": self.motion.pose,
             "target_TCP_pose": self.motion.pose,
             "actual_TCP_speed": self.motion.velocity,
@@ -232,7 +248,22 @@ class Controller:
             "safety_status_bits": self._safety,
         }
 
-    def _program(self) -> Iterator[None]:
+    def _interpret(self, text: str) -> Iterator[None]:
+        functions = ScriptFunctions(self)
+        program = Program(text, functions.functions, functions.motions)
+
+        def run() -> Iterator[None]:
+            try:
+                while program.threads:
+                    program.step()
+                    yield
+            except UrscriptError as error:
+                self.popups.append(str(error))
+            self.stop_program()
+
+        return run()
+
+    def _emulate_ur_rtde(self) -> Iterator[None]:
         """Run the loop of ur-rtde's control program: a command, then done, then ready once the client has noted it."""
         self._set_progress(moving=False)
         executed = False
@@ -265,7 +296,7 @@ class Controller:
         elif command == STOP:
             yield from self._halt(self._read_double(0))
         elif command == GET_TCP:
-            tcp = (*self._tcp, 0.0, 0.0, 0.0)
+            tcp = (*self.tcp, 0.0, 0.0, 0.0)
             self.outputs |= {f"output_double_register_{i}": value for i, value in enumerate(tcp)}
         elif command == WATCHDOG:
             self._watchdog_s = 1 / self._read_double(0)
@@ -275,7 +306,7 @@ class Controller:
     def _move(self, pose: Array, speed: float, acceleration: float) -> Iterator[None]:
         self._set_progress(moving=True)
         yield
-        self.motion.move_to(pose, speed, acceleration, self._now)
+        self.motion.move_to(pose, speed, acceleration, self.now)
         while self.motion.moving:
             yield
         self._set_progress(moving=False)
@@ -284,7 +315,7 @@ class Controller:
         if len(self._threads) > 1:
             self._set_progress(moving=False)
         del self._threads[1:]
-        self.motion.brake(deceleration, self._now)
+        self.motion.brake(deceleration, self.now)
         while self.motion.moving:
             yield
 
@@ -296,6 +327,64 @@ class Controller:
 
     def _read_double(self, index: int) -> float:
         return self.inputs[f"input_double_register_{index}"]
+
+
+class ScriptFunctions:
+    """What programs in URScript may call; names, units (m, rad) and defaults as in its manual."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self.functions = {
+            function.__name__: function
+            for function in (
+                *(self.read_input_integer_register, self.read_input_float_register),
+                *(self.write_output_integer_register, self.write_output_float_register),
+                *(self.get_actual_tcp_pose, self.get_tcp_offset, self.is_within_safety_limits),
+            )
+        }
+        self.motions = {motion.__name__: motion for motion in (self.movel, self.stopl, self.sync)}
+
+    def read_input_integer_register(self, address: int) -> int:
+        return int(self._controller.inputs[f"input_int_register_{_address(address)}"])
+
+    def read_input_float_register(self, address: int) -> float:
+        return float(self._controller.inputs[f"input_double_register_{_address(address)}"])
+
+    def write_output_integer_register(self, address: int, value: int) -> None:
+        self._controller.outputs[f"output_int_register_{_address(address)}"] = value
+
+    def write_output_float_register(self, address: int, value: float) -> None:
+        self._controller.outputs[f"output_double_register_{_address(address)}"] = value
+
+    def get_actual_tcp_pose(self) -> Pose:
+        return Pose(self._controller.motion.pose.tolist())
+
+    def get_tcp_offset(self) -> Pose:
+        return Pose((*map(float, self._controller.tcp), 0.0, 0.0, 0.0))
+
+    def is_within_safety_limits(self, pose: Pose) -> bool:
+        return float(np.linalg.norm(pose[:3])) <= REACH_M + float(np.linalg.norm(self._controller.tcp))
+
+    def movel(self, pose: Pose, a: float = 1.2, v: float = 0.25) -> Iterator[None]:
+        motion = self._controller.motion
+        motion.move_to(np.array(pose), v, a, self._controller.now)
+        while motion.moving:
+            yield
+
+    def stopl(self, a: float) -> Iterator[None]:
+        motion = self._controller.motion
+        motion.brake(a, self._controller.now)
+        while motion.moving:
+            yield
+
+    def sync(self) -> Iterator[None]:
+        yield
+
+
+def _address(address: int) -> int:
+    if not 0 <= address < N_REGISTERS:
+        raise ValueError(f"register {address}; allowed 0 to {N_REGISTERS - 1}")
+    return address
 
 
 class PoseLog:

@@ -76,6 +76,14 @@ def test_section_refusals_name_key_value_and_limits(model, table, message):
     assert len(str(refused.value).splitlines()) == 1
 
 
+def test_wrong_override_is_not_blamed_on_the_file():
+    spec = Spec({"pad": {"grid": 2, "pitch_mm": 0}}, "pad.toml")
+    with pytest.raises(InputError, match=r"^\[pad\] horizontals: got 300, input should be less than or equal to 256"):
+        spec.section(PadSettings, horizontals=300, pitch_mm=8.0)
+    with pytest.raises(InputError, match=r"^pad\.toml: \[pad\] pitch_mm: got 0"):
+        spec.section(PadSettings, horizontals=3)
+
+
 def test_defaults_are_those_of_the_built_pad_and_its_mould():
     layer = {
         **{"model": "layer", "tool": "dome", "tool_radius_mm": 8.4, "depth_mm": 5.0, "thickness_mm": 6.0},

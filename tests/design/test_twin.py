@@ -126,3 +126,14 @@ def test_twin_load_refuses_other_files_in_one_line(twin, tmp_path, change, messa
     path.write_text(json.dumps(document))
     with pytest.raises(InputError, match=rf"^{path}: .*{message}"):
         Twin.load(path)
+
+
+def test_effects_that_another_pad_does_not_have(twin: Twin) -> None:
+    uneven = tuple(None if line is None else np.linspace(0.5, 1.5, len(line) - 1) for line in twin.as_built_mm)
+    assert twin.ignored_effects() is None
+    effects = replace(twin, sensitivity=uneven, angular_weight=0.1 * WEIGHT).ignored_effects()
+    assert effects is not None
+    assert effects.startswith(
+        "not carried over to another pad: the dependence on the angle between fibre and press and "
+    )
+    assert effects.endswith("where along its fibres the response is uneven (31%)")

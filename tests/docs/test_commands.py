@@ -79,3 +79,26 @@ def test_help_examples_parse(name: str, command: click.Command, parser: click.Co
         example, _, _ = line.partition("  ")  # what follows explains it
         for call in arguments(example):
             parser.main(call, standalone_mode=False, prog_name="padforge")
+
+
+@pytest.mark.parametrize(
+    ("name", "group"),
+    [pair for pair in every(cli) if isinstance(pair[1], click.Group)],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_group_lists_all_commands_uncut_in_80_columns(name: str, group: click.Group) -> None:
+    lines = group.get_help(click.Context(group, info_name=name, terminal_width=80)).splitlines()
+    assert [line for line in lines if len(line) > 80] == []
+    for word in group.commands:
+        listed = [line for line in lines if re.match(rf"  {word}  ", line)]
+        assert len(listed) == 1, word
+        assert not listed[0].endswith("..."), listed
+
+
+def test_help_of_sense_lists_commands_by_what_they_are_for() -> None:
+    sense = cli.commands["sense"]
+    text = sense.get_help(click.Context(sense, info_name="padforge sense"))
+    listed = re.findall(r"^(\w+):\n((?:  .+\n?)+)", text, re.MULTILINE)
+    headings = {heading: re.findall(r"^  ([\w-]+) ", rows, re.MULTILINE) for heading, rows in listed}
+    assert [*headings] == ["Options", "Record", "Calibrate", "Use", "Study"]
+    assert headings["Use"] == ["live", "locate", "health", "deploy"]

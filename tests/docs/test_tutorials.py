@@ -35,6 +35,7 @@ BASES = {
     "tutorial-press": None,
     "tutorial-twin": "tutorial-sense",
     "howto-ros": "tutorial-sense",
+    "howto-lerobot": "tutorial-sense",
     "howto-microcontroller": "tutorial-sense",
 }
 """Pages that are run, and the page that each continues."""

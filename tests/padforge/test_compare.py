@@ -94,7 +94,7 @@ def test_interrupt_ends_whole_comparison(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "there are 1 pads to compare"),
+        ((), "pads to compare are 1, allowed are 2 to 64: name settings or morphologies, or vary"),
         (("--vary", "grid=3"), "SECTION.KEY=VALUE"),
         (("--vary", "pad.grid=0,4"), "greater than or equal to 1"),
         (("--vary", "pad.grid=3,3"), "two pads have this name"),

@@ -1,5 +1,6 @@
 """A simulated recording and a quickly trained localizer, shared by the tests of sense."""
 
+import importlib.util
 import sys
 import tempfile
 import time
@@ -15,7 +16,7 @@ from padforge.design import Morphology
 from padforge.sense import Evaluation, Recording, calibrate
 from padforge.sense import settings as sense_settings
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.arms.ur5 import UR5, Driver
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.virtual import virtual_rig
@@ -92,6 +93,8 @@ WAIT_S = 180.0
 ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]
 """Of this machine: on Linux all that begin with 127, elsewhere the first alone."""
 
+HAS_UR_RTDE = importlib.util.find_spec("rtde_control") is not None
+
 FORBIDDEN = ("play", "unlock", "power", "brake", "safety")
 """Words of orders to the dashboard that are for a person alone."""
 
@@ -102,6 +105,7 @@ class Robots:
     def __init__(self, host: str) -> None:
         self.host, self.series, self.robot = host, "", None
         self.arm: UR5 | None = None
+        self.driver: Driver = "urscript"
 
     def get(self, series: Series, **settings: Any) -> EmulatedUR5:
         if self.robot is None or settings or self.series != series:
@@ -109,9 +113,13 @@ class Robots:
             self.series, self.robot = series, EmulatedUR5(series, host=self.host, **settings).__enter__()
         return self.robot
 
-    def connected(self, host: str) -> UR5:
-        """The arm by one of its names, at rest."""
-        arm = self.arm = self.arm or UR5(host)
+    def connected(self, host: str, driver: Driver) -> UR5:
+        """The arm by one of its names, at rest, moved by a driver."""
+        if self.arm is not None and self.driver != driver:
+            self.arm.close()
+            self.arm = None
+        self.driver = driver
+        arm = self.arm = self.arm or UR5(host, driver)
         try:
             if arm.state().moving:
                 arm.stop()
@@ -124,8 +132,9 @@ class Robots:
         if arm is not None:
             arm.close()
         if robot is not None:
-            asked = robot.dashboard_log()
+            asked, popups = robot.dashboard_log(), robot.popups()
             robot.__exit__()
+            assert not popups
             assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
 
 
@@ -188,6 +197,18 @@ def robot(robots: Robots, series: Series) -> EmulatedUR5:
     return robots.get(series)
 
 
+@pytest.fixture(
+    params=[
+        pytest.param("ur-rtde", marks=pytest.mark.skipif(not HAS_UR_RTDE, reason="ur-rtde is not here")),
+        "urscript",
+    ],
+    scope="module",
+)
+def driver(request: pytest.FixtureRequest) -> Driver:
+    """What moves the arm."""
+    return request.param
+
+
 @pytest.fixture
-def arm(robots: Robots, robot: EmulatedUR5, host: str) -> UR5:
-    return robots.connected(host)
+def arm(robots: Robots, robot: EmulatedUR5, host: str, driver: Driver) -> UR5:
+    return robots.connected(host, driver)

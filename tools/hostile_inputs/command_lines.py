@@ -41,6 +41,8 @@ RIGHT: dict[str, tuple[str, ...]] = {
     "--tcp": ("0",),
     "--osc": ("127.0.0.1:9001",),
     "--lsl": ("pad",),
+    "--foxglove": ("0",),
+    "--rerun": ("new.rrd",),
     "--host": ("127.0.0.1", "localhost"),
     "--token": ("word",),
     "--speed": ("1e6", "1e300"),

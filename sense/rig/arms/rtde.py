@@ -1,4 +1,4 @@
-"""RTDE, the data link of Universal Robots controllers: frames, recipes, the dashboard, and a reader of the states.
+"""RTDE, the data link of Universal Robots controllers: frames, recipes, registers, the dashboard, a reader of states.
 
 Frames are big-endian, both ways.
 """
@@ -23,9 +23,9 @@ PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
 VARIABLES = (
     *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
-    *("robot_mode", "runtime_state", "safety_status_bits", "output_int_register_2"),
+    *("robot_mode", "runtime_state", "safety_status_bits"),
 )
-"""What the reader asks for."""
+"""What the reader asks for, besides the register of moves."""
 FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
 MAX_CLOCK_SKEW = 2e-4  # relative difference of the controller's clock and the host's
 
@@ -118,7 +118,7 @@ class RtdeState:
     mode: int  # robot mode
     runtime: int  # state of the program
     safety: int  # status bits
-    progress: int  # ur-rtde's register of moves
+    progress: int  # register of moves of the arm's program
 
 
 class HostClock:
@@ -137,46 +137,70 @@ class HostClock:
         return self._last_s
 
 
-class RtdeReader:
+class RtdeLink:
     """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes."""
 
     def __init__(self, host: str, timeout_s: float) -> None:
-        """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
+        """Connect; ValueError if the controller lacks the protocol."""
         self._link = socket.create_connection((host, RTDE_PORT), timeout_s)
         self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._splitter = FrameSplitter()
         self._queue: deque[tuple[float, bytes]] = deque()
-        self._clock = HostClock()
+        self._recipe, self._inputs, self._outputs = b"", struct.Struct(""), struct.Struct("")
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
         self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of the controller
-        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # states a second
-        names = ",".join(VARIABLES).encode()
-        types = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + names)[1:].decode().split(",")
-        if "NOT_FOUND" in types:
-            raise ValueError(f"the controller has no {VARIABLES[types.index('NOT_FOUND') % len(VARIABLES)]}")
-        if types != [variable_type(name) for name in VARIABLES]:
-            raise ValueError(f"the controller would send {','.join(types)[:200]!r} for {','.join(VARIABLES)}")
-        self._layout = recipe_layout(types)
+        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # control cycles, and states, a second
+
+    def set_inputs(self, names: Sequence[str]) -> None:
+        """Claim registers for `write`; ValueError if the controller lacks one, or another client has claimed it."""
+        self._recipe, self._inputs = self._negotiate(INPUTS, b"", names)
+
+    def write(self, *values: float) -> None:
+        """Write all registers that were claimed, in one package."""
+        self._link.sendall(pack_frame(DATA, self._recipe + self._inputs.pack(*values)))
+
+    def start(self, names: Sequence[str]) -> None:
+        """Start the stream of variables; ValueError if the controller lacks one."""
+        _, self._outputs = self._negotiate(OUTPUTS, struct.pack(">d", self.rate_hz), names)
         self._request(START)
 
-    def read(self, timeout_s: float) -> RtdeState:
-        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
+    def receive(self, timeout_s: float) -> tuple[float, tuple[Any, ...]]:
+        """Return host time and values of the next package of the stream; TimeoutError after `timeout_s` without a byte.
+
+        ValueError for a damaged one.
+        """
         self._link.settimeout(timeout_s)
         while not self._queue:
-            self._receive()
+            self._read_frames()
         arrival_s, payload = self._queue.popleft()
-        return self._parse(arrival_s, _unpack(self._layout, payload[1:]))
+        return arrival_s, _unpack(self._outputs, payload[1:])
+
+    def pause(self) -> None:
+        """Pause the stream for good."""
+        self._request(PAUSE)
+        self._queue.clear()
+
+    def _negotiate(self, kind: int, head: bytes, names: Sequence[str]) -> tuple[bytes, struct.Struct]:
+        """Agree on a recipe with the controller; return its number and its layout."""
+        answer = self._request(kind, head + ",".join(names).encode())
+        types = answer[1:].decode().split(",")
+        for problem, message in (("NOT_FOUND", "has no"), ("IN_USE", "lets another program write")):
+            if problem in types:
+                raise ValueError(f"the controller {message} {names[types.index(problem) % len(names)]}")
+        if types != [variable_type(name) for name in names]:
+            raise ValueError(f"the controller would take or send {','.join(types)[:200]!r} for {','.join(names)}")
+        return answer[:1], recipe_layout(types)
 
     def _request(self, kind: int, payload: bytes = b"") -> bytes:
         self._link.sendall(pack_frame(kind, payload))
         while True:
-            for answer_kind, answer in self._receive():
+            for answer_kind, answer in self._read_frames():
                 if answer_kind == kind:
                     return answer
 
-    def _receive(self) -> list[tuple[int, bytes]]:
-        """Wait for bytes; queue the states among the frames that they complete and return the other frames."""
+    def _read_frames(self) -> list[tuple[int, bytes]]:
+        """Wait for bytes; queue the packages among the frames that they complete and return the other frames."""
         data = self._link.recv(65536)
         if not data:
             raise ConnectionError("the controller closed the link")
@@ -189,7 +213,19 @@ class RtdeReader:
                 answers.append((kind, payload))
         return answers
 
-    def _parse(self, arrival_s: float, values: tuple[float, ...]) -> RtdeState:
+
+class RtdeReader(RtdeLink):
+    """A link that reads the states of the arm."""
+
+    def __init__(self, host: str, timeout_s: float, progress_register: int) -> None:
+        """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
+        super().__init__(host, timeout_s)
+        self._clock = HostClock()
+        self.start((*VARIABLES, f"output_int_register_{progress_register}"))
+
+    def read(self, timeout_s: float) -> RtdeState:
+        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
+        arrival_s, values = self.receive(timeout_s)
         stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
         has_sensor = self.version[0] >= FORCE_SERIES
         if not all(map(math.isfinite, values)):

@@ -1,8 +1,9 @@
-"""The worker process that holds ur-rtde, which can hang or crash: commands on stdin, states and replies on stdout.
+"""The worker process that controls a UR arm: commands on stdin, states and replies on stdout.
 
-Run as `python -m padforge.sense.rig.arms.rtde_worker HOST`. All are JSON lines; an empty one is a heartbeat. The arm's
-watchdog is kicked from here alone, so the arm stops by itself if this process ends or hangs. It also stops if the
-parent ends, or gives no sign of life during a move. Nothing here unlocks, powers or starts an arm.
+Run as `python -m padforge.sense.rig.arms.rtde_worker HOST DRIVER RETREAT`; the driver is ur-rtde, which can hang and
+crash, or our URScript program. All are JSON lines; an empty one is a heartbeat. The arm's watchdog is kicked from here
+alone, so the arm stops by itself if this process ends or hangs. It also stops if the parent ends, or gives no sign of
+life during a move. Nothing here unlocks, powers or starts an arm.
 """
 
 import contextlib
@@ -16,28 +17,58 @@ import sys
 import tempfile
 import threading
 import time
-from importlib.metadata import version
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState
+from padforge.sense.rig.arms.ur_rtde import UrRtdeControl
+from padforge.sense.rig.arms.urscript import Retreat, UrscriptControl
 
-WATCHDOG_HZ = 4.0
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
 HEARTBEAT_TIMEOUT_S = 0.3  # silence of the parent during a move; its heart beats six times as often
 STREAM_TIMEOUT_S = 0.25  # silence of the arm
-STOP_M_S2 = 5.0
 FIRST_STATE_S = 0.05  # wait for the first state after a stop, so that nobody takes an older one for it
 HALT_S = 0.15  # wait for the arm, and then for the parent, when this process has to end
 ANSWER_S = 1.0  # wait for an answer of the arm while connecting
 SESSION_END_S = 1.0  # wait for another session that is about to end: its watchdog needs a quarter of a second
-OPERATION, UNDER_WAY = 0x7F << 24, 1 << 15  # of ur-rtde's register of moves
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 
 class CommandRejected(Exception):  # noqa: N818  the parent raises it as a RigFault
     """A command that fails: cause, message and advice of the fault that the parent raises."""
+
+
+class Control(Protocol):
+    """A program on the arm that moves it; its methods raise an error if the arm is lost. Lengths are m."""
+
+    moving: bool  # whether the last move is under way
+    identity: dict[str, Any]  # the driver
+
+    def tcp_offset(self) -> Sequence[float]:
+        """Return the tool centre point from the flange, m and rad."""
+        ...
+
+    def update(self, progress: int, is_stopped: bool) -> None:
+        """Note the newest register of progress, and whether a protective or emergency stop holds the arm."""
+        ...
+
+    def kick(self) -> None:
+        """Kick the watchdog, which stops the arm after 0.25 s without."""
+        ...
+
+    def move(self, pose: Sequence[float], speed: float, acceleration: float) -> bool:
+        """Start a straight move (m, rad, m/s, m/s²); return whether the arm accepts it."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the arm, and return once it is at rest."""
+        ...
+
+    def end(self) -> None:
+        """Stop the arm and end the program."""
+        ...
 
 
 def _check_ready(state: RtdeState) -> None:
@@ -83,19 +114,18 @@ def _lock_arm(host: str) -> int:
 
 
 class WorkerProcess:
-    """Executes the parent's commands by ur-rtde and reports every state of the arm.
+    """Executes the parent's commands and reports every state of the arm.
 
-    Three threads: the main one reads stdin, one calls ur-rtde, and one reads the states.
+    Three threads: the main one reads stdin, one calls the driver, and one reads the states.
     """
 
-    def __init__(self, host: str, out: int) -> None:
-        self._host, self._out = host, out
+    def __init__(self, host: str, driver: str, retreat: Retreat | None, out: int) -> None:
+        self._host, self._driver, self._retreat, self._out = host, driver, retreat, out
         self._write_lock = threading.Lock()
         self._commands: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._control: Any = None
+        self._control: Control | None = None
         self._arm_lock: int | None = None
         self._latest: RtdeState | None = None
-        self._previous_operation: int | None = None  # number of the operation before the move under way
         self._new_state = threading.Event()
         self._program_running = threading.Event()
         self._halting = False
@@ -108,7 +138,7 @@ class WorkerProcess:
         parent, text = os.getppid(), b""
         while True:
             ready, _, _ = select.select([0], [], [], HEARTBEAT_TIMEOUT_S)
-            if not ready and self._previous_operation is not None:
+            if not ready and self._is_moving():
                 self._halt("deadline", "the program did not look at the arm during a move, so it was stopped")
             data = os.read(0, 65536) if ready else b""
             if (ready and not data) or os.getppid() != parent:
@@ -118,7 +148,7 @@ class WorkerProcess:
                 self._commands.put(json.loads(line))
 
     def _execute_commands(self) -> None:
-        """Call ur-rtde, which is not made for several threads."""
+        """Call the driver, which is not made for several threads."""
         while True:
             try:
                 command = self._commands.get(timeout=KICK_S)
@@ -133,19 +163,18 @@ class WorkerProcess:
             except Exception as error:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
                 if self._control is not None:
-                    self._exit("lost", f"ur-rtde lost the arm: {reason}", "connect again")
+                    self._exit("lost", f"the driver lost the arm: {reason}", "connect again")
                 self._send({"id": command["id"], "fault": ("refused", f"the arm refused: {reason}", "")})
 
     def _do_kick(self) -> None:
-        if self._is_playing() and not self._halting and not self._stopped_by_arm:
-            self._control.kickWatchdog()
+        if (control := self._playing()) and not self._halting and not self._stopped_by_arm:
+            control.kick()
 
     def _do_connect(self) -> dict[str, Any]:
-        import rtde_control
-
+        driver = UrRtdeControl if self._driver == "ur-rtde" else UrscriptControl
         try:
             self._arm_lock = _lock_arm(self._host)
-            reader = RtdeReader(self._host, ANSWER_S)
+            reader = RtdeReader(self._host, ANSWER_S, driver.progress_register)
             state = reader.read(ANSWER_S)
             _check_ready(state)
             state = _wait_until_idle(reader, state)
@@ -156,20 +185,21 @@ class WorkerProcess:
             advice = "check its address, its cable and that it is switched on"
             raise CommandRejected("refused", message, advice) from None
         threading.Thread(target=self._report_states, args=(reader, state), daemon=True).start()
-        control = rtde_control.RTDEControlInterface(self._host)
-        if not control.setWatchdog(WATCHDOG_HZ):
-            raise CommandRejected("refused", "the arm does not take a watchdog", "")
-        tcp = control.getTCPOffset()
+        control = UrRtdeControl(self._host) if driver is UrRtdeControl else UrscriptControl(self._host, self._retreat)
+        tcp = control.tcp_offset()
         self._control = control
         if not self._program_running.wait(ANSWER_S):
             raise CommandRejected("refused", "the arm's program does not run", UNLOCK_ADVICE)
-        return identity | {
-            "host": self._host,
-            "rate_hz": reader.rate_hz,
-            "controller": ".".join(map(str, reader.version)),
-            "ur_rtde": version("ur-rtde"),
-            "tcp": [*(round(1e3 * value, 3) for value in tcp[:3]), *(round(value, 6) for value in tcp[3:])],
-        }
+        return (
+            identity
+            | control.identity
+            | {
+                "host": self._host,
+                "rate_hz": reader.rate_hz,
+                "controller": ".".join(map(str, reader.version)),
+                "tcp": [*(round(1e3 * value, 3) for value in tcp[:3]), *(round(value, 6) for value in tcp[3:])],
+            }
+        )
 
     def _ask_identity(self) -> dict[str, str]:
         """Ask the dashboard what the arm is; reject an arm that a person controls."""
@@ -181,34 +211,38 @@ class WorkerProcess:
         return {name: text for name, text in answers.items() if not text.startswith("could not")}
 
     def _do_move(self, pose_mm: list[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        if not self._is_playing():
+        if not (control := self._playing()):
             raise CommandRejected("refused", "the arm's program does not run, so it takes no moves", UNLOCK_ADVICE)
-        if self._previous_operation is not None or self._latest is None:
+        if control.moving:
             raise CommandRejected("refused", "a move is under way", "wait for its end or stop it")
-        self._previous_operation = self._latest.progress & OPERATION
-        pose = [*(value / 1e3 for value in pose_mm[:3]), *pose_mm[3:]]  # ur-rtde wants m
-        if not self._control.moveL(pose, speed_mm_s / 1e3, acceleration_mm_s2 / 1e3, True):
-            self._previous_operation = None
-            raise CommandRejected("refused", "the arm refused the move", UNLOCK_ADVICE)
+        pose = [*(value / 1e3 for value in pose_mm[:3]), *pose_mm[3:]]  # the arm wants m
+        if not control.move(pose, speed_mm_s / 1e3, acceleration_mm_s2 / 1e3):
+            message = "the arm refused the move: it is stopped, or the pose is beyond its reach or safety limits"
+            raise CommandRejected("refused", message, "look at the pendant")
 
     def _do_stop(self) -> None:
-        if self._is_playing():
-            self._control.stopL(STOP_M_S2)
+        if control := self._playing():
+            control.stop()
             self._new_state.clear()
             self._new_state.wait(FIRST_STATE_S)
-        elif self._control is not None and not rtde.stop_program(self._host, ANSWER_S):
-            raise CommandRejected("lost", "the arm did not confirm the stop", "look at the arm")
-        self._previous_operation = None
+        elif self._control is not None:
+            if not rtde.stop_program(self._host, ANSWER_S):
+                raise CommandRejected("lost", "the arm did not confirm the stop", "look at the arm")
+            self._control.moving = False
         self._halted.set()
 
     def _do_close(self) -> None:
         self._halting = True
-        if self._is_playing():
-            self._control.stopL(STOP_M_S2)
-            self._control.stopScript()
+        if control := self._playing():
+            control.end()
 
-    def _is_playing(self) -> bool:
-        return self._control is not None and self._latest is not None and self._latest.runtime == rtde.PLAYING
+    def _playing(self) -> Control | None:
+        """Return the control if its program runs."""
+        is_playing = self._latest is not None and self._latest.runtime == rtde.PLAYING
+        return self._control if is_playing else None
+
+    def _is_moving(self) -> bool:
+        return self._control is not None and self._control.moving
 
     def _report_states(self, reader: RtdeReader, state: RtdeState) -> None:
         """Send every state to the parent; end before ur-rtde can reconnect and repeat an old command."""
@@ -227,6 +261,8 @@ class WorkerProcess:
 
     def _update(self, state: RtdeState) -> None:
         stopped = bool(state.safety & (rtde.PROTECTIVE_BITS | rtde.EMERGENCY_BITS))
+        if self._control is not None:
+            self._control.update(state.progress, stopped)
         if stopped and not self._stopped_by_arm:
             # A paused program would go on with the old move as soon as a person unlocks the arm and presses play.
             threading.Thread(target=rtde.stop_program, args=(self._host, ANSWER_S), daemon=True).start()
@@ -237,10 +273,6 @@ class WorkerProcess:
         elif self._program_running.is_set() and not stopped and not self._halting:
             self._exit("lost", "the arm's program has ended", "look at the arm, then connect again")
         self._stopped_by_arm = stopped
-        operation = state.progress & OPERATION
-        arrived = self._previous_operation not in (None, operation) and not state.progress & UNDER_WAY
-        if arrived or stopped:
-            self._previous_operation = None
 
     def _to_arm_state(self, state: RtdeState) -> dict[str, Any]:
         """Return the fields of an `ArmState`."""
@@ -252,12 +284,12 @@ class WorkerProcess:
             "force_n": state.force_n,
             "protective_stop": bool(state.safety & rtde.PROTECTIVE_BITS) and not emergency,
             "emergency_stop": emergency,
-            "moving": self._previous_operation is not None,
+            "moving": self._is_moving(),
             "sideways_n": state.sideways_n,
         }
 
     def _halt(self, cause: str, message: str) -> None:
-        """Stop the arm and end; if ur-rtde does not stop it, the watchdog does."""
+        """Stop the arm and end; if the driver does not stop it, the watchdog does."""
         self._halting = True
         self._commands.put({"id": 0, "command": "stop", "arguments": ()})
         self._halted.wait(HALT_S)
@@ -281,8 +313,10 @@ def main() -> None:
     """Keep stdout for the parent alone: what ur-rtde prints goes to stderr."""
     out = os.dup(1)
     os.dup2(2, 1)
+    host, driver, retreat = sys.argv[1:]
+    fields = json.loads(retreat)
     with contextlib.suppress(KeyboardInterrupt):
-        WorkerProcess(sys.argv[1], out).run()
+        WorkerProcess(host, driver, Retreat(**fields) if fields else None, out).run()
 
 
 if __name__ == "__main__":

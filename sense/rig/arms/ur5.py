@@ -1,4 +1,7 @@
-"""A Universal Robots arm over ur-rtde, which can hang and crash and therefore runs in a process that can be killed."""
+"""A Universal Robots arm, driven from a process that can be killed, since ur-rtde can hang and crash.
+
+Where ur-rtde cannot be installed, a URScript program of ours moves the arm.
+"""
 
 import importlib.util
 import itertools
@@ -10,16 +13,19 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from typing import Any
+from dataclasses import asdict, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig.arms.rtde import stop_program
+from padforge.sense.rig.arms.urscript import Retreat
 from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, start
-from padforge.sense.rig.safety import check_finite_move
+from padforge.sense.rig.safety import EDGE_MM, RETREAT_MM, RETREAT_MM_S, check_finite_move
 from padforge.sense.settings import RigSettings
+
+Driver = Literal["ur-rtde", "urscript"]
 
 MAX_STATES = 300_000  # states kept for `drain`: 10 minutes at 500 Hz
 HEARTBEAT_S = 0.05
@@ -32,10 +38,11 @@ DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 
 
 class RtdeWorker:
-    """The worker process that holds ur-rtde, seen from its parent: requests have a deadline, and it can be killed."""
+    """The worker process of the driver, seen from its parent: requests have a deadline, and it can be killed."""
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str, driver: Driver, retreat: Retreat | None) -> None:
         self._host = host
+        self.retreats = driver == "urscript" and retreat is not None  # by itself, once it hears no more of the worker
         self.fault: RigFault | None = None  # why the worker has ended; None while it runs
         self.latest: ArmState | None = None  # last state of the arm
         self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
@@ -45,7 +52,11 @@ class RtdeWorker:
         self._received = threading.Condition()
         self._supervised_s = time.monotonic()
         self._killed = threading.Event()
-        self.process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
+        self.process = start(
+            "padforge.sense.rig.arms.rtde_worker",
+            *(host, driver, json.dumps(asdict(retreat) if retreat else None)),
+            stderr=subprocess.DEVNULL,
+        )
         assert self.process.stdin is not None
         os.set_blocking(self.process.stdin.fileno(), False)
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._receive, self._send_heartbeats)]
@@ -87,6 +98,14 @@ class RtdeWorker:
             if pipe is not None:
                 pipe.close()
 
+    def stop_program(self) -> bool:
+        """Stop the arm by its dashboard once the worker has ended; return whether that is confirmed.
+
+        A program that retreats by itself is left to do so: a stop would end it with the tool on the pad.
+        """
+        self.stopped = self.stopped or (not self.retreats and stop_program(self._host, DASHBOARD_S))
+        return self.stopped
+
     def _write(self, line: bytes) -> None:
         assert self.process.stdin is not None
         try:
@@ -102,7 +121,7 @@ class RtdeWorker:
 
     def _receive(self) -> None:
         assert self.process.stdout is not None
-        reason: tuple[Cause, str, str] = ("lost", "the process that holds ur-rtde has ended", "connect again")
+        reason: tuple[Cause, str, str] = ("lost", "the process that drives the arm has ended", "connect again")
         for line in self.process.stdout:
             try:
                 message = json.loads(line)
@@ -122,37 +141,51 @@ class RtdeWorker:
             self.fault = RigFault(*reason)
             self._received.notify_all()
         if self.latest is not None and not self._killed.is_set():
-            self.stopped = stop_program(self._host, DASHBOARD_S)
+            self.stop_program()
 
 
 class UR5:
     """The arm at a network address; implements `Arm`. Linux and macOS.
+
+    The driver is ur-rtde, or, where that is not installed, our URScript program.
 
     During a move `state` or `drain` must be called at least every 2 s, or the arm is stopped; it also stops within
     0.5 s if this process ends or is suspended. A protective or emergency stop ends the move for good: a person has to
     unlock the arm, and `connect` starts anew. Nothing here unlocks, powers or starts an arm.
     """
 
-    def __init__(self, host: str) -> None:
-        self._host = host
+    def __init__(self, host: str, driver: Driver | None = None, retreat: Retreat | None = None) -> None:
+        """Describe an arm.
+
+        Args:
+            host: its address.
+            driver: what moves it; None for ur-rtde if that is installed, or else "urscript".
+            retreat: what the arm does by itself if this computer fails after a move; by "urscript" only.
+        """
+        self._host, self._retreat = host, retreat
+        self._driver: Driver = driver or ("ur-rtde" if importlib.util.find_spec("rtde_control") else "urscript")
         self._worker: RtdeWorker | None = None
         self._move_s = 0.0
 
     @classmethod
-    def from_settings(cls, rig: RigSettings) -> "UR5":
-        """Return the arm that `[rig]` names."""
-        return cls(rig.host)
+    def from_settings(cls, rig: RigSettings, driver: Driver | None = None) -> "UR5":
+        """Return the arm that `[rig]` names, which retreats if its workspace and the pad's surface are known."""
+        if rig.box_mm is None or rig.contact_mm is None:
+            return cls(rig.host, driver)
+        x0, x1, y0, y1, _, top = rig.box_mm
+        height_mm = min(rig.contact_mm + RETREAT_MM, top)
+        sides = (x0 - EDGE_MM, x1 + EDGE_MM), (y0 - EDGE_MM, y1 + EDGE_MM)
+        return cls(rig.host, driver, Retreat(height_mm, *sides, RETREAT_MM_S))
 
     def connect(self) -> Mapping[str, Any]:
         """Open the link, ending an earlier one of this object.
 
         RigFault("refused") if there is no arm, it is not in remote control or not powered, another program uses it, on
-        this computer or elsewhere, or ur-rtde is missing; "protective_stop", "emergency_stop"; "deadline" after 4.5 s.
+        this computer or elsewhere, or it lacks what the driver needs; "protective_stop", "emergency_stop"; "deadline"
+        after 4.5 s.
         """
-        if importlib.util.find_spec("rtde_control") is None:
-            raise RigFault("refused", "the arm needs ur-rtde", "pip install 'padforge[rig]'")
         self._end_worker()
-        self._worker = RtdeWorker(self._host)
+        self._worker = RtdeWorker(self._host, self._driver, self._retreat)
         try:
             return self._worker.request("connect", timeout_s=CONNECT_S)
         except BaseException:
@@ -198,7 +231,7 @@ class UR5:
         self._move_s = time.monotonic()
 
     def stop(self) -> None:
-        """Stop the arm by ur-rtde, or else by its dashboard and its watchdog; RigFault("lost") if unconfirmed."""
+        """Stop the arm by its driver, or else by dashboard and watchdog; RigFault("lost") if unconfirmed."""
         if self._worker is None or self._worker.stopped:
             return
         try:
@@ -206,7 +239,8 @@ class UR5:
         except RigFault:
             if not self._abandon():
                 reason = f"the arm {self._host} did not confirm the stop"
-                raise RigFault("lost", reason, "its watchdog stops it within 0.3 s, but look at it") from None
+                lift = " and lifts the tool off" if self._worker.retreats else ""
+                raise RigFault("lost", reason, f"its watchdog stops it within 0.3 s{lift}, but look at it") from None
 
     def close(self) -> None:
         """Stop the arm and close the link; never raises."""
@@ -224,11 +258,10 @@ class UR5:
 
     def _abandon(self) -> bool:
         """Kill the worker, so that the watchdog is kicked no more; return whether the dashboard confirms the stop."""
-        if self._worker is not None:
-            self._worker.kill()
-            if self._worker.stopped:
-                return True
-        return stop_program(self._host, DASHBOARD_S)
+        if self._worker is None:
+            return False
+        self._worker.kill()
+        return self._worker.stop_program()
 
     def _end_worker(self) -> None:
         if self._worker is not None:

@@ -12,7 +12,7 @@ from functools import partial
 import pytest
 import torch
 
-from padforge.design.common.parallel import clear_stale_kernels, cluster, one_torch_thread, run_tasks
+from padforge.design.common.parallel import clear_stale_kernels, cluster, makespan, one_torch_thread, run_tasks
 from padforge.design.common.validation import Fault
 
 
@@ -45,6 +45,14 @@ def test_run_tasks_yields_results_by_key_and_raises_errors(threads):
     assert dict(run_tasks([], pool)) == {}
     with pytest.raises(ZeroDivisionError):
         list(run_tasks([("a", partial(pow, 0, -1)), ("b", partial(pow, 1, 2))], pool))
+
+
+@pytest.mark.parametrize(
+    ("parts", "workers", "expected"),
+    [([3, 3, 2], 1, 8), ([3, 3, 2], 2, 5), ([3, 3, 2], 3, 3), ([3, 3, 2], 8, 3), ([4, 2, 1, 1], 2, 4)],
+)
+def test_makespan_is_when_the_last_worker_ends(parts, workers, expected):
+    assert makespan(parts, workers) == expected
 
 
 def test_run_tasks_follows_up_and_yields_as_completed_within_max_parallel():

@@ -41,6 +41,7 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     code, out, err = replay("--json")
     assert code == 0, err
     assert "http://127.0.0.1:" in err
+    assert "simulated" not in err
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
     assert not [key for key in told[0] if key.startswith(("depth", "force"))]
@@ -70,6 +71,13 @@ def test_live_sends_to_tcp_and_osc(replay) -> None:
     assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)
 
 
+def test_live_sends_to_viewers(replay) -> None:
+    code, _, err = replay("--foxglove", "0", "--rerun", "pad.rrd")
+    assert code == 0, err
+    assert re.search(r"^foxglove: ws://127\.0\.0\.1:\d+$", err, re.MULTILINE)
+    assert Path("pad.rrd").stat().st_size > 10_000
+
+
 LOST = RigFault("stale", "the board does not send", "reset it")
 
 
@@ -90,6 +98,8 @@ def test_live_shows_a_rig_until_it_ends(padforge_sense, model, views, monkeypatc
     ended, out, err = padforge_sense("live", "--port", "0", "--model", "mine", "--json")
     assert (ended, out) == (code, "")
     assert said in err.splitlines()[-1]
+    assert err.count("touches are simulated") == 1
+    assert {view["title"] for view in views} == {"simulated touches, mine"}
     board.close.assert_called_once()
     assert told.call_args[0][1] is True
     assert {view["mirrored"] for view in views} == {True}

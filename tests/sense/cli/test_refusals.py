@@ -43,7 +43,12 @@ deploy --model model l.h                        | l.h: a .h learns from a record
 deploy --model model other l.h                  | readings are of 6 fibres, the localizer was learnt from 4
 deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the smallest localizer of 4 fibres takes
 record --seed 9 --out rec                       | never written over
+record --presses -3 --out rec                   | Invalid value for '--presses': got -3, input should be greater
+record --plan rows --out rec                    | Invalid value for '--plan': got 'rows', expected uniform, grid,
+record --plan adaptive                          | --plan is adaptive, which needs --virtual-hardware or a real rig
 record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
+record --mcap --out rec2                        | rec2.mcap: exists, recordings are never written over; choose
+record --mcap --dry-run --virtual-hardware      | --mcap writes what is recorded, and --dry-run keeps nothing
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
@@ -52,12 +57,16 @@ record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, 
 record --rig ur5 {unread} --plan adaptive       | [rig] plan is adaptive, which needs --model
 record --rig hand {straight} --dry-run          | --dry-run and --model need an arm
 doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
-doctor --rig crane                              | arms: got 'crane', allowed are
+doctor --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
+record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
+{live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
+calibrate rec --time-budget nan                 | Invalid value for '--time-budget': got 'nan', expected a finite number
 {live} --model model --port {taken}             | port {taken} of 127.0.0.1: another program uses it
 {live} --model model --replay other             | readings are of 6 fibres, the localizer was learnt from 4
 {live} --model model --rig ur5                  | no board is found
 {live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines reach
 {live} --model model --replay rec --osc here    | --osc is 'here', expected HOST:PORT
+{live} --model model --replay rec --rerun here  | --rerun is 'here', expected an address like rerun+http://HOST:PORT
 {live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 to 256
 """
 SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five")}
@@ -69,6 +78,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """What `few` has, and things that are not what they should be."""
     folder = shutil.copytree(few_presses, tmp_path_factory.mktemp("refused") / "workshop")
     (folder / "noise.mat").write_bytes(b"no matlab" * 100)
+    (folder / "rec2.mcap").write_bytes(b"")
     (folder / "noise.csv").write_text("a,b\n1,2\n")
     for name in ("empty", "mine", "designed"):
         (folder / name).mkdir()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import Mock
@@ -15,6 +16,7 @@ from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording
+from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.rig import operation
 from padforge.sense.settings import RigSettings
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
@@ -28,6 +30,20 @@ def test_record_writes_beside_its_pad(padforge_sense) -> None:
     assert code == 0
     assert out.endswith(" -> mine/recording\n")
     assert Recording.open("mine/recording").source["rig"]["seed"] == 7
+
+
+def test_record_writes_an_mcap_file_as_export_does(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, out, err = padforge_sense("record", "--presses", "4", "--mcap", "--out", "rec")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1] == "rec -> rec.mcap"
+    assert import_bag("rec.mcap") == Recording.open("rec")
+    Path("same").mkdir()
+    assert padforge_sense("export", "rec", "same/rec.mcap")[0] == 0
+    assert Path("same/rec.mcap").read_bytes() == Path("rec.mcap").read_bytes()
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    code, _, err = padforge_sense("record", "--presses", "4", "--mcap", "--out", "other")
+    assert (code, err) == (2, "padforge: other.mcap: MCAP needs rosbags: pip install 'padforge[ros]'\n")
+    assert not Path("other").exists()
 
 
 def test_record_simulates_a_twin(padforge_sense) -> None:

@@ -48,11 +48,11 @@ def test_match_columns_by_name_and_pattern() -> None:
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ("", "mapping has '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, fibres, x"),
-        ("time=t_ms,fibres=ch*,x=px", "names one of x and y, expected both or neither"),
+        ("", "columns are '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, fibres, x"),
+        ("time=t_ms,fibres=ch*,x=px", "name one of x and y, expected both or neither"),
         ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, min or a factor"),
         ("time=ch1,fibres=ch1", "fibres is 'ch1', which is named before"),
-        ("time=" + "t" * 20_000, "mapping has 20005 characters"),
+        ("time=" + "t" * 20_000, "columns have 20005 characters"),
     ],
 )
 def test_columns_refuse_an_ambiguous_mapping(mapping: str, message: str) -> None:

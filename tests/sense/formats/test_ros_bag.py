@@ -12,10 +12,13 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 
 from padforge.design.common.validation import InputError
-from padforge.sense import Recording, import_bag
+from padforge.sense import Recorder, Recording, import_bag
 from padforge.sense.formats import ros_recording
+from padforge.sense.formats.ros_writer import McapFollower
 
 from .foreign import STORE, array, channel, chunk, make, mcap_file, message, write_bag
 
@@ -197,9 +200,64 @@ def test_import_bag_writes_nothing_beside_sqlite_without_an_index(tmp_path: Path
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-def test_import_bag_refuses_a_file_cut_anywhere(bag: Path, tmp_path: Path) -> None:
+def recording_cut_at(content: bytes, size: int, path: Path) -> Recording | None:
+    """Import what is left of a bag; None where that is refused, since no chunk is whole."""
+    path.write_bytes(content[:size])
+    recording, refusal = None, ""
+    try:
+        recording = import_bag(path)
+    except InputError as error:
+        refusal = str(error)
+    line = refusal if recording is None else recording.source["note"]
+    assert "cut off" in line
+    assert "\n" not in line
+    return recording
+
+
+def test_import_bag_recovers_the_whole_chunks_of_a_file_cut_anywhere(tmp_path: Path) -> None:
+    """Each chunk has the 20 readings of a press."""
+    with Recorder(tmp_path / "run", 2, {}, {}) as recorder:
+        recorder.attach(McapFollower(tmp_path / "run.mcap"))
+        for press in range(5):
+            recorder.append(2 * press + np.arange(20) / 10, np.full((20, 2), press + 1.0))
+            recorder.begin((press, 0), recorder.n_readings - 10, press)
+            recorder.finish(recorder.n_readings - 1)
+            recorder.sync()
+    content = (tmp_path / "run.mcap").read_bytes()
+    ends = [index.chunk_start_offset + index.chunk_length for index in chunk_indexes(tmp_path / "run.mcap")]
+    assert len(ends) == 5
+    for size in sorted({*range(0, 60, 3), *np.linspace(60, len(content) - 1, 25).astype(int), *ends, ends[2] - 1}):
+        recording = recording_cut_at(content, size, tmp_path / "cut.mcap")
+        n_whole = sum(end <= size for end in ends)
+        assert (0 if recording is None else len(recording.presses_mm)) == n_whole
+        if recording is not None:
+            np.testing.assert_array_equal(recording.readings[:, 0], np.repeat(np.arange(n_whole) + 1.0, 20))
+
+
+def chunk_indexes(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary
+    return summary.chunk_indexes
+
+
+def test_import_bag_recovers_an_exported_bag_that_lacks_its_index(bag: Path, eight: Recording, tmp_path: Path) -> None:
     content = bag.read_bytes()
-    cut = tmp_path / "cut.mcap"
-    for size in sorted({*range(0, 200, 9), *np.linspace(200, len(content) - 1, 30).astype(int), len(content) - 1}):
-        cut.write_bytes(content[:size])
-        refusal_of(cut, "")
+    assert recording_cut_at(content, len(content) - 1, tmp_path / "cut.mcap") == eight
+    assert recording_cut_at(content, len(content) // 3, tmp_path / "cut.mcap") is None
+    (index,) = chunk_indexes(bag)
+    blank = content[: index.chunk_start_offset + 500] + bytes(index.chunk_length)  # as a power cut leaves it
+    assert recording_cut_at(blank, len(blank), tmp_path / "cut.mcap") is None
+
+
+def test_import_bag_recovers_packed_files_of_a_folder(tmp_path: Path) -> None:
+    messages = [("/f", 0.1 * i, array("Float64MultiArray", np.arange(500.0) + i / 4)) for i in range(1000)]
+    down = [("/down", 0.1 * i, make("Bool", i % 20 < 10)) for i in range(10, 1000, 10)]
+    file = write_bag(tmp_path / "bag", sorted([*messages, *down], key=lambda each: each[1]), packed=True)
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    recording = import_bag(tmp_path / "bag", "fibres=/f,press=/down")
+    n_readings = len(recording.readings)
+    assert 200 < n_readings < 600
+    np.testing.assert_array_equal(recording.readings, [message.data for _, _, message in messages[:n_readings]])
+    assert recording.source["note"].startswith("is cut off; read are ")

@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -96,8 +95,7 @@ def test_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer, 
     z_axis = np.cross([-1 if mirrored else 1, 0, 0], [0, 1, 0])
     assert pose["pose"]["position"]["z"] == pytest.approx(np.dot([0, 0, -2.5e-3], z_axis))
     assert pose["covariance"][14] == pytest.approx((0.5e-3 / 1.6449) ** 2)
-    exported = replace(brief, source={"rig": {"mirrored": mirrored}})
-    assert pose["pose"]["position"]["z"] == depths_to_z(exported, np.array([2.5]))[0]
+    assert pose["pose"]["position"]["z"] == depths_to_z(np.array([2.5]), mirrored)[0]
 
 
 def test_health_comes_first_and_with_every_fault(messages, brief: Recording, localizer: LocalizerModel) -> None:

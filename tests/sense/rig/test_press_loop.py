@@ -1,7 +1,6 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
 import contextlib
-import importlib.util
 import json
 import os
 import signal
@@ -180,6 +179,14 @@ def test_run_stops_and_retreats_at_too_much_force(tmp_path, stays, outcome, end_
     assert fault_of(tmp_path / "run", arm, board, options, message) == "force"
     assert arm.stops >= 1
     assert arm.pose[2] == pytest.approx(end_mm, abs=2)
+
+
+def test_run_stops_and_retreats_when_the_force_sensor_fails_in_a_press(tmp_path):
+    arm, board, options = rig()
+    arm.hook = lambda arm: setattr(arm, "force_n", None if arm.pose[2] < 48 or arm.force_n is None else 0.0)
+    message = "the arm measures no force any more; allowed 60 N; .*; the tool was lifted off"
+    assert fault_of(tmp_path / "run", arm, board, options, message) == "force"
+    assert arm.pose[2] == 60
 
 
 def both_vanish(arm, board):
@@ -404,7 +411,6 @@ def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 @pytest.mark.parametrize("slow_s", [0.0, 1.0])
 def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
     robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float

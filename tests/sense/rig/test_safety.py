@@ -35,7 +35,7 @@ from tests.sense.rig.fakes import RIG, FakeArm, Time
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
 SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)
 X, Y, Z, *TOOL = SAFE
-STILL = ArmState(10.0, SAFE, 0.0, None, False, False, moving=False)
+STILL = ArmState(10.0, SAFE, 0.0, 0.0, False, False, moving=False)
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 inside = st.tuples(st.floats(-100, 100), st.floats(-500, -300), st.floats(44, 120))
 
@@ -184,6 +184,7 @@ def test_check_tcp_compares_with_the_controller(
         ({"force_n": -40.1}, "force"),
         ({"force_n": 30.0, "sideways_n": 27.0}, "force"),
         ({"force_n": 0.0, "sideways_n": math.nan}, "force"),
+        ({"force_n": None}, "force"),
         ({"pose": (0.0, -400.0, 44.0 - 0.31, *TOOL)}, "refused"),
         ({"pose": (0.0, -400.0, math.nan, *TOOL)}, "refused"),
     ],
@@ -199,9 +200,11 @@ def test_check_state_raises_the_cause(change: dict[str, object], cause: str | No
 
 def test_checks_of_an_unwatched_force_and_of_the_deadline() -> None:
     check_state(replace(STILL, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
-    check_start_state(STILL, replace(LIMITS, max_force_n=None))
+    sensorless = replace(STILL, force_n=None)
+    check_state(sensorless, replace(LIMITS, max_force_n=None), 10.0)
+    check_start_state(sensorless, replace(LIMITS, max_force_n=None))
     with pytest.raises(RigFault, match='allowed "unwatched"'):
-        check_start_state(STILL, LIMITS)
+        check_start_state(sensorless, LIMITS)
     with pytest.raises(RigFault, match="30 s") as caught:
         check_state(STILL, LIMITS, 10.4, until_s=10.3)
     assert caught.value.cause == "deadline"

@@ -153,8 +153,11 @@ def test_run_rejects_a_lock_that_is_no_file(tmp_path: Path) -> None:
     [
         (["robustness", "nowhere.json"], "nowhere.json: no such file, and none of square, optimised, random-N"),
         (["robustness", "square", "square"], "another one is called square"),
-        (["robustness", "square", "--presses", "1000"], "presses is 1000, allowed is a square number from 4"),
-        (["scaling", "square", "--grids", "4,x"], "grids is '4,x', expected numbers from 2 to 256"),
+        (
+            ["robustness", "square", "--presses", "1000"],
+            "Invalid value for '--presses': got 1000, allowed is a square number",
+        ),
+        (["scaling", "square", "--grids", "4,x"], "--grids is '4,x', expected numbers from 2 to 256"),
         *(([name, "no"], "no: no such file") for name in ("sensitivity", "force", "shape", "multicontact")),
     ],
 )

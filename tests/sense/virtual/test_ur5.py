@@ -52,7 +52,7 @@ def test_play_resumes_paused_program_but_not_stopped_one(stopped: bool) -> None:
         for _ in range(round(seconds / CYCLE_S)):
             controller.tick(next(clock) * CYCLE_S)
 
-    controller.upload()
+    controller.upload(ur5_controller.UR_RTDE_PROGRAM)
     cycle(1.0)
     pose = (*START[:2], 0.0, *START[3:], 0.1, 1.0)
     orders = {"input_int_register_1": 1, "input_int_register_0": ur5_controller.MOVE_L}

@@ -1,5 +1,6 @@
 """Whole rigs without hardware: real drivers, and emulators that share one simulated pad, through faults and noise."""
 
+import importlib.util
 import json
 import os
 import subprocess
@@ -13,11 +14,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
 
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
@@ -31,7 +37,6 @@ from padforge.sense.simulation.pad_model import LivePad
 from padforge.sense.virtual import virtual_rig
 from padforge.sense.virtual.printer import EmulatedPrinter
 
-pytest.importorskip("rtde_control")
 pytest.importorskip("serial")
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
@@ -49,11 +54,15 @@ ARM = virtual_rig.ur5_settings(RigSettings.model_validate(QUICK | QUIET), PAD)
 PRINTER = virtual_rig.printer_settings(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
 
 
+BY_URSCRIPT = partial(virtual_rig.emulate_ur5, driver="urscript")
+
+
 class Rig:
     """An emulated rig that lives through several recordings; `robot` is the emulated arm or printer."""
 
     def __init__(self, settings: RigSettings, emulate: Callable[..., Any]) -> None:
         self.settings, self.emulate, self.stack = settings, emulate, ExitStack()
+        self.retreats = importlib.util.find_spec("rtde_control") is None or emulate is BY_URSCRIPT
         self.replace()
 
     def replace(self) -> None:
@@ -90,11 +99,14 @@ class Rig:
         return caught.value, time.monotonic() - moment
 
     def is_at_rest(self) -> bool:
-        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds."""
+        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds.
+
+        An arm that retreats by itself has 2 s more.
+        """
         if isinstance(self.robot, EmulatedPrinter):
             now = time.monotonic()
             return bool(np.ptp(self.robot.true_positions([now, now + 9]), axis=0).max() == 0)
-        time.sleep(0.5)
+        time.sleep(2.5 if self.retreats else 0.5)
         now = time.monotonic()
         a, b = self.robot.true_poses([now - 0.05, now - 0.01])[:, :3]
         return bool(np.linalg.norm(b - a) / 0.04 < 1)
@@ -116,6 +128,7 @@ def quick() -> Iterator[None]:
 
 RIGS = {
     "arm": (ARM, virtual_rig.emulate_ur5),
+    "urscript": (ARM, BY_URSCRIPT),
     "line": (ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), virtual_rig.emulate_ur5),
     "printer": (PRINTER, virtual_rig.emulate_printer),
 }
@@ -199,6 +212,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] 
     ("rig", "presses", "names"),
     [
         ("arm", 9, "protective drop freeze stall unplug emergency restart"),
+        ("urscript", 2, "drop"),
         ("line", 6, "reset columns stall unplug"),
         ("printer", 8, " ".join(name for name in FAULTS if "printer" in name)),
     ],
@@ -217,6 +231,9 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
         if name == "board_of_printer":  # the probe is lifted
             tip = rig.robot.true_positions(time.monotonic())[0] + PRINTER.tcp_mm
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
+        if name == "drop" and rig.retreats:
+            height_mm = rig.robot.true_poses(time.monotonic())[0, 2]
+            assert height_mm == pytest.approx((ARM.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
     rig.record(run, plan, lambda done, of, what: rig.board.garble(1e-3))
@@ -250,28 +267,57 @@ main()
 """
 
 
+def places_mm(path: Path) -> tuple[list[list[float]], list[list[float]]]:
+    """Return the commanded positions in an MCAP file, as rosbags and as the readers of `mcap` see them."""
+    topic, places = "/pad/place", ([], [])
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Reader(path) as bag:
+        assert sum(connection.msgcount for connection in bag.connections) == bag.message_count
+        for connection, _, data in bag.messages(row for row in bag.connections if row.topic == topic):
+            places[0].append(store.deserialize_cdr(data, connection.msgtype))
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        places[1].extend(row.decoded_message for row in reader.iter_decoded_messages(topic))
+        file.seek(0)
+        assert sum(1 for _ in NonSeekingReader(file).iter_messages(topic)) == len(places[1])
+    by_rosbags, by_mcap = (
+        [[1000 * place.pose.pose.position.x, 1000 * place.pose.pose.position.y] for place in rows] for rows in places
+    )
+    return by_rosbags, by_mcap
+
+
 @pytest.mark.slow
 def test_killed_recording_resumes_to_complete_plan(
     tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Killed again and again; whenever that is, the MCAP file beside it opens and has every press that is done."""
     monkeypatch.chdir(tmp_path)
     settings = "\n".join(f"{name} = {value}" for name, value in (QUICK | {"rate_hz": 125.0}).items())
     Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{settings}\n", encoding="utf-8")
-    words = ["sense", "record", "--virtual-hardware", "--presses", "5", "--out", "run", "--resume"]
-    journal = Path("run", "journal.ndjson")
-    process = subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
-    end = time.monotonic() + 60
-    while not (journal.exists() and len(read_journal(journal)) >= 2):
-        assert process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    time.sleep(0.1)
-    process.kill()
-    process.wait()
-    presses_before_kill = set(read_journal(journal))
+    words = ["sense", "record", "--virtual-hardware", "--presses", "7", "--out", "run", "--mcap", "--resume"]
+    journal, n_done = Path("run", "journal.ndjson"), 0
+    for wait_s in (0.0, 0.1, 0.35):
+        process = subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
+        end = time.monotonic() + 60
+        while not (journal.exists() and len(read_journal(journal)) > n_done):
+            assert process.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.002)
+        time.sleep(wait_s)
+        process.kill()
+        process.wait()
+        presses_before_kill = read_journal(journal)
+        n_done = len(presses_before_kill)
+        for places in places_mm(Path("run.mcap")):
+            positions = [[press.x_mm, press.y_mm] for press in presses_before_kill.values()]
+            np.testing.assert_allclose(places[:n_done], positions, rtol=1e-12)
+            assert len(places) <= n_done + 1  # one that was not yet in the journal
     monkeypatch.setattr(sys, "argv", ["padforge", *words])
     with pytest.raises(SystemExit) as done:
         main()
     assert not done.value.code
-    assert len(Recording.open(Path("run")).presses_mm) == 5
-    assert set(read_journal(journal)) >= presses_before_kill >= {0, 1}
+    recording = Recording.open(Path("run"))
+    assert len(recording.presses_mm) == 7
+    assert read_journal(journal).items() >= presses_before_kill.items()
+    assert import_bag("run.mcap") == recording
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.toml", "run", "run.mcap"]

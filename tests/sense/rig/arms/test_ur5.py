@@ -1,8 +1,9 @@
-"""The arm behind the real ur-rtde, against the emulated controller: what it does, and that it rests after a fault."""
+"""The arm behind the real ur-rtde, and behind our URScript program: what it does, and that it rests after a fault."""
 
 import importlib.util
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -16,17 +17,22 @@ import numpy as np
 import pytest
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
-from padforge.sense.rig.arms import ur5
-from padforge.sense.rig.arms.ur5 import UR5
+from padforge.sense.rig.arms import rtde, ur5
+from padforge.sense.rig.arms.ur5 import UR5, Driver
+from padforge.sense.rig.arms.urscript import Retreat
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
 from padforge.sense.virtual.ur5 import HOME, EmulatedUR5
 
-pytestmark = pytest.mark.skipif(importlib.util.find_spec("rtde_control") is None, reason="ur-rtde is not here")
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
-LIMITS = Limits(box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, deadline_s=10)
+ONE_DRIVER = pytest.mark.parametrize("driver", ["urscript"], scope="module")
+"""For what does not depend on the driver."""
+LIMITS = Limits(
+    box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, max_force_n=None, deadline_s=10
+)
+FORCE_LIMITS = replace(LIMITS, max_force_n=50.0)
 LOW: Pose = (*HOME[:2], 40.0, *HOME[3:])
 REST_S = 0.5
 LONGEST_CALL_S = 5.0
@@ -120,8 +126,10 @@ def test_stop_ends_move_within_half_a_second(robot: EmulatedUR5, arm: UR5) -> No
     assert arm.state().speed_mm_s == 0
 
 
-def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5) -> None:
+def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5, driver: Driver) -> None:
     before = arm.state().pose
+    if driver == "urscript":  # which asks the controller
+        assert fault_of(arm.move, (2000.0, *HOME[1:]), 10, 10) == "refused"
     assert fault_of(arm.move, (*HOME[:5], float("inf")), 10, 10) == "refused"
     assert fault_of(arm.move, HOME, -1, 10) == "refused"
     assert arm.state().pose == before
@@ -133,9 +141,10 @@ def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure:
     cure()
 
 
-def test_connect_refuses_unavailable_arm(robots: Any, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@ONE_DRIVER
+def test_connect_refuses_unavailable_arm(robots: Any, host: str, driver: Driver) -> None:
     robots.free()
-    with closing(UR5(host)) as arm:
+    with closing(UR5(host, driver)) as arm:
         assert fault_of(arm.connect) == "refused"
         assert fault_of(arm.state) == "lost"
         arm.stop()
@@ -144,14 +153,26 @@ def test_connect_refuses_unavailable_arm(robots: Any, host: str, monkeypatch: py
         refused_until_cured(arm, robot.protective_stop, "protective_stop", robot.clear)
         refused_until_cured(arm, robot.emergency_stop, "emergency_stop", robot.clear)
         arm.connect()
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'"):
-        UR5(host).connect()
 
 
-@pytest.mark.slow
-def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, monkeypatch) -> None:
+@pytest.mark.parametrize("installed", [True, False])
+def test_driver_is_ur_rtde_where_it_is_installed(
+    robots: Any, host: str, monkeypatch: pytest.MonkeyPatch, installed: bool
+) -> None:
+    robots.free()
+    robots.get("cb3")
+    if installed:
+        pytest.importorskip("rtde_control")
+    else:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with closing(UR5(host)) as arm:
+        assert arm.connect()["driver"].startswith("ur-rtde 1" if installed else "URScript")
+
+
+@ONE_DRIVER
+@pytest.mark.slow
+def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, driver: Driver, monkeypatch) -> None:
+    with closing(UR5(host, driver)) as arm:
         refused_until_cured(arm, lambda: robot.refuse(True), "refused", lambda: robot.refuse(False))
         refused_until_cured(arm, lambda: robot.unplug(True), "refused", lambda: robot.unplug(False))
         monkeypatch.setattr(ur5, "CONNECT_S", 1.0)
@@ -159,46 +180,51 @@ def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, monke
         arm.connect()
 
 
-def test_connect_refuses_arm_in_use_on_this_computer(robot: EmulatedUR5, arm: UR5, address: str) -> None:
+@ONE_DRIVER
+def test_connect_refuses_arm_in_use_on_this_computer(
+    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
+) -> None:
     """Nor looked over by `doctor`; the move that is under way goes on."""
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    (diagnosis,) = examine_arm(UR5(address), RigSettings(), time.monotonic, time.sleep)
+    (diagnosis,) = examine_arm(UR5(address, driver), RigSettings(), time.monotonic, time.sleep)
     assert diagnosis.status == "fail"
     assert "another program on this computer uses the arm" in diagnosis.message
     assert arm.state().moving
     arm.stop()
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_arm_in_use_by_another_computer(
-    robot: EmulatedUR5, arm: UR5, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go(arm, HOME)
     arm.move(LOW, 50, 500)
     monkeypatch.setenv("TMPDIR", str(tmp_path))  # where the child locks: as if it ran on another computer
     with pytest.raises(RigFault, match="a program runs on the arm"):
-        UR5(address).connect()
+        UR5(address, driver).connect()
     assert arm.state().moving
     assert wait_until_still(arm, LIMITS).pose == pytest.approx(LOW, abs=0.1)
     go(arm, HOME)
 
 
-def test_force_is_limited_in_all_directions(robots: Any, host: str) -> None:
+@ONE_DRIVER
+def test_force_is_limited_in_all_directions(robots: Any, host: str, driver: Driver) -> None:
     robot = robots.get("e", surface_mm=100, stiffness_n_mm=2.0, tcp_mm=(0.0, 1.5, 150.0))
-    with closing(UR5(host)) as arm:
+    with closing(UR5(host, driver)) as arm:
         assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
         assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
         arm.move(LOW, 50, 500)
-        assert fault_of(wait_until_still, arm, LIMITS) == "force"
+        assert fault_of(wait_until_still, arm, FORCE_LIMITS) == "force"
         state = arm.state()
         assert not state.moving
         assert 50 < (state.force_n or 0) < 60
         arm.move(HOME, 1000, 20_000)
-        wait_until_still(arm, replace(LIMITS, max_force_n=None))
+        wait_until_still(arm, LIMITS)
         arm.move((HOME[0] + 80, *HOME[1:]), 40, 500)
         robot.push(60.0)
-        assert fault_of(wait_until_still, arm, LIMITS) == "force"
+        assert fault_of(wait_until_still, arm, FORCE_LIMITS) == "force"
         state = arm.state()
         assert state.pose[0] < HOME[0] + 40
         assert (state.force_n, state.sideways_n) == (0, 60)
@@ -219,9 +245,16 @@ def signal_worker(name: str) -> Callable[[EmulatedUR5, UR5], None]:
     return send
 
 
+def upload_other_program(robot: EmulatedUR5) -> None:
+    """Another computer sends a program, which replaces the one that moves the arm."""
+    with socket.create_connection((robot.host, rtde.SCRIPT_PORT)) as script:
+        script.sendall(b"def other():\n  while True:\n    sync()\n  end\nend\n")
+
+
 FAULTS: dict[str, tuple[Callable[[EmulatedUR5, UR5], object], str, float, Callable[[EmulatedUR5], object]]] = {
     "protective stop": (lambda robot, arm: robot.protective_stop(), "protective_stop", 0.5, unlock_and_play),
     "stream frozen": (lambda robot, arm: robot.freeze(True), "stale", 1.0, lambda robot: robot.freeze(False)),
+    "other program": (lambda robot, arm: upload_other_program(robot), "lost", 1.0, lambda robot: robot.stop_program()),
     "program stopped": (lambda robot, arm: robot.stop_program(), "lost", 1.0, lambda robot: None),
     "worker killed": (signal_worker("SIGKILL"), "lost stale", 1.5, lambda robot: None),
     "worker hangs": (signal_worker("SIGSTOP"), "lost stale", 1.5, lambda robot: None),
@@ -279,7 +312,7 @@ def test_play_does_not_resume_old_move(robot: EmulatedUR5, arm: UR5) -> None:
 PARENT = f"""
 import sys, time
 from padforge.sense.rig.arms.ur5 import UR5
-arm = UR5(sys.argv[1])
+arm = UR5(*sys.argv[1:])
 arm.connect()
 arm.move({LOW}, 50, 500)
 print("moving", flush=True)
@@ -297,10 +330,12 @@ while True:
         pytest.param("e", "SIGKILL", marks=pytest.mark.slow),
     ],
 )
-def test_arm_rests_after_program_dies_or_is_suspended(robot: EmulatedUR5, arm: UR5, host: str, name: str) -> None:
+def test_arm_rests_after_program_dies_or_is_suspended(
+    robot: EmulatedUR5, arm: UR5, host: str, driver: Driver, name: str
+) -> None:
     go(arm, HOME)
     arm.close()
-    with subprocess.Popen([sys.executable, "-c", PARENT, host], stdout=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen([sys.executable, "-c", PARENT, host, driver], stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         assert program.stdout.readline() == "moving\n"
         time.sleep(0.15)
@@ -311,6 +346,7 @@ def test_arm_rests_after_program_dies_or_is_suspended(robot: EmulatedUR5, arm: U
     assert start_s < last_motion_s(robot) < start_s + REST_S
 
 
+@ONE_DRIVER
 @pytest.mark.slow
 def test_arm_rests_when_program_stops_asking(robot: EmulatedUR5, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5, "SUPERVISION_S", 0.4)
@@ -328,3 +364,29 @@ def test_stop_works_without_script_connection(robot: EmulatedUR5, arm: UR5) -> N
     robot.drop("script")
     arm.stop()
     assert go(arm, LOW).pose == pytest.approx(LOW)
+
+
+def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: Any, host: str) -> None:
+    """The program on the arm does; a parent that lives on leaves it to do so."""
+    robot = robots.get("e", pose=(*HOME[:2], 120.0, *HOME[3:]), surface_mm=100)
+    with closing(UR5(host, "urscript", Retreat(110.0, *LIMITS.box_mm[:2], 100.0))) as arm:
+        arm.connect()
+        go(arm, (*HOME[:2], 95.0, *HOME[3:]))
+        signal_worker("SIGKILL")(robot, arm)
+        with pytest.raises(RigFault, match="lifts the tool off"):
+            within(REST_S, arm.stop)
+        time.sleep(0.7)
+        assert robot.true_poses(time.monotonic())[0, 2] == pytest.approx(110, abs=0.1)
+        arm.connect()
+        robots.free()
+
+
+@ONE_DRIVER
+def test_connect_refuses_registers_that_another_client_writes(robots: Any, host: str, driver: Driver) -> None:
+    robots.free()
+    robot = robots.get("cb3")
+    with socket.create_connection((robot.host, rtde.RTDE_PORT)) as other, closing(UR5(host, driver)) as arm:
+        other.sendall(rtde.pack_frame(rtde.INPUTS, b"input_int_register_25"))
+        assert other.recv(100)
+        with pytest.raises(RigFault, match="lets another program write input_int_register_25"):
+            arm.connect()

@@ -1,0 +1,136 @@
+"""A live pad as a sensor: a thread localizes its presses, and a program reads the latest state at its own rate."""
+
+import threading
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+
+from padforge.design.common.validation import InputError
+from padforge.sense.arrays import Array
+from padforge.sense.health.fault_detector import FaultDetector, has_health
+from padforge.sense.health.health_model import HealthModel
+from padforge.sense.live.pipeline import Live
+from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
+from padforge.sense.rig.devices import Board, RigFault, load_device
+from padforge.sense.rig.streams import stream_board
+from padforge.sense.settings import RigSettings
+
+START_S = 20.0  # within which the first reading must arrive
+
+
+def open_board(rig: str, model: Path, options: RigSettings, fibres: int) -> Board:
+    """Return the board of a rig, alone and not yet connected: a person presses the pad, not its arm.
+
+    Args:
+        rig: "simulated" for the pad that the model was trained on; any other stands for the board of `[rig]`.
+        model: folder that `calibrate` wrote.
+        options: `[rig]`.
+        fibres: number of fibres that are read.
+
+    Raises:
+        InputError: a board that is not installed, or a model of no simulated pad.
+    """
+    if rig == "simulated":
+        from padforge.sense.virtual.virtual_pad import virtual_pad_of
+
+        return virtual_pad_of(model)
+    return load_device("padforge.boards", options.board)(options, options.inputs(fibres))
+
+
+def load_health(model: Path) -> HealthModel | None:
+    """Load the health model in the folder of a model; None if there is none."""
+    return FaultDetector.load(model).live_model_ if has_health(model) else None
+
+
+class PadSensor:
+    """Follow a live pad in a thread.
+
+    Args:
+        rig: as for `open_board`.
+        model: folder that `calibrate` wrote.
+        options: `[rig]`.
+
+    Attributes:
+        names: of the values that `read` returns.
+
+    Raises:
+        InputError: a model that cannot be loaded.
+    """
+
+    def __init__(self, rig: str, model: Path, options: RigSettings) -> None:
+        self._rig, self._model, self._options = rig, model, options
+        self._localizer = LocalizerModel.load(model)
+        measures = [column for each in self._localizer.scaler.measures for column in MEASURE_COLUMNS[each.name]]
+        fibres = [f"fibre_{fibre}_v" for fibre in range(self._localizer.fibres)]
+        self._touch_names = ["x_mm", "y_mm", "r90_mm", *measures]
+        self.names = (*fibres, "pressed", "valid", *self._touch_names)
+        self._thread: threading.Thread | None = None
+        self._stop, self._started = threading.Event(), threading.Event()
+        self._values: Mapping[str, float] = {}
+        self._error: Exception | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        return self._thread is not None
+
+    def connect(self) -> None:
+        """Connect the board, and wait for the first reading; raises InputError or RigFault if none arrives."""
+        if self._thread is not None:
+            raise InputError("the pad is connected already")
+        self._error = None
+        self._stop.clear()
+        self._started.clear()
+        self._thread = threading.Thread(target=self._follow, name="padforge pad", daemon=True)
+        self._thread.start()
+        if not self._started.wait(START_S):
+            self._error = RigFault("stale", f"no reading has arrived in {START_S:g} s", "look at the board")
+        if self._error is not None:
+            self.close()
+            raise self._error
+
+    def read(self) -> dict[str, float]:
+        """Return the latest state by name: readings in V, NaN where one is missing, and the touch.
+
+        `pressed` is 1 while the pad is pressed. While `valid` is 1, position, radius, depth and force are those of the
+        press under way, or else of the last one; they are 0 before the first estimate of a press.
+
+        Raises:
+            RigFault: the board failed.
+            InputError: the pad is not connected.
+        """
+        if self._thread is None:
+            raise InputError("the pad is not connected")
+        if self._error is not None:
+            raise self._error
+        return dict(self._values)
+
+    def close(self) -> None:
+        """Disconnect the board; the pad can be connected again."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _follow(self) -> None:
+        try:
+            board = open_board(self._rig, self._model, self._options, self._localizer.fibres)
+            with closing(board):
+                stream = stream_board(board, self._localizer.rate_hz)
+                pipeline = Live(self._localizer, load_health(self._model), stream.fibres, stream.rate_hz)
+                for times_s, readings in stream.blocks:
+                    pipeline.feed(times_s, readings)
+                    if len(times_s):
+                        self._values = self._summarize(pipeline, readings[-1])
+                        self._started.set()
+                    if self._stop.is_set():
+                        return
+        except Exception as error:  # whatever it is, the program that reads has to know
+            self._error = error
+            self._started.set()
+
+    def _summarize(self, pipeline: Live, volts: Array) -> Mapping[str, float]:
+        latest = pipeline.presses[-1] if pipeline.presses else None
+        # a model of method `published` has no estimate of the press under way, and the latest is that of the one before
+        is_valid = latest is not None and not (pipeline.pressed and latest.final)
+        touch = [getattr(latest, name) if is_valid else 0.0 for name in self._touch_names]
+        return dict(zip(self.names, [*volts.tolist(), float(pipeline.pressed), float(is_valid), *touch], strict=True))

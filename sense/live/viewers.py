@@ -1,0 +1,178 @@
+"""Viewers of robotics as outputs of a live pad: Foxglove, which connects to a server here, and Rerun.
+
+Both show the readings, the state of the pad and its fibres, and in 3D the latest touch: a disc as large as its radius
+of 90 % on the sensed area.
+"""
+
+import contextlib
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from padforge.design.common.files import atomic_file
+from padforge.design.common.server import HOST
+from padforge.design.common.validation import InputError, short_repr
+from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
+from padforge.sense.live.outputs import Message
+
+if TYPE_CHECKING:
+    pass
+
+SCENE = "/pad/scene"
+THICKNESS_MM = 1.0  # of the disc
+BLUE, GREY = (0.13, 0.47, 0.71, 0.8), (0.5, 0.5, 0.5, 0.3)  # red, green, blue, alpha of disc and area
+
+
+class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
+    """A WebSocket server of this machine for Foxglove: all messages as JSON, and the scene; in m, frame `pad`.
+
+    Args:
+        port: 0 for any that is free.
+        centre_mm: x and y of the middle of the sensed area.
+        half_mm: half its width and height.
+
+    Raises:
+        InputError: the port cannot be used.
+    """
+
+    def __init__(self, port: int, centre_mm: list[float], half_mm: list[float]) -> None:
+        import foxglove
+        from foxglove.channels import SceneUpdateChannel
+
+        channels: dict[str, foxglove.Channel] = {}
+        latest: dict[str, dict[str, Any]] = {}
+
+        class Listener(foxglove.websocket.ServerListener):
+            """Repeats the health to a client that comes later, as it is sent only when it changes."""
+
+            def on_subscribe(self, client: Any, channel: Any) -> None:
+                if channel.topic == HEALTH and HEALTH in latest:
+                    channels[HEALTH].log(latest[HEALTH])
+
+        self._channels, self._latest = channels, latest
+        self._context = foxglove.Context()  # not that of the process, which may show two pads
+        options = {"context": self._context, "server_listener": Listener()}
+        try:
+            self._server = foxglove.start_server(name="padforge", host=HOST, port=port, **options)
+        except RuntimeError as error:
+            raise InputError(f"--foxglove is {port}: no server can be started there ({error})") from error
+        self.url = f"ws://{HOST}:{self._server.port}"
+        self._scene = SceneUpdateChannel(SCENE, context=self._context)
+        self._centre_mm, self._half_mm = centre_mm, half_mm
+
+    def __exit__(self, *error: object) -> None:
+        self._server.stop()
+
+    def send(self, message: Message) -> None:
+        import foxglove
+
+        if message.topic not in self._channels:
+            schema = _json_schema(message.msg) | {"title": TOPICS[message.topic].msgtype}
+            self._channels[message.topic] = foxglove.Channel(message.topic, schema=schema, context=self._context)
+        self._channels[message.topic].log(message.msg)
+        self._latest[message.topic] = message.msg
+        if message.topic == TOUCHES:
+            self._scene.log(self._scene_update(message))
+
+    def _scene_update(self, touch: Message) -> Any:
+        from foxglove.messages import (
+            Color,
+            CubePrimitive,
+            CylinderPrimitive,
+            Pose,
+            Quaternion,
+            SceneEntity,
+            SceneUpdate,
+            Vector3,
+        )
+
+        def solid(position: dict[str, float], *size_mm: float, color: tuple[float, ...]) -> dict[str, Any]:
+            pose = Pose(position=Vector3(**position), orientation=Quaternion(w=1.0))
+            size = Vector3(**{axis: mm / 1000 for axis, mm in zip("xyz", size_mm, strict=True)})
+            return {"pose": pose, "size": size, "color": Color(**dict(zip("rgba", color, strict=True)))}
+
+        x, y = self._centre_mm
+        centre = {"x": x / 1000, "y": y / 1000, "z": 0.0}
+        width, height = 2 * self._half_mm[0], 2 * self._half_mm[1]
+        area = CubePrimitive(**solid(centre, width, height, THICKNESS_MM / 2, color=GREY))
+        diameter = 2 * touch.pad["r90_mm"]
+        disc = solid(touch.msg["pose"]["pose"]["position"], diameter, diameter, THICKNESS_MM, color=BLUE)
+        discs = [CylinderPrimitive(**disc, bottom_scale=1.0, top_scale=1.0)]
+        return SceneUpdate(entities=[SceneEntity(frame_id=FRAME, id="touch", cubes=[area], cylinders=discs)])
+
+
+def _json_schema(value: Any) -> dict[str, Any]:
+    """Return the JSON Schema of values like this one; None stands for a number that is missing."""
+    if isinstance(value, dict):
+        return {"type": "object", "properties": {name: _json_schema(part) for name, part in value.items()}}
+    if isinstance(value, list):
+        return {"type": "array", "items": _json_schema(value[0] if value else None)}
+    return {"type": {bool: "boolean", str: "string"}.get(type(value), "number")}
+
+
+class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
+    """A stream for Rerun, in V and mm by the clock of the readings, to a viewer or into a file.
+
+    The file is complete at the end of the `with` block, and not there before.
+
+    Args:
+        target: address of a viewer, rerun+http://HOST:PORT/proxy, or a file that ends in .rrd.
+        fibres: number of fibres that are read.
+        centre_mm: x and y of the middle of the sensed area.
+        half_mm: half its width and height.
+
+    Raises:
+        InputError: neither of them, or a file that cannot be written.
+    """
+
+    def __init__(self, target: str, fibres: int, centre_mm: list[float], half_mm: list[float]) -> None:
+        import rerun
+        from rerun.blueprint import Blueprint, Horizontal, Spatial3DView, TextLogView, TimeSeriesView, Vertical
+
+        plots = [TimeSeriesView(origin=name) for name in ("readings", "pressed")]
+        layout = Blueprint(Horizontal(Spatial3DView(origin="pad"), Vertical(*plots, TextLogView(origin="health"))))
+        self._stream = rerun.RecordingStream("padforge")
+        self._pressed = False
+        with contextlib.ExitStack() as stack:
+            try:
+                if Path(target).suffix == ".rrd":
+                    self._stream.save(stack.enter_context(atomic_file(Path(target))))
+                else:
+                    self._stream.connect_grpc(target)
+            except (RuntimeError, UnicodeError) as error:
+                expected = "an address like rerun+http://HOST:PORT/proxy, or a file that ends in .rrd"
+                raise InputError(f"--rerun is {short_repr(target)}, expected {expected}") from error
+            stack.callback(self._stream.disconnect)  # which flushes, before the file gets its name
+            self._stream.send_blueprint(layout)
+            area = rerun.Boxes3D(centers=[[*centre_mm, 0.0]], half_sizes=[[*half_mm, 0.0]], colors=[GREY])
+            self._stream.log("pad", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            self._stream.log("pad/area", area, static=True)
+            names = [f"fibre {fibre}" for fibre in range(1, fibres + 1)]
+            self._stream.log("readings", rerun.SeriesLines(names=names), static=True)
+            self._stack = stack.pop_all()
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()  # whatever the error: Ctrl-C is the usual end of a live pad
+
+    def send(self, message: Message) -> None:
+        import rerun
+
+        pad = message.pad
+        self._stream.set_time("pad_time", duration=pad["now_s"] if message.topic == TOUCHES else pad["time_s"])
+        if message.topic in (READINGS, PRESSED):
+            if message.topic == READINGS:
+                volts = [math.nan if value is None else value for value in pad["volts"]]
+                self._stream.log("readings", rerun.Scalars(volts))
+            self._pressed = pad.get("pressed", self._pressed)
+            # at every reading, and once more at a change: points are joined by lines, and an edge must not slope
+            self._stream.log("pressed", rerun.Scalars([float(self._pressed)]))
+        elif message.topic == TOUCHES:
+            z_mm = 1000 * message.msg["pose"]["pose"]["position"]["z"]
+            half_mm = [pad["r90_mm"], pad["r90_mm"], THICKNESS_MM / 2]
+            disc = rerun.Ellipsoids3D(
+                centers=[[pad["x_mm"], pad["y_mm"], z_mm]], half_sizes=[half_mm], colors=[BLUE], fill_mode="solid"
+            )
+            self._stream.log("pad/touch", disc)
+        elif message.topic == HEALTH:
+            text = ", ".join(f"fibre {fibre}: {state}" for fibre, state in enumerate(pad["states"], 1))
+            self._stream.log("health", rerun.TextLog(text, level="WARN" if "fault" in pad else "INFO"))

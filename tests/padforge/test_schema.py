@@ -1,0 +1,116 @@
+"""The JSON Schema of pad.toml, which editors read: valid, and as strict as the settings as far as one key goes."""
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from padforge.cli import PRESETS
+from padforge.design.common.settings import Spec
+from padforge.design.common.validation import InputError
+from padforge.run import SECTIONS, section_models
+from tests.docs.pages import BLOCK, PAGES, relative
+from tests.helpers.door import called
+
+MODELS = section_models()
+WRITTEN = re.compile(r"> \S+\.toml <<'END'\n(.*?)^END$", re.MULTILINE | re.DOTALL)  # by a shell
+
+
+def documented() -> Iterator[tuple[str, str]]:
+    """Every settings file on the pages, as a block of TOML or written by a shell, with the name of its page."""
+    for page in PAGES:
+        for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+            if block["language"] == "toml":
+                yield relative(page), block["body"]
+            yield from ((relative(page), text) for text in WRITTEN.findall(block["body"]))
+
+
+@pytest.fixture(scope="module")
+def schema(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    ended = called("schema", cwd=tmp_path_factory.mktemp("schema"))
+    assert (ended.code, ended.err) == (0, "")
+    return json.loads(ended.out)
+
+
+@pytest.fixture(scope="module")
+def validator(schema: Any) -> jsonschema.Draft7Validator:
+    return jsonschema.Draft7Validator(schema)
+
+
+def test_schema_is_valid_and_describes_every_key(schema: Any) -> None:
+    jsonschema.Draft7Validator.check_schema(schema)
+    assert schema["properties"].keys() == SECTIONS.keys()
+    for name, model in MODELS.items():
+        table = schema["$defs"][schema["properties"][name]["$ref"].rpartition("/")[2]]
+        assert table["properties"].keys() == model.model_fields.keys()
+        for key, value in model().model_dump(mode="json").items():
+            described = table["properties"][key]
+            assert described["description"] == model.model_fields[key].description
+            assert described["default"] == value
+    assert "null" not in json.dumps(schema)  # which TOML does not have
+
+
+@pytest.mark.parametrize("preset", [None, *PRESETS])
+def test_written_settings_validate(validator: jsonschema.Draft7Validator, tmp_path: Path, preset: str | None) -> None:
+    assert called("init", *(["--preset", preset] if preset else []), cwd=tmp_path).code == 0
+    validator.validate(tomllib.loads((tmp_path / "pad.toml").read_text(encoding="utf-8")))
+
+
+def test_documented_settings_validate(validator: jsonschema.Draft7Validator) -> None:
+    tables = [(page, tomllib.loads(text)) for page, text in documented()]
+    settings = [(page, table) for page, table in tables if table.keys() & SECTIONS.keys()]
+    pages = {page for page, _ in settings}
+    assert pages >= {"docs/tutorial-design.md", "docs/tutorial-sense.md", "docs/howto-boards.md"}
+    for page, table in settings:
+        assert not list(validator.iter_errors(table)), page
+        Spec(table, page, SECTIONS)
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "is_valid"),
+    [
+        ("pad", "pitch_mm", 8, True),
+        ("pad", "pitch_mm", ["0.5 cm", 8], True),
+        ("pad", "pitch_mm", "200 µm", True),
+        ("pad", "pitch_mm", "5 kg", False),
+        ("pad", "pitch_mm", 0, False),
+        ("pad", "pitch_mm", [8, 8, 8], False),
+        ("pad", "grid", "5 mm", False),
+        ("pad", "horizontals", "grid", True),
+        ("pad", "bent_radius_mm", "round", False),
+        ("pad", "gird", 4, False),
+        ("contact", "sensitivity_profile", [[0, 1], [5, 0.5], [9, 0]], True),
+        ("contact", "sensitivity_profile", [[0, 1, 2]], False),
+        ("contact", "sensitivity_profile", [[0, 1]] * 65, False),
+        ("contact", "sides", "circle", True),
+        ("search", "contacts", [{"depth_mm": "2 mm"}], True),
+        ("search", "contacts", [{"depth_mm": "2 s"}], False),
+        ("search", "max_failures", [0, 1], True),
+        ("rig", "max_force_n", "unwatched", True),
+        ("rig", "tcp_mm", [0, 0, "12 cm"], True),
+        ("rig", "channels", [0, 600], False),
+        ("silicone", "cure_h", "90 min", True),
+        ("dispenser", "arm_pose", [0, 0, 0, 0, 0], False),
+        ("localizer", "method", "published", True),
+        ("localizer", "method", "forest", False),
+    ],
+)
+def test_schema_judges_a_key_as_the_settings_do(
+    validator: jsonschema.Draft7Validator, section: str, key: str, value: Any, is_valid: bool
+) -> None:
+    assert validator.is_valid({section: {key: value}}) == is_valid
+    spec = Spec({section: {key: value}})
+    if is_valid:
+        spec.section(MODELS[section])
+    else:
+        with pytest.raises(InputError):
+            spec.section(MODELS[section])
+
+
+def test_schema_refuses_an_unknown_section(validator: jsonschema.Draft7Validator) -> None:
+    assert not validator.is_valid({"pads": {}})
