@@ -19,7 +19,6 @@ from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.lerobot import export_lerobot
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[2]
 Run = Callable[..., str]
 pytestmark = pytest.mark.slow
 
@@ -40,7 +39,7 @@ def lerobot(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactor
                 (pytest.fail if "CI" in os.environ else pytest.skip)(f"LeRobot cannot be installed: {done.stderr}")
             part.rename(packages)
     home = tmp_path_factory.mktemp("home")
-    path = os.pathsep.join(map(str, (ROOT, packages)))
+    path = os.pathsep.join(map(str, (HERE, packages)))
     environment = {**os.environ, "PYTHONPATH": path, "HF_HOME": str(home), "HF_HUB_OFFLINE": "1"}
 
     def run(*words: object) -> str:
