@@ -7,16 +7,13 @@ of 90 % on the sensed area.
 import contextlib
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from padforge.design.common.files import atomic_file
 from padforge.design.common.server import HOST
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.live.outputs import Message
-
-if TYPE_CHECKING:
-    pass
 
 SCENE = "/pad/scene"
 THICKNESS_MM = 1.0  # of the disc
