@@ -1,6 +1,6 @@
 """Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics.
 
-An MCAP file that lacks its end, because its recorder was killed or a copy broken off, is read as far as its messages are
+An MCAP file that lacks its end, since its recorder was killed or a copy broken off, is read as far as its messages are
 whole, and the recording says so. Otherwise damage is an error.
 
 MCAP is read by the library rosbags, SQLite by the standard library, and neither is trusted: a file may claim anything.
