@@ -154,9 +154,9 @@ class StandInNode:
         self.ros, self.name = ros, name
 
     def declare_parameter(self, name: str, value: Any) -> SimpleNamespace:
-        given = self.ros.parameters.pop(name, value)
-        assert type(given) is type(value)
-        return SimpleNamespace(value=given)
+        chosen = self.ros.parameters.pop(name, value)
+        assert type(chosen) is type(value)
+        return SimpleNamespace(value=chosen)
 
     def create_publisher(self, kind: Any, topic: str, qos: SimpleNamespace) -> SimpleNamespace:
         assert kind is self.ros.types.get(kind.MSGTYPE)
