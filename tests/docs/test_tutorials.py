@@ -34,8 +34,9 @@ BASES = {
     "tutorial-study": "tutorial-design",
     "tutorial-press": None,
     "tutorial-twin": "tutorial-sense",
-    "howto-ros": "tutorial-sense",
-    "howto-microcontroller": "tutorial-sense",
+    "example": None,
+    "howto-ros": "example",
+    "howto-microcontroller": "example",
 }
 """Pages that are run, and the page that each continues."""
 REWRITE = "REWRITE_DOCS" in os.environ
