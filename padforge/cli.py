@@ -180,7 +180,7 @@ def _example(out: Path) -> None:
     with locked_folder(out):
         recording = write_example(out)
     repository, file = PUBLISHED_RECORDING
-    click.echo(f"6 fibres -> {out / 'morphology.json'}")
+    click.echo(f"{recording.fibres} fibres -> {out / 'morphology.json'}")
     click.echo(recording_line(recording, out / "recording"))
     click.echo("simulated, with the properties of the published pad, whose recording is the authors':")
     click.echo(f"  {file} of {repository}")
