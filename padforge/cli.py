@@ -126,7 +126,7 @@ def _init(path: Path, preset: str | None) -> None:
 
 @cli.command("schema")
 def _schema() -> None:
-    """Print the JSON Schema of pad.toml, by which editors complete it.
+    """Print the JSON Schema of pad.toml, for editors.
 
     \b
     padforge schema > pad.schema.json
@@ -182,7 +182,7 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
 @cli.command("example")
 @common.out_option("out/example", "Folder of the example; must be new, empty, or an earlier example")
 def _example(out: Path) -> None:
-    """Write a pad and a recording of 4 MB, on which other commands can be tried.
+    """Write a pad and a recording, to try commands on.
 
     \b
     padforge example
