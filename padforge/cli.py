@@ -1,4 +1,4 @@
-"""The command line: the stages, studies, `design compare`, `run`, `init`, `schema`, `report` and `bench`."""
+"""The command line: the stages, studies, `design compare`, `run`, `example`, `init`, `schema`, `report` and `bench`."""
 
 import sys
 from functools import partial
@@ -15,6 +15,7 @@ from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs
 from padforge.sense.cli.main import sense as sense_group
+from padforge.sense.cli.options import recording_line
 from padforge.sense.cli.studies import study as study_group
 
 from .report import write_report
@@ -51,6 +52,7 @@ def cli(context: click.Context) -> None:
 
     \b
     padforge run                                  all stages, into out/pad
+    padforge example                              a pad and a recording to try
     padforge design --out out/pad                 optimise the paths of the fibres
     padforge fabricate out/pad/morphology.json    make the mould
     padforge sense calibrate out/pad/recording    train a localizer on presses
@@ -124,7 +126,7 @@ def _init(path: Path, preset: str | None) -> None:
 
 @cli.command("schema")
 def _schema() -> None:
-    """Print the JSON Schema of pad.toml, by which editors complete it.
+    """Print the JSON Schema of pad.toml, for editors.
 
     \b
     padforge schema > pad.schema.json
@@ -175,6 +177,31 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
             with stage("report"):
                 click.echo(f"report: {write_report(out)}")
     context.exit(code)
+
+
+@cli.command("example")
+@common.out_option("out/example", "Folder of the example; must be new, empty, or an earlier example")
+def _example(out: Path) -> None:
+    """Write a pad and a recording, to try commands on.
+
+    \b
+    padforge example
+    padforge sense calibrate out/example/recording
+
+    The recording is simulated: 1500 presses on a pad like the published one. No setting changes it. The authors' own
+    recording is not part of padforge; a line says where it is.
+    """
+    from padforge.design.common.files import locked_folder
+    from padforge.sense.simulation.example import PUBLISHED_RECORDING, write_example
+
+    with locked_folder(out):
+        recording = write_example(out)
+    repository, file = PUBLISHED_RECORDING
+    click.echo(f"{recording.fibres} fibres -> {out / 'morphology.json'}")
+    click.echo(recording_line(recording, out / "recording"))
+    click.echo("simulated, with the properties of the published pad, whose recording is the authors':")
+    click.echo(f"  {file} of {repository}")
+    click.echo(f"  padforge sense calibrate {Path(file).name}")
 
 
 @cli.command("report")

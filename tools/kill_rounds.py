@@ -22,7 +22,9 @@ from pathlib import Path
 
 from padforge.design.common.files import read_json, recover, sha256
 from padforge.design.common.validation import InputError
+from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.run_directory import read_journal
 from tools.kills import KILLED, forked, kill_at
 
 SETTINGS = """
@@ -91,7 +93,8 @@ COMMANDS = {
     "run": Command("run --seed 1 --formats stl,svg --out pad", ((), RESUMED)),
     "record": Command("sense record --morphology other/morphology.json --seed 1 --out pad/recording", old=False),
     "drivers": Command(
-        "sense record --virtual-hardware --presses 2 --morphology other/morphology.json --out pad/recording --resume",
+        "sense record --virtual-hardware --presses 2 --morphology other/morphology.json --out pad/recording"
+        " --resume --mcap",
         old=False,
         real_time=True,
     ),
@@ -146,6 +149,9 @@ def require_whole(folder: Path, old: dict[str, str], new: dict[str, str], real_t
     recording = folder / "pad" / "recording"
     if (recording / "start.json").exists() and not real_time:
         Recording.open(recording)
+    if (folder / "pad" / "recording.mcap").exists():
+        n_done = len(read_journal(recording / "journal.ndjson"))
+        assert len(import_bag(folder / "pad" / "recording.mcap").presses_mm) >= n_done
     return " and ".join(sorted(told))
 
 

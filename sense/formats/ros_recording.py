@@ -1,7 +1,7 @@
 """Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics.
 
-An MCAP file that lacks its end, because who wrote it was killed or a copy was broken off, is read as far as its chunks
-are whole, and the recording says so. Otherwise damage is an error.
+An MCAP file that lacks its end, since its recorder was killed or a copy broken off, is read as far as its messages are
+whole, and the recording says so. Otherwise damage is an error.
 
 MCAP is read by the library rosbags, SQLite by the standard library, and neither is trusted: a file may claim anything.
 Messages are read in sequence, whatever an index says; chunks are unpacked to no more than they claim and than
@@ -80,7 +80,9 @@ _MAGIC = b"\x89MCAP0\r\n"
 _HEADER = struct.Struct("<BQ")  # of a record: opcode and length
 _FOOTER, _FOOTER_BYTES = _HEADER.pack(2, 20), 9 + 20 + len(_MAGIC)
 _DATA_OPCODES = {1, 3, 4, 5, 6, 7, 9, 12, *range(128, 256)}  # of records before the index, and of extensions
-_SCANNED, _MESSAGE, _MIN_MESSAGE, _DATA_END = {3, 4, 6}, 5, 22, 15  # schemas, channels and chunks
+_MESSAGE, _MIN_MESSAGE, _CHUNK, _DATA_END = 5, 22, 6, 15
+_SCANNED = {3, 4, _CHUNK}  # schemas and channels as well
+_CHUNK_HEADER = struct.Struct("<B4QIIQ")  # of one that is not packed: the name of its compression has length 0
 
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
@@ -205,17 +207,20 @@ def _read_mcap(
         else:
             storage.open()
         with closing(storage):
+            parts = [(storage.data_start, storage.data_end)]
             if lacks_end:
-                notes.append(_recover(storage, path.stat().st_size))
+                parts, note = _recover(storage, path.stat().st_size)
+                notes.append(note)
             selected = [
                 connection
                 for connection in storage.connections
                 if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
             ]
             n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
-            for connection, stamp, message in storage.messages_scan(selected):
-                n_messages += 1
-                yield connection.topic, stamp, message
+            for storage.data_start, storage.data_end in parts:
+                for connection, stamp, message in storage.messages_scan(selected):
+                    n_messages += 1
+                    yield connection.topic, stamp, message
     if n_messages < n_expected:  # rosbags ends without an error at a record that is longer than its chunk
         raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
 
@@ -230,30 +235,42 @@ def _lacks_end(path: Path) -> bool:
     return not (end.startswith(_FOOTER) and end.endswith(_MAGIC))
 
 
-def _recover(storage: Any, size: int) -> str:
-    """Have rosbags read a file of a size without its end, as far as its records are whole; return what is lost."""
-    file, start, end, opcode, n_messages = storage.bio, len(_MAGIC), len(_MAGIC), 0, 0
-    while len(header := _read_at(file, end, _HEADER.size)) == _HEADER.size:
+def _recover(storage: Any, size: int) -> tuple[list[tuple[int, int]], str]:
+    """Have rosbags open a file of a size without its end; return the parts that are whole, and what is lost."""
+    end, n_messages, opcode = _scan(storage, len(_MAGIC), size)
+    parts = [(len(_MAGIC), end)]
+    chunk = _read_at(storage.bio, end, _CHUNK_HEADER.size)
+    if opcode == _CHUNK and len(chunk) == _CHUNK_HEADER.size and _CHUNK_HEADER.unpack(chunk)[-2] == 0:
+        # The records in a chunk that is not packed are like those of the file itself.
+        start = end + len(chunk)
+        end, n_more, _ = _scan(storage, start, size)
+        parts.append((start, end))
+        n_messages += n_more
+    if not n_messages:
+        raise InputError("is cut off before its first whole message")
+    if opcode == _DATA_END:
+        return parts, "is cut off in its index, and lacks no message"
+    return parts, f"is cut off; read are {end} bytes of whole messages, {size - end} more are left out"
+
+
+def _scan(storage: Any, start: int, size: int) -> tuple[int, int, int]:
+    """Return where whole records end, how many messages they have, and the opcode of the next one; 0 without."""
+    end, n_messages = start, 0
+    while len(header := _read_at(storage.bio, end, _HEADER.size)) == _HEADER.size:
         opcode, length = _HEADER.unpack(header)
         after = end + _HEADER.size + length
         if opcode not in _DATA_OPCODES or after > size or (opcode == _MESSAGE and length < _MIN_MESSAGE):
-            break
+            return end, n_messages, opcode
         if opcode in _SCANNED:
-            # A chunk is unpacked here: its length may be right, and its content not written.
             storage.data_start, storage.data_end = end, after
             try:
-                storage.meta_scan()
+                storage.meta_scan()  # unpacks a chunk: its length may be right, and its content not written
             except Exception:  # rosbags raises many kinds
-                break
+                return end, n_messages, opcode
             n_messages += storage.statistics.message_count
         n_messages += opcode == _MESSAGE
         end = after
-    if not n_messages:
-        raise InputError("is cut off before its first whole chunk")
-    storage.data_start, storage.data_end = start, end
-    if opcode == _DATA_END:
-        return "is cut off in its index, and lacks no message"
-    return f"is cut off; read are {end} bytes of whole chunks, {size - end} more are left out"
+    return end, n_messages, 0
 
 
 def _read_at(file: BinaryIO, position: int, size: int) -> bytes:
@@ -363,7 +380,7 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
             if (recording := _restore(ros_messages.decode_text(store, raw[RECORDING]), topics)) is not None:
                 return replace(recording, source={**recording.source, **note}) if note else recording
             source.setdefault(NOTE, f"was changed since it was exported; {RECORDING} is left out")
-        arrays = _to_arrays(topics)
+        arrays = _to_arrays(topics, is_cut=bool(note))
     return assemble_recording(path, arrays, source)
 
 
@@ -381,13 +398,13 @@ def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
     return replace(recording, source={**recording.source, NOTE: "readings are not those that were exported"})
 
 
-def _to_arrays(topics: Mapping[str, TopicSeries]) -> _Arrays:
+def _to_arrays(topics: Mapping[str, TopicSeries], is_cut: bool) -> _Arrays:
     """Return what the messages of an exported bag say by themselves."""
     stamps, readings = topics[READINGS]
     arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", ""), readings)]
     if PRESSED not in topics:
         return arrays
-    down, up = _find_commands(topics[PRESSED], stamps)
+    down, up = _find_commands(topics[PRESSED], stamps, is_cut)
 
     def in_presses(topic: str, column: int, factor: float = 1e3) -> Array:
         """Return the number of the last message in each press; NaN without one."""
@@ -413,15 +430,17 @@ def _commands(down: Indices, up: Indices) -> _Arrays:
     return [(ColumnEntry("down_command", "", 1.0), down / 1e9), (ColumnEntry("up_command", "", 1.0), up / 1e9)]
 
 
-def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, Indices]:
+def _find_commands(pressed: TopicSeries, readings: Indices, is_cut: bool) -> tuple[Indices, Indices]:
     """Return the (Q,) stamps at which presses begin and end; the first reading is before all presses.
 
-    A press that is held at the end of the bag ends with its last reading.
+    A press that is held at the end of the bag ends with its last reading, or is left out of a file without its end.
     """
     is_down = pressed.values[:, 0] != 0
     was_down = np.append(False, is_down[:-1])
     down, up = pressed.stamps[is_down & ~was_down], pressed.stamps[~is_down & was_down]
-    if len(up) < len(down):
+    if len(up) < len(down) and is_cut:
+        down = down[:-1]
+    elif len(up) < len(down):
         up = np.append(up, ros_messages.stamps_at(readings, np.array([len(readings)])))
     valid = (down > readings[0]) & (down <= readings[-1])
     if not valid.any():
@@ -443,7 +462,7 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
         arrays: _Arrays = [(ColumnEntry("time", ""), clock / 1e9)]
         for entry, topic in series:
             if entry.quantity == "press":
-                arrays += _commands(*_find_commands(topic, clock))
+                arrays += _commands(*_find_commands(topic, clock, is_cut=bool(note)))
                 continue
             if entry.factor is None and UNITS[entry.quantity] is MILLIMETRES:
                 entry = entry._replace(factor=MILLIMETRES["m"])

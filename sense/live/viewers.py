@@ -7,16 +7,13 @@ of 90 % on the sensed area.
 import contextlib
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from padforge.design.common.files import atomic_file
 from padforge.design.common.server import HOST
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.live.outputs import Message
-
-if TYPE_CHECKING:
-    pass
 
 SCENE = "/pad/scene"
 THICKNESS_MM = 1.0  # of the disc
@@ -127,10 +124,13 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
 
     def __init__(self, target: str, fibres: int, centre_mm: list[float], half_mm: list[float]) -> None:
         import rerun
-        from rerun.blueprint import Blueprint, Horizontal, Spatial3DView, TextLogView, TimeSeriesView, Vertical
+        from rerun import blueprint
 
-        plots = [TimeSeriesView(origin=name) for name in ("readings", "pressed")]
-        layout = Blueprint(Horizontal(Spatial3DView(origin="pad"), Vertical(*plots, TextLogView(origin="health"))))
+        x, y, far = *centre_mm, 3 * max(half_mm)
+        eye = blueprint.EyeControls3D(position=[x, y, far], look_target=[x, y, 0.0], eye_up=[0.0, 1.0, 0.0])  # the plan
+        scene = blueprint.Spatial3DView(origin="pad", eye_controls=eye)
+        plots = [blueprint.TimeSeriesView(origin=name) for name in ("readings", "pressed")]
+        data = blueprint.Vertical(*plots, blueprint.TextLogView(origin="health"))
         self._stream = rerun.RecordingStream("padforge")
         self._pressed = False
         with contextlib.ExitStack() as stack:
@@ -143,7 +143,7 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
                 expected = "an address like rerun+http://HOST:PORT/proxy, or a file that ends in .rrd"
                 raise InputError(f"--rerun is {short_repr(target)}, expected {expected}") from error
             stack.callback(self._stream.disconnect)  # which flushes, before the file gets its name
-            self._stream.send_blueprint(layout)
+            self._stream.send_blueprint(blueprint.Blueprint(blueprint.Horizontal(scene, data)))
             area = rerun.Boxes3D(centers=[[*centre_mm, 0.0]], half_sizes=[[*half_mm, 0.0]], colors=[GREY])
             self._stream.log("pad", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
             self._stream.log("pad/area", area, static=True)

@@ -239,7 +239,11 @@ class Recorder:
         return self
 
     def attach(self, follower: Follower) -> None:
-        """Hand over what was recorded so far, and from now on everything as it is recorded."""
+        """Hand over what was recorded so far, and from now on everything as it is recorded.
+
+        Args:
+            follower: that writes it, too; closed with the recorder.
+        """
         follower.start(read_json(self._path / START, FORMAT)["source"])
         follower.append(read_blocks(self._path / READINGS, self.fibres)[0])
         if self._states is not None:

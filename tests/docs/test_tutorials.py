@@ -34,9 +34,10 @@ BASES = {
     "tutorial-study": "tutorial-design",
     "tutorial-press": None,
     "tutorial-twin": "tutorial-sense",
-    "howto-ros": "tutorial-sense",
-    "howto-lerobot": "tutorial-sense",
-    "howto-microcontroller": "tutorial-sense",
+    "example": None,
+    "howto-ros": "example",
+    "howto-lerobot": "example",
+    "howto-microcontroller": "example",
 }
 """Pages that are run, and the page that each continues."""
 REWRITE = "REWRITE_DOCS" in os.environ

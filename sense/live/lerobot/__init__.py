@@ -1,1 +1,1 @@
-"""The plugin of LeRobot: `--robot.discover_packages_path=padforge.sense.live.lerobot` loads its modules."""
+"""The robot `padforge` of LeRobot, which the package in `plugins/lerobot_robot_padforge` makes known to it."""

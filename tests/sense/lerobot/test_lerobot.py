@@ -19,6 +19,7 @@ from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.lerobot import export_lerobot
 
 HERE = Path(__file__).parent
+PLUGIN = HERE.parents[2] / "plugins" / "lerobot_robot_padforge"
 Run = Callable[..., str]
 pytestmark = pytest.mark.slow
 
@@ -27,12 +28,13 @@ pytestmark = pytest.mark.slow
 def lerobot(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Run a module with LeRobot, which is installed once for each list of requirements; return its output."""
     requirements, cache = HERE / "requirements.txt", pytestconfig.cache.mkdir("lerobot")  # type: ignore[union-attr]
-    packages = cache / hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]
+    texts = (path.read_bytes() for path in [requirements, *sorted(PLUGIN.glob("*.*"))])
+    packages = cache / hashlib.sha256(b"".join(texts)).hexdigest()[:12]
     with filelock.FileLock(cache / "lock"):
         if not packages.exists():
             part = tmp_path_factory.mktemp("packages", numbered=True)
             options = ["--disable-pip-version-check", "--no-compile", "--no-deps", "--target", str(part)]
-            pip = [sys.executable, "-m", "pip", "install", "-q", *options, "-r", str(requirements)]
+            pip = [sys.executable, "-m", "pip", "install", "-q", *options, "-r", str(requirements), str(PLUGIN)]
             done = subprocess.run(pip, capture_output=True, text=True, check=False)
             if done.returncode:
                 # on the machines of CI it must not be missing unnoticed
@@ -92,10 +94,9 @@ def test_lerobot_opens_exported_datasets(lerobot: Run, brief: Recording, tmp_pat
 
 
 def test_lerobot_records_a_pad_beside_an_arm(lerobot: Run, model: Path, tmp_path: Path) -> None:
-    plugins = {"robot": "padforge.sense.live.lerobot", "teleop": "virtual_arm"}
     said = lerobot(
         "lerobot.scripts.lerobot_record",
-        *(f"--{device}.discover_packages_path={package}" for device, package in plugins.items()),
+        "--teleop.discover_packages_path=virtual_arm",  # the arm of the tests; the pad is found by its name
         *("--robot.type=padforge", f"--robot.model={model}", "--robot.robot={type: virtual_arm, start: -3}"),
         *("--teleop.type=virtual_leader", f"--dataset.root={tmp_path / 'set'}", "--dataset.repo_id=padforge/test"),
         *("--dataset.single_task=Touch.", "--dataset.fps=20", "--dataset.episode_time_s=2", "--dataset.num_episodes=2"),

@@ -273,7 +273,7 @@ def places_mm(path: Path) -> tuple[list[list[float]], list[list[float]]]:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Reader(path) as bag:
         assert sum(connection.msgcount for connection in bag.connections) == bag.message_count
-        for connection, _, data in bag.messages(row for row in bag.connections if row.topic == topic):
+        for connection, _, data in bag.messages([row for row in bag.connections if row.topic == topic]):
             places[0].append(store.deserialize_cdr(data, connection.msgtype))
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
