@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -49,20 +50,22 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Workers get whole groups of tests; kernels are compiled by one process, not by each worker again."""
-    if config.getoption("numprocesses", None) and not config.option.collectonly:
-        if config.option.dist == "load":
-            config.option.dist = "loadgroup"
-        if kernels.missing():
-            kernels.compile_all()
+    """Kernels are compiled by one process, not by each worker again."""
+    if config.getoption("numprocesses", None) and not config.option.collectonly and kernels.missing():
+        kernels.compile_all()
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The tests of a file go to one worker, which makes what they share; a test may be marked for another group."""
-    for item in items if config.pluginmanager.hasplugin("xdist") else ():
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(f"{item.path.parent.name}/{item.path.stem}"))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """The tests of a file go to one worker, which makes what they share; in tests/docs those of a page of the docs."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class FileScheduling(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file, _, test = nodeid.partition("::")
+            return test.partition("[")[2] or file if file.startswith("tests/docs") else file
+
+    return FileScheduling(config, log) if config.option.dist == "load" else None
 
 
 @pytest.fixture(scope="session")

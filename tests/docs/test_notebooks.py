@@ -26,7 +26,7 @@ def test_notebook_is_that_of_its_page(page: str) -> None:
 
 @pytest.mark.slow
 @needs_unix_shell
-@pytest.mark.parametrize("page", [pytest.param(page, marks=pytest.mark.xdist_group(page)) for page in notebooks.PAGES])
+@pytest.mark.parametrize("page", notebooks.PAGES)
 def test_notebook_runs_in_the_folder_of_its_page(page: str, once: Once, tmp_path: Path) -> None:
     """Its commands are those of the page, which `test_tutorials.py` runs: here their cells only call padforge."""
     folder = shutil.copytree(followed(page, once)[0], tmp_path / "followed")

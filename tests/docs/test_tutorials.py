@@ -148,7 +148,7 @@ needs_unix_shell = pytest.mark.skipif(
 
 @pytest.mark.slow
 @needs_unix_shell
-@pytest.mark.parametrize("page", [pytest.param(page, marks=pytest.mark.xdist_group(page)) for page in BASES])
+@pytest.mark.parametrize("page", BASES)
 def test_pages_print_what_they_show(page: str, once: Once) -> None:
     _, wrong = followed(page, once)
     assert REWRITE or not wrong, wrong
