@@ -157,7 +157,7 @@ def test_live_events_do_not_depend_on_blocks(recording, hasty, cuts: list[int]) 
     assert replay(part, hasty, cuts=sorted(cuts))[1] == replay(part, hasty)[1]
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(st.lists(st.integers(1, 45), min_size=8, max_size=8))
 def test_live_handles_presses_of_any_length_and_distance(recording, hasty, lengths: list[int]) -> None:
     """Down to presses of one reading, and such that follow at once."""

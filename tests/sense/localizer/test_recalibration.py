@@ -84,6 +84,7 @@ def test_cross_validation_compares_presses_left_out() -> None:
     assert seen == [[0, 2], [1, 3]]  # a fold is changed by the other presses only
 
 
+@pytest.mark.slow
 def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: Recording) -> None:
     now, result = recalibrate(localizer, known_only(remade(recording), NEW))
     pad = remade(recording)

@@ -75,6 +75,7 @@ def test_twin_responds_as_the_fitted_pad(result: Identification) -> None:
     assert volts == pytest.approx(fitted, abs=0.05 * np.abs(fitted).max())
 
 
+@pytest.mark.slow
 @few_candidates()
 def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
     recording = simulate(PLAN, ideal_rig(presses=200, depth_mm=4.0, seed=2), Contact(depth_mm=4.0))
@@ -93,6 +94,7 @@ def test_identify_recovers_the_printed_pad_among_all_candidates(printed: Twin) -
     assert_recovered(identify_pad(simulate(printed, ideal_rig(presses=500, seed=3)), PLAN, seed=1), printed)
 
 
+@pytest.mark.slow
 @few_candidates()
 def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_without_a_layer() -> None:
     pad = Morphology.straight(2)
@@ -108,6 +110,7 @@ def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_wi
     assert abs(result.fit.pad.transform.turn_deg) < 20  # of all that are as good, the one rotated least
 
 
+@pytest.mark.slow
 @few_candidates()
 def test_identify_gives_no_fibre_to_channels_without_readings(recording: Recording, printed: Twin) -> None:
     live = next(channel.channel for channel in printed.channels if channel.fibre is not None)
