@@ -54,6 +54,7 @@ ARM = virtual_rig.ur5_settings(RigSettings.model_validate(QUICK | QUIET), PAD)
 PRINTER = virtual_rig.printer_settings(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
 
 
+ATTEMPTS = 3  # to disturb a recording
 BY_URSCRIPT = partial(virtual_rig.emulate_ur5, driver="urscript")
 
 
@@ -84,9 +85,13 @@ class Rig:
             PressLoop(self.arm, self.board_driver, recorder, self.settings).run(plan, report)
         return start_s
 
-    def disturbed(self, run: Path, plan: PressPlan, disturb: Callable[["Rig"], object]) -> tuple[RigFault, float]:
-        """Record, disturbed after one more press; return the fault, and how long it took to be raised."""
-        moment, at = 0.0, 1 + (len(read_journal(run / "journal.ndjson")) if run.exists() else 0)
+    def disturbed(self, run: Path, plan: PressPlan, name: str) -> tuple[RigFault, float]:
+        """Record, disturbed after one more press; return the fault, and how long it took to be raised.
+
+        On a busy machine another fault may come first. The recording goes on after that, too, and is disturbed again.
+        """
+        disturb, cause, cure = FAULTS[name]
+        moment = 0.0
 
         def report(done: int, of: int, what: str) -> None:
             nonlocal moment
@@ -94,9 +99,15 @@ class Rig:
                 moment = time.monotonic()
                 disturb(self)
 
-        with pytest.raises(RigFault) as caught:
-            self.record(run, plan, report)
-        return caught.value, time.monotonic() - moment
+        attempts = 0
+        while True:
+            attempts += 1
+            at = 1 + (len(read_journal(run / "journal.ndjson")) if run.exists() else 0)
+            with pytest.raises(RigFault) as caught:
+                self.record(run, plan, report)
+            if caught.value.cause == cause or attempts == ATTEMPTS:
+                return caught.value, time.monotonic() - moment
+            cure(self)
 
     def is_at_rest(self) -> bool:
         """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds.
@@ -211,10 +222,10 @@ FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] 
 @pytest.mark.parametrize(
     ("rig", "presses", "names"),
     [
-        ("arm", 9, "protective drop freeze stall unplug emergency restart"),
-        ("urscript", 2, "drop"),
-        ("line", 6, "reset columns stall unplug"),
-        ("printer", 8, " ".join(name for name in FAULTS if "printer" in name)),
+        ("arm", 10, "protective drop freeze stall unplug emergency restart"),
+        ("urscript", 4, "drop"),
+        ("line", 8, "reset columns stall unplug"),
+        ("printer", 9, " ".join(name for name in FAULTS if "printer" in name)),
     ],
     indirect=["rig"],
 )
@@ -222,8 +233,8 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
     """One after the other in one recording, which is resumed after each, in the end with a garbled board."""
     run, plan = tmp_path / "run", rig.plan(presses)
     for press, name in enumerate(names.split(), start=1):
-        disturb, cause, cure = FAULTS[name]
-        fault, notice_s = rig.disturbed(run, plan, disturb)
+        _, cause, cure = FAULTS[name]
+        fault, notice_s = rig.disturbed(run, plan, name)
         assert fault.cause == cause, name
         assert "\n" not in str(fault)
         assert notice_s < (2 if rig.settings is PRINTER else 5), name
