@@ -251,6 +251,8 @@ class EmulatedUR5:
 
     def _process_frame(self, connection: Connection, kind: int, payload: bytes) -> None:
         if kind == rtde.DATA:
+            if not 0 < payload[0] <= len(connection.inputs):
+                return  # a client that reconnects, as ur-rtde does, sends the recipes of its last link first
             names, layout = connection.inputs[payload[0] - 1]
             values = dict(zip(names, layout.unpack(payload[1:]), strict=True))
             self._do(lambda: self._controller.write(values, time.monotonic()))

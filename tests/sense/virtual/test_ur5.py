@@ -1,6 +1,7 @@
 """The emulated arm: the record of what it really did, its dashboard and program, and what it leaves behind."""
 
 import re
+import socket
 from itertools import count
 
 import numpy as np
@@ -38,6 +39,15 @@ def test_emulator_has_its_ports_alone_and_frees_them(address: str) -> None:
         assert answers[1:4] == ["false", "20185500000", "Program running: false"]
         assert answers[4].startswith("could not understand")
         assert robot.dashboard_log() == asked
+
+
+def test_emulator_drops_packages_of_recipes_that_a_link_has_not_agreed_on(address: str) -> None:
+    """ur-rtde sends those of its last link when it connects again."""
+    with EmulatedUR5(host=address), socket.create_connection((address, rtde.RTDE_PORT), 1.0) as link:
+        for payload in (b"\x0b\x00\x00\x00\x00", b"\x00"):
+            link.sendall(rtde.pack_frame(rtde.DATA, payload))
+        link.sendall(rtde.pack_frame(rtde.VERSION, b"\x00\x02"))
+        assert link.recv(100) == rtde.pack_frame(rtde.VERSION, b"\x01")
 
 
 START, CYCLE_S = np.array([-0.12, -0.43, 0.2, 0.0, np.pi, 0.0]), 0.008
