@@ -210,7 +210,7 @@ def _load_and_check(
     "--port", type=click.IntRange(0, 65535), default=EDIT_PORT, show_default=True, help="Port of the page; 0: any."
 )
 def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, port: int) -> None:
-    """Edit the paths in a browser on this machine. It shows broken rules and ambiguity at every step.
+    """Edit the paths in a browser on this machine. The page shows broken rules and ambiguity at every step.
 
     \b
     padforge design edit out/pad/morphology.json     saves to out/pad/morphology-edited.json
@@ -268,7 +268,7 @@ def import_(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Import the paths from a drawing (.svg or .dxf). It has one curve per fibre; exit code 1 if a rule is broken.
+    """Import the paths from a drawing (.svg or .dxf). Every curve is a fibre; exit code 1 if a rule is broken.
 
     \b
     padforge design import plan.svg                      into out/plan/morphology.json

@@ -64,7 +64,7 @@ def live(
     as_json: bool,
     **output: Any,
 ) -> None:
-    """Show touches as they happen, in the terminal and a page. It is for the browsers of this machine.
+    """Show touches as they happen, in the terminal and a page. The page is for the browsers of this machine.
 
     \b
     padforge sense live --model out/pad

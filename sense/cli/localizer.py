@@ -145,7 +145,7 @@ def locate(
 @common.json_option
 @click.pass_context
 def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
-    """Detect failed, damaged and drifting fibres of RECORDING. It needs the readings alone.
+    """Detect failed, damaged and drifting fibres of RECORDING. The readings alone are needed.
 
     \b
     padforge sense health --model out/pad out/later/recording
@@ -243,7 +243,7 @@ def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize:
 @common.force_option
 @common.json_option
 def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Adapt a model to a pad that has drifted or was cast again. RECORDING has 20 to 500 presses at known positions.
+    """Adapt a model to a pad that has drifted or was cast again. RECORDING holds 20 to 500 presses at known positions.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
@@ -378,7 +378,8 @@ def identify(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Identify the twin of a printed pad from RECORDING. It has fibres as built, wiring, pose and sensitivity profile.
+    """Identify the twin of a printed pad from RECORDING. The twin has its fibres as built, wiring, pose and
+    sensitivity profile.
 
     If [contact] is a layer, its width, squeeze and stretch are measured.
 

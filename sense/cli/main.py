@@ -30,7 +30,7 @@ _PATH = click.Path(path_type=Path)
 @click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="Content of columns, datasets or topics.")
 @out_option(what="Folder of the recording; must be new or empty")
 def import_(file: Path, columns: str, out: Path | None) -> None:
-    """Import a recording of another program from FILE. This is a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a
+    """Import a recording of another program from FILE. FILE is a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a
     ROS 2 bag (.mcap, .db3 or a folder with metadata.yaml). The default folder for NAME.csv is out/NAME/recording.
 
     \b

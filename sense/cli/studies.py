@@ -118,7 +118,7 @@ def _check_square(context: click.Context, param: click.Parameter, value: int) ->
 )
 @common.spec_option
 def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
-    """Errors by number of failed fibres (figures 3 to 5). They are over all sets of these; there are error maps.
+    """Errors by number of failed fibres (figures 3 to 5). Means are over all sets of them; error maps are drawn.
 
     \b
     padforge study robustness square random-5 --max-failures 2
@@ -158,7 +158,7 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
 
 @_command("drift", "PAD_OR_RECORDING")
 def drift(names: tuple[str, ...], *, seed: int) -> "Study":
-    """Filters and drift compensation (figure 12, table III). They run on simulated pads and on recordings.
+    """Filters and drift compensation (figure 12, table III). The methods run on simulated pads and on recordings.
 
     \b
     padforge study drift out/pad/recording
@@ -192,7 +192,7 @@ _sensitivity = """Other tools and depths, trained with or not (figure 6).
 They have half to one and a half times the radius and the depth that [contact] states. If [contact] is a shape, as in
 the preset `published`, the objects are those of the paper, of sizes K and shapes D in grid units."""
 _force = "Depth and force of a press, from the signals. A tool presses the layer of [contact]."
-_shape = "Which object was pressed, from the signals. It is a dome, a ball, a finger or a flat end."
+_shape = "Which object was pressed, from the signals. Objects are a dome, a ball, a finger and a flat end."
 _multicontact = "Number and positions of contacts at once (figure 9). Of two contacts, either comes first."
 _strokes = "Follow a finger that slides over simulated pads. The localizers are trained on single presses of them."
 _add_study("strokes", "strokes", _strokes, "optimised")
