@@ -44,7 +44,7 @@ def write_report(folder: Path) -> Path:
         (DESIGN_FORMAT, "design.json", write_design),
         ("padforge-fabrication/2", "fabrication.json", fabrication_sections),
         ("padforge-recording/2", "recording/start.json", sense.recording_sections),
-        ("padforge-identification/3", "identification.json", identification_sections),
+        ("padforge-identification/4", "identification.json", identification_sections),
         ("padforge-calibration/3", "calibration.json", sense.calibration_sections),
         ("padforge-fibre-loss/3", "fibre_loss.json", sense.fibre_loss_sections),
         ("padforge-contacts/1", "contacts.json", contact_sections),

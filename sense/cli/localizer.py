@@ -369,7 +369,9 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 @common.force_option
 @common.json_option
 @common.profile_option
+@click.pass_context
 def identify(
+    ctx: click.Context,
     recording: Path,
     morphology: Path,
     seed: int | None,
@@ -381,7 +383,9 @@ def identify(
     """Identify the twin of a printed pad from RECORDING. The twin has its fibres as built, wiring, pose and
     sensitivity profile.
 
-    If [contact] is a layer, its width, squeeze and stretch are measured.
+    If [contact] is a layer, its width, squeeze and stretch are measured. A twin that is doubtful is written
+    nevertheless, and what is doubtful is printed, with exit code 1: a channel that does not fit this pad, or a second
+    wiring that fits nearly as well.
 
     \b
     padforge sense identify out/pad/recording --morphology out/pad/morphology.json
@@ -402,3 +406,4 @@ def identify(
         options = {"contact": contact, "inputs": inputs, "on_progress": show, "force": force}
         document = identify_into(opened, pad, folder, seed or 0, **options)
     common.show_result(document, identification_lines(document, folder), as_json)
+    ctx.exit(1 if document["doubts"] else 0)

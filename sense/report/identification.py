@@ -19,11 +19,10 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Contact
 from padforge.sense.recording.recording import Recording
+from padforge.sense.twin.doubts import find_doubts, offset_mm
 from padforge.sense.twin.identification import Identification, MeasuredContact, identify_pad
 
-FORMAT = "padforge-identification/3"
-MIN_ADVANTAGE = 0.02
-"""Share of the variance by which a plan must explain more than straight fibres, else it may be of another pad."""
+FORMAT = "padforge-identification/4"
 CHANNEL_HEAD = ["channel", "fibre", "or", "gain (mV/%)", "noise (mV)", "explained", "lateral offset (mm)"]
 COMMAND, TWIN = "padforge sense identify", "twin.json"
 
@@ -79,7 +78,8 @@ def _document(result: Identification) -> dict[str, Any]:
     for row, (offset, std, within) in enumerate(result.lateral_offsets_mm()):
         fibre = result.fit.pad.fibres[row]
         channels[int(result.live[row])] |= {
-            "lateral_offset_mm": float(np.sqrt((offset[within] ** 2).mean())) if within.any() else 0.0,
+            "explained_smooth": float(result.explained_smooth[row]),
+            "lateral_offset_mm": offset_mm(offset, within),
             "lateral_offset_std_mm": float((std[within] if within.any() else std).mean()),
             "alternative_fibres": sorted({wiring.fibres[row] for wiring in result.alternatives} - {fibre}),
         }
@@ -90,7 +90,6 @@ def _document(result: Identification) -> dict[str, Any]:
         "channels": channels,
         "explained": float(result.explained.mean()),
         "explained_on_plan": result.explained_on_plan,
-        "explained_by_straight": result.explained_by_straight,
         "contact": None if result.contact is None else _contact_document(result.contact),
         "noise": twin.noise,
         "frame": asdict(twin.frame),
@@ -98,6 +97,7 @@ def _document(result: Identification) -> dict[str, Any]:
         "angular": twin.angular_weight is not None,
         "sensed_mm": list(twin.sensed_mm),
         "n_alternatives": len(result.alternatives),
+        "doubts": find_doubts(result),
     }
 
 
@@ -186,7 +186,7 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
         f" as it is; noise {document['noise']:.1%} of full scale",
         f"the pad lay {_pose(document)}",
         *_contact_lines(document),
-        *_warnings(document),
+        *_doubt_lines(document),
     ]
 
 
@@ -214,15 +214,10 @@ def _channel_cells(row: Mapping[str, Any]) -> list[str]:
     return [str(row["channel"] + 1), _fibre(row), alternatives, gain, noise, *explained]
 
 
-def _warnings(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the presses leave open."""
-    if document["n_alternatives"]:
-        yield f"ambiguous: {document['n_alternatives']} other poses and wirings explain the presses as well"
-    straight = document["explained_by_straight"]
-    if straight is not None and document["explained_on_plan"] < straight + MIN_ADVANTAGE:
-        yield (
-            f"straight fibres explain {straight:.3f}, about as much as this plan does: is it the recording of this pad?"
-        )
+def _doubt_lines(document: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what makes the twin doubtful."""
+    for doubt in document["doubts"]:
+        yield f"doubtful: {doubt}"
 
 
 def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -239,7 +234,7 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
     ]
     body = [
         paragraph(summary),
-        *map(paragraph, [*_contact_lines(document), *_warnings(document)]),
+        *map(paragraph, [*_contact_lines(document), *_doubt_lines(document)]),
         channels,
         figures(pictures),
     ]

@@ -23,7 +23,7 @@ from padforge.sense.arrays import Array, Indices
 from padforge.sense.twin.responses import Responses
 
 EPSILON = 1e-6  # squared distance below which the direction to the press is undefined, squared grid units
-N_ELEMENTS = 160  # elements of a fibre
+N_ELEMENTS, N_COARSE = 160, 48  # elements of a fibre, and of one where wirings are compared
 FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
 N_SPLINES = 12  # splines of a profile
 SPLINE_STEP = 0.48
@@ -135,25 +135,30 @@ def channel_response(
 
 @dataclass(frozen=True)
 class PadPlan:
-    """Planned fibres, cut into N_ELEMENTS elements that are evenly spaced along each; grid units."""
+    """Planned fibres, cut into E elements that are evenly spaced along each; grid units."""
 
-    paths: Array  # (fibres, N_ELEMENTS, 2), middles of the elements
-    tangents: Array  # (fibres, N_ELEMENTS, 2), unit vectors
-    lengths: Array  # (fibres, N_ELEMENTS)
+    paths: Array  # (fibres, E, 2), middles of the elements
+    tangents: Array  # (fibres, E, 2), unit vectors
+    lengths: Array  # (fibres, E)
     layout: Layout
 
     @classmethod
-    def from_morphology(cls, pad: Morphology) -> "PadPlan":
+    def from_morphology(cls, pad: Morphology, elements: int = N_ELEMENTS) -> "PadPlan":
         """Cut the fibres of a morphology into elements."""
         ends = []
         for line in flatten(pad, FLAT_TOLERANCE):
             arc = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
-            along = np.linspace(0, arc[-1], N_ELEMENTS + 1)
+            along = np.linspace(0, arc[-1], elements + 1)
             ends.append(np.column_stack([np.interp(along, arc, line[:, axis]) for axis in range(2)]))
         points = np.array(ends)
         step = np.diff(points, axis=1)
         lengths = np.hypot(step[..., 0], step[..., 1])
         return cls((points[:, :-1] + points[:, 1:]) / 2, step / lengths[..., None], lengths, pad.layout)
+
+    @property
+    def elements(self) -> int:
+        """Elements E of a fibre."""
+        return self.paths.shape[1]
 
     def to_grid(self, positions_mm: Array) -> Array:
         """Convert positions (Q, 2) on the plan from mm from its middle to grid units from its corner."""
@@ -208,18 +213,18 @@ class AsBuiltPad:
         return self.values[4:N_SHARED].reshape(2, N_SPLINES) @ _profile_basis(distance / self.step).T
 
     def path(self, channel: int) -> tuple[Array, Array]:
-        """Return the middles (N_ELEMENTS, 2), grid units, and sensitivities (N_ELEMENTS,) of a channel's fibre."""
-        offset, log_gain = (evaluate_along_fibre(curves, N_ELEMENTS)[0][0] for curves in self._curves(channel))
+        """Return the middles (E, 2), grid units, and sensitivities (E,) of a channel's fibre."""
+        offset, log_gain = (evaluate_along_fibre(curves, self.plan.elements)[0][0] for curves in self._curves(channel))
         return self.plan.paths[self.fibres[channel]] + offset.T, np.exp(log_gain[0])
 
     def elements(self, channel: int) -> tuple[Array, Array, Array]:
         """Return the elements of a channel's fibre, grid units.
 
-        They are middles (N_ELEMENTS, 2), lengths times sensitivities (N_ELEMENTS,) and unit tangents (N_ELEMENTS, 2).
+        They are middles (E, 2), lengths times sensitivities (E,) and unit tangents (E, 2).
         """
         plan, fibre = self.plan, self.fibres[channel]
         middles, sensitivities = self.path(channel)
-        change = evaluate_along_fibre(self._curves(channel)[0], N_ELEMENTS)[0][1]
+        change = evaluate_along_fibre(self._curves(channel)[0], plan.elements)[0][1]
         steps = np.ascontiguousarray(plan.lengths[fibre][:, None] * plan.tangents[fibre] + change.T)
         lengths = np.hypot(*steps.T)
         return np.ascontiguousarray(middles), sensitivities * lengths, steps / lengths[:, None]
@@ -300,9 +305,9 @@ class AsBuiltPad:
         rotated = built @ rotation
         shift = (planned - rotated)[within].mean(axis=0)
         # 2. splines of the offsets that remain
-        offset = (rotated + shift - planned).reshape(len(self.fibres), N_ELEMENTS, 2)
-        basis = evaluate_along_fibre(np.eye(N_OFFSET), N_ELEMENTS)[0][0].T
-        coefficients = np.linalg.lstsq(basis, offset.transpose(1, 0, 2).reshape(N_ELEMENTS, -1), rcond=None)[0]
+        offset = (rotated + shift - planned).reshape(len(self.fibres), self.plan.elements, 2)
+        basis = evaluate_along_fibre(np.eye(N_OFFSET), self.plan.elements)[0][0].T
+        coefficients = np.linalg.lstsq(basis, offset.transpose(1, 0, 2).reshape(self.plan.elements, -1), rcond=None)[0]
         # 3. the transform rotates about the middle of the pad, step 1 about its corner
         values, middle = self.values.copy(), np.array(self.plan.layout.extent) / 2
         values[0] += turn

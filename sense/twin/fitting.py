@@ -15,7 +15,6 @@ from padforge.design.twin import TwinScatter
 from padforge.sense.arrays import MIN_SCALE_V, Array, Indices, Mask
 from padforge.sense.twin.as_built import (
     N_CHANNEL,
-    N_ELEMENTS,
     N_OFFSET,
     N_SENSITIVITY,
     N_SHARED,
@@ -34,7 +33,7 @@ TRANSFORM_STD = np.array([0.1, 5.0, 5.0, 0.05])
 ANGULAR_STD = 0.3  # prior standard deviation of the splines of v
 PROFILE_BEND = 0.15
 """Prior standard deviation of the second differences of a profile's splines, as a share of its largest weight."""
-OFFSET_RANGE_MM, SENSITIVITY_RANGE = (0.1, 1.2), (0.02, 0.4)
+OFFSET_RANGE_MM, SENSITIVITY_RANGE = (0.1, 1.2), (0.02, 0.9)
 """Ranges of the standard deviations of lateral offset, mm, and log-sensitivity."""
 FIRST_PRIOR_STEP = 3  # step from which these are estimated; before, a poor fit would pass for large offsets
 TOLERANCE = 1e-4  # relative change of the objective at which a fit has converged
@@ -72,9 +71,9 @@ class AsBuiltFit:
     log_evidence: float  # logarithm of the marginal likelihood, to compare fits to the same presses
 
     def offset_std(self, channel: int) -> Array:
-        """Compute the standard deviation of the lateral offset along a channel's fibre (N_ELEMENTS,), grid units."""
-        _, first, values = evaluate_along_fibre(np.zeros((1, N_OFFSET)), N_ELEMENTS)
-        basis = np.zeros((N_ELEMENTS, N_OFFSET))
+        """Compute the standard deviation of the lateral offset along a channel's fibre (E,), grid units."""
+        _, first, values = evaluate_along_fibre(np.zeros((1, N_OFFSET)), self.pad.plan.elements)
+        basis = np.zeros((self.pad.plan.elements, N_OFFSET))
         np.put_along_axis(basis, first[:, None] + np.arange(4), values[0], axis=1)
         blocks = [self.covariance[np.ix_(axis, axis)] for axis in np.split(channel_indices(channel)[OFFSET], 2)]
         return np.sqrt(np.maximum(sum(np.einsum("fj,jk,fk->f", basis, block, basis) for block in blocks), 0))

@@ -10,10 +10,8 @@
 """
 
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment, minimize
 from threadpoolctl import threadpool_limits
 
 from padforge.design import Morphology
@@ -24,7 +22,6 @@ from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import (
     PARTS,
-    PlanTransform,
     Twin,
     TwinChannel,
     TwinPart,
@@ -36,11 +33,19 @@ from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.built_pad import PressParts
 from padforge.sense.simulation.simulated_recording import measure_rig_settings
-from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
+from padforge.sense.twin.as_built import N_COARSE, AsBuiltPad, PadPlan
 from padforge.sense.twin.contact_fit import ContactFit, fit_contact
 from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built, gain_wander
 from padforge.sense.twin.press_parts import smooth_maps, split_presses
-from padforge.sense.twin.responses import Responses, compute_responses, fit_gp, normalize, select_one_depth
+from padforge.sense.twin.responses import (
+    Responses,
+    compute_responses,
+    explained_by_gp,
+    fit_gp,
+    normalize,
+    select_one_depth,
+)
+from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images
 
 PROFILE_POINTS, MIN_WEIGHT = 13, 0.01  # points of the sensitivity profile of a twin, and the least weight that counts
 MIN_PRESSES = 60
@@ -48,134 +53,21 @@ MIN_SIDE = 0.5
 """Least width and height of what was pressed, as a share of the rectangle half a pitch beyond the outermost fibres."""
 HELD_OUT = 0.15  # share of the presses that are held out
 MAX_PRESSES = 2000  # presses of the last fit
-N_CANDIDATES, N_COMPARED = 8, 150
-"""Wirings that are fitted, and presses by which they are compared: residuals are correlated over about half a grid
-unit, so that more presses would count the same evidence twice."""
+N_CANDIDATES, N_COMPARED = 4, 250
+"""Wirings that are fitted beside the images of the best, and presses by which they are compared: residuals are
+correlated over about half a grid unit, so that more presses would count the same evidence twice."""
+LOG_ODDS_IN_ORDER, LOG_ODDS_POSE = 14.0, 4.0
+"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. Half of the belief in either
+among 6! wirings and 8 poses would be 7 and 2; they count twice, as do the presses, whose residuals are correlated."""
 N_CONTACT = 400  # presses that a contact is fitted to, for the same reason
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
-MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live, and another wiring is ruled out
+MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live
+MIN_LOG_ODDS = 20.0  # from which on another wiring is ruled out
 SAME_LOG_EVIDENCE = 1.0  # difference of log evidence below which two fits are equally good
 MIN_ANGULAR_GAIN = 0.01  # share of the variance of held-out responses that an angular term must explain
 MAP_STRIDE = 3  # every such node of the maps of residuals is kept: they change over several
 MIN_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else the recording is of another pad."""
-
-PROFILE_WIDTH = 0.55  # standard deviation of the Gaussian profile that is tried first, grid units
-N_SCORED = 400  # presses by which transforms are scored
-ELEMENT_STRIDE = 4  # every such element of a fibre is used
-SHIFTS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # shifts that are tried along each axis, grid units
-N_REFINED = 24  # transforms of the grid that are refined
-FIRST_STEPS = np.array([0.06, 0.25, 0.25, 0.03, 0.15])
-"""First steps of the refinement: turn (rad), shift (grid units), scale, and logarithm of the profile's width."""
-STEP_COST = 0.002  # cost of a change by one such step in all, in shares of the variance explained
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """A candidate for the wiring and pose of a pad."""
-
-    transform: PlanTransform
-    width: float  # standard deviation of the Gaussian profile, grid units
-    fibres: tuple[int, ...]  # the fibre that each channel reads
-    match: float  # mean squared correlation, 0 to 1
-
-
-class _Scorer:
-    """Finds the best wiring for a plan transform, by correlation with responses under a Gaussian profile.
-
-    A transform is scored by the mean over channels of squared correlations of one sign, each channel assigned to
-    another fibre.
-    """
-
-    def __init__(self, plan: PadPlan, responses: Responses, rng: np.random.Generator) -> None:
-        rows = np.sort(rng.choice(len(responses), min(N_SCORED, len(responses)), replace=False))
-        self._plan, self._responses = plan, responses.select(rows)
-        self._paths, self._lengths = plan.paths[:, ::ELEMENT_STRIDE], plan.lengths[:, ::ELEMENT_STRIDE]
-        self._volts = _standardize(self._responses.volts, self._responses.valid)
-
-    def __call__(self, transform: PlanTransform, width: float) -> Wiring:
-        positions = self._plan.to_grid(transform.to_plan(self._responses.positions_mm))
-        points = self._paths.reshape(-1, 2)
-        squares = (points**2).sum(axis=1) + (positions**2).sum(axis=1)[:, None] - 2 * positions @ points.T
-        weights = np.exp(squares * (-0.5 / width**2)).reshape(len(positions), *self._lengths.shape)
-        signals, valid = np.einsum("qfi,fi->qf", weights, self._lengths), self._responses.valid
-        if valid.all():
-            correlations = _standardize(signals, valid[:, :1]).T @ self._volts
-        else:
-            columns = enumerate(self._volts.T)
-            correlations = np.column_stack([_standardize(signals, valid[:, c, None]).T @ volts for c, volts in columns])
-        match, fibres = assign_fibres(correlations)
-        return Wiring(transform, width, fibres, match)
-
-
-def _standardize(values: Array, valid: Mask) -> Array:
-    """Centre the columns of values (Q, n) and scale them to unit length; 0 where invalid, or all the same."""
-    mean = np.where(valid, values, 0).sum(axis=0) / np.maximum(np.sum(valid, axis=0), 1)
-    values = np.where(valid, values - mean, 0.0)
-    norms = np.linalg.norm(values, axis=0)
-    return np.divide(values, norms, out=np.zeros_like(values), where=norms > 0)
-
-
-def assign_fibres(correlations: Array) -> tuple[float, tuple[int, ...]]:
-    """Return the mean squared correlation and the fibre of each channel, for the largest ones (F, C) of one sign."""
-    best: tuple[float, tuple[int, ...]] = (-1.0, ())
-    for sign in (1, -1):
-        squares = np.maximum(sign * correlations, 0) ** 2
-        fibres, channels = linear_sum_assignment(-squares)
-        match = float(squares[fibres, channels].mean())
-        if match > best[0]:
-            best = match, tuple(fibres[np.argsort(channels)].tolist())
-    return best
-
-
-def find_wirings(
-    plan: PadPlan,
-    responses: Responses,
-    rng: np.random.Generator,
-    on_progress: OnProgress = ignore_progress,
-) -> list[Wiring]:
-    """Search for wirings of the channels of `responses`, best first, each with its best transform.
-
-    Transforms on a grid are tried, and the best refined by Nelder-Mead; there is no first guess.
-    `rng` draws presses where there are many, and `on_progress` is called with (refined, total, "wiring").
-    """
-    scorer, unit_mm = _Scorer(plan, responses, rng), plan.layout.unit_mm
-    middle_mm = responses.positions_mm.min(axis=0) / 2 + responses.positions_mm.max(axis=0) / 2
-    tried = []
-    for mirrored, quarter, x, y in product((False, True), range(4), SHIFTS, SHIFTS):
-        transform = PlanTransform(mirrored, 90.0 * quarter)
-        pressed_mm = transform.rotate(middle_mm[None])[0]
-        if np.abs(pressed_mm).max() <= unit_mm:  # the arm's frame is about the pad's own middle
-            pressed_mm = np.zeros(2)
-        shift_mm = np.array([x, y]) * unit_mm - pressed_mm
-        tried.append(scorer(replace(transform, shift_mm=tuple(shift_mm.tolist())), PROFILE_WIDTH))
-    tried.sort(key=lambda wiring: -wiring.match)
-    best: dict[tuple[bool, tuple[int, ...]], Wiring] = {}
-    for number, wiring in enumerate(tried[:N_REFINED]):
-        on_progress(number, N_REFINED, "wiring")
-        refined = _refine(scorer, wiring, unit_mm)
-        key = refined.transform.mirrored, refined.fibres
-        if key not in best or best[key].match < refined.match:
-            best[key] = refined
-    return sorted(best.values(), key=lambda wiring: -wiring.match)
-
-
-def _refine(scorer: _Scorer, wiring: Wiring, unit_mm: float) -> Wiring:
-    """Return the best wiring near one."""
-    start, unit = wiring.transform, FIRST_STEPS * [1, unit_mm, unit_mm, 1, 1]
-
-    def evaluate(change: Array) -> Wiring:
-        turn, x, y, scale, width = (change * unit).tolist()
-        turn_deg, shift_mm = start.turn_deg + float(np.degrees(turn)), (start.shift_mm[0] + x, start.shift_mm[1] + y)
-        transform = PlanTransform(start.mirrored, turn_deg, shift_mm, max(start.scale + scale, 0.5))
-        return scorer(transform, wiring.width * float(np.exp(width)))
-
-    def cost(change: Array) -> float:
-        return -evaluate(change).match + STEP_COST * float(change @ change) / len(change)
-
-    simplex = np.vstack([np.zeros(len(unit)), np.eye(len(unit))])
-    options = {"maxfev": 120, "initial_simplex": simplex}
-    return evaluate(minimize(cost, np.zeros(len(unit)), method="Nelder-Mead", options=options).x)
 
 
 @dataclass(frozen=True)
@@ -201,8 +93,8 @@ class Identification:
     fit: AsBuiltFit
     live: Indices  # (C',)
     explained: Array  # (C',), share of the variance of held-out responses
+    explained_smooth: Array  # (C',), the same by a smooth function of the position, without any pad
     explained_on_plan: float  # the same if every fibre lay as planned, mean over channels
-    explained_by_straight: float | None  # the same of straight fibres in their best pose; None for a straight plan
     noise_v: Array  # (C,), scatter of the responses that neither position nor history explains
     noise: float  # that of live channels as a share of full scale
     alternatives: list[Wiring]  # those that the presses do not rule out
@@ -357,24 +249,12 @@ def identify_pad(
     compared = training.select(np.arange(min(N_COMPARED, len(training))))
 
     # 3. Wiring
-    plan = PadPlan.from_morphology(pad)
-    candidates = _fit_candidates(plan, training, compared, rng, on_progress)
-    if (match := candidates[0][0].match) < MIN_MATCH:
-        raise InputError(
-            f"the recording does not go with this pad: its fibres explain {match:.0%} of the responses, allowed is"
-            f" {MIN_MATCH:.0%} or more"
-        )
-    ranked = _rank_as_built(candidates, compared)
-    wiring, best = ranked[0]
-    straight_plan = PadPlan.from_morphology(Morphology.straight(pad.layout))
-    explained_by_straight = None
-    if not np.allclose(straight_plan.paths, plan.paths):
-        straight = _fit_candidates(straight_plan, training, compared, rng, on_progress)
-        explained_by_straight = _explained_on_plan([fit for _, fit in straight], training, held_out)
+    candidates = _fit_candidates(PadPlan.from_morphology(pad, N_COARSE), training, compared, live, rng, on_progress)
+    plan, best = PadPlan.from_morphology(pad), candidates[0]
 
     # 4. All presses
     on_progress(0, 3, "paths")
-    fit = _fit_all(best.pad, training, on_progress)
+    fit = _fit_all(replace(best.fit.pad, plan=plan), training, on_progress)
 
     # 5. Parts of a press
     readings, parts, residual, pressed = None, {}, None, training
@@ -388,7 +268,7 @@ def identify_pad(
         readings = TwinReadings(**statistics | split.rig, gain_wander=wander)
 
     # 6. Contact
-    on_plan = next(planned.pad for candidate, planned in candidates if candidate is wiring)
+    on_plan = replace(best.on_plan.pad, plan=plan)
     measured = _measure_contact(_as_deep(contact, recording), fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)
     held = parts["held"].pad if parts else fit.pad
@@ -402,12 +282,12 @@ def identify_pad(
         fit=fit,
         live=live,
         explained=held_out.explained_variance(fit.pad.predict(held_out.positions_mm)),
-        explained_on_plan=_explained_on_plan([on_plan for _, on_plan in candidates], training, held_out),
-        explained_by_straight=explained_by_straight,
+        explained_on_plan=_explained_on_plan(candidates, plan, training, held_out),
+        explained_smooth=explained_by_gp(training, held_out, pad.unit_mm),
         noise_v=noise_v,
         noise=float(noise_v[live].mean() / full_scale_v.mean()),
         alternatives=[
-            wiring for wiring, other in ranked[1:] if best.log_evidence - other.log_evidence < MIN_LOG_BAYES_FACTOR
+            other.wiring for other in candidates[1:] if best.log_posterior - other.fit.log_evidence < MIN_LOG_ODDS
         ],
         readings=readings,
         parts=parts,
@@ -435,33 +315,82 @@ def _check_positions(positions_mm: Array, pad: Morphology) -> None:
         raise InputError(f"the presses lie within {spans[0]:.0f} x {spans[1]:.0f} mm, allowed is what spans {allowed}")
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """A wiring and its fits, of fibres that lie as planned and as built."""
+
+    wiring: Wiring
+    on_plan: AsBuiltFit
+    fit: AsBuiltFit
+    log_prior: float
+
+    @property
+    def log_posterior(self) -> float:
+        """Logarithm of its probability, up to a constant."""
+        return self.fit.log_evidence + self.log_prior
+
+    @property
+    def turn_deg(self) -> float:
+        """How far the pad lay turned, from 0 to 180."""
+        return abs(self.fit.pad.transform.turn_deg)
+
+
 def _fit_candidates(
-    plan: PadPlan, training: Responses, compared: Responses, rng: np.random.Generator, on_progress: OnProgress
-) -> list[tuple[Wiring, AsBuiltFit]]:
-    """Return the best wirings on a plan, best first, each with a fit in which fibres lie as planned."""
+    plan: PadPlan,
+    training: Responses,
+    compared: Responses,
+    live: Indices,
+    rng: np.random.Generator,
+    on_progress: OnProgress,
+) -> list[_Candidate]:
+    """Fit the best wirings, the stated one, and images of the most probable, which is first.
+
+    Of equally probable ones, the one rotated least is first.
+    """
+    candidates: dict[tuple[bool, tuple[int, ...]], _Candidate] = {}
+
+    def fit(wirings: list[Wiring]) -> _Candidate:
+        for wiring in wirings:
+            start = AsBuiltPad.from_plan(plan, wiring.fibres, wiring.transform, wiring.width)
+            on_plan = fit_as_built(start.fit_gains(compared), compared, Priors())
+            as_built = fit_as_built(on_plan.pad, compared, FIRST_PRIORS)
+            is_unturned = not wiring.transform.mirrored and abs(as_built.pad.transform.turn_deg) < 45
+            log_prior = LOG_ODDS_IN_ORDER * (wiring.fibres == tuple(live.tolist())) + LOG_ODDS_POSE * is_unturned
+            key, candidate = (
+                (wiring.transform.mirrored, wiring.fibres),
+                _Candidate(wiring, on_plan, as_built, log_prior),
+            )
+            if key not in candidates or candidates[key].log_posterior < candidate.log_posterior:
+                candidates[key] = candidate
+        return max(candidates.values(), key=lambda candidate: candidate.log_posterior)
+
     wirings = find_wirings(plan, training, rng, on_progress)[:N_CANDIDATES]
-    starts = [AsBuiltPad.from_plan(plan, wiring.fibres, wiring.transform, wiring.width) for wiring in wirings]
-    fits = [fit_as_built(start.fit_gains(compared), compared, Priors()) for start in starts]
-    return list(zip(wirings, fits, strict=True))
+    if (match := wirings[0].match) < MIN_MATCH:
+        raise InputError(
+            f"the recording does not go with this pad: its fibres explain {match:.0%} of the responses, allowed is"
+            f" {MIN_MATCH:.0%} or more"
+        )
+    if live.max() < plan.layout.fibres:
+        wirings.append(as_stated(live, training, plan.layout.unit_mm))
+    best = fit(wirings)
+    best = fit(images(replace(best.wiring, transform=best.fit.pad.transform), plan.layout))
+    for key, candidate in candidates.items():  # which of them is best is decided by where they converge
+        if candidate.log_posterior > best.log_posterior - 2 * MIN_LOG_ODDS:
+            refit = fit_as_built(candidate.fit.pad, compared, candidate.fit.priors)
+            candidates[key] = max(candidate, replace(candidate, fit=refit), key=lambda each: each.log_posterior)
+    best = max(candidates.values(), key=lambda candidate: candidate.log_posterior)
+
+    def rank(candidate: _Candidate) -> tuple[float, float]:
+        is_best = candidate.log_posterior > best.log_posterior - SAME_LOG_EVIDENCE
+        return candidate.turn_deg if is_best else 360.0, -candidate.log_posterior
+
+    return sorted(candidates.values(), key=rank)
 
 
-def _rank_as_built(candidates: list[tuple[Wiring, AsBuiltFit]], compared: Responses) -> list[tuple[Wiring, AsBuiltFit]]:
-    """Fit the candidates as built, and sort them by evidence; of equally good ones, the one rotated least is first."""
-    fits = [(wiring, fit_as_built(on_plan.pad, compared, FIRST_PRIORS)) for wiring, on_plan in candidates]
-    best = max(fit.log_evidence for _, fit in fits)
-
-    def rank(candidate: tuple[Wiring, AsBuiltFit]) -> tuple[float, float]:
-        fit = candidate[1]
-        turn_deg = abs(fit.pad.transform.turn_deg)
-        return turn_deg if fit.log_evidence > best - SAME_LOG_EVIDENCE else 360.0, -fit.log_evidence
-
-    return sorted(fits, key=rank)
-
-
-def _explained_on_plan(fits: list[AsBuiltFit], training: Responses, held_out: Responses) -> float:
+def _explained_on_plan(candidates: list[_Candidate], plan: PadPlan, training: Responses, held_out: Responses) -> float:
     """Return the mean explained variance of the most probable pad that lies on its plan, fitted to all presses."""
-    best = max(fits, key=lambda fit: fit.log_evidence)
-    pad = fit_as_built(best.pad, training, Priors()).pad
+    best = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
+    pad = fit_as_built(replace(best.pad, plan=plan), training, Priors()).pad
     return float(held_out.explained_variance(pad.predict(held_out.positions_mm)).mean())
 
 

@@ -108,37 +108,74 @@ def near_pairs(positions_mm: Array) -> tuple[Indices, Indices]:
     return first, second
 
 
-def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
-    """Fit a Gaussian process over the position to each channel, by maximum likelihood over kernel width and noise.
+@dataclass(frozen=True)
+class GaussianProcess:
+    """A smooth function of the position, for one channel."""
 
-    Returns the standard deviation (C,) of what no smooth function of position explains, NaN where too few presses are
-    valid; and the log Bayes factor (C,): log-likelihood of a smooth function minus that of noise alone.
+    points: Array  # (n, 2), positions of the presses it was fitted to, grid units
+    width: float  # standard deviation of its kernel, grid units
+    weights: Array  # (n,), V
+    mean_v: float
+    noise_v: float  # standard deviation of what it does not explain
+    log_bayes_factor: float  # log-likelihood of a smooth function minus that of noise alone
+
+    def predict(self, points: Array) -> Array:
+        """Evaluate it at points (Q, 2), grid units; shape (Q,), V."""
+        return self.mean_v + np.exp(_squares(points, self.points) * (-0.5 / self.width**2)) @ self.weights
+
+
+def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess | None]:
+    """Fit a Gaussian process to each channel, by maximum likelihood over kernel width and noise.
+
+    None where fewer than MIN_GP_PRESSES presses are valid.
     """
-    positions = responses.positions_mm[:GP_PRESSES] / unit_mm
-    squares = ((positions[:, None, :] - positions) ** 2).sum(axis=2)
+    points = responses.positions_mm[:GP_PRESSES] / unit_mm
+    squares = _squares(points, points)
 
     @cache  # most channels are valid in the same presses
     def eigen(valid: bytes, width: float) -> tuple[np.ndarray, np.ndarray]:
         rows = np.frombuffer(valid, bool)
         return np.linalg.eigh(np.exp(squares[np.ix_(rows, rows)] * (-0.5 / width**2)))
 
-    channels = responses.volts.shape[1]
-    noise, log_bayes_factor = np.full(channels, np.nan), np.zeros(channels)
-    for channel in range(channels):
+    out: list[GaussianProcess | None] = []
+    for channel in range(responses.volts.shape[1]):
         valid = np.ascontiguousarray(responses.valid[:GP_PRESSES, channel])
         if valid.sum() < MIN_GP_PRESSES:
+            out.append(None)
             continue
         volts = responses.volts[:GP_PRESSES, channel][valid]
-        fits = [_fit_ratio(*eigen(valid.tobytes(), width), volts - volts.mean()) for width in GP_WIDTHS]
-        noise[channel], log_bayes_factor[channel] = max(fits, key=lambda fit: fit[1])
-    return noise, log_bayes_factor
+        mean_v = float(volts.mean())
+        fits = [(*_fit_ratio(*eigen(valid.tobytes(), width), volts - mean_v), width) for width in GP_WIDTHS]
+        noise_v, log_bayes_factor, weights, width = max(fits, key=lambda fit: fit[1])
+        out.append(GaussianProcess(points[valid], width, weights, mean_v, noise_v, log_bayes_factor))
+    return out
 
 
-def _fit_ratio(eigenvalues: np.ndarray, eigenvectors: np.ndarray, volts: np.ndarray) -> tuple[float, float]:
-    """Return the noise and the log Bayes factor of the most likely of GP_RATIOS."""
-    projected = (eigenvectors.T @ volts) ** 2
+def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
+    """Return the `noise_v` (C,), NaN where too few presses are valid, and `log_bayes_factor` (C,) of `fit_gps`."""
+    gps = fit_gps(responses, unit_mm)
+    noise_v = np.array([np.nan if gp is None else gp.noise_v for gp in gps])
+    return noise_v, np.array([0.0 if gp is None else gp.log_bayes_factor for gp in gps])
+
+
+def explained_by_gp(training: Responses, held_out: Responses, unit_mm: float) -> Array:
+    """Return the share of the variance of held-out responses that a smooth function of the position explains; (C,)."""
+    gps, points = fit_gps(training, unit_mm), held_out.positions_mm / unit_mm
+    predicted = [np.zeros(len(points)) if gp is None else gp.predict(points) for gp in gps]
+    return held_out.explained_variance(np.column_stack(predicted))
+
+
+def _squares(points: Array, others: Array) -> Array:
+    """Return the squared distances (Q, n) of points (Q, 2) from others (n, 2)."""
+    return ((points[:, None, :] - others) ** 2).sum(axis=2)
+
+
+def _fit_ratio(eigenvalues: np.ndarray, eigenvectors: np.ndarray, volts: np.ndarray) -> tuple[float, float, Array]:
+    """Return the noise and the log Bayes factor of the most likely of GP_RATIOS, and the weights (n,) of its mean."""
+    projected = eigenvectors.T @ volts
     variances = 1 + GP_RATIOS[:, None] * np.maximum(eigenvalues, 0)
-    noise_var = np.maximum((projected / variances).mean(axis=1), 1e-300)
+    noise_var = np.maximum((projected**2 / variances).mean(axis=1), 1e-300)
     log_likelihood = -0.5 * (len(volts) * np.log(noise_var) + np.log(variances).sum(axis=1))
     best = int(np.argmax(log_likelihood))
-    return float(np.sqrt(noise_var[best])), float(log_likelihood[best] - log_likelihood[0])
+    weights = GP_RATIOS[best] * (eigenvectors @ (projected / variances[best]))
+    return float(np.sqrt(noise_var[best])), float(log_likelihood[best] - log_likelihood[0]), weights

@@ -1,4 +1,4 @@
-"""Fits of as-built pads, of their wiring and of their scatter, on pads whose truth is known."""
+"""Fits of as-built pads and of their scatter, on pads whose truth is known."""
 
 from dataclasses import replace
 
@@ -7,7 +7,6 @@ import pytest
 
 from padforge.sense.twin.as_built import OFFSET, SENSITIVITY, AsBuiltPad, PadPlan
 from padforge.sense.twin.fitting import Priors, estimate_scatter, fit_as_built
-from padforge.sense.twin.identification import find_wirings
 from padforge.sense.twin.responses import Responses
 
 from .conftest import PLAN, simulate_responses
@@ -83,16 +82,3 @@ def test_estimate_scatter_recovers_share_common_and_floor(printed, fitted, share
     assert scatter.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35, abs=0.25 * noise_v.mean())
     if share:
         assert scatter.common == pytest.approx(common, abs=0.15)
-
-
-@pytest.mark.parametrize("missing", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_find_wirings_puts_the_true_one_first(printed, responses, missing) -> None:
-    if missing:
-        volts, valid = responses.volts.copy(), responses.valid.copy()
-        volts[::3, 0], valid[::3, 0] = 5.0, False
-        responses = Responses(responses.positions_mm, volts, valid)
-    best = find_wirings(PadPlan.from_morphology(PLAN), responses, np.random.default_rng(0))[0]
-    assert best.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
-    assert best.transform.mirrored
-    assert np.hypot(*np.subtract(best.transform.shift_mm, printed.frame.shift_mm)) < 1.0
-    assert best.match > 0.9

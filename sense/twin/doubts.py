@@ -1,0 +1,63 @@
+"""Doubts about an identified pad: channels that its fibres do not explain, and wirings that fit nearly as well."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from padforge.sense.arrays import Array, Mask
+from padforge.sense.twin.identification import Identification
+
+MAX_UNEXPLAINED = 0.08
+"""Share of the variance of held-out responses that a smooth function of the position may explain beyond the twin. On
+the pad that was recorded it is at most 0.03."""
+MAX_OFFSET_MM, MAX_OFFSET = 3.0, 0.5
+"""How far a fibre may lie beside its plan, rms in mm and in grid units, whichever is less. Pads are laid to a
+millimetre or two, and beyond half a pitch the plan of another fibre is nearer."""
+
+
+def find_doubts(result: Identification) -> list[str]:
+    """Return what makes an identification doubtful, each in a line; channels and fibres count from 1."""
+    unfit = list(_channels_that_do_not_fit(result))
+    lines = [line for _, line in unfit]
+    channels = {channel for channel, _ in unfit}
+    if 2 * len(channels) >= len(result.live):
+        lines.insert(0, f"{len(channels)} of {len(result.live)} channels do not fit: is it the recording of this pad?")
+    return lines + list(_other_wirings(result))
+
+
+def offset_mm(offset: Array, within: Mask) -> float:
+    """Return the rms of a lateral offset along a fibre (F,), where it was pressed; 0 where it was not."""
+    return float(np.sqrt((offset[within] ** 2).mean())) if within.any() else 0.0
+
+
+def _channels_that_do_not_fit(result: Identification) -> Iterator[tuple[int, str]]:
+    allowed_mm = min(MAX_OFFSET_MM, MAX_OFFSET * result.pad.unit_mm)
+    explained = zip(result.explained.tolist(), result.explained_smooth.tolist(), strict=True)
+    for row, ((by_fibre, smooth), (offset, _, within)) in enumerate(
+        zip(explained, result.lateral_offsets_mm(), strict=True)
+    ):
+        channel, fibre = int(result.live[row]) + 1, result.fit.pad.fibres[row] + 1
+        if by_fibre < smooth - MAX_UNEXPLAINED:
+            yield (
+                channel,
+                f"channel {channel} does not fit: fibre {fibre} explains {by_fibre:.2f} of held-out responses, a smooth"
+                f" function of the position {smooth:.2f}",
+            )
+        if (beside_mm := offset_mm(offset, within)) > allowed_mm:
+            yield (
+                channel,
+                f"channel {channel} does not fit: fibre {fibre} lies {beside_mm:.1f} mm beside its plan, allowed is"
+                f" {allowed_mm:.1f}",
+            )
+
+
+def _other_wirings(result: Identification) -> Iterator[str]:
+    if not result.alternatives:
+        return
+    count = len(result.alternatives)
+    others = "pose or wiring explains" if count == 1 else "poses or wirings explain"
+    yield f"{count} other {others} the presses nearly as well"
+    for row, fibre in enumerate(result.fit.pad.fibres):
+        if read := sorted({wiring.fibres[row] + 1 for wiring in result.alternatives} - {fibre + 1}):
+            fibres = " or ".join(map(str, read))
+            yield f"channel {result.live[row] + 1} may read fibre {fibres} in place of {fibre + 1}"

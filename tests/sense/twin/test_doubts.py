@@ -1,0 +1,88 @@
+"""What is said of pads that are not the one recorded, and not said of those that are."""
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from padforge.design import Morphology
+from padforge.sense import RigSettings, simulate
+from padforge.sense.twin import identification
+from padforge.sense.twin.doubts import find_doubts
+from padforge.sense.twin.identification import Identification, identify_pad
+from padforge.sense.twin.wiring import Wiring
+from tests.helpers.rigs import ideal_rig
+
+from .conftest import PLAN
+
+
+@pytest.fixture(scope="module")
+def result() -> Identification:
+    """A pad that lies as planned, without its contact and its parts."""
+    return identified(PLAN, PLAN, ideal_rig(presses=120, seed=1))
+
+
+def identified(built: Morphology, told: Morphology, rig: RigSettings) -> Identification:
+    """Identify a simulated pad by a plan; its contact and the parts of presses, which take longest, do not count."""
+    contact = patch.object(identification, "_measure_contact", lambda *_: None)
+    with contact, patch.object(identification, "measure_rig_settings", lambda _: {}):
+        return identify_pad(simulate(built, rig), told, seed=1)
+
+
+def moved(pad: Morphology, fibre: int, pitches: float) -> Morphology:
+    """Move the inner knots of a fibre across its axis, within the pad."""
+    knots, axis = pad.knots.copy(), 1 - pad.layout.family(fibre)
+    inner = knots[fibre, 1:-1, axis] + pitches
+    knots[fibre, 1:-1, axis] = np.clip(inner, 0.05, pad.layout.extent[axis] - 0.05)
+    return Morphology.from_layout(knots, pad.layout)
+
+
+def test_nothing_is_doubted_of_a_pad_that_lies_as_planned(result: Identification) -> None:
+    assert result.fit.pad.fibres == (0, 1, 2, 3)
+    assert find_doubts(result) == []
+
+
+def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_doubted(result: Identification) -> None:
+    explained = result.explained.copy()
+    explained[2] = 0.2
+    (doubt,) = find_doubts(replace(result, explained=explained))
+    assert doubt.startswith(f"channel 3 does not fit: fibre {result.fit.pad.fibres[2] + 1} explains 0.20 of held-out")
+    whole, *channels = find_doubts(replace(result, explained=result.explained - 0.2))
+    assert whole == "4 of 4 channels do not fit: is it the recording of this pad?"
+    assert len(channels) == 4
+
+
+def test_a_fibre_far_beside_its_plan_is_doubted(result: Identification) -> None:
+    built = result.fit.pad
+    far = replace(result.fit, pad=replace(built, plan=replace(built.plan, paths=built.plan.paths.copy())))
+    values = built.values.copy()
+    rows = identification.AsBuiltPad.channel_values.fget(replace(built, values=values))  # a view
+    rows[1, 2 : 2 + 12] += 0.4  # 4.5 mm along x
+    beside = find_doubts(replace(result, fit=replace(far, pad=replace(built, values=values))))
+    assert [line.split(" does")[0] for line in beside if "mm beside its plan, allowed is 3.0" in line] == ["channel 2"]
+
+
+def test_a_second_wiring_is_told_of_the_channels_that_it_changes(result: Identification) -> None:
+    swapped = Wiring(result.fit.pad.transform, 0.5, (1, 0, 2, 3), 0.9)
+    count, *channels = find_doubts(replace(result, alternatives=[swapped]))
+    assert count.startswith("1 other pose or wiring explains")
+    assert channels == ["channel 1 may read fibre 2 in place of 1", "channel 2 may read fibre 1 in place of 2"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_another_pad_is_doubted_and_the_recorded_one_is_not(seed: int) -> None:
+    rig = RigSettings(presses=250, seed=seed)
+    built = Morphology.random(3, knots=3, seed=seed)
+    right, wrong = (identified(built, told, rig) for told in (built, Morphology.random(3, knots=4, seed=seed + 10)))
+    assert find_doubts(right) == []
+    assert right.fit.pad.fibres == (0, 1, 2, 3, 4, 5)
+    assert any("does not fit" in doubt for doubt in find_doubts(wrong))
+
+
+@pytest.mark.slow
+def test_a_fibre_moved_by_a_pitch_is_doubted() -> None:
+    told = Morphology.random(3, knots=3, seed=1)
+    result = identified(moved(told, 2, 1.0), told, RigSettings(presses=250, seed=60))
+    assert any("channel 3 does not fit" in doubt for doubt in find_doubts(result))
