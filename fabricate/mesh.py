@@ -14,13 +14,16 @@ import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 from numpy.typing import NDArray
 
-from padforge.design.common.files import check_file
+from padforge.design.common.files import check_file, read_bytes
 from padforge.design.common.validation import InputError, check_path
 from padforge.design.morphology import Array
 from padforge.fabricate.mould import BODY_COLOURS, Body, Prism, mould_body
 from padforge.fabricate.plan import Plan, polygon_rings
 
 Numbers = NDArray[np.int64]
+
+_STL_HEADER = b"padforge, mm".ljust(80)
+_STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 SEPARATION_MM = 1e-4
 """Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
@@ -100,11 +103,10 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
     corners = vertices[triangles].astype("<f4")
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    records = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    records = np.zeros(len(corners), _STL_RECORD)
     records["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
     records["corners"] = corners
-    header = b"padforge, mm".ljust(80)
-    path.write_bytes(header + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
+    path.write_bytes(_STL_HEADER + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
@@ -147,9 +149,33 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     Raises:
         InputError: the file is missing, or not a mesh with triangles.
     """
+    path = check_file(check_path("path", path))
+    corners = _read_binary_stl(path) if path.suffix.lower() == ".stl" else None
+    if corners is None:
+        vertices, triangles = _read_by_trimesh(path)
+    else:
+        vertices, triangles = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise InputError(f"{path}: holds no triangles that can be read, or is torn")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max() > MAX_COORDINATE_MM:
+        raise InputError(f"{path}: vertices hold NaN, infinity or more than {MAX_COORDINATE_MM:g}")
+    return vertices.astype(np.float64), triangles
+
+
+def _read_binary_stl(path: Path) -> NDArray[np.float32] | None:
+    """Return the corners (m, 3, 3) of a binary STL; None if the file is not as long as its number of triangles says."""
+    content = read_bytes(path)
+    start = len(_STL_HEADER) + 4
+    n_triangles = int.from_bytes(content[start - 4 : start], "little")
+    if len(content) != start + n_triangles * _STL_RECORD.itemsize:
+        return None
+    return np.frombuffer(content, _STL_RECORD, offset=start)["corners"]
+
+
+def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
+    """Read vertices and triangles of a 3MF, or of an STL that is text."""
     import trimesh
 
-    path = check_file(check_path("path", path))
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it logs on top of raising
     try:
         if path.suffix.lower() == ".3mf":
@@ -159,16 +185,11 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
             if scene.units:
                 scene = scene.convert_units("millimeters")
             mesh = scene.to_mesh()
-        vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # readers of broken files raise whatever comes
         missing = isinstance(error, KeyError)
         reason = f"{error} is missing in it" if missing else " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
-    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(f"{path}: holds no triangles that can be read, or is torn")
-    if not np.isfinite(vertices).all() or np.abs(vertices).max() > MAX_COORDINATE_MM:
-        raise InputError(f"{path}: vertices hold NaN, infinity or more than {MAX_COORDINATE_MM:g}")
-    return vertices, triangles
 
 
 def _check_3mf_size(path: Path) -> None:

@@ -161,7 +161,6 @@ def litter(folder: Path) -> list[str]:
     found = [
         path for path in (*folder.rglob("*"), *temporary.rglob("*")) if path.name.startswith((".", "tmp", "padforge-"))
     ]
-    found = [path for path in found if not path.name.startswith("padforge-arm-")]  # a lock that stays
     return [str(path) for path in (*found, *folder.rglob("search"), *folder.rglob("*-unfinished"))]
 
 

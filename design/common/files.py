@@ -2,12 +2,13 @@
 
 A set of files (a pad, a mould, a localizer) is replaced by a write-ahead protocol:
 
-1. The files are written into a temporary folder beside their destinations, and synchronised to the disk.
+1. The files are written into a temporary folder beside their destinations.
 2. That folder is renamed to `EXCHANGE`. This single rename is the commit: from here on readers get the new files.
 3. The files move to their destinations, and the folder is removed.
 
 A run that is killed before step 2 leaves a temporary folder, which the next run removes; one that is killed after it
 leaves `EXCHANGE`, from which readers take the files that have not moved yet, and which the next writer completes.
+Each step is synchronised to the disk before the next one, so that a power cut ends a run as a kill does.
 """
 
 import errno
@@ -156,7 +157,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
     busy = f"{folder}: another run is writing there; wait for its end, or choose another folder"
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     with reraise_write_error(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     try:
         with locked(folder, busy) if fcntl is not None else _lock_file(folder / f"{UNFINISHED}lock", busy):
             recover(folder)
@@ -247,12 +248,13 @@ def atomic_file(path: Path) -> Iterator[Path]:
     with reraise_write_error(path):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it exists and is no file)")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         recover(path.parent)  # else a later recovery would replace the new file by an older one
         with temporary_file(path.parent, path.suffix) as temporary:
             yield temporary
             sync(temporary)
             temporary.replace(path)
+        sync(path.parent)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -266,14 +268,28 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder, and those above it, such that they outlast a power cut; one that exists stays as it is."""
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in created:
+        sync(path.parent)
+
+
 def sync(path: Path) -> None:
     """Synchronise a file, or the names in a folder, to the disk, so that they outlast a power cut; POSIX only."""
-    if os.name == "posix":
+    if os.name != "posix":
+        return
+    try:
         handle = os.open(path, os.O_RDONLY)
         try:
             to_disk(handle)
         finally:
             os.close(handle)
+    except OSError as error:
+        # Of a folder this is more than some network disks can do, and than whoever may write there need be allowed.
+        if error.errno not in (errno.EINVAL, errno.EACCES) or not path.is_dir():
+            raise
 
 
 def to_disk(handle: int) -> None:
@@ -301,7 +317,7 @@ def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     removed as the others come.
     """
     with reraise_write_error(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         recover(folder)
         with temporary_folder(folder) as stage:
             yield stage
@@ -329,11 +345,12 @@ def _commit(stage: Path, folder: Path, without: Collection[str]) -> None:
     inodes = [folder.stat().st_ino, stage.stat().st_ino]
     note = _Note(inodes, names, sorted({*without} - {*names}))
     (stage / _NOTE).write_text(json.dumps(note), encoding="utf-8")
-    for name in (*names, _NOTE):
-        sync(stage / name)
+    for path in (*(stage / name for name in (*names, _NOTE)), stage):
+        sync(path)
     for attempt in count(1):
         try:
             stage.rename(folder / EXCHANGE)
+            sync(folder)
             return
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or attempt == _MAX_ATTEMPTS:
@@ -361,6 +378,7 @@ def recover(folder: Path) -> None:
                 for name in note.names:
                     with suppress(FileNotFoundError):  # it has moved
                         (exchange / name).replace(folder / name)
+                sync(folder)
                 # One rename ends the exchange: if its folder is not removed then, it is a leftover like any other.
                 with suppress(FileNotFoundError):  # on Windows, where another run may have ended it
                     leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")

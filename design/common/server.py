@@ -10,7 +10,6 @@ import errno
 import hashlib
 import hmac
 import json
-import math
 import os
 import secrets
 import socket
@@ -30,7 +29,7 @@ from padforge.design.common.validation import InputError
 
 HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN, MAX_TOKEN = 16, 256  # characters
-MAX_CONNECTIONS = 64  # at once; far fewer than the files that a process may open
+MAX_CONNECTIONS = 64  # at once of admitted clients, and of others; far fewer than the files that a process may open
 POLL_S = 0.05  # interval at which a server checks whether it is to end
 ADMIT_S = 10.0  # time limit for a connection to send a valid request, however slowly it sends
 END_S = 1.0  # time limit for sending the last message at the end
@@ -45,9 +44,14 @@ Handler = Callable[[bytes], Mapping[str, Any] | None]
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):
-    """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate."""
+    """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate.
+
+    Connections that have not authenticated themselves take no place of those that have, and the oldest gives way to a
+    new one: however many there are, a client that authenticates itself at once is served.
+    """
 
     daemon_threads = True
+    request_queue_size = socket.SOMAXCONN  # waiting to be accepted; one that finds no room there comes a second late
     # On Windows the flag would let two programs share a port; elsewhere it frees a port that was used a minute ago.
     allow_reuse_address = os.name == "posix"
 
@@ -67,7 +71,9 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
             example = f"--token {secrets.token_urlsafe(MIN_TOKEN)}"
             raise InputError(f"host is {host!r}, which other machines reach: state a token, such as {example}")
         self.token = token
-        self._connections = dict[Any, float]()  # when they are cut off unless admitted
+        self._lock = threading.Lock()  # of the connections: threads add and remove them
+        self._strangers = dict[Any, float]()  # not admitted, oldest first, and when they are cut off
+        self._admitted = set[Any]()
         reasons = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "this user may not use it"}
         try:
             super().__init__(address, handler)
@@ -94,40 +100,58 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         raise NotImplementedError
 
     def admit(self, request: Any) -> None:
-        """Lift the time limit of a connection, which has authenticated itself."""
-        self._connections[request] = math.inf
+        """Lift the time limit of a connection, which has authenticated itself.
+
+        Raises:
+            ConnectionAbortedError: it was cut off meanwhile, or MAX_CONNECTIONS are admitted already.
+        """
+        with self._lock:
+            if self._strangers.pop(request, None) is None or len(self._admitted) >= MAX_CONNECTIONS:
+                raise ConnectionAbortedError
+            self._admitted.add(request)
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Register a connection, or refuse it beyond MAX_CONNECTIONS."""
-        if is_accepted := len(self._connections) < MAX_CONNECTIONS:
-            self._connections[request] = time.monotonic() + ADMIT_S
-        return is_accepted
+        """Register a connection; beyond MAX_CONNECTIONS the oldest that is not admitted is cut off."""
+        with self._lock:
+            self._strangers[request] = time.monotonic() + ADMIT_S
+            if len(self._strangers) > MAX_CONNECTIONS:
+                oldest = next(iter(self._strangers))
+                del self._strangers[oldest]
+                _cut_off(oldest)
+        return True
 
     def close_request(self, request: Any) -> None:
         """Unregister and close a connection."""
-        self._connections.pop(request, None)
+        with self._lock:
+            self._strangers.pop(request, None)
+            self._admitted.discard(request)
         super().close_request(request)
 
     def service_actions(self) -> None:
         """Cut off connections that have not authenticated themselves in time; called every POLL_S."""
-        self._cut_off(time.monotonic())
+        time_s = time.monotonic()
+        with self._lock:
+            for connection, deadline_s in self._strangers.items():
+                if deadline_s <= time_s:
+                    _cut_off(connection)
 
     def server_close(self) -> None:
         """Stop listening, and cut off all connections."""
         super().server_close()
-        self._cut_off(math.inf)
-
-    def _cut_off(self, time_s: float) -> None:
-        """End connections, such that what was sent still arrives, and threads that wait for them wake up."""
-        for connection, deadline_s in self._connections.copy().items():  # a copy: threads add and remove others
-            if deadline_s <= time_s:
-                with suppress(OSError):
-                    connection.shutdown(socket.SHUT_RDWR)
+        with self._lock:
+            for connection in (*self._strangers, *self._admitted):
+                _cut_off(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report errors other than those of a connection that was closed by its client."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
+
+
+def _cut_off(connection: socket.socket) -> None:
+    """End a connection, such that what was sent still arrives, and the thread that waits for it wakes up."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class LocalPage(ConnectionServer):

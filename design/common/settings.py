@@ -4,10 +4,11 @@ import json
 import math
 import sys
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from pydantic import (
     BaseModel,
@@ -42,7 +43,7 @@ class Settings(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise _to_input_error(error, type(self), f"[{self.section()}]") from error
+            raise _to_input_error(error, type(self), values, f"[{self.section()}]") from error
 
     @model_validator(mode="before")
     @classmethod
@@ -215,11 +216,15 @@ def validate(
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        raise _to_input_error(error, model, where, overrides) from error
+        raise _to_input_error(error, model, values, where, overrides) from error
 
 
 def _to_input_error(
-    error: ValidationError, model: type[Settings], where: str, overrides: Collection[str] = ()
+    error: ValidationError,
+    model: type[Settings],
+    values: Mapping[str, Any],
+    where: str,
+    overrides: Collection[str] = (),
 ) -> InputError:
     first = error.errors()[0]
     if first["loc"] and first["loc"][0] in overrides:
@@ -227,12 +232,30 @@ def _to_input_error(
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:  # an error of the whole section names its keys itself
         return InputError(f"{where} {message}")
-    key = ".".join(str(part) for part in first["loc"] if str(part) in model.model_fields or isinstance(part, int))
+    key = _key_path(first["loc"], model, values)
     if first["type"] == "extra_forbidden":
         allowed = f", allowed are {', '.join(model.model_fields)}" if len(first["loc"]) == 1 else ""
-        return InputError(f"{where} {'.'.join(map(str, first['loc']))}: no such key{allowed}")
+        return InputError(f"{where} {key}: no such key{allowed}")
     message = message[:1].lower() + message[1:]  # units keep their capitals
     return InputError(f"{where} {key}: got {short_repr(first['input'])}, {message}")
+
+
+def _key_path(loc: Sequence[str | int], model: type[Settings], values: object) -> str:
+    """Return where in the values of a model an error is, such as contacts[0].radius.
+
+    Parts of `loc` that are neither keys nor indices are names of types, which pydantic puts between.
+    """
+    path = ""
+    for part in loc:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif part in model.model_fields or (isinstance(values, Mapping) and part in values):
+            path += f".{part}"
+        else:
+            continue
+        with suppress(LookupError, TypeError):  # a number that stands for an array of one
+            values = cast("Any", values)[part]
+    return path.removeprefix(".")
 
 
 def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:

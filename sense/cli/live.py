@@ -105,14 +105,16 @@ def live(
             stream, mirrored = stream_recording(recording, speed), recording.mirrored
         pipeline = Live(localizer, _load_health(model), stream.fibres, stream.rate_hz)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
-        click.echo(f"page: {page.url} (Ctrl-C ends)", err=True)
         if replay is None and rig == "simulated":
             click.echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
         touches = replay or ("simulated touches" if rig == "simulated" else f"{rig} rig")
         scaler, title = localizer.scaler, f"{touches}, {model}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
         area = {"centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm}
-        outputs, builder = _open_outputs(stack, stream, area, **output), MessageBuilder(pipeline, mirrored)
+        outputs, addresses = _open_outputs(stack, stream, area, **output)
+        for line in (f"page: {page.url} (Ctrl-C ends)", *addresses):
+            click.echo(line, err=True)
+        builder = MessageBuilder(pipeline, mirrored)
         draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
         pad = {"title": title, **area, "mirrored": mirrored}
 
@@ -158,15 +160,16 @@ def _open_outputs(
     rerun: str | None,
     host: str,
     token: str,
-) -> "list[OutputStream]":
-    """Open the outputs that were asked for; `stack` closes them."""
+) -> "tuple[list[OutputStream], list[str]]":
+    """Return the outputs that were asked for, which `stack` closes, and lines with the addresses of servers."""
     from padforge.sense.live.outputs import JsonLines, LslOutput, OscOutput
     from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
 
     outputs: list[OutputStream] = []
+    addresses: list[str] = []
     if tcp is not None:
         lines = stack.enter_context(JsonLines(host, tcp, token))
-        click.echo(f"lines: {lines.address[0]}:{lines.address[1]}", err=True)
+        addresses.append(f"lines: {lines.address[0]}:{lines.address[1]}")
         outputs.append(lines)
     if osc is not None:
         outputs.append(stack.enter_context(OscOutput(osc)))
@@ -174,11 +177,11 @@ def _open_outputs(
         outputs.append(LslOutput(lsl, stream.fibres, stream.rate_hz))
     if foxglove is not None:
         viewer = stack.enter_context(FoxgloveOutput(foxglove, **area))
-        click.echo(f"foxglove: {viewer.url}", err=True)
+        addresses.append(f"foxglove: {viewer.url}")
         outputs.append(viewer)
     if rerun is not None:
         outputs.append(stack.enter_context(RerunOutput(rerun, stream.fibres, **area)))
-    return outputs
+    return outputs, addresses
 
 
 def _load_health(model: Path) -> "HealthModel | None":

@@ -152,11 +152,15 @@ def _make_follower(target: Path, dry_run: bool, resume: bool) -> "McapFollower":
 
     if dry_run:
         raise InputError("--mcap writes what is recorded, and --dry-run keeps nothing")
-    named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
-    follower = McapFollower(named.with_name(f"{named.name}.mcap"))
+    follower = McapFollower(_mcap_path(target))
     if follower.path.exists() and not (resume and (target / START).exists()):
         raise InputError(f"{follower.path}: exists, recordings are never written over; choose another --out")
     return follower
+
+
+def _mcap_path(target: Path) -> Path:
+    named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
+    return named.with_name(f"{named.name}.mcap")
 
 
 def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morphology":
@@ -174,6 +178,8 @@ def _record_with(
 
     if resume and not (config.out / START).exists():
         _warn(f"{config.out}: nothing to resume, a new recording begins")
+    if resume and config.follower is None and (mcap := _mcap_path(config.out)).exists():
+        _warn(f"{mcap}: stays as it is, without what is recorded now; --resume --mcap goes on with it")
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")

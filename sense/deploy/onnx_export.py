@@ -307,9 +307,10 @@ class OnnxReport:
 
     @property
     def text(self) -> str:
+        failed = f"{self.max_failures} failed fibre{'s' * (self.max_failures != 1)}"
         return (
             f"{self.size / 1e6:.1f} MB, tested on {self.n_presses} presses and at every moment of one, with up to "
-            f"{self.max_failures} failed fibres: positions within {1e3 * self.position_difference_mm:.2f} µm of the "
+            f"{failed}: positions within {1e3 * self.position_difference_mm:.2f} µm of the "
             f"localizer's, radii within {1e3 * self.r90_difference_mm:.2f} µm"
         )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import reraise_write_error, temporary_folder, write_json
+from padforge.design.common.files import make_folder, reraise_write_error, sync, temporary_folder, write_json
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Indices
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
@@ -60,12 +60,16 @@ def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotatio
     columns, names = _build_columns(recording, starts, ends, annotations)
     path = path.resolve()
     with reraise_write_error(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         with temporary_folder(path.parent) as folder:
-            _write(folder / path.name, columns, names, ends - starts, _frame_rate(recording))
+            dataset = folder / path.name
+            _write(dataset, columns, names, ends - starts, _frame_rate(recording))
+            for content in (*dataset.rglob("*"), dataset):
+                sync(content)
             if path.exists():
                 path.rmdir()
-            (folder / path.name).rename(path)
+            dataset.rename(path)
+            sync(path.parent)
 
 
 def _frame_rate(recording: Recording) -> float:

@@ -190,8 +190,9 @@ def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float)
 
 
 def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
-    """Return ARM from (n, 10) states, in m and with rotation vectors as quaternions, from the epoch on."""
-    states = states[np.isfinite(states[:, :7]).all(axis=1) & (states[:, 0] >= epoch_s)]
+    """Return ARM from (n, 10) states, in m and with rotation vectors as quaternions; only of times that stamps hold."""
+    is_stamped = (states[:, 0] >= epoch_s) & (states[:, 0] - epoch_s < _MAX_STAMP_S - 1)
+    states = states[np.isfinite(states[:, :7]).all(axis=1) & is_stamped]
     angle = np.linalg.norm(states[:, 4:7], axis=1)
     x_y_z = states[:, 4:7] * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]  # sin(angle / 2) along the axis
     return TopicSeries(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common.files import recover, temporary_folder, to_disk
+from padforge.design.common.files import recover, sync, temporary_folder, to_disk
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.formats import ros_messages
@@ -221,6 +221,7 @@ class _GrowingMcap:
         # 3. It takes the name of the other one, which stays as it is until the next write.
         self._next.hardlink_to(self._copies[0])
         self._next.replace(self._path)
+        sync(self._path.parent)
         self._copies.reverse()
         self._end, self._last = self._end + len(chunks), chunks
 

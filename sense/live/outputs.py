@@ -106,8 +106,9 @@ def _touch_message(estimate: Estimate, z_sign: float) -> Message:
 
 def _header(time_s: float) -> dict[str, Any]:
     """Return the header of a time by the clock of the readings, which starts with them."""
-    seconds = math.floor(time_s)
-    return {"stamp": {"sec": seconds, "nanosec": round((time_s - seconds) * 1e9) % 10**9}, "frame_id": FRAME}
+    whole_s = math.floor(time_s)
+    seconds, nanoseconds = divmod(whole_s * 10**9 + round((time_s - whole_s) * 1e9), 10**9)
+    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": FRAME}
 
 
 class OutputStream(Protocol):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import locked, read_json, reraise_write_error, sync, temporary_folder
+from padforge.design.common.files import locked, make_folder, read_json, reraise_write_error, sync, temporary_folder
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import (
     MAX_FIBRES,
@@ -183,7 +183,7 @@ class Recording:
         check_target(path := check_path("path", path))
         path = path.resolve()
         with reraise_write_error(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             with temporary_folder(path.parent) as folder:
                 self._write(folder / path.name, provenance)
                 if replacing:

@@ -281,6 +281,7 @@ class Recorder:
         """
         if self._states is None:
             file = (self._path / STATES).open("xb", buffering=0)
+            sync(self._path)
             self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
         self._states[0].append(rows)
         if self._follower is not None:

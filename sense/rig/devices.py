@@ -20,6 +20,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import padforge
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 
@@ -27,8 +28,8 @@ Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""
 Cause = Literal["refused", "lost", "stale", "protective_stop", "emergency_stop", "deadline", "force", "data", "disk"]
 Group = Literal["padforge.arms", "padforge.boards"]
-ROOT = Path(__file__).parents[3]
-"""The folder that `padforge` is imported from."""
+ROOT = Path(padforge.__file__).parents[1]
+"""The folder that `padforge` is imported from; in a checkout, this file is not below that package."""
 
 
 class RigFault(Fault):

@@ -137,7 +137,7 @@ def run(
 @contextmanager
 def _locked(out: Path, name: str) -> Iterator[None]:
     """Keep other runs of a study out of its folder; other studies may run there."""
-    out.mkdir(parents=True, exist_ok=True)
+    files.make_folder(out)
     path, busy = out / f".{name}.lock", f"{out}: a {name} study is running there; wait for it or choose another --out"
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         raise InputError(f"{path}: is no file, expected one or nothing; remove it, or choose another --out")

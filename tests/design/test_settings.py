@@ -69,6 +69,24 @@ REFUSED = [
 ]
 
 
+NESTED = [
+    ({"contacts": [{"radius": 0.9}, {"radius": -1}]}, r"contacts\[1\]\.radius: got -1, .*greater"),
+    ({"contacts": [{"radius": 0.9, "height": 1}]}, r"contacts\[0\]\.height: no such key"),
+    ({"contacts": [{"model": "layer", "radius": 0.9}]}, r"contacts\[0\]: got .*, radius is 0.9, which counts where"),
+    ({"contacts": [{"fibre_depths_mm": [1, 0]}]}, r"contacts\[0\]\.fibre_depths_mm\[1\]: got 0, .*greater"),
+    ({"contacts": 3}, "contacts: got 3, "),
+    ({"weights": [1, "x", 1]}, r"weights\[1\]: got 'x', "),
+]
+
+
+@pytest.mark.parametrize(("table", "message"), NESTED)
+def test_refusals_name_the_whole_path_of_a_key(table, message):
+    with pytest.raises(InputError, match=rf"^pad\.toml: \[search\] {message}"):
+        Spec({"search": table}, "pad.toml", sections=MODELS).section(SearchSettings)
+    with pytest.raises(InputError, match=rf"^\[search\] {message}"):
+        SearchSettings(**table)
+
+
 @pytest.mark.parametrize(("model", "table", "message"), REFUSED, ids=lambda value: str(value)[:30])
 def test_section_refusals_name_key_value_and_limits(model, table, message):
     with pytest.raises(InputError, match=rf"^pad\.toml: \[{model.section()}\] .*{message}") as refused:

@@ -1,6 +1,7 @@
 """Files of meshes: there and back, damaged, or made to be awkward; each is read and judged, or refused in one line."""
 
 import json
+import tracemalloc
 import zipfile
 from pathlib import Path
 from xml.etree import ElementTree
@@ -145,6 +146,18 @@ def test_read_mesh_refuses_vertices_that_are_not_finite(tmp_path, odd):
         written(tmp_path / "box.stl", changed)
     with pytest.raises(InputError, match="vertices hold NaN, infinity or more than"):
         read_mesh(tmp_path / "box.stl")
+
+
+def test_read_mesh_refuses_many_odd_triangles_in_little_memory(tmp_path):
+    path = written(tmp_path / "odd.stl", np.full((3, 3), np.nan), np.tile([0, 1, 2], (100_000, 1)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="vertices hold NaN"):
+            read_mesh(path)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 4 * path.stat().st_size
 
 
 @settings(max_examples=25)

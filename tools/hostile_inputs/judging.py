@@ -20,8 +20,6 @@ _OF_ANY_NAME = (b"press,", b"# padf")
 """What tables of places and settings begin with, which are written to whatever name is asked for, as pictures are."""
 _BEGIN = {".json": b"{[", ".png": b"\x89", ".svg": b"<", ".html": b"<"}
 """Bytes that a file of a kind begins with, one of them; with another one it is no part of such a file."""
-_LASTING = re.compile(r"padforge-arm-.*")
-"""Names of temporary files that stay: locks."""
 
 
 def outcome(ended: Ended) -> str:
@@ -54,7 +52,7 @@ def violations(ended: Ended, changed: Sequence[Path], temporary: Sequence[Path])
         if changed:
             found.append(f"refused, and changed {', '.join(map(_name, changed[:5]))}")
     found += [f"left {_name(path)}" for path in changed if path.name.startswith(".") and os.path.lexists(path)]
-    found += [f"left the temporary {_name(path)}" for path in temporary if not _LASTING.fullmatch(path.name)]
+    found += [f"left the temporary {_name(path)}" for path in temporary]
     found += [f"torn: {_name(path)}" for path in changed if path.is_file() and not _whole(path)]
     if ended.cpu_s > MOST_CPU_S:
         found.append(f"computed {ended.cpu_s:.1f} s")

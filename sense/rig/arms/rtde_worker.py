@@ -14,7 +14,6 @@ import queue
 import select
 import socket
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Sequence
@@ -33,6 +32,7 @@ FIRST_STATE_S = 0.05  # wait for the first state after a stop, so that nobody ta
 HALT_S = 0.15  # wait for the arm, and then for the parent, when this process has to end
 ANSWER_S = 1.0  # wait for an answer of the arm while connecting
 SESSION_END_S = 1.0  # wait for another session that is about to end: its watchdog needs a quarter of a second
+LOCK_FOLDER = Path("/tmp")  # that of all users; a user may have another TMPDIR
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 
@@ -92,25 +92,43 @@ def _wait_until_idle(reader: RtdeReader, state: RtdeState) -> RtdeState:
     return state
 
 
-def _lock_arm(host: str) -> int:
+def lock_arm(host: str) -> int:
     """Keep other programs on this computer off the arm until the descriptor is closed or this process ends."""
     address = socket.getaddrinfo(host, None)[0][4][0]
-    path = Path(tempfile.gettempdir(), f"padforge-arm-{address}.lock")
-    try:
-        lock = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644)
-    except FileExistsError:  # it may be another user's, who cannot keep one from reading it
-        lock = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    path = LOCK_FOLDER / f"padforge-arm-{address}.lock"
     deadline = time.monotonic() + SESSION_END_S
     while True:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() > deadline:
-                message = f"another program on this computer uses the arm {host}"
-                raise CommandRejected("refused", message, "wait for its end, or end it") from None
-            time.sleep(KICK_S)
-        else:
+            if (lock := _try_lock(path)) is not None:
+                return lock
+            message = f"another program on this computer uses the arm {host}: it has locked {path}"
+            advice = "wait for its end, or end it"
+        except OSError as error:  # which may pass: another user's program is just creating the file
+            message = f"{path}: cannot be locked ({error.strerror})"
+            advice = "remove it, or let the user who created it or an administrator do so"
+        if time.monotonic() > deadline:
+            raise CommandRejected("refused", message, advice)
+        time.sleep(KICK_S)
+
+
+def _try_lock(path: Path) -> int | None:
+    """Lock a file in a folder where any user may have created it, or put a link in its place.
+
+    Returns:
+        The descriptor; None if another program has locked the file, or it was removed meanwhile.
+    """
+    try:
+        lock = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644)
+        os.fchmod(lock, 0o644)  # whatever the umask: other users must be able to open it
+    except FileExistsError:
+        lock = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with contextlib.suppress(BlockingIOError, FileNotFoundError):
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # What cleans temporary files locks them, too, and removes them then: a lock on such a file keeps nobody out.
+        if os.path.samestat(os.fstat(lock), path.lstat()):
             return lock
+    os.close(lock)
+    return None
 
 
 class WorkerProcess:
@@ -173,7 +191,7 @@ class WorkerProcess:
     def _do_connect(self) -> dict[str, Any]:
         driver = UrRtdeControl if self._driver == "ur-rtde" else UrscriptControl
         try:
-            self._arm_lock = _lock_arm(self._host)
+            self._arm_lock = lock_arm(self._host)
             reader = RtdeReader(self._host, ANSWER_S, driver.progress_register)
             state = reader.read(ANSWER_S)
             _check_ready(state)

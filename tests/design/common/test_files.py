@@ -3,8 +3,10 @@
 import errno
 import json
 import os
+import stat
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +16,7 @@ import pytest
 from padforge.design.common import files
 from padforge.design.common.files import EXCHANGE
 from padforge.design.common.validation import InputError
+from tests.helpers.power_cut import ON_LINUX, Disk
 
 LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.design.common.files import locked_folder\n"
 ANOTHER = LOCK + "try:\n  with locked_folder(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
@@ -147,6 +150,63 @@ def test_interrupted_move_reads_as_the_new_set_and_the_next_run_completes_it(tmp
     assert (tmp_path / EXCHANGE).exists() == (stop is PermissionError)  # an interrupt waits for the end of the move
     with files.locked_folder(tmp_path):
         assert contents(tmp_path) == dict.fromkeys("abcd", "new") | {"mine": "old"}
+
+
+LINUX = pytest.mark.skipif(
+    sys.platform != "linux", reason="files are named by their descriptors, synchronised by fsync"
+)
+
+
+@ON_LINUX
+def test_atomic_file_outlasts_a_power_cut(tmp_path, monkeypatch):
+    disk, path = Disk(monkeypatch), tmp_path / "a" / "b" / "file.txt"
+    for text in ("old", "new"):
+        files.write_text(path, text)
+        assert disk.read(path) == text.encode()
+    assert disk.has_name(tmp_path / "a")
+    assert disk.has_name(tmp_path / "a" / "b")
+    assert disk.torn == []
+
+
+@ON_LINUX
+def test_atomic_files_are_all_old_or_all_new_after_a_power_cut_at_any_rename(tmp_path, monkeypatch):
+    disk, folder = Disk(monkeypatch), tmp_path / "pad"
+    names, renamed = ("a.json", "b.csv"), []
+
+    def check(source: Path) -> None:
+        renamed.append(source.name)
+        if source.parent.name == EXCHANGE:  # a file moves: the exchange that says so lasts, with all of them
+            assert disk.has_name(folder / EXCHANGE)
+        if source.name == EXCHANGE:  # it ends: all of them have arrived
+            assert [disk.read(folder / name) for name in names] == [text, text]
+        elif source.parent == folder:  # it begins
+            assert [disk.read(source / name) for name in names] == [text, text]
+
+    disk.on_rename = check
+    for text in (b"old", b"new"):
+        with files.atomic_files(folder) as stage:
+            for name in names:
+                (stage / name).write_bytes(text)
+        assert [disk.read(folder / name) for name in names] == [text, text]
+    assert len(renamed) == 2 * 4
+    assert disk.has_name(folder)
+    assert disk.torn == []
+
+
+@ON_LINUX
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EIO])
+def test_folder_is_written_on_disks_that_synchronise_no_folders(tmp_path, monkeypatch, number):
+    fsync = os.fsync
+
+    def fail(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with nullcontext() if number == errno.EINVAL else pytest.raises(InputError, match="cannot be written"):
+        files.write_text(tmp_path / "file.txt", "new")
+    assert (tmp_path / "file.txt").read_text(encoding="utf-8") == "new"
 
 
 def test_commit_waits_for_the_exchange_of_another_run(tmp_path, monkeypatch):

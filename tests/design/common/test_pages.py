@@ -2,11 +2,13 @@
 
 import json
 import re
+import selectors
 import socket
+import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
-from http.client import HTTPConnection, HTTPResponse
+from contextlib import ExitStack, contextmanager, suppress
+from http.client import HTTPConnection, HTTPResponse, RemoteDisconnected
 from typing import Any
 
 import pytest
@@ -146,6 +148,71 @@ def test_unauthorised_connections_are_limited_and_cut_off(page: LocalPage, monke
         page.show({"at": 1})
         told = (line for line in events if line.startswith(b"data: "))
         assert [json.loads(next(told)[6:])["at"] for _ in range(2)] == [0, 1]
+
+
+@contextmanager
+def flood(port: int, size: int) -> Iterator[None]:
+    """Half-open connections, each opened again once it is cut off."""
+    is_complete, has_ended = threading.Event(), threading.Event()
+
+    def reopen() -> None:
+        with ExitStack() as stack, selectors.DefaultSelector() as selector:
+
+            def connect() -> None:
+                stranger = stack.enter_context(socket.create_connection((HOST, port), timeout=10))
+                stranger.send(b"GET / HTTP/1.0")
+                selector.register(stranger, selectors.EVENT_READ)
+
+            while not has_ended.is_set():
+                while len(selector.get_map()) < size:
+                    with suppress(OSError):
+                        connect()
+                is_complete.set()
+                for key, _ in selector.select(0.02):
+                    selector.unregister(key.fileobj)
+
+    thread = threading.Thread(target=reopen)
+    thread.start()
+    try:
+        assert is_complete.wait(20)
+        yield
+    finally:
+        has_ended.set()
+        thread.join()
+
+
+def test_flood_of_half_open_connections_keeps_no_client_out(page: LocalPage) -> None:
+    page.show({"at": 0})
+    browser = HTTPConnection(HOST, port_of(page), timeout=10)
+    browser.request("GET", "/events")
+    with browser.getresponse() as events, flood(port_of(page), 200):
+        views = (json.loads(line[6:])["at"] for line in events if line.startswith(b"data: "))
+        assert next(views) == 0
+        for at in range(1, 6):
+            assert posted(page, b"1").status == 200
+            page.show({"at": at})
+            assert next(views) == at
+
+
+def test_clients_beyond_the_limit_are_refused_and_take_no_place(
+    page: LocalPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listening, "MAX_CONNECTIONS", 2)
+    page.show({"at": 0})
+
+    def read_events(stack: ExitStack) -> HTTPResponse:
+        browser = HTTPConnection(HOST, port_of(page), timeout=10)
+        browser.request("GET", "/events")
+        return stack.enter_context(browser.getresponse())
+
+    with ExitStack() as stack:
+        readers = [read_events(stack) for _ in range(2)]
+        for _ in range(3):
+            with pytest.raises((RemoteDisconnected, ConnectionError)):
+                read_events(stack)
+        page.show({"at": 1})
+        for events in readers:
+            assert next(line for line in events if line.endswith(b'{"at": 1}\n'))
 
 
 def test_markdown_renders_elements_and_escapes_html():

@@ -66,7 +66,7 @@ calibrate rec --time-budget nan                 | Invalid value for '--time-budg
 {live} --model model --rig ur5                  | no board is found
 {live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines reach
 {live} --model model --replay rec --osc here    | --osc is 'here', expected HOST:PORT
-{live} --model model --replay rec --rerun here  | --rerun is 'here', expected an address like rerun+http://HOST:PORT
+{live} --model model --replay rec --tcp 0 --rerun here | --rerun is 'here', expected an address like rerun+http://HOST:PORT
 {live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 to 256
 """
 SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five")}
@@ -116,6 +116,7 @@ def test_invalid_command_fails_in_one_line(
     assert (code, out) == (2, "")
     assert last.startswith("padforge: ")
     assert said.format(**meant) in last
+    assert not [note for note in notes if note.startswith(("page: ", "lines: ", "foxglove: "))]
     assert notes == [] or words.startswith(("{live}", "calibrate")) or "--resume" in words
     assert {path: path.stat().st_mtime_ns for path in workshop.rglob("*") if path.is_file()} == before
     assert not {"out", "r", "recording", "m", "set"} & {path.name for path in workshop.iterdir()}

@@ -126,6 +126,7 @@ def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
     assert (
         " MB, tested on 300 presses and at every moment of one, with up to 3 failed fibres: positions within " in text
     )
+    assert "with up to 1 failed fibre: positions" in replace(exported[1], max_failures=1).text
 
 
 def test_export_refuses_other_localizers_and_a_graph_that_differs(localizer, tmp_path, monkeypatch) -> None:

@@ -15,6 +15,7 @@ from padforge.sense.formats import lerobot
 from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.import_export import export_file
 from padforge.sense.formats.lerobot import export_lerobot
+from tests.helpers.power_cut import ON_LINUX, Disk
 
 COUNTED = {"timestamp": "float32"} | dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
@@ -107,6 +108,15 @@ def test_export_lerobot_writes_the_format(eight: Recording, tmp_path: Path) -> N
         np.testing.assert_array_equal(state, eight.readings[start : start + len(state)].astype(np.float32))
         times = eight.times_s[start : start + len(state)]
         np.testing.assert_allclose(columns["observation.time"][rows], times - times[0], atol=1e-5)
+
+
+@ON_LINUX
+def test_export_lerobot_outlasts_a_power_cut(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk, path = Disk(monkeypatch), tmp_path / "new" / "data"
+    export_file(eight, path, "lerobot")
+    files = [file for file in path.rglob("*") if file.is_file()]
+    assert all(disk.read(file) == file.read_bytes() for file in files)
+    assert all(disk.has_name(folder) for folder in (path.parent, path, *path.rglob("*")))
 
 
 def test_export_lerobot_puts_every_frame_in_an_episode(eight: Recording, tmp_path: Path) -> None:

@@ -1,14 +1,18 @@
 """Recordings from and to bags of ROS 2, also as another reader (`mcap` with `mcap-ros2-support`) sees them."""
 
 import json
+import operator
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.interfaces import QosDurability
@@ -19,6 +23,7 @@ from padforge.sense import Recording, open_recording
 from padforge.sense.formats import ros_recording
 from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
 from padforge.sense.formats.import_export import export_file, import_file
+from padforge.sense.formats.ros_messages import choose_epoch, to_stamps
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 
 from .foreign import STORE, Message, array, make, pose, wrench, write_bag
@@ -121,8 +126,8 @@ def test_export_bag_carries_annotations(eight: Recording, tmp_path: Path) -> Non
 
 
 def test_export_bag_writes_arm_poses(eight: Recording, tmp_path: Path) -> None:
-    states = np.zeros((3, 10))
-    states[:, 0] = [-5, 1, 2]
+    states = np.zeros((4, 10))
+    states[:, 0] = [-5, 1, 2, 1e10]  # stamps cannot hold the first and the last
     states[:, 1:4] = [100, 200, 300]
     states[1, 4:7] = [0, np.pi, 0]
     export_bag(eight, tmp_path / "r.mcap", states=states)
@@ -134,6 +139,16 @@ def test_export_bag_writes_arm_poses(eight: Recording, tmp_path: Path) -> None:
     np.testing.assert_allclose([turned.pose.orientation.y, turned.pose.orientation.w], [1, 0], atol=1e-15)
     assert straight.pose.orientation.w == 1
     assert import_bag(tmp_path / "r.mcap") == eight
+
+
+@given(st.floats(-1e10, 1e10) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))
+@example(1.9999999996)
+def test_stamps_are_the_nearest_nanoseconds(time_s: float) -> None:
+    times_s = np.array([time_s])
+    epoch_s = choose_epoch(times_s)
+    (stamp,) = to_stamps(times_s, epoch_s).tolist()
+    assert 0 <= stamp < 2**31 * 10**9
+    assert abs(stamp - 10**9 * (Fraction(time_s) - Fraction(epoch_s))) < 0.5 + 1e-6
 
 
 def test_export_bag_refuses_what_cannot_be_read_or_written(

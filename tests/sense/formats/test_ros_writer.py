@@ -18,6 +18,7 @@ from padforge.sense import Recorder, Recording
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 from padforge.sense.formats.ros_writer import McapFollower
 from padforge.sense.recording.run_directory import read_journal
+from tests.helpers.power_cut import ON_LINUX, Disk
 from tools.kills import killed
 
 FIBRES = 3
@@ -87,6 +88,17 @@ def test_follower_writes_what_export_does(tmp_path: Path) -> None:
     np.testing.assert_allclose(imported.forces_n, recording.forces_n)
     np.testing.assert_allclose(imported.reached_mm, recording.reached_mm)
     np.testing.assert_array_equal(imported.readings, recording.readings)
+
+
+@ON_LINUX
+def test_file_outlasts_a_power_cut_after_every_press(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk, path = Disk(monkeypatch), tmp_path / "run.mcap"
+    with Recorder(tmp_path / "run", FIBRES, SOURCE, {}) as recorder:
+        recorder.attach(McapFollower(path))
+        for number in range(3):
+            press(recorder, number)
+            assert disk.read(path) == path.read_bytes()
+    assert "next.mcap" not in disk.torn
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import operator
 import pickle
 import re
 import socket
@@ -10,11 +11,15 @@ import sys
 import threading
 import time
 from contextlib import ExitStack, suppress
+from fractions import Fraction
 from pathlib import Path
-from typing import IO
+from types import SimpleNamespace
+from typing import IO, Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from pythonosc.osc_message import OscMessage
 from pythonosc.udp_client import UDPClient
 
@@ -83,6 +88,16 @@ def test_touch_messages_are_metres_with_variances(messages) -> None:
         assert (position["z"], covariance[14]) == (0, -1)  # depth was not learnt
         stamp = message.msg["header"]["stamp"]
         assert stamp["sec"] + stamp["nanosec"] * 1e-9 == pytest.approx(pad["now_s"], abs=1e-9)
+
+
+@given(st.floats(-1e10, 1e10) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))
+@example(1.9999999996)
+def test_stamp_is_the_nearest_nanosecond(time_s: float) -> None:
+    silent: Any = SimpleNamespace(pressed=False, view=lambda: {"fibres": []})
+    health, _ = MessageBuilder(silent).build(np.array([time_s]), np.zeros((1, 1)), [])
+    stamp = health.msg["header"]["stamp"]
+    assert 0 <= stamp["nanosec"] < 10**9
+    assert abs(10**9 * (stamp["sec"] - Fraction(time_s)) + stamp["nanosec"]) < 0.5 + 1e-6
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording
 from padforge.sense.recording.block_file import block_dtype
+from tests.helpers.power_cut import ON_LINUX, Disk
 from tools.kills import killed
 
 START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
@@ -50,6 +51,19 @@ def five(tmp_path_factory):
     """Return the files of a run directory of five presses."""
     path = record_presses(tmp_path_factory.mktemp("five"))
     return {file.name: file.read_bytes() for file in path.iterdir()}
+
+
+@ON_LINUX
+def test_files_outlast_a_power_cut_after_every_press(tmp_path, monkeypatch):
+    disk, run = Disk(monkeypatch), tmp_path / "run"
+    with Recorder(run, FIBRES, {"kind": "made"}, {}) as recorder:
+        for press in range(2):
+            record(recorder, range(press, press + 1), 2.0 * press)
+            assert {path.name: disk.read(path) for path in run.iterdir()} == {
+                path.name: path.read_bytes() for path in run.iterdir()
+            }
+    assert disk.has_name(run)
+    assert disk.torn == []
 
 
 def check_as_recorded(recording):
@@ -298,7 +312,7 @@ def test_recorder_and_save_sync_files_before_folders(tmp_path, monkeypatch):
     assert [path.name for path in synced] == [".unfinished-start.json", "run", tmp_path.name]
     synced.clear()
     record(recorder, range(1), 0.0)
-    assert {path.name for path in synced} == {READINGS, STATES, JOURNAL}
+    assert {path.name for path in synced} == {READINGS, STATES, "run", JOURNAL}
     recorder.__exit__(None, None, None)
     synced.clear()
     Recording.open(tmp_path / "run").save(tmp_path / "copy", {})

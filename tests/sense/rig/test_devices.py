@@ -30,6 +30,10 @@ def test_load_device_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         load_device("padforge.arms", "crane")
 
 
+def test_root_holds_the_package() -> None:
+    assert (devices.ROOT / "padforge" / "__init__.py").is_file()
+
+
 @pytest.mark.parametrize("python_path", [None, ":", "/nowhere::"])
 def test_start_imports_nothing_from_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, python_path: str | None

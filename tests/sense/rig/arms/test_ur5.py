@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -197,11 +196,13 @@ def test_connect_refuses_arm_in_use_on_this_computer(
 @ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_arm_in_use_by_another_computer(
-    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
 ) -> None:
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where the child locks: as if it ran on another computer
+    from padforge.sense.rig.arms.rtde_worker import LOCK_FOLDER  # not on Windows
+
+    (LOCK_FOLDER / f"padforge-arm-{address}.lock").unlink()  # as if the other arm's program ran on another computer
     with pytest.raises(RigFault, match="a program runs on the arm"):
         UR5(address, driver).connect()
     assert arm.state().moving
