@@ -9,6 +9,7 @@ import pytest
 from padforge.design import Morphology
 from padforge.sense import RigSettings, simulate
 from padforge.sense.twin import identification
+from padforge.sense.twin.as_built import OFFSET, channel_indices
 from padforge.sense.twin.doubts import find_doubts
 from padforge.sense.twin.identification import Identification, identify_pad
 from padforge.sense.twin.wiring import Wiring
@@ -54,13 +55,12 @@ def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_dou
 
 
 def test_a_fibre_far_beside_its_plan_is_doubted(result: Identification) -> None:
-    built = result.fit.pad
-    far = replace(result.fit, pad=replace(built, plan=replace(built.plan, paths=built.plan.paths.copy())))
-    values = built.values.copy()
-    rows = identification.AsBuiltPad.channel_values.fget(replace(built, values=values))  # a view
-    rows[1, 2 : 2 + 12] += 0.4  # 4.5 mm along x
-    beside = find_doubts(replace(result, fit=replace(far, pad=replace(built, values=values))))
-    assert [line.split(" does")[0] for line in beside if "mm beside its plan, allowed is 3.0" in line] == ["channel 2"]
+    values = result.fit.pad.values.copy()
+    values[channel_indices(1)[OFFSET]] += 0.6  # 6.75 mm along x and y: across a fibre, whichever way it runs
+    beside = replace(result, fit=replace(result.fit, pad=replace(result.fit.pad, values=values)))
+    (doubt,) = find_doubts(beside)
+    assert doubt.startswith("channel 2 does not fit: fibre 2 lies")
+    assert doubt.endswith("mm beside its plan, allowed is 3.0")
 
 
 def test_a_second_wiring_is_told_of_the_channels_that_it_changes(result: Identification) -> None:
