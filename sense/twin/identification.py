@@ -58,8 +58,8 @@ N_CANDIDATES, N_COMPARED = 4, 250
 correlated over about half a grid unit, so that more presses would count the same evidence twice."""
 LOG_ODDS_IN_ORDER, LOG_ODDS_POSE = 15.0, 4.0
 """Prior log odds of channels in the order of the plan, and of a pad that lay as planned. Half of the belief in either
-among 6! wirings and 8 poses would be 7 and 2; they count twice, as presses do, whose residuals are correlated. Less than
-MIN_LOG_ODDS together, so that a wiring that fits as well as the stated one is an alternative."""
+among 6! wirings and 8 poses would be 7 and 2; they count twice, as presses do, whose residuals are correlated. They are
+less than MIN_LOG_ODDS together, so that a wiring that fits as well as the stated one is an alternative."""
 N_CONTACT = 400  # presses that a contact is fitted to, for the same reason
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
 MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live
