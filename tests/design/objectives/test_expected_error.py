@@ -262,6 +262,6 @@ def test_bound_in_single_precision_holds_under_faint_noise(floor):
 
 
 def test_bound_in_single_precision_does_not_overflow_under_faint_noise():
-    responses = np.repeat(2 * PLACES.T, 8, axis=0).astype(np.float32)
+    responses = np.repeat(2 * (PLACES @ [[1.0, 1.0], [1.0, 0.5]]).T, 8, axis=0).astype(np.float32)
     expected = REGRESSION_WEIGHT * leave_one_out_error(responses.astype(float))
     assert error(responses, Scatter(1e-9)) == pytest.approx(expected, rel=1e-4)
