@@ -24,6 +24,7 @@ from padforge.design.kernels.geometry import (
     UNIFORM,
     find_touched_range,
     find_unit_roots,
+    refine_root,
     select_frame,
     shell_sort,
     weigh_element,
@@ -56,6 +57,8 @@ GAUSS = np.array(
 MAX_HALVINGS = 48
 PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
 """Relative error of a piece without a closed form; of a profile, relative to weight 1."""
+MAX_TURN = 8.0
+"""Ratio of the steepest rise of a piece to its least one, or to its run, up to which the quadrature converges fast."""
 PIECES, PATIENCE = 500, 100
 """Beyond PIECES the tolerance doubles with every PATIENCE more pieces: halving pure rounding errors would not end."""
 
@@ -67,9 +70,15 @@ def evaluate_cubic(span: Any, s: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def _rise(span: Any, s: float) -> float:
+    """Return dv/ds."""
+    return span[3] + s * (2 * span[4] + 3 * s * span[5])
+
+
+@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
 def _density(span: Any, s: float, law: Any) -> float:
     """Return the weighted length per unit of s."""
-    rise = span[3] + s * (2 * span[4] + 3 * s * span[5])
+    rise = _rise(span, s)
     run = span[1] + abs(rise) if law.length == MANHATTAN else math.sqrt(span[1] ** 2 + rise**2)
     if law.weight == UNIFORM:
         return run
@@ -81,18 +90,18 @@ def _density(span: Any, s: float, law: Any) -> float:
 def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
     """Integrate over [a, b] by the 15-point Kronrod rule and estimate the relative error by the 7-point Gauss rule.
 
-    For a profile, whose weights may cancel, the estimate is relative to the integral at weight 1, and the plain
-    difference: QUADPACK's sharpening (200 d)^1.5 holds for smooth functions only, and splines bend at their knots.
+    For a profile, whose weights may cancel, the estimate is relative to the integral at weight 1, so that those of all
+    pieces add up to no more than it says of the whole fibre; and it is the plain difference, without QUADPACK's
+    sharpening (200 d)^1.5.
     """
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
-    centre = _density(span, middle, law)
-    fine, coarse = KRONROD[7] * centre, GAUSS[3] * centre
-    for i in range(7):
-        x = half * NODES[i]
-        pair = _density(span, middle - x, law) + _density(span, middle + x, law)
-        fine += KRONROD[i] * pair
-        if i % 2 == 1:
-            coarse += GAUSS[i // 2] * pair
+    fine, coarse = 0.0, 0.0
+    for i in range(15):
+        k = min(i, 14 - i)
+        value = _density(span, middle + half * (NODES[k] if i > 7 else -NODES[k]), law)
+        fine += KRONROD[k] * value
+        if k % 2 == 1:
+            coarse += GAUSS[k // 2] * value
     if law.weight == PROFILE:
         run = span[1] + abs(evaluate_cubic(span, b) - evaluate_cubic(span, a)) / (b - a)  # spans are monotone
         return fine * half, abs(fine - coarse) / run
@@ -104,7 +113,24 @@ def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, f
 def is_precise(error: float, pieces: int, law: Any) -> bool:
     """Whether the error of a piece, the `pieces`-th that was integrated, is acceptable."""
     least = PROFILE_PRECISION if law.weight == PROFILE else PRECISION
-    return error <= least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)
+    return not error > least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)  # that of a piece without length is NaN
+
+
+@njit(cache=True, error_model="numpy")
+def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
+    """Whether a fibre turns from its axis to a steep rise within [a, b] so sharply that the quadrature may miss it.
+
+    It turns where the rise is about the run, and both add up to the length there: a share of about run / steepest rise
+    of [a, b], on which the length differs by about the run.
+    """
+    if law.length == MANHATTAN:
+        return False
+    first, last = abs(_rise(span, a)), abs(_rise(span, b))
+    least, most = min(first, last), max(first, last)
+    vertex = -span[4] / (3 * span[5]) if span[5] != 0 else a  # of the rise, which has one sign
+    if a < vertex < b:
+        least, most = min(least, abs(_rise(span, vertex))), max(most, abs(_rise(span, vertex)))
+    return most > MAX_TURN * max(least, span[1]) and span[1] ** 2 * (b - a) > PRECISION * most
 
 
 @njit(cache=True, error_model="numpy")
@@ -118,16 +144,17 @@ def _integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> f
     top = 0
     while top >= 0:
         low, high = stack[top]
-        part, error = integrate_kronrod(span, low, high, law)
-        pieces += 1
-        if is_precise(error, pieces, law) or top >= MAX_HALVINGS:
-            total += part
-            top -= 1
-        else:
-            middle = 0.5 * (low + high)
-            stack[top, 1] = middle
-            top += 1
-            stack[top, 0], stack[top, 1] = middle, high
+        if top >= MAX_HALVINGS or not _has_turn(span, low, high, law):
+            part, error = integrate_kronrod(span, low, high, law)
+            pieces += 1
+            if top >= MAX_HALVINGS or is_precise(error, pieces, law):
+                total += part
+                top -= 1
+                continue
+        middle = 0.5 * (low + high)
+        stack[top, 1] = middle
+        top += 1
+        stack[top, 0], stack[top, 1] = middle, high
     return total
 
 
@@ -136,8 +163,8 @@ _CLEAR = 1e6  # a value this many tolerances from zero has a certain sign
 
 
 @njit(cache=True, error_model="numpy")
-def find_circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
-    """Append to out[count:] the s in (a, b) at which the span crosses the circle of `radius`; return the count."""
+def _expand_square(span: Any, a: float, b: float, radius: float, p: Any) -> None:
+    """Expand the squared distance less that of a circle in u, for s = a + (b - a) u, into the coefficients p (7,)."""
     w = b - a
     t0, t1 = span[0] + span[1] * a, span[1] * w
     v0, v3 = evaluate_cubic(span, a), span[5] * w**3
@@ -149,6 +176,13 @@ def find_circle_roots(span: Any, a: float, b: float, radius: float, out: Any, co
     p[4] = v2 * v2 + 2 * v1 * v3
     p[5] = 2 * v2 * v3
     p[6] = v3 * v3
+
+
+@njit(cache=True, error_model="numpy")
+def find_circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
+    """Append to out[count:] the s in (a, b) at which the span crosses the circle of `radius`; return the count."""
+    w = b - a
+    _expand_square(span, a, b, radius, p)
     end = find_unit_roots(p, np.int64(6), 16 * EPS * radius * radius, out, count, work)
     for i in range(count, end):
         out[i] = a + w * out[i]
@@ -289,20 +323,47 @@ def find_stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: 
 
 
 @njit(cache=True, error_model="numpy")
-def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
-    """Return the signal of a stretch inside the press, split where the weight bends or may be missed.
+def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
+    """Return the signal of a stretch inside a profile, split where the profile bends.
 
-    That is at the kink of the 1/d weight, or at the edge of a contact and abreast of the press.
+    The quadrature might miss a bend between its nodes. Bends are crossed one by one where the squared distance, of
+    degree 6, is monotone: from one point at which it is stationary to the next.
     """
     roots, work, p, stack, _ = scratch
-    circle = law.radius / 100 if law.weight == INVERSE else law.edge
-    if circle == 0:
-        return _integrate_stretch(span, a, b, law, stack)
-    count = find_circle_roots(span, a, b, circle, roots, np.int64(0), work, p)
-    if law.weight == PROFILE and a < 0 < b:
-        roots[count] = 0.0
-        count += 1
-        shell_sort(roots, count)
+    w, profile = b - a, law.profile
+    _expand_square(span, a, b, 0.0, p)
+    for i in range(6):
+        p[i] = (i + 1) * p[i + 1]
+    count = find_unit_roots(p, np.int64(5), 0.0, roots, np.int64(0), work)
+    roots[count] = 1.0
+    _expand_square(span, a, b, 0.0, p)
+    first, total, low, before = p[0], 0.0, 0.0, p[0]
+    for i in range(count + 1):
+        high, after = roots[i], p[6]
+        for k in range(5, -1, -1):
+            after = after * high + p[k]
+        for k in range(1, len(profile)):
+            square = profile[k if after > before else len(profile) - k, 0]
+            if min(before, after) < square < max(before, after):
+                p[0] = first - square
+                cut = refine_root(p, 6, low, high, after > before)
+                p[0] = first
+                total += _integrate_stretch(span, a + w * low, a + w * cut, law, stack)
+                low = cut
+        total += _integrate_stretch(span, a + w * low, a + w * high, law, stack)
+        low, before = high, after
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
+    """Return the signal of a stretch inside the press, split where the weight bends."""
+    roots, work, p, stack, _ = scratch
+    if law.weight == PROFILE:
+        return _compute_profile_signal(span, a, b, law, scratch)
+    count = np.int64(0)
+    if law.weight == INVERSE:
+        count = find_circle_roots(span, a, b, law.radius / 100, roots, count, work, p)
     total, begin = 0.0, a
     for i in range(count):
         total += _integrate_stretch(span, begin, roots[i], law, stack)

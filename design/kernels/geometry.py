@@ -106,7 +106,7 @@ def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law:
     return weight
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
 def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> float:
     """Return the weight of an element at (t, v) from the press centre that runs along (run, rise), by a framed law."""
     if law.weight != PROFILE:
@@ -369,7 +369,7 @@ def shell_sort(values: Any, count: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
+def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
     """Find the one sign change of p in (low, high) by Newton's method, safeguarded by bisection."""
     u = 0.5 * (low + high)
     for _ in range(100):
@@ -421,7 +421,7 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
         if changes == 0 or largest <= tolerance:
             top -= 1
         elif changes == 1:
-            out[count] = _refine_root(p, degree, b[lo], b[hi], b[0] < 0)
+            out[count] = refine_root(p, degree, b[lo], b[hi], b[0] < 0)
             count += 1
             top -= 1
         elif top >= _DEPTH:

@@ -223,9 +223,10 @@ def expected_error(
         scatter: of responses; its floor is above 0.
         weights: of responses in the kernel; shape (F,).
     """
-    positions, step, masks = (x.to(responses.dtype) for x in (positions, step, masks))
+    positions, masks = (x.to(responses.dtype) for x in (positions, masks))
     count = len(free)
-    bound = _bound(responses[:, :count], step, free, masks, scatter)
+    # squares of slopes over a faint noise overflow in single precision, and one direction would hide the other
+    bound = _bound(responses[:, :count].double(), step.double(), free, masks.double(), scatter).to(responses.dtype)
     rows = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(positions))])
     middle = positions[:count].mean(dim=0)
     weighted = (responses * weights[:, None].to(responses))[:, rows] / WIDTH

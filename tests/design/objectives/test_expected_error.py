@@ -246,3 +246,22 @@ def test_kernel_weights_scale_fibres_of_a_strip():
 def test_bound_of_one_informative_direction_keeps_the_prior_of_the_other(dtype):
     along = np.stack([PLACES[:, 0], 2 * PLACES[:, 0]]).astype(dtype)
     assert bound(along, Scatter(1e-9)) == pytest.approx(SIZE[1] / np.sqrt(12), rel=1e-3)
+
+
+@pytest.mark.parametrize("floor", [1e-4, 1e-3, 1.0])
+def test_bound_in_single_precision_holds_under_faint_noise(floor):
+    """Fibres that all answer to one oblique direction: the prior remains across it, whatever is known along it."""
+    way = np.array([0.6, 0.8])
+    along = (2 * np.arange(1, 4)[:, None] * (PLACES @ way)).astype(np.float32)
+    precision = np.outer(way, way) * 4 * 14 / floor**2 + np.diag(12 / SIZE**2)
+    expected = np.sqrt(np.trace(np.linalg.inv(precision)))
+    found = errors(along, [[1.0] * 3, [0.0] * 3], Scatter(floor))
+    learning = [REGRESSION_WEIGHT * leave_one_out_error(works * along.astype(float)) for works in (1.0, 0.0)]
+    assert found[0] == pytest.approx(BOUND_WEIGHT * expected + learning[0], rel=0.01)
+    assert found[1] == pytest.approx(BOUND_WEIGHT * np.sqrt(2 * SIZE[0] ** 2 / 12) + learning[1], rel=1e-4)
+
+
+def test_bound_in_single_precision_does_not_overflow_under_faint_noise():
+    responses = np.repeat(2 * (PLACES @ [[1.0, 1.0], [1.0, 0.5]]).T, 8, axis=0).astype(np.float32)
+    expected = REGRESSION_WEIGHT * leave_one_out_error(responses.astype(float))
+    assert error(responses, Scatter(1e-9)) == pytest.approx(expected, rel=1e-4)
