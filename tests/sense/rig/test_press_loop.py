@@ -181,6 +181,24 @@ def test_run_stops_and_retreats_at_too_much_force(tmp_path, stays, outcome, end_
     assert arm.pose[2] == pytest.approx(end_mm, abs=2)
 
 
+@pytest.mark.parametrize(("silent_s", "end_mm"), [(0.9, 60), (3.0, 46)])
+def test_run_retreats_as_soon_as_states_come_again(tmp_path, silent_s, end_mm):
+    """A state that is too old ends the recording, and the tool is pressed into the pad."""
+    arm, board, options = rig()
+    state, since_s = arm.state, [np.inf]
+
+    def last_state():
+        if arm.pose[2] < 46.001 and not arm.stops:
+            since_s[0] = min(since_s[0], arm.time())
+        if 0.02 < arm.time() - since_s[0] < silent_s:
+            raise RigFault("stale", "the last state is old")
+        return state()
+
+    arm.state = last_state
+    assert fault_of(tmp_path / "run", arm, board, options, "the last state is old") == "stale"
+    assert arm.pose[2] == pytest.approx(end_mm)
+
+
 def test_run_stops_and_retreats_when_the_force_sensor_fails_in_a_press(tmp_path):
     arm, board, options = rig()
     arm.hook = lambda arm: setattr(arm, "force_n", None if arm.pose[2] < 48 or arm.force_n is None else 0.0)
