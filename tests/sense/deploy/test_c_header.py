@@ -116,6 +116,30 @@ def test_header_survives_the_wrap_of_its_counter(student, recording, tmp_path) -
     check_twin(build_program(student, tmp_path, text=short)(recording.readings), student.predict(recording.readings))
 
 
+MISSING = """
+#include <stdio.h>
+#include "localizer.h"
+int main(void) {
+  static localizer_state pad;
+  localizer_touch touch;
+  const float volts[LOCALIZER_FIBRES] = {NAN, 1.0f, 1.0f, 1.0f};
+  localizer_init(&pad);
+  for (int n = 0; n < 50; n++) localizer_reading_held(&pad, volts, 0.0f, n >= 40, &touch);
+  printf("%ld %d", (long)pad.missing[0], touch.n_failed);
+  return 0;
+}
+"""
+
+
+def test_header_counts_missing_readings_of_a_press_alone(student, tmp_path) -> None:
+    """A broken fibre is missing for years while nobody presses, and the counter has 32 bits."""
+    (tmp_path / "localizer.h").write_text(render_header(student, BUDGET, []))
+    for source, expected in ((MISSING, "9 1"), (MISSING.replace("n >= 40", "0"), "0 0")):
+        (tmp_path / "main.c").write_text(source)
+        program = compile_c(tmp_path / "main.c", tmp_path)
+        assert subprocess.run([program], check=True, capture_output=True, text=True).stdout == expected
+
+
 def test_header_agrees_with_its_twin_on_any_readings(student, program) -> None:
     """Steps, spikes, gaps and values that are no voltage, with its own detector and without."""
 

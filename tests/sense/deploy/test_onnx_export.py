@@ -78,6 +78,21 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     assert sorted(set(n_complete)) == list(range(18))
 
 
+def test_graph_masks_a_fibre_whose_readings_are_missing(graph, localizer, recording) -> None:
+    """In the presses that its mean or its history would be missing in; the others of the call are as ever."""
+    readings = np.array(interpolate_gaps(recording.readings))
+    presses, first = localizer.scaled_features(recording), 200
+    readings[recording.down_command[first] + 2, 1] = np.nan
+    fibre_mask = np.array(presses.fibre_mask)
+    expected_mask = fibre_mask.copy()
+    expected_mask[first:, 1] = False
+    inputs = inputs_of(recording, fibre_mask) | {"readings": readings}
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs)
+    expected = localizer.predict_features(replace(presses, fibre_mask=expected_mask))
+    check_positions(positions_mm, expected)
+    np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+
+
 def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None:
     """After the touch of a press come the readings of another one."""
     readings = np.array(recording.readings)
