@@ -13,7 +13,7 @@ from pathlib import Path
 from tools.kills import forked
 
 MIB = 2**20
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 _TOLD = 10**6
 """Bytes of what a process writes that are looked at, the last ones."""
 

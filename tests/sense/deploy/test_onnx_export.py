@@ -78,6 +78,25 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     assert sorted(set(n_complete)) == list(range(18))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording, seed: int) -> None:
+    """Short ones, too, and from the first readings on: windows and rests end where a press or the recording begins."""
+    rng = np.random.default_rng(seed)
+    edges = np.cumsum(rng.choice([1, 2, 3, 7, 12, 25], 2 * 60))
+    down, up = edges[::2], edges[1::2]
+    until = edges[-1] + seed
+    unknown = np.full((60, 2), np.nan)
+    quick = Recording(recording.readings[:until], recording.times_s[:until], unknown, down, up)
+    scaled = localizer.scaled_features(quick)
+    for failed in ((), (1,)):
+        fibre_mask = scaled.fibre_mask & ~np.isin(np.arange(4), failed)
+        expected = localizer.predict_features(replace(scaled, fibre_mask=fibre_mask))
+        positions_mm, std_mm, r90_mm = graph.run(["positions_mm", "std_mm", "r90_mm"], inputs_of(quick, fibre_mask))
+        check_positions(positions_mm, expected)
+        np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
+        np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+
+
 def test_graph_masks_a_fibre_whose_readings_are_missing(graph, localizer, recording) -> None:
     """In the presses that its mean or its history would be missing in; the others of the call are as ever."""
     readings = np.array(interpolate_gaps(recording.readings))
