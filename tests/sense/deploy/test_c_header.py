@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import LocalizerSettings, Recording, calibrate
+from padforge.sense.arrays import MAX_VOLTS
 from padforge.sense.deploy.c_header import (
     WRAP_AT,
     WRAP_BY,
@@ -21,7 +22,7 @@ from padforge.sense.deploy.c_header import (
     quantize,
     render_header,
 )
-from padforge.sense.deploy.streaming import CODE_BYTES, MemoryBudget, commanded_presses
+from padforge.sense.deploy.streaming import CODE_BYTES, MAX_PRESS, MemoryBudget, commanded_presses
 from padforge.sense.formats.import_export import open_recording
 from padforge.sense.localizer.calibration import split_unseen
 from padforge.sense.localizer.model import LocalizerModel
@@ -71,13 +72,23 @@ def test_header_detects_presses_of_the_twin(student, program, recording) -> None
     assert (touched[: len(released)] < released).all()
 
 
+def test_header_takes_a_long_press_for_a_new_rest(student, program, recording) -> None:
+    """A fibre breaks while the pad is free."""
+    readings = np.array(recording.readings)
+    readings[2012:, 0] = 0.0
+    twin = student.predict(readings)
+    assert (twin[0].ended - twin[0].down_command > MAX_PRESS).sum() == 1
+    check_twin(program(readings), twin)
+
+
 def test_header_gives_depth_and_force(deep_student, deep_recording, tmp_path) -> None:
-    pressed = commanded_presses(deep_recording)
-    output = build_program(deep_student, tmp_path, "-DDEPTH")(deep_recording.readings, pressed)
-    twin = deep_student.predict(deep_recording.readings, pressed)
-    check_twin(output, twin)
-    measures = [column for each in twin[1].measures.values() for column in (each.values, each.r90)]
-    np.testing.assert_allclose(output.positions[:, 9:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
+    pressed, run = commanded_presses(deep_recording), build_program(deep_student, tmp_path, "-DDEPTH")
+    for failed in ((), (0, 1, 2, 3)):
+        output = run(deep_recording.readings, pressed, failed)
+        twin = deep_student.predict(deep_recording.readings, pressed, failed)
+        check_twin(output, twin, failed)
+        measures = [column for each in twin[1].measures.values() for column in (each.values, each.r90)]
+        np.testing.assert_allclose(output.positions[:, 9:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
 
 
 def test_header_writes_whole_rates_as_floats(student) -> None:
@@ -116,7 +127,7 @@ def test_header_survives_the_wrap_of_its_counter(student, recording, tmp_path) -
     check_twin(build_program(student, tmp_path, text=short)(recording.readings), student.predict(recording.readings))
 
 
-MISSING = """
+BROKEN = """
 #include <stdio.h>
 #include "localizer.h"
 int main(void) {
@@ -124,20 +135,32 @@ int main(void) {
   localizer_touch touch;
   const float volts[LOCALIZER_FIBRES] = {NAN, 1.0f, 1.0f, 1.0f};
   localizer_init(&pad);
-  for (int n = 0; n < 50; n++) localizer_reading_held(&pad, volts, 0.0f, n >= 40, &touch);
-  printf("%ld %d", (long)pad.missing[0], touch.n_failed);
+  for (int n = 0; n < 50; n++) {
+    memset(&touch, 1, sizeof touch);
+    localizer_reading_held(&pad, volts, 0.5f * (float)n, n >= 40, &touch);
+  }
+  printf("%ld %d %.1f %g", (long)pad.missing[0], touch.n_failed, touch.seconds, touch.r90_mm);
   return 0;
 }
 """
+"""A fibre is missing, and the pad is pressed with the last readings."""
 
 
-def test_header_counts_missing_readings_of_a_press_alone(student, tmp_path) -> None:
+def test_header_counts_missing_readings_and_the_time_of_a_press_alone(student, tmp_path) -> None:
     """A broken fibre is missing for years while nobody presses, and the counter has 32 bits."""
     (tmp_path / "localizer.h").write_text(render_header(student, BUDGET, []))
-    for source, expected in ((MISSING, "9 1"), (MISSING.replace("n >= 40", "0"), "0 0")):
+    for source, expected in ((BROKEN, "9 1 20.0 "), (BROKEN.replace("n >= 40", "0"), "0 0 0.0 0")):
         (tmp_path / "main.c").write_text(source)
         program = compile_c(tmp_path / "main.c", tmp_path)
-        assert subprocess.run([program], check=True, capture_output=True, text=True).stdout == expected
+        assert subprocess.run([program], check=True, capture_output=True, text=True).stdout.startswith(expected)
+
+
+def test_header_takes_the_radii_of_the_most_failures_for_more(student, recording, tmp_path) -> None:
+    """They were calibrated for one failed fibre only."""
+    model = replace(student.model, interval_factors=student.model.interval_factors[:, :2])
+    fewer, pressed = replace(student, model=model), commanded_presses(recording)
+    output = build_program(fewer, tmp_path)(recording.readings, pressed, (0, 1, 2))
+    check_twin(output, fewer.predict(recording.readings, pressed, (0, 1, 2)), (0, 1, 2))
 
 
 def test_header_agrees_with_its_twin_on_any_readings(student, program) -> None:
@@ -150,7 +173,7 @@ def test_header_agrees_with_its_twin_on_any_readings(student, program) -> None:
         levels = np.cumsum(step * rng.standard_normal((400, 4)) * (rng.random((400, 1)) < 0.1), axis=0)
         readings = 2 + levels + 1e-3 * rng.standard_normal((400, 4))
         odd = rng.random(readings.shape) < 0.02
-        readings[odd] = rng.choice([np.nan, np.inf, -np.inf, 1e30, 5e3, 0.0, 900.0], odd.sum())
+        readings[odd] = rng.choice([np.nan, np.inf, -np.inf, 1e30, 5e3, 0.0, 900.0, MAX_VOLTS], odd.sum())
         readings[200:300, 1] = rng.choice([np.inf, 2.0])
         pressed = np.resize(np.repeat(rng.random(100) < 0.4, rng.integers(1, 9, 100)), 400) if is_held else None
         check_twin(program(readings, pressed), student.predict(readings, pressed))
