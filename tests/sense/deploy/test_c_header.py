@@ -97,10 +97,32 @@ def test_header_writes_whole_rates_as_floats(student) -> None:
         assert f"#define LOCALIZER_RATE_HZ {literal}\n" in render_header(other, BUDGET, [])
 
 
-@pytest.mark.parametrize("budget", [MemoryBudget(40_000, 500), MemoryBudget(9_000, 8_000)])
-def test_header_beyond_its_budget_does_not_compile(student, tmp_path, budget: MemoryBudget) -> None:
+def test_header_holds_the_very_numbers_of_its_tables(student) -> None:
+    text = render_header(student, BUDGET, [])
+    for name, table in (("mean", student.model.scaler.mean_v), ("first_b", student.weights["first.b"])):
+        match = re.search(rf"localizer_{name}_\[\d+\] = {{\n(.*?)\n}};", text, re.DOTALL)
+        assert match is not None
+        numbers = [float(number.strip().removesuffix("f")) for number in match[1].split(",")]
+        assert np.array_equal(np.array(numbers, np.float32), table.ravel().astype(np.float32))
+
+
+@pytest.mark.parametrize("short", ["ram", "flash"])
+def test_header_beyond_its_budget_does_not_compile(student, tmp_path, short: str) -> None:
+    flash = student.table_bytes + CODE_BYTES
+    budget = MemoryBudget(flash, 500) if short == "ram" else MemoryBudget(flash - 1, 8_000)
     with pytest.raises(subprocess.CalledProcessError):
         build_program(student, tmp_path, budget=budget)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_header_limits_the_errors_that_it_expects(student, recording, tmp_path, sign: int) -> None:
+    """A network far from its training answers with errors of any size."""
+    networks = {
+        name: weights | {"last.b": weights["last.b"] + sign * np.float32(30)}
+        for name, weights in student.model.networks.items()
+    }
+    sure, pressed = replace(student, model=replace(student.model, networks=networks)), commanded_presses(recording)
+    check_twin(build_program(sure, tmp_path)(recording.readings, pressed), sure.predict(recording.readings, pressed))
 
 
 def test_program_of_the_tutorial_prints_touches(student, recording, tmp_path) -> None:

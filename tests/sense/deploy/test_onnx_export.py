@@ -17,9 +17,11 @@ from padforge.design.common.validation import Fault, InputError
 from padforge.sense import Recording, calibrate, export_csv
 from padforge.sense.deploy import onnx_export
 from padforge.sense.deploy.onnx_export import FORMAT, MAX_DIFFERENCE_MM, OnnxReport, export_onnx
+from padforge.sense.deploy.streaming import commanded_presses
 from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.network import predict
+from padforge.sense.localizer.scaler import MAX_INPUT
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import tutorial_code
 
@@ -95,6 +97,18 @@ def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer,
         check_positions(positions_mm, expected)
         np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
         np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+
+
+def test_graph_clips_what_is_far_beyond_the_training(graph, localizer, recording) -> None:
+    readings = np.array(recording.readings)
+    readings[:] = np.where(commanded_presses(recording), 1000.0, -1000.0)[:, None]
+    strong = replace(recording, readings=readings)
+    presses = localizer.scaled_features(strong)
+    assert (np.abs(presses.inputs) == MAX_INPUT).any()
+    expected = localizer.predict_features(presses)
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(strong, presses.fibre_mask))
+    check_positions(positions_mm, expected)
+    np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
 
 def test_graph_masks_a_fibre_whose_readings_are_missing(graph, localizer, recording) -> None:
