@@ -44,7 +44,7 @@ MAX_DIFFERENCE_MM = 1e-4
 N_TRIALS, TRIAL_READINGS = 64, 40
 """Presses that are made up to test a graph where there is no recording, and readings from one to the next."""
 INPUTS = {
-    "readings": "V, (R, C): one row a reading so far, one column a fibre, none missing",
+    "readings": "V, (R, C): one row a reading so far, one column a fibre, which fails where one is missing",
     "down_command": "(Q,), ascending: row of the first reading after the probe was sent down",
     "up_command": "(Q,): row of the first reading after it was sent up; R where there is none yet",
     "fibre_mask": "(Q, C): which fibres count in each press",
@@ -187,6 +187,7 @@ class _LocalizerModule(nn.Module):
         self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
     ) -> tuple[Tensor, ...]:
         scaled, seen = self.features(readings, down_command, up_command)
+        fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # or one missing reading would spoil all presses
         n_complete = seen.sum(dim=1)
         x, _ = network_inputs(scaled, fibre_mask, seen, None)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)

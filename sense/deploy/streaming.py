@@ -86,7 +86,7 @@ def _run_stream(
     pad = np.zeros(8, np.int64)
     n_presses = n_estimates = 0
     for n in range(n_readings):
-        _ingest(n, readings[n], ring, averages, levels[0], missing, rates)
+        _ingest(n, readings[n], ring, averages, missing, rates)
         if len(pressed):
             change = _follow(n, pressed[n], pad)
         else:
@@ -129,7 +129,7 @@ def _run_stream(
 
 
 @kernel
-def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: Any, rates: Any) -> None:
+def _ingest(n: int, row: Any, ring: Any, averages: Any, missing: Any, rates: Any) -> None:
     """Store a reading; what is missing or beyond MAX_VOLTS repeats the reading before."""
     for c in range(len(row)):
         x = row[c]
@@ -138,8 +138,6 @@ def _ingest(n: int, row: Any, ring: Any, averages: Any, baseline: Any, missing: 
             x = ring[(n - 1) % RING, c]
         lagged = ring[(n - LAG) % RING, c]
         ring[n % RING, c] = x
-        if n == 0:
-            baseline[c] = x
         for j in range(len(rates)):
             if n == 0:
                 averages[c, j] = x

@@ -61,11 +61,10 @@ class DiskThread(ThreadPoolExecutor):
         self._last = super().submit(work)
         return self._last
 
-    def is_idle(self, timeout_s: float = 0.0) -> bool:
-        """Wait for at most `timeout_s`; return whether all calls are done. Raises what a failed call raised."""
-        if done := bool(wait([self._last], timeout_s).done):
+    def check(self) -> None:
+        """Raise what a failed call raised."""
+        if self._last.done():  # at once after a failure, as no more calls are made
             self._last.result()
-        return done
 
 
 class Interrupts:
@@ -160,12 +159,10 @@ class PressLoop:
                     if (changed := planner(plan, press)) is not plan:
                         check_plan(changed, self._rig)
                         plan = changed
-                    self._press(press, plan.positions_mm[press], float(plan.depths_mm[press]))
-                    self._await_disk()
+                    self._await_disk(self._press(press, plan.positions_mm[press], float(plan.depths_mm[press])))
                     on_progress(len(self._recorder.done), len(plan), "")
             self._record_until(self._clock() + self._half_s)  # the release after the last press
-            self._disk.submit(self._recorder.sync)
-            self._await_disk()
+            self._await_disk(self._disk.submit(self._recorder.sync))
 
     def _start_clock(self) -> None:
         """Let times begin at 0, or a second after the last ones; drop what came while the devices were connected."""
@@ -174,7 +171,8 @@ class PressLoop:
         last_s = self._recorder.last_s
         self._zero_s = self._clock() - (last_s + 1 if np.isfinite(last_s) else 0.0)
 
-    def _press(self, press: int, position_mm: Array, depth_mm: float) -> None:
+    def _press(self, press: int, position_mm: Array, depth_mm: float) -> Future[Any]:
+        """Make a press; return the call that puts it on the disk."""
         above = self._frame.pose(position_mm, -self._rig.clearance_mm)
         # 1. Travel, and let the pad recover for half a cycle.
         start_s = self._clock()
@@ -202,8 +200,9 @@ class PressLoop:
         self._await_reading(up_s)
         reached["lost"] = self._averager.n_missing
         self._disk.submit(self._recorder.finish, self._reading_after(up_s), **reached)
-        self._disk.submit(self._recorder.sync)
+        synced = self._disk.submit(self._recorder.sync)
         self._await_still()
+        return synced
 
     def _move(self, pose: Pose, speed_mm_s: float) -> None:
         check_state(self._arm.state(), self._limits, self._clock())
@@ -233,20 +232,21 @@ class PressLoop:
             self._sleep(POLL_S)
             self._poll()
 
-    def _await_disk(self) -> None:
-        """Record until all that was submitted is on the disk."""
+    def _await_disk(self, synced: Future[Any]) -> None:
+        """Record until a call of the disk thread is done; what is recorded meanwhile may wait."""
         deadline_s = self._clock() + _DISK_DEADLINE_S
-        while not self._disk.is_idle(POLL_S):
+        while not wait([synced], POLL_S).done:
             if self._clock() >= deadline_s:
                 message = f"the disk took more than {_DISK_DEADLINE_S:.0f} s for a press"
                 raise RigFault("disk", message, "look at the disk")
             self._poll()
+        synced.result()
 
     def _poll(self) -> None:
         """Check that all is well, before anything else; then read the devices, and have that recorded."""
         self._interrupts.check()
         check_state(self._arm.state(), self._limits, self._clock())
-        self._disk.is_idle()  # raises what a write raised
+        self._disk.check()
         times_s, volts = self._averager.feed(self._board.read())
         if len(times_s):
             self._disk.submit(self._recorder.append, times_s - self._zero_s, volts)

@@ -30,6 +30,7 @@ POLL_S = 0.004
 RETREAT_MM_S = 10.0
 RETREAT_MM = 10.0  # height above the pad, or above the place where the force was too great
 FALL_START_S, FALL_END_S = 0.2, 1.0  # by when such a force has to begin to fall, and to be below its limit
+FRESH_S = 1.0  # longest wait for a state before the retreat: a link that was silent for a moment may recover
 MAX_RISE_N = 5.0  # of such a force above its minimum: the error of force sensors
 EDGE_MM = 1.0  # how far outside the box a tool may stand that was sent to its edge: arms stop near their target
 
@@ -216,7 +217,7 @@ def retreat(
     Everything is checked as in any move, except that a force or depth beyond its limit has to decrease, and that the
     tool may stand at the edge of the box. The arm is stopped, and RigFault("force") raised, if it does not decrease.
     """
-    state = arm.state()
+    state = _await_state(arm, clock, sleep)
     if state.force_n is None:  # the sensor may have failed in a press, and the tool has to come off all the same
         limits = replace(limits, max_force_n=None)
     if limits.contact_mm is None:
@@ -242,6 +243,21 @@ def retreat(
         _falling_force_check(arm, state.total_force_n or 0.0, max_n, clock) if overloaded and max_n else lambda: None
     )
     check_state(wait_until_still(arm, relaxed, clock, sleep, meanwhile), limits, clock())
+
+
+def _await_state(arm: Arm, clock: Callable[[], float], sleep: Callable[[float], None]) -> ArmState:
+    """Return the first state that is not stale; raises the RigFault of `arm.state` if none comes in time."""
+    deadline_s = clock() + FRESH_S
+    while True:
+        try:
+            state = arm.state()
+        except RigFault as fault:
+            if fault.cause != "stale" or clock() >= deadline_s:
+                raise
+        else:
+            if clock() - state.time_s <= MAX_STATE_AGE_S or clock() >= deadline_s:
+                return state
+        sleep(POLL_S)
 
 
 def _falling_force_check(arm: Arm, first_n: float, max_n: float, clock: Callable[[], float]) -> Callable[[], None]:

@@ -71,7 +71,9 @@ def test_commands_on_pages_parse(page: Path, parser: click.Command) -> None:
                 pytest.fail(f"{relative(page)}: {command}: {error.format_message()}")
 
 
-@pytest.mark.parametrize(("name", "command"), every(cli), ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(
+    ("name", "command"), list(every(cli)), ids=lambda value: value if isinstance(value, str) else ""
+)
 def test_help_examples_parse(name: str, command: click.Command, parser: click.Command) -> None:
     lines = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
     assert [line for line in lines if line.startswith(name)]

@@ -49,13 +49,18 @@ def assert_both_ways_agree(body: Body) -> None:
     assert box == pytest.approx(as_read(body).bounds, abs=1e-4)
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """z of the products of vectors in a plane."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
 def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
     """z of the mould's surface seen from above."""
     corners = solid.triangles
     a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
-    area = np.cross(b - a, c - a)
+    area = cross(b - a, c - a)
     up = area > 1e-12
-    w = np.stack([np.cross(c - b, (x, y) - b), np.cross(a - c, (x, y) - c), np.cross(b - a, (x, y) - a)])[:, up]
+    w = np.stack([cross(c - b, (x, y) - b), cross(a - c, (x, y) - c), cross(b - a, (x, y) - a)])[:, up]
     w = w / area[up]
     inside = (w >= -1e-9).all(axis=0)
     return float((w[:, inside] * corners[up][inside][:, :, 2].T).sum(axis=0).max())

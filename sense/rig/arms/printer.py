@@ -128,9 +128,12 @@ class NozzleThread(threading.Thread):
         try:
             result.result(timeout_s)
         except TimeoutError:
+            result.cancel()  # or it would be executed later, when nobody waits for its end
             raise self.fault or RigFault("deadline", f"the printer did not answer within {timeout_s} s") from None
 
     def _execute(self, command: Callable[[], None], result: "Future[None]") -> None:
+        if not result.set_running_or_notify_cancel():
+            return
         try:
             command()
         except RigFault as fault:
@@ -147,10 +150,10 @@ class NozzleThread(threading.Thread):
         move = move.limit_axes(self._max_mm_s, self._max_mm_s2)
         if not move.length_mm:
             return
+        self._move = move  # before anything is sent, as `stop` has nothing to do without a move
         if move.acceleration != self._acceleration:
             self._link.execute(f"M204 P{move.acceleration:.1f} T{move.acceleration:.1f}")
             self._acceleration = move.acceleration
-        self._move = move
         self._link.execute(format_move(end, move.speed))
         self._start_s = time.monotonic()
         # Without R the firmware reports the end of its moves: software endstops may have clipped this one.

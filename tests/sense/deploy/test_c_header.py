@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.sense import LocalizerSettings, Recording, calibrate
+from padforge.sense.arrays import MAX_VOLTS
 from padforge.sense.deploy.c_header import (
     WRAP_AT,
     WRAP_BY,
@@ -21,7 +22,7 @@ from padforge.sense.deploy.c_header import (
     quantize,
     render_header,
 )
-from padforge.sense.deploy.streaming import CODE_BYTES, MemoryBudget, commanded_presses
+from padforge.sense.deploy.streaming import CODE_BYTES, MAX_PRESS, MemoryBudget, commanded_presses
 from padforge.sense.formats.import_export import open_recording
 from padforge.sense.localizer.calibration import split_unseen
 from padforge.sense.localizer.model import LocalizerModel
@@ -71,13 +72,23 @@ def test_header_detects_presses_of_the_twin(student, program, recording) -> None
     assert (touched[: len(released)] < released).all()
 
 
+def test_header_takes_a_long_press_for_a_new_rest(student, program, recording) -> None:
+    """A fibre breaks while the pad is free."""
+    readings = np.array(recording.readings)
+    readings[2012:, 0] = 0.0
+    twin = student.predict(readings)
+    assert (twin[0].ended - twin[0].down_command > MAX_PRESS).sum() == 1
+    check_twin(program(readings), twin)
+
+
 def test_header_gives_depth_and_force(deep_student, deep_recording, tmp_path) -> None:
-    pressed = commanded_presses(deep_recording)
-    output = build_program(deep_student, tmp_path, "-DDEPTH")(deep_recording.readings, pressed)
-    twin = deep_student.predict(deep_recording.readings, pressed)
-    check_twin(output, twin)
-    measures = [column for each in twin[1].measures.values() for column in (each.values, each.r90)]
-    np.testing.assert_allclose(output.positions[:, 9:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
+    pressed, run = commanded_presses(deep_recording), build_program(deep_student, tmp_path, "-DDEPTH")
+    for failed in ((), (0, 1, 2, 3)):
+        output = run(deep_recording.readings, pressed, failed)
+        twin = deep_student.predict(deep_recording.readings, pressed, failed)
+        check_twin(output, twin, failed)
+        measures = [column for each in twin[1].measures.values() for column in (each.values, each.r90)]
+        np.testing.assert_allclose(output.positions[:, 9:], np.column_stack(measures), rtol=1e-4, atol=1e-4)
 
 
 def test_header_writes_whole_rates_as_floats(student) -> None:
@@ -86,10 +97,32 @@ def test_header_writes_whole_rates_as_floats(student) -> None:
         assert f"#define LOCALIZER_RATE_HZ {literal}\n" in render_header(other, BUDGET, [])
 
 
-@pytest.mark.parametrize("budget", [MemoryBudget(40_000, 500), MemoryBudget(9_000, 8_000)])
-def test_header_beyond_its_budget_does_not_compile(student, tmp_path, budget: MemoryBudget) -> None:
+def test_header_holds_the_very_numbers_of_its_tables(student) -> None:
+    text = render_header(student, BUDGET, [])
+    for name, table in (("mean", student.model.scaler.mean_v), ("first_b", student.weights["first.b"])):
+        match = re.search(rf"localizer_{name}_\[\d+\] = {{\n(.*?)\n}};", text, re.DOTALL)
+        assert match is not None
+        numbers = [float(number.strip().removesuffix("f")) for number in match[1].split(",")]
+        assert np.array_equal(np.array(numbers, np.float32), table.ravel().astype(np.float32))
+
+
+@pytest.mark.parametrize("short", ["ram", "flash"])
+def test_header_beyond_its_budget_does_not_compile(student, tmp_path, short: str) -> None:
+    flash = student.table_bytes + CODE_BYTES
+    budget = MemoryBudget(flash, 500) if short == "ram" else MemoryBudget(flash - 1, 8_000)
     with pytest.raises(subprocess.CalledProcessError):
         build_program(student, tmp_path, budget=budget)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_header_limits_the_errors_that_it_expects(student, recording, tmp_path, sign: int) -> None:
+    """A network far from its training answers with errors of any size."""
+    networks = {
+        name: weights | {"last.b": weights["last.b"] + sign * np.float32(30)}
+        for name, weights in student.model.networks.items()
+    }
+    sure, pressed = replace(student, model=replace(student.model, networks=networks)), commanded_presses(recording)
+    check_twin(build_program(sure, tmp_path)(recording.readings, pressed), sure.predict(recording.readings, pressed))
 
 
 def test_program_of_the_tutorial_prints_touches(student, recording, tmp_path) -> None:
@@ -116,6 +149,42 @@ def test_header_survives_the_wrap_of_its_counter(student, recording, tmp_path) -
     check_twin(build_program(student, tmp_path, text=short)(recording.readings), student.predict(recording.readings))
 
 
+BROKEN = """
+#include <stdio.h>
+#include "localizer.h"
+int main(void) {
+  static localizer_state pad;
+  localizer_touch touch;
+  const float volts[LOCALIZER_FIBRES] = {NAN, 1.0f, 1.0f, 1.0f};
+  localizer_init(&pad);
+  for (int n = 0; n < 50; n++) {
+    memset(&touch, 1, sizeof touch);
+    localizer_reading_held(&pad, volts, 0.5f * (float)n, n >= 40, &touch);
+  }
+  printf("%ld %d %.1f %g", (long)pad.missing[0], touch.n_failed, touch.seconds, touch.r90_mm);
+  return 0;
+}
+"""
+"""A fibre is missing, and the pad is pressed with the last readings."""
+
+
+def test_header_counts_missing_readings_and_the_time_of_a_press_alone(student, tmp_path) -> None:
+    """A broken fibre is missing for years while nobody presses, and the counter has 32 bits."""
+    (tmp_path / "localizer.h").write_text(render_header(student, BUDGET, []))
+    for source, expected in ((BROKEN, "9 1 20.0 "), (BROKEN.replace("n >= 40", "0"), "0 0 0.0 0")):
+        (tmp_path / "main.c").write_text(source)
+        program = compile_c(tmp_path / "main.c", tmp_path)
+        assert subprocess.run([program], check=True, capture_output=True, text=True).stdout.startswith(expected)
+
+
+def test_header_takes_the_radii_of_the_most_failures_for_more(student, recording, tmp_path) -> None:
+    """They were calibrated for one failed fibre only."""
+    model = replace(student.model, interval_factors=student.model.interval_factors[:, :2])
+    fewer, pressed = replace(student, model=model), commanded_presses(recording)
+    output = build_program(fewer, tmp_path)(recording.readings, pressed, (0, 1, 2))
+    check_twin(output, fewer.predict(recording.readings, pressed, (0, 1, 2)), (0, 1, 2))
+
+
 def test_header_agrees_with_its_twin_on_any_readings(student, program) -> None:
     """Steps, spikes, gaps and values that are no voltage, with its own detector and without."""
 
@@ -126,7 +195,7 @@ def test_header_agrees_with_its_twin_on_any_readings(student, program) -> None:
         levels = np.cumsum(step * rng.standard_normal((400, 4)) * (rng.random((400, 1)) < 0.1), axis=0)
         readings = 2 + levels + 1e-3 * rng.standard_normal((400, 4))
         odd = rng.random(readings.shape) < 0.02
-        readings[odd] = rng.choice([np.nan, np.inf, -np.inf, 1e30, 5e3, 0.0, 900.0], odd.sum())
+        readings[odd] = rng.choice([np.nan, np.inf, -np.inf, 1e30, 5e3, 0.0, 900.0, MAX_VOLTS], odd.sum())
         readings[200:300, 1] = rng.choice([np.inf, 2.0])
         pressed = np.resize(np.repeat(rng.random(100) < 0.4, rng.integers(1, 9, 100)), 400) if is_held else None
         check_twin(program(readings, pressed), student.predict(readings, pressed))

@@ -17,9 +17,11 @@ from padforge.design.common.validation import Fault, InputError
 from padforge.sense import Recording, calibrate, export_csv
 from padforge.sense.deploy import onnx_export
 from padforge.sense.deploy.onnx_export import FORMAT, MAX_DIFFERENCE_MM, OnnxReport, export_onnx
+from padforge.sense.deploy.streaming import commanded_presses
 from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.network import predict
+from padforge.sense.localizer.scaler import MAX_INPUT
 from tests.sense.conftest import QUICK
 from tests.sense.deploy.conftest import tutorial_code
 
@@ -78,6 +80,52 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     assert sorted(set(n_complete)) == list(range(18))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording, seed: int) -> None:
+    """Short ones, too, and from the first readings on: windows and rests end where a press or the recording begins."""
+    rng = np.random.default_rng(seed)
+    edges = np.cumsum(rng.choice([1, 2, 3, 7, 12, 25], 2 * 60))
+    down, up = edges[::2], edges[1::2]
+    until = edges[-1] + seed
+    unknown = np.full((60, 2), np.nan)
+    quick = Recording(recording.readings[:until], recording.times_s[:until], unknown, down, up)
+    scaled = localizer.scaled_features(quick)
+    for failed in ((), (1,)):
+        fibre_mask = scaled.fibre_mask & ~np.isin(np.arange(4), failed)
+        expected = localizer.predict_features(replace(scaled, fibre_mask=fibre_mask))
+        positions_mm, std_mm, r90_mm = graph.run(["positions_mm", "std_mm", "r90_mm"], inputs_of(quick, fibre_mask))
+        check_positions(positions_mm, expected)
+        np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
+        np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+
+
+def test_graph_clips_what_is_far_beyond_the_training(graph, localizer, recording) -> None:
+    readings = np.array(recording.readings)
+    readings[:] = np.where(commanded_presses(recording), 1000.0, -1000.0)[:, None]
+    strong = replace(recording, readings=readings)
+    presses = localizer.scaled_features(strong)
+    assert (np.abs(presses.inputs) == MAX_INPUT).any()
+    expected = localizer.predict_features(presses)
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(strong, presses.fibre_mask))
+    check_positions(positions_mm, expected)
+    np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+
+
+def test_graph_masks_a_fibre_whose_readings_are_missing(graph, localizer, recording) -> None:
+    """In the presses that its mean or its history would be missing in; the others of the call are as ever."""
+    readings = np.array(interpolate_gaps(recording.readings))
+    presses, first = localizer.scaled_features(recording), 200
+    readings[recording.down_command[first] + 2, 1] = np.nan
+    fibre_mask = np.array(presses.fibre_mask)
+    expected_mask = fibre_mask.copy()
+    expected_mask[first:, 1] = False
+    inputs = inputs_of(recording, fibre_mask) | {"readings": readings}
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs)
+    expected = localizer.predict_features(replace(presses, fibre_mask=expected_mask))
+    check_positions(positions_mm, expected)
+    np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
+
+
 def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None:
     """After the touch of a press come the readings of another one."""
     readings = np.array(recording.readings)
@@ -105,13 +153,15 @@ def test_graph_of_a_brief_training_is_tested_with_its_recording(brief: Recording
 
 def test_graph_gives_depth_and_force(deep_localizer, deep_recording, tmp_path) -> None:
     export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", deep_recording)
-    presses = deep_localizer.scaled_features(deep_recording)
-    expected, graph = deep_localizer.predict_features(presses), onnxruntime.InferenceSession(tmp_path / "l.onnx")
+    presses, graph = deep_localizer.scaled_features(deep_recording), onnxruntime.InferenceSession(tmp_path / "l.onnx")
     names = [each.name for each in graph.get_outputs()][4:]
     assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
-    values = graph.run(names, inputs_of(deep_recording, presses.fibre_mask))
-    columns = [column for each in expected.measures.values() for column in (each.values, each.r90)]
-    np.testing.assert_allclose(np.array(values), np.array(columns), rtol=1e-4, atol=1e-4)
+    for failed in ((), (0, 1, 2, 3)):
+        fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), failed)
+        expected = deep_localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
+        values = graph.run(names, inputs_of(deep_recording, fibre_mask))
+        columns = [column for each in expected.measures.values() for column in (each.values, each.r90)]
+        np.testing.assert_allclose(np.array(values), np.array(columns), rtol=1e-4, atol=1e-4)
 
 
 def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:

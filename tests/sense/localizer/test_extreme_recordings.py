@@ -61,7 +61,7 @@ def test_predict_and_evaluate_stay_finite(localizer: LocalizerModel, brief: Reco
     require_finite(localizer, one, evaluate(localizer, one, (0, 3)).to_dict() if one.has_position.any() else ())
 
 
-@pytest.mark.parametrize(("seed", "method"), enumerate([*["ensemble"] * 6, *["published"] * 2]))
+@pytest.mark.parametrize(("seed", "method"), list(enumerate([*["ensemble"] * 6, *["published"] * 2])))
 def test_calibrate_learns_or_refuses(brief: Recording, seed: int, method: str) -> None:
     one = worst(seed, brief)
     try:

@@ -181,6 +181,24 @@ def test_run_stops_and_retreats_at_too_much_force(tmp_path, stays, outcome, end_
     assert arm.pose[2] == pytest.approx(end_mm, abs=2)
 
 
+@pytest.mark.parametrize(("silent_s", "end_mm"), [(0.9, 60), (3.0, 46)])
+def test_run_retreats_as_soon_as_states_come_again(tmp_path, silent_s, end_mm):
+    """A state that is too old ends the recording, and the tool is pressed into the pad."""
+    arm, board, options = rig()
+    state, since_s = arm.state, [np.inf]
+
+    def last_state():
+        if arm.pose[2] < 46.001 and not arm.stops:
+            since_s[0] = min(since_s[0], arm.time())
+        if 0.02 < arm.time() - since_s[0] < silent_s:
+            raise RigFault("stale", "the last state is old")
+        return state()
+
+    arm.state = last_state
+    assert fault_of(tmp_path / "run", arm, board, options, "the last state is old") == "stale"
+    assert arm.pose[2] == pytest.approx(end_mm)
+
+
 def test_run_stops_and_retreats_when_the_force_sensor_fails_in_a_press(tmp_path):
     arm, board, options = rig()
     arm.hook = lambda arm: setattr(arm, "force_n", None if arm.pose[2] < 48 or arm.force_n is None else 0.0)
@@ -282,6 +300,34 @@ def test_run_raises_a_disk_that_hangs(tmp_path):
     assert len(arm.moves) == 3
 
 
+def test_run_waits_for_a_press_alone_on_a_disk_that_never_rests(tmp_path):
+    """What is recorded while a press is awaited takes the disk until there is more of it."""
+    arm, board, options = rig()
+    drain, more, over = arm.drain, threading.Semaphore(0), threading.Event()
+
+    def counted_drain():
+        if len(arm.moves) == 3 and arm.pose[2] > 50:
+            if over.is_set():
+                more.release()
+            over.set()  # the only press is
+            arm.time.sleep(0.1)
+        return drain()
+
+    with open_run(tmp_path / "run") as recorder:
+        append_states = recorder.append_states
+
+        def slow(rows):
+            if over.is_set():
+                more.acquire(timeout=0.5)
+            append_states(rows)
+
+        arm.drain, recorder.append_states = counted_drain, slow
+        loop(arm, board, recorder, options).run(
+            PressPlan(PLAN.positions_mm[:1], PLAN.depths_mm[:1]), lambda *progress: more.release(1000)
+        )
+    assert n_done(tmp_path / "run") == 1
+
+
 def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
     """To connect an arm may take longer than the second between the last reading and the next."""
     for presses in (1, 2):
@@ -340,7 +386,9 @@ def test_disk_thread_stops_after_a_failure() -> None:
         disk.submit(done.append, 2)
         for _ in range(2):
             with pytest.raises(OSError, match="No space"):
-                disk.is_idle(5)
+                disk.submit(done.append, 3).result(5)
+            with pytest.raises(OSError, match="No space"):
+                disk.check()
     assert done == [1]
 
 

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -136,6 +136,19 @@ def test_unconfirmed_stop_halts_printer_and_clipped_move_raises():
         assert fault.value.cause == "lost"
         assert printer.true_positions(time.monotonic() + 9)[0] == pytest.approx(AT, abs=0.5)
         fault_of(arm.state, "lost")
+
+
+@pytest.mark.parametrize("asked_s", [0.1, pytest.param(0.0, marks=pytest.mark.slow)])
+def test_move_that_was_given_up_is_never_made(asked_s: float):
+    """The thread waits for a position as it is told to move, or for the new acceleration."""
+    with connected() as (arm, printer):
+        printer.busy(0.95)
+        time.sleep(asked_s)
+        fault_of(lambda: arm.move(pose(110, 110, 38), 50.0, 3000.0), "deadline", "did not answer within")
+        with suppress(RigFault):  # halted, as the stop is not confirmed in time
+            arm.stop()
+        time.sleep(0.3)
+        assert printer.true_positions(time.monotonic() + 9)[0] == pytest.approx(AT)
 
 
 @pytest.mark.parametrize(

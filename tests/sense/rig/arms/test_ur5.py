@@ -313,7 +313,9 @@ def test_play_does_not_resume_old_move(robot: EmulatedUR5, arm: UR5) -> None:
 PARENT = f"""
 import sys, time
 from padforge.sense.rig.arms.ur5 import UR5
-arm = UR5(*sys.argv[1:])
+from padforge.sense.rig.arms.urscript import Retreat
+host, driver, *height_mm = sys.argv[1:]
+arm = UR5(host, driver, Retreat(float(*height_mm), *{LIMITS.box_mm[:2]}, 100.0) if height_mm else None)
 arm.connect()
 arm.move({LOW}, 50, 500)
 print("moving", flush=True)
@@ -345,6 +347,24 @@ def test_arm_rests_after_program_dies_or_is_suspended(
         time.sleep(0.55)
         program.kill()
     assert start_s < last_motion_s(robot) < start_s + REST_S
+
+
+@pytest.mark.parametrize("name", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
+def test_arm_retreats_by_itself_after_program_dies_or_is_suspended(robots: Any, host: str, name: str) -> None:
+    """Nobody is left to lift the tool but the program on the arm."""
+    robot = robots.get("e", pose=HOME)
+    height_mm = HOME[2] - 1.0  # its way down is slow
+    command = [sys.executable, "-c", PARENT, host, "urscript", str(height_mm)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "moving\n"
+        time.sleep(0.15)
+        program.send_signal(signal.Signals[name])
+        assert robot.true_poses(time.monotonic() - 0.05)[0, 2] < height_mm
+        time.sleep(1.5)
+        program.kill()
+    assert robot.true_poses(time.monotonic() - 0.05)[0, 2] == pytest.approx(height_mm, abs=0.1)
+    robots.free()
 
 
 @ONE_DRIVER
