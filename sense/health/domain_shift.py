@@ -124,8 +124,9 @@ def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[i
     if scaler.measures:
         expected = expected * (localization.measures["depth_mm"].values / scaler.measures[0].origin)[:, None, None]
     expected_v, response_v = (part * scaler.scale_v + scaler.mean_v for part in (expected, presses.inputs))
-    is_located = np.delete(presses.fibre_mask, failed, axis=1).any(axis=1)
-    expected_v = np.where(is_located[:, None, None] & presses.fibre_mask[:, :, None], expected_v, 0.0)
+    is_located = np.delete(presses.fibre_mask, failed, axis=1).any(axis=1, keepdims=True)
+    valid = np.logical_and(is_located, presses.fibre_mask)
+    expected_v = np.where(valid[:, :, None], expected_v, 0.0)
     response_v = np.where(expected_v == 0, 0.0, response_v)
     return (response_v**2).sum(axis=2), (expected_v**2).sum(axis=2)
 
