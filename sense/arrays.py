@@ -46,7 +46,7 @@ def check_magnitude(name: str, values: Array, limit: float, unit: str, missing: 
         row = int(np.argmin(valid.all(axis=1)))
         kind = "infinity" if missing else "NaN or infinity"
         raise InputError(f"{name} hold {kind} (first in row {row}), expected finite numbers")
-    beyond = np.abs(values) > limit
+    beyond = (values > limit) | (values < -limit)  # without a copy of what may have gigabytes
     if beyond.any():
         row = int(np.argmax(beyond.any(axis=1)))
         raise InputError(

@@ -127,14 +127,18 @@ def locate(
     The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
     deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
     of a model that estimates them also depth_mm, depth_r90_mm, force_n, force_r90_n.
+
+    Lines on stderr name fibres that are faulty, and those that differ from the calibration, so that radii may fail.
     """
     from padforge.sense.localizer.model import write_localization
 
     file = out or common.pad_folder(recording) / "places.csv"
     opened = read_recording(recording)
-    localization, faults, _ = predict_despite_faults(model, opened, exclude_fibres, moment)
+    localization, faults, shifts, _ = predict_despite_faults(model, opened, exclude_fibres, moment)
     for fault in faults:
         click.echo(f"{fault.text}; masked from press {fault.since} on", err=True)
+    for shift in shifts:
+        click.echo(shift.text, err=True)
     write_localization(localization, file)
     click.echo(f"{len(localization.r50_mm)} positions -> {file}")
 
@@ -150,21 +154,24 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     \b
     padforge sense health --model out/pad out/later/recording
 
-    Exit 1 if there are any. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0.
+    Exit 1 if there are any. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0, and "shifts"
+    how fibres differ from the calibration.
     """
     from dataclasses import asdict
 
     from padforge.sense.health.fault_detector import FaultDetector, fault_lines
 
-    opened, detector = read_recording(recording), FaultDetector.load(model)
-    findings = detector.predict(opened)
+    opened, dead = read_recording(recording), FaultDetector.load(model).model_.dead
+    _, findings, shifts, _ = predict_despite_faults(model, opened)
     document = {
-        "format": "padforge-findings/3",
+        "format": "padforge-findings/4",
         "presses": len(opened.down_command),
-        "dead": list(detector.model_.dead),
+        "dead": list(dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
+        "shifts": [asdict(shift) | {"text": shift.text} for shift in shifts],
     }
-    common.show_result(document, fault_lines(findings, opened.fibres, detector.model_.dead), as_json)
+    lines = [*fault_lines(findings, opened.fibres, dead), *(shift.text for shift in shifts)]
+    common.show_result(document, lines, as_json)
     context.exit(int(bool(findings)))
 
 
@@ -271,6 +278,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
         check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *HEALTH_FILES], force)
         write_json(folder / "recalibration.json", result.to_dict())
         if detector:  # it does not depend on positions
+            detector.include_rests(opened)
             detector.save(folder)
     common.show_result(result.to_dict(), recalibration.recalibration_lines(result), as_json)
 

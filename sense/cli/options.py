@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -13,6 +13,7 @@ from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
     from padforge.sense.arrays import Indices
+    from padforge.sense.health.domain_shift import DomainShift
     from padforge.sense.health.fault_detector import FaultDetector, FibreFault
     from padforge.sense.localizer.model import Localization, LocalizerModel
     from padforge.sense.recording.recording import Recording
@@ -84,13 +85,23 @@ def recording_line(recording: "Recording", out: Path) -> str:
     )
 
 
+class Prediction(NamedTuple):
+    """What a folder of models says of a recording; without a health model, nothing of its fibres."""
+
+    localization: "Localization"  # without a faulty fibre from where it is detected
+    faults: "list[FibreFault]"
+    shifts: "list[DomainShift]"
+    detector: "FaultDetector | None"
+
+
 def predict_despite_faults(
     model: Path, recording: "Recording", failed: Sequence[int] = (), moment: tuple[str, float] | None = None
-) -> "tuple[Localization, list[FibreFault], FaultDetector | None]":
+) -> Prediction:
     """Localize all presses without some fibres by number, and without a faulty one from where it is detected.
 
     `moment` is "touch" or "lift" and s since then, by what is known then; None for whole presses.
     """
+    from padforge.sense.health.domain_shift import detect_shifts
     from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel
 
@@ -100,7 +111,10 @@ def predict_despite_faults(
     faults = detector.predict(recording) if detector else []
     fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
     until = None if moment is None else _until(localizer, recording, *moment)
-    return localizer.predict(recording, excluded, fibre_mask, until), faults, detector
+    localization = localizer.predict(recording, excluded, fibre_mask, until)
+    fibre_mask[:, list(excluded)] = False
+    shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if detector else []
+    return Prediction(localization, faults, shifts, detector)
 
 
 def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time_s: float) -> "Indices":

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -16,6 +16,7 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Mask, check_magnitude, check_numbers
 from padforge.sense.formats.columns import PRESSES_DETECTED
+from padforge.sense.health.domain_shift import rest_levels
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, MAX_LLR, cusum_update, estimate_noise
 from padforge.sense.health.health_model import (
     COMMANDED,
@@ -334,6 +335,24 @@ class FaultDetector:
             first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
             faults += monitor.update(readings[first:last], int(down - first), int(up - first))
         return faults
+
+    def include_rests(self, recording: Recording) -> None:
+        """Make the rests of a recording usual ones, as after a recalibration.
+
+        Args:
+            recording: of the pad as it is now, healthy.
+
+        Raises:
+            InputError: another number of fibres than trained on, or `fit` or `load` was not called.
+        """
+        self._check_fitted()
+        rests = rest_levels(check_type("recording", recording, Recording))
+        check_same_pad(self.model_, "health", recording.fibres, recording.rate_hz)
+        for name in ("model_", "live_model_"):
+            model: HealthModel = getattr(self, name)
+            (low, high), new = model.rest_range_v, rests[:, model.living]  # fmin and fmax pass over what is missing
+            range_v = np.stack([np.fmin(low, np.fmin.reduce(new)), np.fmax(high, np.fmax.reduce(new))])
+            setattr(self, name, replace(model, rest_range_v=range_v))
 
     def save(self, folder: str | Path) -> None:
         """Write both models.

@@ -166,7 +166,7 @@ def _has_valid_crc(content: bytes, dtype: np.dtype[np.void], start: int) -> bool
 
 def _checksums(blocks: NDArray[np.void]) -> NDArray[np.uint32]:
     """Return (B,) CRC-32 of each block without its checksum field."""
-    view = memoryview(blocks.tobytes())
+    view = np.ascontiguousarray(blocks).view(np.uint8).data  # no copy of what was read, which may be gigabytes
     size = blocks.dtype.itemsize
     crcs = np.empty(len(blocks), np.uint32)
     for i in range(len(blocks)):

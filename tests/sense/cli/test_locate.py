@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,24 @@ def test_locate_excludes_a_faulty_fibre(enough) -> None:
     places, masked = (Path(name).read_text().splitlines() for name in ("places.csv", "masked.csv"))
     assert places[82:] == masked[82:]
     assert places[:60] != masked[:60]
+
+
+def test_locate_and_health_name_what_differs_from_the_calibration(enough) -> None:
+    assert enough("locate", "--model", "model", "rec")[2] == ""
+    whole = Recording.open("rec")
+    readings = np.array(whole.readings)
+    readings[:, 2] += 0.33
+    replace(whole, readings=readings).save("moved", {})
+    code, out, err = enough("locate", "--model", "model", "moved")
+    assert (code, out) == (0, "360 positions -> places.csv\n")
+    assert re.fullmatch(r"fibre 3 rests at \S+ V, usual since calibration is .* V: radii may be too small; .*\n", err)
+    assert enough("locate", "--model", "model", "moved", "--exclude-fibres", "3")[2] == ""
+    code, out, _ = enough("health", "--model", "model", "moved")
+    assert (code, out.splitlines()[1]) == (0, err.strip())
+    code, out, _ = enough("health", "--model", "model", "moved", "--json")
+    (shift,) = json.loads(out)["shifts"]
+    assert (shift["kind"], shift["fibres"], shift["text"]) == ("rest", [2], err.strip())
+    assert shift["value"] > shift["usual"][1]
 
 
 def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model(enough) -> None:

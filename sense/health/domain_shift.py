@@ -1,0 +1,148 @@
+"""Domain shift: how a recording differs from the one that a localizer was calibrated on, so that its radii may fail.
+
+Rests far from all those of the calibration, or responses of another size than to presses at the predicted positions
+then, show that a pad, its wiring or the depth of presses has changed since; true positions need not be known. A fibre
+that fails within a recording is detected by `fault_detector`.
+"""
+
+from dataclasses import dataclass, replace
+from math import exp, hypot
+
+import numpy as np
+
+from padforge.design.common.validation import check_type
+from padforge.sense.arrays import Array, Mask
+from padforge.sense.health.health_model import HealthModel
+from padforge.sense.localizer.features import mean_at_rest
+from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.response_model import interpolate_grid
+from padforge.sense.localizer.scaler import ScaledFeatures
+from padforge.sense.recording.recording import Recording
+
+REST_MARGIN = 0.25  # of the range of rests in calibration, by which the median of a recording leaves it at most
+WANDER, COMMON_WANDER = 0.045, 0.03
+"""Standard deviation of the logarithm of a gain that wanders in minutes on an unchanged pad: of a fibre of the
+published pad, and of all six together."""
+STANDARD_DEVIATIONS = 4.0  # of wander and of chance together, up to which a gain is usual
+MIN_PRESSES, MAX_PRESSES = 100, 1000
+"""From which a gain is estimated, since of a few presses one or two stretch a fibre most; and that are looked at."""
+
+
+@dataclass(frozen=True)
+class DomainShift:
+    """How fibres differ from what they were in calibration."""
+
+    kind: str  # "rest" or "gain"
+    fibres: tuple[int, ...]  # their indices: one, or all
+    value: float  # median rest, V; or size of the responses over that in calibration
+    usual: tuple[float, float]  # least and greatest that is usual
+
+    @property
+    def text(self) -> str:
+        """One line; fibres are numbered from 1."""
+        (low, high), is_one = self.usual, len(self.fibres) == 1
+        name = f"fibre {self.fibres[0] + 1}" if is_one else "all fibres"
+        if self.kind == "rest":
+            what = f"rests at {self.value:.2f} V, usual since calibration is {low:.2f} to {high:.2f} V"
+        else:
+            verb = "responds" if is_one else "respond"
+            what = f"{verb} {self.value:.2f} times as strongly as in calibration, usual is {low:.2f} to {high:.2f}"
+        return f"{name} {what}: radii may be too small; recalibrate"
+
+
+def detect_shifts(
+    localizer: LocalizerModel, health: HealthModel, recording: Recording, fibre_mask: Mask
+) -> list[DomainShift]:
+    """Detect how a recording differs from that of the calibration.
+
+    The size of responses cannot be told from the depth of presses: where the localizer predicts depths, responses are
+    compared with those at these.
+
+    Args:
+        localizer: of the pad.
+        health: of the pad.
+        recording: of a pad with the fibres and the rate of the training.
+        fibre_mask: (Q, C), false where a fibre is masked in a press; nothing is said of one that always is.
+
+    Raises:
+        InputError: as `LocalizerModel.raw_features`.
+    """
+    check_type("health", health, HealthModel)
+    shifts = _rest_shifts(health, recording, fibre_mask)
+    if check_type("localizer", localizer, LocalizerModel).features == "windows":
+        shifts += _gain_shifts(localizer, recording, fibre_mask)
+    return shifts
+
+
+def rest_levels(recording: Recording) -> Array:
+    """Return the rests (Q, C) before the presses of a recording, V; NaN where a reading is missing."""
+    previous_end = np.concatenate([[0], recording.up_command[:-1]])
+    return mean_at_rest(recording.readings, recording.down_command, previous_end)
+
+
+def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
+    rests, shifts = rest_levels(recording), []
+    for fibre, (low, high) in zip(health.living.tolist(), health.rest_range_v.T.tolist(), strict=True):
+        rest = rests[fibre_mask[:, fibre] & np.isfinite(rests[:, fibre]), fibre]
+        margin = REST_MARGIN * (high - low)
+        usual = low - margin, high + margin
+        if len(rest) and not usual[0] <= (median := float(np.median(rest))) <= usual[1]:
+            shifts.append(DomainShift("rest", (fibre,), median, usual))
+    return shifts
+
+
+def _gain_shifts(localizer: LocalizerModel, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
+    """Compare responses with those expected at the predicted positions: all fibres together, or else each of them.
+
+    A single fibre is compared at the positions that the others predict, since it would pull them towards itself.
+    """
+    presses = localizer.scaled_features(recording)
+    rows = np.linspace(0, len(presses) - 1, min(len(presses), MAX_PRESSES)).astype(np.int64)
+    presses = replace(presses[rows], fibre_mask=presses.fibre_mask[rows] & fibre_mask[rows])
+    fibres = tuple(range(localizer.fibres))
+    moment, energy = _compare(localizer, presses)
+    together = _gain_shift(fibres, moment.sum(axis=1), energy.sum(axis=1), COMMON_WANDER)
+    if together or len(fibres) == 1:
+        return [together] if together else []
+    shifts = []
+    for fibre in fibres:
+        moment, energy = _compare(localizer, presses, (fibre,))
+        shifts.append(_gain_shift((fibre,), moment[:, fibre], energy[:, fibre], WANDER))
+    return [shift for shift in shifts if shift]
+
+
+def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[int, ...] = ()) -> tuple[Array, Array]:
+    """Products of responses and of expected responses with expected ones (Q, C), V^2; 0 where a fibre is masked.
+
+    Expected are the responses at the positions and depths that the localizer predicts without the failed fibres; none
+    where no other is valid.
+    """
+    scaler, side = localizer.scaler, len(localizer.table)
+    localization = localizer.predict_features(presses, failed)
+    positions = (localization.positions_mm - scaler.origin_mm) / scaler.scale_mm
+    expected = interpolate_grid(localizer.table.reshape(side, side, -1), positions).reshape(presses.inputs.shape)
+    if scaler.measures:
+        expected = expected * (localization.measures["depth_mm"].values / scaler.measures[0].origin)[:, None, None]
+    expected_v, response_v = (part * scaler.scale_v + scaler.mean_v for part in (expected, presses.inputs))
+    is_located = np.delete(presses.fibre_mask, failed, axis=1).any(axis=1, keepdims=True)
+    valid = np.logical_and(is_located, presses.fibre_mask)
+    expected_v = np.where(valid[:, :, None], expected_v, 0.0)
+    response_v = np.where(expected_v == 0, 0.0, response_v)
+    return (response_v**2).sum(axis=2), (expected_v**2).sum(axis=2)
+
+
+def _gain_shift(fibres: tuple[int, ...], energy: Array, expected: Array, wander: float) -> DomainShift | None:
+    """Compare (Q,) energies of responses with expected ones, and return the gain if it is unusual.
+
+    A least-squares gain would be too small by the error of the positions, which blurs the expected responses alone.
+    """
+    if (expected > 0).sum() < MIN_PRESSES:
+        return None
+    ratio, leverage = energy.sum() / expected.sum(), expected / expected.sum()
+    gain = float(np.sqrt(ratio))
+    # Presses scatter in proportion to their responses, and a few stretch a fibre most: the jackknife's standard error.
+    residual = (energy / ratio - expected) / (1 - leverage)
+    standard_error = float(np.linalg.norm(residual) / (2 * expected.sum()))
+    limit = STANDARD_DEVIATIONS * hypot(wander, standard_error)
+    usual = exp(-limit), exp(limit)
+    return None if usual[0] <= gain <= usual[1] else DomainShift("gain", fibres, gain, usual)

@@ -1,0 +1,92 @@
+"""Recordings of a pad that has changed since calibration are named as such, those of the same pad are not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from padforge.sense import FaultDetector, HealthModel, Recording, calibrate
+from padforge.sense.health.domain_shift import MIN_PRESSES, DomainShift, detect_shifts, rest_levels
+from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.settings import LocalizerSettings
+from tests.helpers.once import Once
+from tests.sense.health.pads import PRESSES, TRAINED, part_of
+
+COARSE = LocalizerSettings(members=2, hidden=24, layers=1, epochs=2, batch=64, max_failures=1)
+"""Errs by 3 mm, by which the size of responses must not look like another."""
+
+
+@pytest.fixture(scope="session")
+def localizer(once: Once, pad: Recording) -> LocalizerModel:
+    start = part_of(pad, 0, TRAINED, int(pad.down_command[TRAINED]))
+    return once("health-localizer", lambda folder: calibrate(start, COARSE))[0]
+
+
+@pytest.fixture
+def later(pad: Recording) -> Recording:
+    return part_of(pad, TRAINED, PRESSES, len(pad.readings))
+
+
+def changed(recording: Recording, fibres: list[int], gain: float = 1.0, offset_v: float = 0.0) -> Recording:
+    readings, level = np.array(recording.readings), np.median(recording.readings, axis=0)
+    readings[:, fibres] = (level + offset_v + gain * (readings - level))[:, fibres]
+    return replace(recording, readings=readings)
+
+
+def detect(
+    localizer: LocalizerModel, health: HealthModel, recording: Recording, failed: tuple[int, ...] = ()
+) -> list[tuple[str, tuple[int, ...]]]:
+    mask = np.tile(~np.isin(np.arange(recording.fibres), failed), (len(recording.down_command), 1))
+    return [(shift.kind, shift.fibres) for shift in detect_shifts(localizer, health, recording, mask)]
+
+
+def test_text_names_value_and_what_is_usual() -> None:
+    assert DomainShift("rest", (2,), 2.1512, (1.7, 1.8)).text == (
+        "fibre 3 rests at 2.15 V, usual since calibration is 1.70 to 1.80 V: radii may be too small; recalibrate"
+    )
+    assert DomainShift("gain", (0, 1), 0.7, (0.87, 1.15)).text.startswith(
+        "all fibres respond 0.70 times as strongly as in calibration, usual is 0.87 to 1.15: "
+    )
+    assert DomainShift("gain", (0,), 0.7, (0.87, 1.15)).text.startswith("fibre 1 responds 0.70 times")
+
+
+@pytest.mark.parametrize("offset_v", [-0.33, 0.33])
+def test_other_rests_are_detected(model: HealthModel, localizer: LocalizerModel, later: Recording, offset_v) -> None:
+    recording = changed(later, [1], offset_v=offset_v)
+    assert detect(localizer, model, recording) == [("rest", (1,))]
+    assert detect(localizer, model, recording, failed=(1,)) == []
+    every = changed(later, list(range(6)), offset_v=offset_v)
+    assert detect(localizer, model, every) == [("rest", (fibre,)) for fibre in range(6)]
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.4])
+def test_other_gains_are_detected(model: HealthModel, localizer: LocalizerModel, later: Recording, gain: float) -> None:
+    assert detect(localizer, model, changed(later, [2], gain)) == [("gain", (2,))]
+    assert detect(localizer, model, changed(later, list(range(6)), gain)) == [("gain", tuple(range(6)))]
+
+
+def test_same_pad_later_has_no_shift(model: HealthModel, localizer: LocalizerModel, later: Recording) -> None:
+    assert detect(localizer, model, later) == []
+    gappy = np.array(later.readings)
+    gappy[:2000, 3] = gappy[1000:1100] = np.nan
+    assert detect(localizer, model, replace(later, readings=gappy)) == []
+
+
+def test_gains_of_few_presses_are_no_shift(model: HealthModel, localizer: LocalizerModel, pad: Recording) -> None:
+    few = part_of(pad, TRAINED, TRAINED + MIN_PRESSES - 1, int(pad.down_command[TRAINED + MIN_PRESSES - 1]))
+    assert detect(localizer, model, changed(few, list(range(6)), 0.5)) == []
+
+
+def test_included_rests_are_usual(
+    model: HealthModel, localizer: LocalizerModel, later: Recording, tmp_path: Path
+) -> None:
+    detector = FaultDetector()
+    detector.model_ = detector.live_model_ = model
+    recording = changed(later, [1], offset_v=0.33)
+    detector.include_rests(recording)
+    assert detect(localizer, detector.model_, recording) == detect(localizer, detector.model_, later) == []
+    rests = rest_levels(recording)
+    np.testing.assert_allclose(
+        detector.live_model_.rest_range_v[1], np.maximum(model.rest_range_v[1], rests.max(axis=0))
+    )
