@@ -317,7 +317,7 @@ def _check_positions(positions_mm: Array, pad: Morphology) -> None:
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class _FittedWiring:
     """A wiring and its fits, of fibres that lie as planned and as built."""
 
     wiring: Wiring
@@ -343,14 +343,14 @@ def _fit_candidates(
     live: Indices,
     rng: np.random.Generator,
     on_progress: OnProgress,
-) -> list[_Candidate]:
+) -> list[_FittedWiring]:
     """Fit the best wirings, the stated one, and images of the most probable, which is first.
 
     Of equally probable ones, the one rotated least is first.
     """
-    candidates: dict[tuple[bool, tuple[int, ...]], _Candidate] = {}
+    candidates: dict[tuple[bool, tuple[int, ...]], _FittedWiring] = {}
 
-    def fit(wirings: list[Wiring]) -> _Candidate:
+    def fit(wirings: list[Wiring]) -> _FittedWiring:
         for wiring in wirings:
             start = AsBuiltPad.from_plan(plan, wiring.fibres, wiring.transform, wiring.width)
             on_plan = fit_as_built(start.fit_gains(compared), compared, Priors())
@@ -359,7 +359,7 @@ def _fit_candidates(
             log_prior = LOG_ODDS_IN_ORDER * (wiring.fibres == tuple(live.tolist())) + LOG_ODDS_POSE * is_unturned
             key, candidate = (
                 (wiring.transform.mirrored, wiring.fibres),
-                _Candidate(wiring, on_plan, as_built, log_prior),
+                _FittedWiring(wiring, on_plan, as_built, log_prior),
             )
             if key not in candidates or candidates[key].log_posterior < candidate.log_posterior:
                 candidates[key] = candidate
@@ -381,14 +381,16 @@ def _fit_candidates(
             candidates[key] = max(candidate, replace(candidate, fit=refit), key=lambda each: each.log_posterior)
     best = max(candidates.values(), key=lambda candidate: candidate.log_posterior)
 
-    def rank(candidate: _Candidate) -> tuple[float, float]:
+    def rank(candidate: _FittedWiring) -> tuple[float, float]:
         is_best = candidate.log_posterior > best.log_posterior - SAME_LOG_EVIDENCE
         return candidate.turn_deg if is_best else 360.0, -candidate.log_posterior
 
     return sorted(candidates.values(), key=rank)
 
 
-def _explained_on_plan(candidates: list[_Candidate], plan: PadPlan, training: Responses, held_out: Responses) -> float:
+def _explained_on_plan(
+    candidates: list[_FittedWiring], plan: PadPlan, training: Responses, held_out: Responses
+) -> float:
     """Return the mean explained variance of the most probable pad that lies on its plan, fitted to all presses."""
     best = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
     pad = fit_as_built(replace(best.pad, plan=plan), training, Priors()).pad

@@ -136,15 +136,15 @@ def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
     out = []
     for mirrored, quarter in product((False, True), range(0, 4, 1 if layout.is_square else 2)):
         symmetry, old = PlanTransform(mirrored, 90.0 * quarter), wiring.transform
-        apart = np.hypot(*(symmetry.rotate(middles_mm)[:, None] - middles_mm).T).T
-        apart[(families[:, None] ^ (quarter % 2)) != families] = np.inf
+        distance_mm = np.hypot(*(symmetry.rotate(middles_mm)[:, None] - middles_mm).T).T
+        distance_mm[(families[:, None] ^ (quarter % 2)) != families] = np.inf
         transform = PlanTransform(
             mirrored != old.mirrored,
             (symmetry.turn_deg + (-old.turn_deg if mirrored else old.turn_deg) + 180) % 360 - 180,
             tuple(symmetry.rotate(np.array([old.shift_mm]))[0].tolist()),
             old.scale,
         )
-        fibres = tuple(apart.argmin(axis=1)[list(wiring.fibres)].tolist())
+        fibres = tuple(distance_mm.argmin(axis=1)[list(wiring.fibres)].tolist())
         out.append(replace(wiring, transform=transform, fibres=fibres))
     return out[1:]
 
