@@ -80,7 +80,8 @@ def test_items_of_a_representation_stay_a_set(file):
     for content in entities(file.read_text(encoding="utf-8")).values():
         if (kind := content.partition("(")[0]) in kinds:
             kinds[kind].append(content)
-    items = [re.findall(r"#\d+", re.search(r"\(([^()]*)\)", each)[1]) for each in kinds["SHAPE_REPRESENTATION"]]
+    lists = [content.split("(")[2].partition(")")[0] for content in kinds["SHAPE_REPRESENTATION"]]
+    items = [re.findall(r"#\d+", each) for each in lists]
     assert max(map(len, items)) == 3  # the origin of an assembly, and the placements of its two parts
     assert [len(set(each)) for each in items] == [len(each) for each in items]
     ends = [re.findall(r"#\d+", each) for each in kinds["ITEM_DEFINED_TRANSFORMATION"]]
