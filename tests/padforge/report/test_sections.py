@@ -13,8 +13,10 @@ from markupsafe import escape
 
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import Fault, InputError
+from padforge.design.contact import contact_press
+from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
-from padforge.design.report import contact_line
+from padforge.design.report import contact_line, draw_press
 from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report
@@ -293,3 +295,20 @@ def test_report_of_other_contacts_has_no_press(pad: Path) -> None:
     design["provenance"]["settings"]["contact"] = Contact(radius=0.6).model_dump(mode="json")
     written(pad / "design.json", design)
     assert ">Press</h2>" not in write_report(pad).read_text()
+
+
+@pytest.mark.parametrize("tool", ["dome", "ball"])
+def test_drawn_tool_touches_the_face_within_its_contact(tool: Tool) -> None:
+    """The silicone follows the tool up to the edge of the contact, where it leaves it downwards."""
+    contact = Contact(tool=tool, tool_radius_mm=12.0, depth_mm=2.0, thickness_mm=8.0)
+    edge_mm = contact_press(contact).contact_radius_mm
+    section = draw_press(contact, 11.25).axes[0]
+    x, face = (np.asarray(part, float) for part in section.lines[0].get_data())
+    rise = x**2 / 24 if tool == "dome" else 12 - np.sqrt(np.maximum(12**2 - x**2, 0))
+    inside = np.abs(x) < 0.95 * edge_mm
+    np.testing.assert_allclose(face[inside], 6.0 + rise[inside], atol=0.02)
+    # of the tool: its surface, and the top of the picture
+    drawn = np.asarray(section.collections[1].get_paths()[0].vertices, float)
+    for at, height in zip(x, 6.0 + rise, strict=True):
+        if edge_mm < abs(at) and height < drawn[:, 1].max():
+            assert np.isclose(drawn[np.isclose(drawn[:, 0], at), 1], height).any()
