@@ -22,6 +22,7 @@ from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
+from padforge.sense.report.sections import fibre_loss_sections
 from tests.padforge.report.conftest import (
     HOSTILE,
     PAD,
@@ -312,3 +313,11 @@ def test_drawn_tool_touches_the_face_within_its_contact(tool: Tool) -> None:
     for at, height in zip(x, 6.0 + rise, strict=True):
         if edge_mm < abs(at) and height < drawn[:, 1].max():
             assert np.isclose(drawn[np.isclose(drawn[:, 0], at), 1], height).any()
+
+
+def test_fibre_loss_lists_mean_errors_of_the_sets_that_a_fibre_is_in() -> None:
+    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 8.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 30.0}
+    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
+    (section,) = fibre_loss_sections(Path(), {"by_subset": by_subset})
+    words = " ".join(re.sub("<[^>]*>", " ", " ".join(section.body)).split())
+    assert "alone (mm) with one fibre more 1 2.00 15.00 2 4.00 20.00 3 8.00 25.00" in words
