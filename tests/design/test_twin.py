@@ -137,3 +137,13 @@ def test_effects_that_another_pad_does_not_have(twin: Twin) -> None:
         "not carried over to another pad: the dependence on the angle between fibre and press and "
     )
     assert effects.endswith("where along its fibres the response is uneven (31%)")
+
+
+def test_one_uneven_fibre_is_an_effect_that_another_pad_does_not_have(twin: Twin) -> None:
+    sizes = [None if line is None else len(line) - 1 for line in twin.as_built_mm]
+    even = tuple(None if size is None else np.full(size, 1.01) for size in sizes)
+    assert replace(twin, sensitivity=even).ignored_effects() is None
+    assert sizes[0] is not None
+    uneven = (np.linspace(0.5, 1.5, sizes[0]), *even[1:])
+    effects = replace(twin, sensitivity=uneven).ignored_effects()
+    assert effects == "not carried over to another pad: where along its fibres the response is uneven (10%)"

@@ -216,6 +216,10 @@ def test_mesh_arrays_separates_coincident_vertices():
     assert len(np.unique(vertices, axis=0)) == len(vertices)
     assert trimesh.Trimesh(vertices, triangles).is_watertight
     assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(2, abs=2e-3)
+    blocks = sorted(trimesh.Trimesh(vertices, triangles).split(), key=lambda block: block.bounds[0, 0])
+    for low, block in zip((0, 1), blocks, strict=True):  # drawn back, not into each other
+        assert (block.bounds[:, :2] >= low).all()
+        assert (block.bounds[:, :2] <= low + 1).all()
 
 
 @pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])

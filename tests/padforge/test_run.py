@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import trimesh
@@ -16,6 +17,8 @@ from safetensors.numpy import load_file
 
 from padforge.design.common.files import sha256
 from padforge.design.common.parallel import Checkpoints
+from padforge.design.common.settings import Spec
+from padforge.run import Run
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused, started
 from tests.padforge.conftest import SMALL
@@ -238,6 +241,15 @@ def test_time_budget_covers_all_stages(tmp_path: Path, monkeypatch: pytest.Monke
     assert 0 <= given[0] < 8
     again = called(*words, "--resume", cwd=tmp_path)
     assert f"earlier run: {ALL}" in again.err, again
+
+
+def test_remaining_time_counts_from_the_start_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A share is of the whole budget, whatever was spent before; 30 s are."""
+    monkeypatch.setattr("padforge.run.time", SimpleNamespace(monotonic=lambda: 130.0))
+    run = Run(Spec({}), Path("pad"), time_budget=100.0, started_s=100.0)
+    assert (run.remaining_s(), run.remaining_s(0.5), run.remaining_s(reserve_s=12.0)) == (70.0, 20.0, 58.0)
+    assert run.remaining_s(0.25) == 0.0
+    assert Run(Spec({}), Path("pad"), started_s=100.0).remaining_s(0.5) is None
 
 
 @pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/2"}', '{"format": "padforge-run/2", "stages": 3}'])

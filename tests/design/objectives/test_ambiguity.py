@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design import Contact, Morphology
-from padforge.design.contact import signals
+from padforge.design.contact import relative_stretch, signals
 from padforge.design.objectives.ambiguity import ambiguities, ambiguity, ambiguity_map, free_presses, full_scale
 from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets, sample_failures
 from padforge.design.objectives.score import sharpness
@@ -111,3 +111,14 @@ def test_ambiguity_map_shows_where_presses_are_alike():
     assert values[4] == pytest.approx(0, abs=1e-9)
     assert values[:4] == pytest.approx(np.linspace(0.8, 0.2, 4), rel=1e-6)  # half of the way to the other side
     assert values[5:] == pytest.approx(values[:4][::-1])
+
+
+def test_ambiguity_map_has_the_full_scale_of_touched_fibres():
+    """Presses beside the lowest of six fibres, of which it is the only one to respond."""
+    pad, presses = Morphology.straight((6, 0)), np.stack([np.ones(5), np.linspace(0.8, 1.4, 5)], axis=1)
+    stretch = torch.tensor(relative_stretch(pad, presses, PUBLISHED_CONTACT).T)
+    assert stretch.any(dim=1).tolist() == [True] + 5 * [False]
+    noise, one = 0.05 * stretch.max().item(), torch.ones(1).double()
+    expected = ambiguity(stretch, torch.tensor(presses), torch.ones(1, 6), one, noise).item()
+    assert expected > 0.05
+    assert ambiguity_map(pad, presses, PUBLISHED_CONTACT, 0, 0.05)[0].mean() == pytest.approx(expected, rel=1e-9)

@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from padforge.design import Contact, InputError, Morphology
 from padforge.design.objectives.published import published_terms
-from padforge.design.objectives.score import score
-from padforge.design.settings import PadSettings
+from padforge.design.objectives.score import ScoredPad, score
+from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -35,6 +36,18 @@ def test_score_joint_entropy_saturates_before_those_of_families():
     assert published_terms(pad)[0].entropy < 9
     one = score(Morphology.straight((1, 0)), max_failures=0)  # one family is all there is
     assert one["published_joint_entropy"] == one["published_entropy"]
+
+
+@pytest.mark.parametrize(
+    ("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [0.75, 0.25]), ((2, 2), [3 / 6, 1 / 6, 1 / 6, 1 / 6])]
+)
+def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fibres, weights):
+    """Half of the weight is on no failure, and 1, 2 and 3 share the rest: in these proportions also where fewer can."""
+    pad = Morphology.straight(fibres)
+    size = PadSettings().for_layout(pad.layout)
+    scored = ScoredPad(pad, Contact(), SearchSettings(max_failures=3), RulesSettings(), size)
+    assert len(scored.expected_errors) == len(weights)
+    assert scored.objective == pytest.approx(np.prod(np.power(scored.expected_errors, weights)))
 
 
 @pytest.mark.parametrize(

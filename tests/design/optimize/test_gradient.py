@@ -12,7 +12,14 @@ from padforge.design.contact import fibre_axes
 from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
-from padforge.design.optimize.gradient import ZIGZAG_START, GradientSearch, Parametrization, initial_paths
+from padforge.design.optimize import gradient
+from padforge.design.optimize.gradient import (
+    PENALTY_WEIGHT,
+    ZIGZAG_START,
+    GradientSearch,
+    Parametrization,
+    initial_paths,
+)
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.optimize.search import search
 from padforge.design.paths.curves import lengths, refine
@@ -157,3 +164,17 @@ def test_gradient_search_beats_straight_fibres_within_the_rules():
     assert found.violations == []
     assert pad["ambiguity_mm_0"] < 0.5 * grid["ambiguity_mm_0"]
     assert pad["ambiguity_mm_1"] < 0.5 * grid["ambiguity_mm_1"]
+
+
+def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
+    """By equal factors from the first weight to the last: the derivative of what is minimised by a penalty."""
+    weights = []
+
+    def penalties(along, across, *_):
+        value = 0 * (along.sum() + across.sum())
+        value.register_hook(lambda weight: weights.append(weight.item()))
+        return {"a rule": value}
+
+    monkeypatch.setattr(gradient, "penalties", penalties)
+    advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings()), 4)
+    assert weights == pytest.approx(np.geomspace(*PENALTY_WEIGHT, 4))

@@ -112,6 +112,20 @@ def test_search_within_a_time_budget_returns_the_best_so_far(time_budget):
     assert result.seconds < 30
 
 
+def test_search_out_of_time_returns_the_start_that_is_best_by_now(tmp_path):
+    """Not the one that was best at first; both are read from the states that an earlier run has kept."""
+    folder, settings = tmp_path / "search", SMALL.model_copy(update={"steps": 2})
+    search(PAD, None, settings, FREE, run=SearchOptions(keep_in=folder))
+    kept = Checkpoints(folder, json.loads((folder / "search.json").read_text())["settings"])
+    states = kept.begin(resume=True)
+    for best in (0, 1):
+        for start, state in states.items():
+            last = 0.2 if start == best else 0.3
+            kept.save(start, state | {"history": np.array([[1, 0.5 - last], [2, last]])})
+        result = search(PAD, None, settings, FREE, run=SearchOptions(keep_in=folder, resume=True, time_budget=1e-6))
+        assert (result.stopped, result.candidate) == ("out of time", f"start {best + 1}")
+
+
 class Hung(Executor):
     """Takes work and never does it."""
 

@@ -98,6 +98,20 @@ def test_import_follows_units_transforms_and_visibility(
     assert apart(import_plan(svg(tmp_path, drawn, head=head), LAYOUT, 0.4).pad, plain) < 0.02
 
 
+@pytest.mark.parametrize(
+    ("moved", "placement"),
+    [
+        ("0 0", "its origin is the middle of the pad"),
+        ("20 -18", "its origin is the lower left corner of the pad"),  # y of an SVG goes down
+        ("20 18", "its origin is the upper left corner of the pad"),
+        ("500 80", "the middle of its curves is that of the pad"),
+    ],
+)
+def test_import_states_where_the_origin_was_found(tmp_path: Path, moved: str, placement: str) -> None:
+    drawn = svg(tmp_path, f'<g transform="translate({moved})">{PATHS}</g>')
+    assert import_plan(drawn, LAYOUT, 0.4).placement == placement
+
+
 def test_import_joins_pieces_and_ignores_external_entities(tmp_path: Path) -> None:
     parts = [
         '<polyline points="-20,-6 -5,-8"/><line x1="5" y1="-4" x2="-5" y2="-8"/><path d="M5-4 20-6"/>',

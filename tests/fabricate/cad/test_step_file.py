@@ -72,3 +72,17 @@ def test_same_shapes_give_the_same_bytes(file, tmp_path):
         write_step(path, assemblies[-1])
         assert path.read_bytes() == file.read_bytes()
     assert len(list(tmp_path.iterdir())) == 2  # no temporary file is left beside them
+
+
+def test_items_of_a_representation_stay_a_set(file):
+    """ISO 10303-43: no item twice; a part that is not moved has a placement of its own beside its assembly's."""
+    kinds = {"SHAPE_REPRESENTATION": [], "ITEM_DEFINED_TRANSFORMATION": []}
+    for content in entities(file.read_text(encoding="utf-8")).values():
+        if (kind := content.partition("(")[0]) in kinds:
+            kinds[kind].append(content)
+    lists = [content.split("(")[2].partition(")")[0] for content in kinds["SHAPE_REPRESENTATION"]]
+    items = [re.findall(r"#\d+", each) for each in lists]
+    assert max(map(len, items)) == 3  # the origin of an assembly, and the placements of its two parts
+    assert [len(set(each)) for each in items] == [len(each) for each in items]
+    ends = [re.findall(r"#\d+", each) for each in kinds["ITEM_DEFINED_TRANSFORMATION"]]
+    assert [len(set(each)) for each in ends] == [2] * 4

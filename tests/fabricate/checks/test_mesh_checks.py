@@ -63,6 +63,7 @@ class TestSolid:
             ([20.0, 10.0, 4.99], "fail"),
             ([9.99, 30.0, 5.0], "fail"),
             ([30.0, 10.0, 5.0], "pass"),
+            ([30.0, 8.0, 20.0], "fail"),  # it would have to stand on its side
         ],
     )
     def test_bed(self, bed, status):

@@ -242,3 +242,11 @@ class TestLean:
 
 def _manifold(mesh: trimesh.Trimesh) -> Manifold:
     return Manifold(Mesh(np.float32(mesh.vertices), np.uint32(mesh.faces)))
+
+
+@pytest.mark.parametrize(("layers", "status"), [(0.4, "pass"), (0.6, "fail"), (1.5, "fail"), (4.0, "fail")])
+def test_ridges_of_half_a_layer_or_more_are_as_wide_as_the_nozzle(layers: float, status: str) -> None:
+    """Lower ones are not printed."""
+    printer = PrinterSettings(layer_mm=0.2)
+    narrow = ridge(spanning(0.0, width=0.5 * printer.line_mm), layers * printer.layer_mm)
+    assert check_body(tray(narrow), printer=printer)["ridge_width"].status == status

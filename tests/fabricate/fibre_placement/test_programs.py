@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -197,3 +198,21 @@ def test_toolpath_svg_shows_every_fibre_with_its_number_turn_and_depth(pad):
     end = float(clip[0].attrib["y"]) + float(clip[0].attrib["height"])
     written = [text for text in root.iter(f"{SVG}text") if text.get("text-anchor") == "start"]
     assert min(float(text.get("y", "")) for text in written) - 1.25 > end  # the box does not run through it
+
+
+def test_script_cuts_corners_by_no_more_and_no_less_than_the_tolerance():
+    """An arc that begins b before a turn by t passes its corner at R (1 / cos(t / 2) - 1), R = b / tan(t / 2)."""
+    plan = Plan(Morphology.straight(1))
+    step = plan_toolpath(plan, 0.3)[0]
+    turns = np.radians([90.0, 30.0, -5.0, 0.2])
+    headings, lengths = np.append(0.0, np.cumsum(turns)), np.array([20.0, 10.0, 5.0, 8.0, 6.0])
+    sides = lengths[:, None] * np.column_stack([np.cos(headings), np.sin(headings)])
+    corners = np.vstack([np.zeros(2), np.cumsum(sides, axis=0)])
+    stroke = replace(step.strokes[0], positions_mm=corners, feeds_mm_s=np.full(5, 6.0))
+    script = urscript(plan, [replace(step, strokes=(stroke,))])
+    blends = np.array(re.findall(r"movep\(.* r=([\d.e-]+)\)", script), float)
+    radii = 1000 * blends[:-1] / np.tan(np.abs(turns) / 2)
+    passes = radii * (1 / np.cos(turns / 2) - 1)
+    assert passes[:3] == pytest.approx(0.005, rel=0.01)
+    # no longer than the shorter side has room, and none at the end
+    assert 1000 * blends[3:] == pytest.approx([0.4 * 6.0, 0.0])

@@ -13,13 +13,16 @@ from markupsafe import escape
 
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import Fault, InputError
+from padforge.design.contact import contact_press
+from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
-from padforge.design.report import contact_line
+from padforge.design.report import contact_line, draw_press
 from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
+from padforge.sense.report.sections import fibre_loss_sections
 from tests.padforge.report.conftest import (
     HOSTILE,
     PAD,
@@ -293,3 +296,28 @@ def test_report_of_other_contacts_has_no_press(pad: Path) -> None:
     design["provenance"]["settings"]["contact"] = Contact(radius=0.6).model_dump(mode="json")
     written(pad / "design.json", design)
     assert ">Press</h2>" not in write_report(pad).read_text()
+
+
+@pytest.mark.parametrize("tool", ["dome", "ball"])
+def test_drawn_tool_touches_the_face_within_its_contact(tool: Tool) -> None:
+    """The silicone follows the tool up to the edge of the contact, where it leaves it downwards."""
+    contact = Contact(tool=tool, tool_radius_mm=12.0, depth_mm=2.0, thickness_mm=8.0)
+    edge_mm = contact_press(contact).contact_radius_mm
+    section = draw_press(contact, 11.25).axes[0]
+    x, face = (np.asarray(part, float) for part in section.lines[0].get_data())
+    rise = x**2 / 24 if tool == "dome" else 12 - np.sqrt(np.maximum(12**2 - x**2, 0))
+    inside = np.abs(x) < 0.95 * edge_mm
+    np.testing.assert_allclose(face[inside], 6.0 + rise[inside], atol=0.02)
+    # of the tool: its surface, and the top of the picture
+    drawn = np.asarray(section.collections[1].get_paths()[0].vertices, float)
+    for at, height in zip(x, 6.0 + rise, strict=True):
+        if edge_mm < abs(at) and height < drawn[:, 1].max():
+            assert np.isclose(drawn[np.isclose(drawn[:, 0], at), 1], height).any()
+
+
+def test_fibre_loss_lists_mean_errors_of_the_sets_that_a_fibre_is_in() -> None:
+    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 8.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 30.0}
+    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
+    (section,) = fibre_loss_sections(Path(), {"by_subset": by_subset})
+    words = " ".join(re.sub("<[^>]*>", " ", " ".join(section.body)).split())
+    assert "alone (mm) with one fibre more 1 2.00 15.00 2 4.00 20.00 3 8.00 25.00" in words

@@ -84,6 +84,21 @@ def test_sensor_reads_what_the_pipeline_says(
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm", "r90_mm")] == [0, 0, 0, 0]
 
 
+def test_sensor_reads_where_the_press_under_way_is(
+    boards: list[ReplayedBoard], sensor: PadSensor, few: Recording, localizer: LocalizerModel
+) -> None:
+    end = boards[0].end = int(few.up_command[1]) - 1
+    sensor.connect()
+    values, pipeline = sensor.read(), Live(localizer, None, few.fibres, few.rate_hz)
+    pipeline.feed(few.times_s[:end], few.readings[:end])
+    latest = pipeline.presses[-1]
+    assert (pipeline.pressed, latest.press, latest.final) == (True, 1, False)
+    assert [values[name] for name in ("pressed", "valid")] == [1, 1]
+    assert [values[name] for name in ("x_mm", "y_mm", "r90_mm")] == pytest.approx(
+        [latest.x_mm, latest.y_mm, latest.r90_mm]
+    )
+
+
 def read_for(sensor: PadSensor, duration_s: float) -> None:
     end_s = time.monotonic() + duration_s
     while time.monotonic() < end_s:

@@ -11,7 +11,7 @@ from padforge.sense.localizer.features import DOWN, N_FEATURES, N_TIMED, NOW
 from padforge.sense.localizer.moments import N_DOWN, PHASES, Phase
 from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
-from padforge.sense.localizer.scaler import TrainingPresses
+from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses
 from tests.helpers.presses import training_presses
 
 PRESSES, FIBRES, SIDE, BATCH = 60, 2, 9, 400
@@ -126,3 +126,17 @@ def test_a_stroke_goes_at_its_speed(monkeypatch: pytest.MonkeyPatch, count: int)
     np.testing.assert_allclose(features[:, :, N_TIMED], presses.targets[rows], atol=1e-4)
     latest = features[:, :, N_TIMED] - features[:, :, N_TIMED + 1]
     np.testing.assert_allclose(latest, step[:, :, 0], atol=1e-4)
+
+
+def test_windows_of_a_press_become_windows_of_now() -> None:
+    """What has the same voltage in both, each scaled by its own mean and deviation."""
+    rng = np.random.default_rng(0)
+    mean_v, scale_v = rng.standard_normal((FIBRES, N_FEATURES)), rng.uniform(0.5, 2, (FIBRES, N_FEATURES))
+    history = np.zeros((FIBRES, 0, N_FEATURES)), np.zeros((FIBRES, 0))
+    scaler = FeatureScaler(mean_v, scale_v, *history, np.zeros(2), 20.0, np.ones(2))
+    volts = rng.standard_normal((FIBRES, N_DOWN, 1))
+    down = scaler.scale(np.broadcast_to(volts, (FIBRES, N_DOWN, N_FEATURES)).swapaxes(0, 1))  # (windows, C, F)
+    factor, offset = scaler.to_now(N_TIMED)
+    for window, scaled in enumerate(down):
+        now = factor[:, :, window] * scaled[:, window, None] + offset[:, :, window]
+        np.testing.assert_allclose(now, scaled[:, OF_NOW], atol=1e-5)

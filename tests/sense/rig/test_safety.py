@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.safety import (
     FALL_END_S,
+    FALL_START_S,
     MAX_TILT_DEG,
     RETREAT_MM,
     RETREAT_MM_S,
@@ -297,6 +298,21 @@ def test_retreat_stops_if_the_force_does_not_fall(force: Callable[[FakeArm], flo
     assert caught.value.cause == "force"
     assert arm.stops == 1
     assert arm.pose[2] < DEEP_MM + max_rise_mm
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_retreat_gives_a_force_time_to_fall(late_s: float) -> None:
+    """It has to begin to fall after FALL_START_S, and then along a line."""
+
+    def force(arm: FakeArm) -> float:
+        remaining = (100 + FALL_END_S + late_s - arm.time()) / (FALL_END_S - FALL_START_S)
+        limit_n = RETREAT_LIMITS.max_force_n or 0.0
+        return limit_n + (200 - limit_n) * min(max(remaining, 0.0), 1.0)
+
+    arm = arm_at(DEEP_MM, force)
+    with pytest.raises(RigFault, match="the force does not fall") if late_s else contextlib.nullcontext():
+        assert retreated(arm).pose[2] == pytest.approx(50 + RETREAT_MM)
+    assert arm.stops == (late_s > 0)
 
 
 @pytest.mark.parametrize("fault", ["protective_stop", "emergency_stop", "lost", "pose"])

@@ -325,3 +325,15 @@ def test_align_to_detected_keeps_presses_that_are_not_detected(recording: Record
     down_command, up_command = align(int(up[20]) - 2, int(down[21]) + 10)  # two presses look like one
     assert (down_command[20], up_command[20]) == (down[20], up[20])
     np.testing.assert_array_equal(align(1, len(recording.readings)), (down, up))
+
+
+def test_align_to_detected_keeps_a_press_whose_release_shows_in_the_next_one(recording: Recording) -> None:
+    down, up = recording.down_command, recording.up_command
+    readings, lifted = recording.readings.copy(), int(down[21]) + 5
+    readings[up[20] - 2 : lifted] = readings[up[20] - 3]
+    readings[lifted : down[22]] = readings[down[20] - 1]
+    touched, released = detect_presses(readings, recording.times_s)
+    joined = np.searchsorted(touched, down[20] - MAX_LEAD)
+    assert abs(released[joined] - lifted) <= 3  # well before the second one ends by its command
+    down_command, up_command = align_to_detected(readings, recording.times_s, down, up)
+    assert (down_command[20], up_command[20]) == (down[20], up[20])

@@ -38,6 +38,19 @@ def test_fit_contact_recovers_scale_and_shares(base: Base) -> None:
     assert gaussian.shares_std == 0
 
 
+def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
+    """Gains take up any other: twice the squeeze and stretch are twice the results, and as uncertain as a share."""
+    responses = press(Contact(squeeze=0.7, stretch=1.3), PlanTransform(), 24)
+    pad = AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), (0, 1, 2, 3), PlanTransform(), 0.5)
+    noise_v = 0.05 * np.sqrt(responses.variance)
+    single, double = (
+        fit_contact(pad, Contact(squeeze=share, stretch=share), responses, responses, noise_v) for share in (0.5, 1.0)
+    )
+    for name in ("squeeze", "stretch", "shares_std"):
+        assert getattr(double, name) == pytest.approx(2 * getattr(single, name), rel=1e-3)
+    assert (double.scale, double.scale_std) == pytest.approx((single.scale, single.scale_std), rel=1e-3)
+
+
 def test_elements_of_a_pad_sum_to_its_lengths_and_follow_its_offsets() -> None:
     plan = PadPlan.from_morphology(PLAN)
     pad = AsBuiltPad.from_plan(plan, (2, 0), PlanTransform(), 0.5)

@@ -159,6 +159,17 @@ def test_identification_lines_state_the_side_with_regard_to_the_rig(mirrored, ri
     assert any(line.startswith(f"the pad lay {side}") for line in identification_lines(document, Path()))
 
 
+def test_identification_lines_count_from_1_and_state_millivolts_for_a_percent() -> None:
+    """A fibre of -50 mV for a relative stretch of 1 reads half a millivolt less for 1 %."""
+    row = {"channel": 0, "fibre": 1, "gain_v": -0.05, "noise_v": 2e-3, "explained": 0.9, "alternative_fibres": [2]}
+    row |= {"lateral_offset_mm": 0.3, "lateral_offset_std_mm": 0.1}
+    document = {"presses": 10, "channels": [row], "explained": 0.9, "explained_on_plan": 0.8, "noise": 0.01}
+    frame = {"mirrored": False, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
+    document |= {"n_alternatives": 0, "explained_by_straight": None, "frame": frame}
+    lines = [line.split() for line in identification_lines(document, Path())]
+    assert ["1", "2", "3", "-0.5", "2.00", "0.90", "0.30", "±", "0.10"] in lines
+
+
 @pytest.mark.slow
 @few_candidates()
 def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:

@@ -157,6 +157,11 @@ def test_move_that_was_given_up_is_never_made(asked_s: float):
         ({}, {"tcp_mm": None}, "tcp_mm is unknown"),
         ({"position": (0.0, 0.0, 0.0)}, {}, "has not been homed"),
         ({"max_mm_s": (500.0, 500.0, 3.0)}, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
+        (
+            {"max_mm_s": (500.0, 500.0, 3.0)},
+            {"clearance_mm": 1.0, "depths_mm": (1.0, 4.0)},  # the deepest press counts
+            r"way down of 5 mm takes 1\.7 s",
+        ),
     ],
 )
 def test_connect_refuses_unusable_printer(options, settings, match):
