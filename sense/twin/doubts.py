@@ -7,9 +7,12 @@ import numpy as np
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.twin.identification import Identification
 
-MAX_UNEXPLAINED = 0.08
-"""Share of the variance of held-out responses that a smooth function of the position may explain beyond the twin. On
-the pad that was recorded it is at most 0.03."""
+MAX_UNEXPLAINED, MAX_UNEXPLAINED_MEAN = 0.10, 0.025
+"""Share of the variance of held-out responses that a smooth function of the position may explain beyond the twin: of a
+channel, and mean over channels. From 250 presses of the right pad they are up to 0.08 and 0.02, if fibres bend much."""
+MAX_TURN_DEG, MIN_SCALE = 10.0, 0.8
+"""How far a pad may lie off a quarter turn, and its scale, or the inverse, be below 1: the plan of another pad is
+rotated and shrunk until it fits."""
 MAX_OFFSET_MM, MAX_OFFSET = 3.0, 0.5
 """How far a fibre may lie beside its plan, rms in mm and in grid units, whichever is less. Pads are laid to a
 millimetre or two, and beyond half a pitch the plan of another fibre is nearer."""
@@ -22,12 +25,28 @@ def find_doubts(result: Identification) -> list[str]:
     channels = {channel for channel, _ in unfit}
     if 2 * len(channels) >= len(result.live):
         lines.insert(0, f"{len(channels)} of {len(result.live)} channels do not fit: is it the recording of this pad?")
-    return lines + list(_other_wirings(result))
+    return [*_pad_that_does_not_fit(result), *lines, *_other_wirings(result)]
 
 
 def offset_mm(offset: Array, within: Mask) -> float:
     """Return the rms of a lateral offset along a fibre (F,), where it was pressed; 0 where it was not."""
     return float(np.sqrt((offset[within] ** 2).mean())) if within.any() else 0.0
+
+
+def _pad_that_does_not_fit(result: Identification) -> Iterator[str]:
+    explained, smooth = (float(shares.mean()) for shares in (result.explained, result.explained_smooth))
+    if explained < smooth - MAX_UNEXPLAINED_MEAN:
+        yield (
+            f"the fibres explain {explained:.3f} of held-out responses, smooth functions of the position {smooth:.3f}:"
+            " is it the recording of this pad?"
+        )
+    transform = result.fit.pad.transform
+    off_quarter_deg = abs((transform.turn_deg + 45) % 90 - 45)
+    if off_quarter_deg > MAX_TURN_DEG or not MIN_SCALE <= transform.scale <= 1 / MIN_SCALE:
+        yield (
+            f"the pad would have lain {off_quarter_deg:.0f} degrees off a quarter turn, at a scale of"
+            f" {transform.scale:.2f}: is it the recording of this pad?"
+        )
 
 
 def _channels_that_do_not_fit(result: Identification) -> Iterator[tuple[int, str]]:

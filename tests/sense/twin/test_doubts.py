@@ -47,11 +47,13 @@ def test_nothing_is_doubted_of_a_pad_that_lies_as_planned(result: Identification
 def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_doubted(result: Identification) -> None:
     explained = result.explained.copy()
     explained[2] = 0.2
-    (doubt,) = find_doubts(replace(result, explained=explained))
+    *_, doubt = find_doubts(replace(result, explained=explained))
     assert doubt.startswith(f"channel 3 does not fit: fibre {result.fit.pad.fibres[2] + 1} explains 0.20 of held-out")
-    whole, *channels = find_doubts(replace(result, explained=result.explained - 0.2))
-    assert whole == "4 of 4 channels do not fit: is it the recording of this pad?"
+    whole, count, *channels = find_doubts(replace(result, explained=result.explained - 0.2))
+    assert whole.startswith("the fibres explain 0.")
+    assert count == "4 of 4 channels do not fit: is it the recording of this pad?"
     assert len(channels) == 4
+    assert find_doubts(replace(result, explained=result.explained_smooth - 0.02)) == []
 
 
 def test_a_fibre_far_beside_its_plan_is_doubted(result: Identification) -> None:
@@ -61,6 +63,17 @@ def test_a_fibre_far_beside_its_plan_is_doubted(result: Identification) -> None:
     (doubt,) = find_doubts(beside)
     assert doubt.startswith("channel 2 does not fit: fibre 2 lies")
     assert doubt.endswith("mm beside its plan, allowed is 3.0")
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "scale", "said"), [(90, 1, ""), (-101, 1, "11 degrees"), (2, 0.7, "scale of 0.70")]
+)
+def test_a_pad_that_lay_askew_or_at_another_scale_is_doubted(result, turn_deg: float, scale: float, said: str) -> None:
+    values = result.fit.pad.values.copy()
+    values[0], values[3] = np.radians(turn_deg), scale
+    fit = replace(result.fit, pad=replace(result.fit.pad, values=values))
+    doubts = find_doubts(replace(result, fit=fit))
+    assert [said in doubt for doubt in doubts if "would have lain" in doubt] == [True] * bool(said)
 
 
 def test_a_second_wiring_is_told_of_the_channels_that_it_changes(result: Identification) -> None:
