@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from padforge.design.common.mat_files import load_mat
 from padforge.design.common.validation import InputError, check_path
 from padforge.sense.arrays import Array
@@ -68,7 +70,7 @@ def import_file(path: Path, columns: str = "") -> Recording:
 def arm_states(path: Path) -> Array | None:
     """Return the (n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None if it has none."""
     file = path / STATES
-    return read_blocks(file, len(STATE_COLUMNS) - 1)[0] if file.is_file() else None
+    return np.column_stack(read_blocks(file, len(STATE_COLUMNS) - 1)[:2]) if file.is_file() else None
 
 
 def export_file(

@@ -8,6 +8,7 @@ torn last block, which is cut off by readers; damage before an intact block has 
 import os
 import re
 import zlib
+from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
 from typing import BinaryIO
@@ -15,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import read_bytes
+from padforge.design.common.files import check_file
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, MAX_FIBRES, Array
 
@@ -23,6 +24,7 @@ _MAGIC = b"PFB1"
 _UNIT = 256
 _COUNT_OFFSET, _CRC_OFFSET = 16, 20
 _HEADER = 24
+_CHUNK_BYTES = 2**22  # of a file that are read at once
 
 
 def open_in_place(path: Path) -> BinaryIO:
@@ -63,14 +65,14 @@ class BlockWriter:
 
     @classmethod
     def resume(cls, path: Path, fibres: int) -> tuple["BlockWriter", BinaryIO, Array]:
-        """Cut off the torn tail of a file; return a writer, the open file, and the (R, 1 + C) rows that it has."""
-        rows, _ = read_blocks(path, fibres)
+        """Cut off the torn tail of a file; return a writer, the open file, and the (R,) times of its rows."""
+        times_s, _, _ = read_blocks(path, fibres)
         dtype = block_dtype(fibres)
         file = open_in_place(path)
-        blocks = len(_intact_blocks(file.read(), dtype))
+        blocks = sum(map(len, _intact_chunks(file, dtype)))
         file.seek(blocks * dtype.itemsize)
         file.truncate()
-        return cls(file, fibres, blocks, len(rows)), file, rows
+        return cls(file, fibres, blocks, len(times_s)), file, times_s
 
     def append(self, rows: Array) -> None:
         """Add (n, 1 + C) rows of time and volts."""
@@ -109,13 +111,27 @@ def write_at(file: BinaryIO, position: int, data: bytes) -> None:
         remaining = remaining[file.write(remaining) :]
 
 
-def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
-    """Return all intact rows (R, 1 + C) of a file, and whether a torn tail follows them; refuse other damage."""
+def read_blocks(path: Path, fibres: int) -> tuple[Array, Array, bool]:
+    """Return times (R,) and values (R, C) of all intact rows, and whether a torn tail follows; refuse other damage.
+
+    The file is read in chunks, straight into the arrays: it may have gigabytes.
+    """
     dtype = block_dtype(fibres)
-    content = read_bytes(path, MAX_BYTES)
-    blocks = _intact_blocks(content, dtype)
-    end = len(blocks)
-    tail = content[end * dtype.itemsize :]
+    try:
+        with check_file(path, MAX_BYTES).open("rb") as file:
+            n_blocks = os.fstat(file.fileno()).st_size // dtype.itemsize
+            max_rows = n_blocks * dtype["rows"].shape[0]
+            times_s, values = np.empty(max_rows), np.empty((max_rows, fibres))
+            end = n_rows = 0
+            for blocks in _intact_chunks(file, dtype):
+                rows = blocks["rows"][np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]]
+                part = slice(n_rows, n_rows + len(rows))
+                times_s[part], values[part] = rows[:, 0], rows[:, 1:]
+                end, n_rows = end + len(blocks), part.stop
+            file.seek(end * dtype.itemsize)
+            tail = file.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     if _has_block(tail, dtype):
         raise InputError(
             f"{path}: block {end} (byte {end * dtype.itemsize}) is damaged although intact blocks follow, "
@@ -123,19 +139,38 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, bool]:
         )
     if _begins_with_block(tail):  # a writer that died does not leave it
         raise InputError(f"{path}: block {end} is whole, but not of {fibres} fibres, as the recording says it is")
-    valid = np.arange(dtype["rows"].shape[0]) < blocks["count"][:, None]
-    return blocks["rows"][valid], bool(tail)
+    # In place, no view of a larger array: nothing else has them.
+    times_s.resize(n_rows, refcheck=False)
+    values.resize((n_rows, fibres), refcheck=False)
+    return times_s, values, bool(tail)
 
 
-def _intact_blocks(content: bytes, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """Return the blocks before the first without its magic and checksum, or that was written elsewhere."""
+def _intact_chunks(file: BinaryIO, dtype: np.dtype[np.void]) -> Iterator[NDArray[np.void]]:
+    """Yield the blocks before the first one that is not intact, in chunks, as far as the file goes now."""
+    remaining = os.fstat(file.fileno()).st_size // dtype.itemsize  # it may grow meanwhile
+    sequence = first = 0
+    while remaining:
+        n_blocks = min(remaining, max(1, _CHUNK_BYTES // dtype.itemsize))
+        blocks = _intact_blocks(file.read(n_blocks * dtype.itemsize), dtype, sequence, first)
+        yield blocks
+        if len(blocks) < n_blocks:
+            return
+        sequence, first = sequence + n_blocks, first + int(blocks["count"].sum())
+        remaining -= n_blocks
+
+
+def _intact_blocks(content: bytes, dtype: np.dtype[np.void], sequence: int, first: int) -> NDArray[np.void]:
+    """Return the blocks before the first without its magic and checksum, or that was written elsewhere.
+
+    The content begins with block number `sequence`, whose first row is row number `first`.
+    """
     blocks = np.frombuffer(content, dtype, count=len(content) // dtype.itemsize)
     counts = blocks["count"].astype(np.int64)
     is_intact = (
         (blocks["magic"] == _MAGIC)
         & (blocks["crc"] == _checksums(blocks))
-        & (blocks["sequence"] == np.arange(len(blocks)))
-        & (blocks["first"] == np.cumsum(counts) - counts)
+        & (blocks["sequence"] == sequence + np.arange(len(blocks)))
+        & (blocks["first"] == first + np.cumsum(counts) - counts)
         & (counts <= dtype["rows"].shape[0])
     )
     return blocks[: int(np.argmin(np.append(is_intact, False)))]

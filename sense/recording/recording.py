@@ -78,7 +78,10 @@ class Recording:
 
     def __post_init__(self) -> None:
         for name, kind in _ARRAYS.items():
-            self._freeze(name, check_numbers(getattr(self, name), kind, name))
+            values = getattr(self, name)
+            # What can change no more is taken as it is: it may have gigabytes.
+            is_frozen = isinstance(values, np.ndarray) and values.flags.owndata and not values.flags.writeable
+            self._freeze(name, check_numbers(values, kind, name, copy=not is_frozen))
         _check_source(self.source)
         _check_readings(self)
         _check_presses(self)
@@ -150,19 +153,22 @@ class Recording:
             InputError: other damage, or no run directory.
         """
         path = check_path("path", path)
-        rows, _ = read_blocks(path / READINGS, read_fibres(path))
-        done = read_journal(path / JOURNAL)
-        presses = [press for press in done.values() if press.up_command <= len(rows)]
-        table = np.array(presses, dtype=np.float64).reshape(-1, len(Press._fields))
+        fibres = read_fibres(path)
+        # The journal first: its objects are gone before the readings come, which the journal never precedes.
+        done = np.array(list(read_journal(path / JOURNAL).values()), dtype=np.float64).reshape(-1, len(Press._fields))
+        times_s, readings, _ = read_blocks(path / READINGS, fibres)
+        table = done[done[:, 3] <= len(times_s)]
+        for array in (times_s, readings):
+            array.setflags(write=False)
         try:
             return cls(
-                readings=rows[:, 1:],
-                times_s=rows[:, 0],
+                readings=readings,
+                times_s=times_s,
                 presses_mm=table[:, :2],
                 down_command=table[:, 2].astype(np.int64),
                 up_command=table[:, 3].astype(np.int64),
                 source=read_json(path / START, FORMAT).get("source", {}),
-                torn_presses=len(done) - len(presses),
+                torn_presses=len(done) - len(table),
                 depths_mm=table[:, 4],
                 reached_mm=table[:, 5],
                 forces_n=table[:, 6],

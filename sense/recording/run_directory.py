@@ -213,27 +213,27 @@ class Recorder:
             try:
                 lock(self._journal, busy_message(path))
                 journal = read_journal(path / JOURNAL)
-                times_s = read_blocks(path / READINGS, fibres)[0][:, 0]
+                times_s, _, _ = read_blocks(path / READINGS, fibres)
                 if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
                     # No break leaves that, so nothing may be cut off.
                     what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
                     raise InputError(f"{path / READINGS}: not {what}")
-                blocks, self._stream, rows = BlockWriter.resume(path / READINGS, fibres)
+                blocks, self._stream, times_s = BlockWriter.resume(path / READINGS, fibres)
             except InputError:
                 self._journal.close()
                 raise
             end = (path / JOURNAL).read_bytes().rfind(b"\n") + 1
             self._journal.truncate(end)  # of a torn line
             self._set_state(path, blocks, end)
-            self._update_last_time(rows)
+            self._update_last_time(times_s)
             if (path / STATES).exists():
-                states, file, state_rows = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
+                states, file, state_times_s = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
                 self._states = (states, file)
-                self._update_last_time(state_rows)
-        self.n_readings = len(rows)
-        self.done = {number for number, press in journal.items() if press.up_command <= len(rows)}
+                self._update_last_time(state_times_s)
+        self.n_readings = len(times_s)
+        self.done = {number for number, press in journal.items() if press.up_command <= len(times_s)}
         for number in sorted(journal.keys() - self.done):  # or they would count again as soon as enough rows follow
-            self._write_event("aborted", number, len(rows), reason="its readings were torn off")
+            self._write_event("aborted", number, len(times_s), reason="its readings were torn off")
         self.sync()
         self._press = max(self.done, default=-1) + 1
         return self
@@ -245,9 +245,9 @@ class Recorder:
             follower: that writes it, too; closed with the recorder.
         """
         follower.start(read_json(self._path / START, FORMAT)["source"])
-        follower.append(read_blocks(self._path / READINGS, self.fibres)[0])
+        follower.append(np.column_stack(read_blocks(self._path / READINGS, self.fibres)[:2]))
         if self._states is not None:
-            follower.append_states(read_blocks(self._path / STATES, len(STATE_COLUMNS) - 1)[0])
+            follower.append_states(np.column_stack(read_blocks(self._path / STATES, len(STATE_COLUMNS) - 1)[:2]))
         for number, press in read_journal(self._path / JOURNAL).items():
             follower.finish(number, press)
         follower.sync()
@@ -270,7 +270,7 @@ class Recorder:
         self._blocks.append(rows)
         if self._follower is not None:
             self._follower.append(rows)
-        self._update_last_time(rows)
+        self._update_last_time(rows[:, 0])
         self.n_readings += len(rows)
 
     def append_states(self, rows: Array) -> None:
@@ -286,11 +286,11 @@ class Recorder:
         self._states[0].append(rows)
         if self._follower is not None:
             self._follower.append_states(rows)
-        self._update_last_time(rows)
+        self._update_last_time(rows[:, 0])
 
-    def _update_last_time(self, rows: Array) -> None:
-        if len(rows):
-            self.last_s = max(self.last_s, float(rows[-1, 0]))
+    def _update_last_time(self, times_s: Array) -> None:
+        if len(times_s):
+            self.last_s = max(self.last_s, float(times_s[-1]))
 
     def begin(self, position_mm: ArrayLike, reading: int, press: int | None = None, **more: Any) -> None:
         """Note that the probe is sent down.

@@ -1,6 +1,7 @@
 """Recordings and their run directory."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -168,3 +169,16 @@ def test_open_while_recording(tmp_path: Path) -> None:
     assert np.array_equal(opened.readings, readings[:26])
     assert opened.presses_mm.tolist() == [[1.5, -2.5]]
     assert (opened.down_command.tolist(), opened.up_command.tolist()) == ([10], [20])
+
+
+def test_open_needs_little_more_memory_than_the_readings(tmp_path: Path) -> None:
+    """Also where the file has several chunks: neither its content nor a second copy of the readings is kept."""
+    readings, down = np.random.default_rng(0).normal(size=(30_000, 60)), np.arange(1, 30_000, 40)
+    recording = Recording(readings, np.arange(30_000.0), np.zeros((len(down), 2)), down, down + 20)
+    recording.save(tmp_path / "recording", {})
+    tracemalloc.start()
+    opened = Recording.open(tmp_path / "recording")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert opened == recording
+    assert peak < 1.6 * (readings.nbytes + 8 * len(readings)) + 2**23
