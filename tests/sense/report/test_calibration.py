@@ -1,19 +1,19 @@
 """Figures of a calibration show what its document says."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from padforge.sense.localizer.evaluation import Evaluation
 from padforge.sense.report import calibration
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Those that are drawn; nothing is written."""
-    drawn: list[Figure] = []
+    drawn: list[Any] = []
     monkeypatch.setattr(calibration, "save_figure", lambda figure, path: drawn.append(figure))
     return drawn
 
@@ -24,7 +24,7 @@ def evaluated(**parts: object) -> Evaluation:
     return Evaluation(**(empty | rest | parts))  # type: ignore[arg-type]
 
 
-def test_error_map_draws_true_positions_with_lines_to_those_predicted(figures: list[Figure]) -> None:
+def test_error_map_draws_true_positions_with_lines_to_those_predicted(figures: list[Any]) -> None:
     """Errors of 3, 5 and 10 mm."""
     pressed = [[0.0, 0.0], [10.0, 0.0], [0.0, -20.0]]
     predicted = [[0.0, 3.0], [13.0, 4.0], [-10.0, -20.0]]
@@ -37,7 +37,7 @@ def test_error_map_draws_true_positions_with_lines_to_those_predicted(figures: l
     assert axes.get_title("left").startswith("3 presses never trained on: mean error 6.00 mm")
 
 
-def test_errors_by_moment_are_drawn_by_time_and_failed_fibres(figures: list[Figure]) -> None:
+def test_errors_by_moment_are_drawn_by_time_and_failed_fibres(figures: list[Any]) -> None:
     rows = [
         {"since": since, "n_failed": n_failed, "time_s": time_s, "mean_mm": (1 + n_failed) * (scale + time_s)}
         for since, scale in (("touch", 2.0), ("lift", 1.0))

@@ -1,4 +1,6 @@
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -56,10 +58,10 @@ def test_adaptive_planner_stays_within_the_sides_of_its_plan(monkeypatch):
     """Of a plan 10 mm wide and 40 mm high; the errors do not matter, as all are the same."""
     pressed_mm = np.random.default_rng(0).uniform([-5, -20], [5, 20], (2 * ADAPT_EVERY, 2))
     recording = SimpleNamespace(presses_mm=pressed_mm[:ADAPT_EVERY])
-    localizer = SimpleNamespace(predict=lambda recording: SimpleNamespace(positions_mm=recording.presses_mm + 1.0))
+    localizer: Any = SimpleNamespace(predict=lambda recording: SimpleNamespace(positions_mm=recording.presses_mm + 1.0))
     monkeypatch.setattr(Recording, "open", lambda run: recording)
     planner = AdaptivePlanner(
-        localizer, None, np.random.default_rng(1), lambda positions_mm: np.ones(len(positions_mm), bool)
+        localizer, Path(), np.random.default_rng(1), lambda positions_mm: np.ones(len(positions_mm), bool)
     )
     plan = PressPlan(pressed_mm, np.full(len(pressed_mm), 3.0))
     assert planner(plan, ADAPT_EVERY - 1) is plan

@@ -161,7 +161,8 @@ def test_drift_study_draws_levels_by_minute_and_readings_by_second(recorded: Rec
     row = {"mean_mm": 3.0, "std_mm": 0.5, "mean_last_mm": 4.0, "std_last_mm": 1.0, "kind": "recorded"}
     cases = [{"recording": "real", "filter": name, "compensation": each} for name in FILTERS for each in COMPENSATIONS]
     document = {"rows": [row | case for case in cases], "excerpts": [excerpt]}
-    levels, readings, errors = drift_study({}, {"real": recorded}).draw(document).axes
+    axes: list[Any] = drift_study({}, {"real": recorded}).draw(document).axes
+    levels, readings, errors = axes
     before, pressed = (np.asarray(dots.get_offsets()).tolist() for dots in levels.collections)
     assert (before, pressed) == ([[2.0, 1.0], [4.0, 1.5]], [[2.0, 2.0], [4.0, 2.5]])
     assert (levels.get_title("left"), levels.get_xlabel()) == ("real, fibre 2", "time (min)")

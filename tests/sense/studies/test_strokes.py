@@ -1,5 +1,7 @@
 """The study of strokes: what it makes of the errors of its tasks."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ def test_strokes_study_compares_errors_after_the_first_fifth_with_those_at_rest(
     assert [row["within_r90"] for row in result.rows] == [0, 0.5, 0, 0, 0]
     assert [row["lifted_mm"] for row in result.rows] == pytest.approx(0.5 + 2 * np.arange(speeds))
     document = {"title": study.title, "rows": result.rows, **result.extra}
-    rested = study.draw(document).axes[0].lines[0]
+    rested: Any = study.draw(document).axes[0].lines[0]
     rate_hz = RigSettings().rate_hz
     np.testing.assert_allclose(rested.get_xdata(), np.arange(1, 11) / rate_hz)  # a reading after the touch shows it
     np.testing.assert_allclose(rested.get_ydata()[2:], 2.0)

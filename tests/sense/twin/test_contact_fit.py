@@ -53,8 +53,8 @@ def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
         assert getattr(double, name) == pytest.approx(2 * getattr(single, name), rel=1e-3)
     assert (double.scale, double.scale_std) == pytest.approx((single.scale, single.scale_std), rel=1e-3)
     sizes = {name: getattr(Contact(), name) / 2 for name in ("tool_radius_mm", "depth_mm", "thickness_mm")}
-    depths_mm = tuple(depth_mm / 2 for depth_mm in Contact().fibre_depths_mm)
-    halved = Contact(**sizes, fibre_depths_mm=depths_mm, scale=2.0)
+    first_mm, second_mm = Contact().fibre_depths_mm
+    halved = Contact(**sizes, fibre_depths_mm=(first_mm / 2, second_mm / 2), scale=2.0)
     small = fit_contact(pad, halved, responses, responses, noise_v)
     assert small.scale == pytest.approx(2 * double.scale, rel=1e-3)
     assert small.scale_std == pytest.approx(2 * double.scale_std, rel=0.05)
