@@ -6,11 +6,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
 from padforge.sense import Recording
+from padforge.sense.cli.localizer import deploy
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.moments import Moment
+from padforge.sense.signals.press_detection import first_readings
 
 
 def test_locate_excludes_fibres_by_number(few) -> None:
@@ -110,3 +114,25 @@ def test_deploy_names_a_missing_library(few, library: str, monkeypatch: pytest.M
     code, out, err = few("deploy", "--model", "model", "localizer.onnx")
     assert (code, out) == (2, "")
     assert err == f"padforge: this needs {library}, which is not installed: pip install 'padforge[deploy]'\n"
+
+
+@pytest.mark.parametrize(
+    ("moment", "since", "readings"), [("lift+0.22s", "lift", 3), ("end", "lift", 0), ("0.3s", "touch", 4)]
+)
+def test_locate_looks_at_the_readings_nearest_to_a_moment(few, moment: str, since: str, readings: int) -> None:
+    """At 13.3 readings a second, 2.9 and 4.0 of them."""
+    assert few("locate", "--model", "model", "rec", "--at", moment)[0] == 0
+    table, recording = np.genfromtxt("places.csv", delimiter=",", names=True), Recording.open("rec")
+    touched = first_readings(recording.readings, recording.times_s, recording.down_command, recording.up_command)
+    until = Moment(since, readings).until(touched, recording.up_command)  # type: ignore[arg-type]
+    expected_mm = LocalizerModel.load("model").predict(recording, until=until).positions_mm
+    np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), expected_mm, atol=1e-4)
+
+
+def test_deploy_takes_bytes_kibibytes_and_mebibytes() -> None:
+    flash = next(option for option in deploy.params if option.name == "flash")
+    context = click.Context(deploy)
+    sizes = [flash.process_value(context, text) for text in ("65536", "64k", "1M")]
+    assert sizes == [65_536, 65_536, 1_048_576]
+    with pytest.raises(click.BadParameter, match="expected bytes, as 65536, 64k or 1M"):
+        flash.process_value(context, "64K")

@@ -4,6 +4,7 @@ import re
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from padforge.sense.arrays import MAX_VOLTS
 from padforge.sense.deploy.c_header import (
     WRAP_AT,
     WRAP_BY,
+    HeaderReport,
     StudentNetwork,
     distill,
     evaluate_student,
@@ -265,3 +267,17 @@ def test_quantize_is_within_half_a_step(student: StudentNetwork) -> None:
         step = np.abs(weight).max(axis=-2, keepdims=True) / 127 if name.endswith(".w") else 0  # biases stay
         assert (np.abs(quantized[name] - weight) <= 0.501 * step).all()
         assert not name.endswith(".w") or (np.abs(np.rint(quantized[name] / step)) <= 127).all()
+
+
+def test_header_report_is_in_kibibytes() -> None:
+    """Of tables of 2 and a state of 1.5 KiB."""
+    student = SimpleNamespace(hidden=8, quantized=True, table_bytes=2048, state_bytes=1536)
+    rows = [{"n_failed": 0, "subsets": 1, "mean_mm": 1.234}, {"n_failed": 1, "subsets": 4, "mean_mm": 2.5}]
+    evaluation = {"errors": {"header": rows, "at the end": rows}, "n_detected": 7, "n_false": 1}
+    report = HeaderReport(student, evaluation | {"detected_mean_mm": 3.125}, 9)  # type: ignore[arg-type]
+    lines = report.lines(MemoryBudget(40 * 1024, 8192, True))
+    code_kib = CODE_BYTES / 1024
+    assert f"int8: flash {2 + code_kib:.1f} KiB of 40, {code_kib:g} of them for code; RAM 1.5 KiB of 8" in lines[0]
+    assert lines[3].split() == ["0", "1", "1.23", "1.23"]
+    assert lines[4].split() == ["1", "4", "2.50", "2.50"]
+    assert "detects 7 of 9 presses, with 1 false detections; mean error of these 3.12 mm" in lines[5]

@@ -11,7 +11,7 @@ from padforge.design.common.validation import InputError
 from padforge.sense import FaultDetector, HealthModel, Recording
 from padforge.sense.arrays import MIN_SCALE_V
 from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
-from padforge.sense.health.health_model import COMMANDED, MIN_PRESSES, find_dead_fibres
+from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, find_dead_fibres
 from padforge.sense.localizer.model_files import files_of
 from tests.sense.health.pads import detect_later, fit, part_of, plant
 
@@ -107,3 +107,9 @@ def test_few_presses_never_detect_a_reduced_gain(pad: Recording) -> None:
     assert not detector_of(model).predict(start)
     faults = detect_later(model, plant(pad, "reduced_gain"), pad, FEW)
     assert "reduced_gain" not in {fault.kind for fault in faults}
+
+
+@pytest.mark.parametrize("rate", [1e-5, 1e-2])
+def test_all_hypotheses_together_give_the_false_alarms_that_are_allowed(model: HealthModel, rate: float) -> None:
+    threshold = replace(model, false_alarm_rate=rate).threshold
+    assert len(HYPOTHESES) * np.exp(-threshold) == pytest.approx(rate)

@@ -326,3 +326,14 @@ def test_live_refuses_what_does_not_fit(recording, hasty) -> None:
     live.feed(recording.times_s[:9], recording.readings[:9])
     with pytest.raises(InputError, match=r"times begin at .* later than"):
         live.feed(recording.times_s[8:12], recording.readings[8:12])
+
+
+def test_estimate_has_moved_beyond_the_larger_radius_and_is_sharper_by_a_quarter() -> None:
+    def estimate(x_mm: float, y_mm: float, r90_mm: float) -> Estimate:
+        return Estimate(0, 0.0, 1.0, "touch", 1, 1.0, False, x_mm, y_mm, 1.0, 1.0, r90_mm / 2, r90_mm, ())
+
+    at_first = estimate(0.0, 0.0, 4.0)
+    for x_mm, y_mm, r90_mm, has_moved in ((3.0, 4.0, 2.0, True), (2.0, 3.0, 2.0, False), (3.0, 4.0, 6.0, False)):
+        later = estimate(x_mm, y_mm, r90_mm)
+        assert later.has_moved_from(at_first) == at_first.has_moved_from(later) == has_moved
+    assert [estimate(0, 0, r90_mm).is_sharper_than(at_first) for r90_mm in (2.9, 3.0, 3.1)] == [True, True, False]

@@ -218,6 +218,7 @@ def test_calibrate_learns_depth_and_force(deep_recording: Recording, deeply_cali
         ({"depths_mm": np.full(400, 5.0)}, [], []),
         ({"depths_mm": np.nan}, [], ["depth is not learnt: it is known of 399 of 400 presses, needed is of all"]),
         ({"reached_mm": -0.1}, [], ["depth is not learnt: 1 of 400 presses reached 0 mm or less"]),
+        ({"reached_mm": 0.0}, [], ["depth is not learnt: 1 of 400 presses reached 0 mm or less"]),
     ],
 )
 def test_known_measures_need_depth_that_varies(

@@ -41,6 +41,10 @@ def test_a_touch_in_focus_is_one_of_the_test(
     assert focus["pressed_mm"] == recording.presses_mm[focus["press"]].tolist()
     radii = [moment["r90_mm"] for moment in focus["moments"]]
     assert radii[0] > radii[-1]
+    last = model.predict(recording, until=recording.up_command + MOMENTS[-1].readings).positions_mm
+    assert focus["moments"][-1]["predicted_mm"] == pytest.approx(last[focus["press"]].tolist())
+    errors_mm = distances(last, recording.presses_mm)[list(model.test)]
+    assert np.sort(errors_mm)[len(errors_mm) // 2] == pytest.approx(errors_mm[model.test.index(focus["press"])])
 
 
 def test_rows_are_those_of_predictions_until_a_moment(

@@ -16,7 +16,13 @@ from padforge.sense.localizer.evaluation import distances
 from padforge.sense.localizer.features import N_TIMED
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import PHASES
-from padforge.sense.localizer.recalibration import CrossValidation, fit_correction, recalibrate
+from padforge.sense.localizer.recalibration import (
+    CrossValidation,
+    Recalibration,
+    fit_correction,
+    recalibrate,
+    recalibration_lines,
+)
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.training import fine_tune
 from tests.helpers.door import called
@@ -191,3 +197,15 @@ def test_recalibrate_follows_depths_known_or_not(deep_localizer: LocalizerModel,
     assert "depth_mean_mm" not in result.after[0]
     depths = unknown.predict_features(unknown.scaled_features(deep_recording)).measures["depth_mm"].values
     assert np.abs(depths - deep_recording.depths_mm).mean() < 0.5
+
+
+def test_recalibration_lines_compare_before_with_after() -> None:
+    before, after = (
+        [{"n_failed": 2, "subsets": 15, "mean_mm": m, "within_r90": r}] for m, r in ((3.5, 0.5), (2.0, 0.9))
+    )
+    result = Recalibration(60, ["corrected", "fine_tuned"], before, after, 1.5, 0.125, [], {})
+    lines = recalibration_lines(result)
+    assert lines[0].startswith("60 new presses")
+    assert lines[2].split() == ["2", "15", "3.50", "2.00", "50.0%", "90.0%"]
+    assert lines[3] == "corrected and fine-tuned: errors shrink by 1.500 mm (standard error 0.125 mm)"
+    assert recalibration_lines(replace(result, changes=[]))[3] == "nothing gained: positions are predicted as before"

@@ -470,3 +470,24 @@ def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recordin
     _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert evaluation.errors[0]["mean_mm"] < 0.55 * scale_mm
+
+
+def test_presses_are_held_for_half_a_cycle_at_the_rate_of_the_board(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    """A board of 1000 Hz gives 500 readings a second where 400 are asked for: every second sample."""
+    holds_s: list[float] = []
+
+    class EndedError(Exception):
+        """The session is not run."""
+
+    def begin(recorder: object, fibres: int, targets_mm: np.ndarray, hold_s: float, n_done: int) -> None:
+        holds_s.append(hold_s)
+        raise EndedError
+
+    class Connected:
+        connect = staticmethod(lambda: IDENTITY | {"channels": 8})
+
+    monkeypatch.setattr(by_hand, "HandSession", begin)
+    config = replace(config_of(presses=3, rate_hz=400.0, readings_per_press=40), out=tmp_path / "out")
+    with pytest.raises(EndedError):
+        record_by_hand(config, Connected(), lambda view: None, list)  # type: ignore[arg-type]
+    assert holds_s == [20 / 500]

@@ -99,3 +99,12 @@ def test_examine_arm_checks_force_and_tcp(monkeypatch, force_n, settings, name, 
     row = rig.examine_arm(**settings)[name]
     assert row.status == status
     assert words in row.message
+
+
+def test_examine_arm_tells_the_usual_rate_and_the_longest_gap():
+    """Of states 10 ms apart but for one gap of half a second."""
+    rig = Rig()
+    times_s = np.cumsum([0.0, *[0.01] * 60, 0.5, *[0.01] * 60])
+    rig.arm.drain = lambda: np.column_stack([times_s, np.zeros((len(times_s), 9))])
+    row = rig.examine_arm()["states"]
+    assert (row.status, row.message) == ("warn", "100 Hz, longest gap 500 ms")

@@ -1,3 +1,7 @@
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 
 from padforge.sense.localizer.calibration import calibrate
@@ -48,3 +52,20 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
     assert (pressed_mm[ADAPT_EVERY:] != plan.positions_mm[ADAPT_EVERY:]).any(axis=1).all()
     assert np.abs(pressed_mm).max() <= np.abs(plan.positions_mm).max()
     assert (pressed_mm[ADAPT_EVERY:, 0] > 0).mean() > 2 / 3
+
+
+def test_adaptive_planner_stays_within_the_sides_of_its_plan(monkeypatch):
+    """Of a plan 10 mm wide and 40 mm high; the errors do not matter, as all are the same."""
+    pressed_mm = np.random.default_rng(0).uniform([-5, -20], [5, 20], (2 * ADAPT_EVERY, 2))
+    recording = SimpleNamespace(presses_mm=pressed_mm[:ADAPT_EVERY])
+    localizer: Any = SimpleNamespace(predict=lambda recording: SimpleNamespace(positions_mm=recording.presses_mm + 1.0))
+    monkeypatch.setattr(Recording, "open", lambda run: recording)
+    planner = AdaptivePlanner(
+        localizer, Path(), np.random.default_rng(1), lambda positions_mm: np.ones(len(positions_mm), bool)
+    )
+    plan = PressPlan(pressed_mm, np.full(len(pressed_mm), 3.0))
+    assert planner(plan, ADAPT_EVERY - 1) is plan
+    moved_mm = planner(plan, ADAPT_EVERY).positions_mm
+    np.testing.assert_array_equal(moved_mm[:ADAPT_EVERY], pressed_mm[:ADAPT_EVERY])
+    assert (moved_mm[ADAPT_EVERY:] != pressed_mm[ADAPT_EVERY:]).any(axis=1).all()
+    assert (np.abs(moved_mm) <= np.abs(pressed_mm).max(axis=0)).all()

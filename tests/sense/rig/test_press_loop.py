@@ -1,6 +1,7 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -497,3 +498,12 @@ def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
     assert rows[-1, 7] == 0
     assert (rows[-3:, 1:4] == (0, -400, 60)).all()
     robots.free()
+
+
+def test_run_records_the_median_of_the_force(tmp_path):
+    """Every fifth state has a spike."""
+    arm, board, options = rig()
+    count = itertools.count()
+    arm.hook = lambda arm: setattr(arm, "force_n", 30.0 if next(count) % 5 == 0 else 7.5)
+    run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:1], np.array([4.0])))
+    assert Recording.open(tmp_path / "run").forces_n.tolist() == [7.5]

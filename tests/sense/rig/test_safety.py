@@ -16,6 +16,7 @@ from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.safety import (
     FALL_END_S,
     FALL_START_S,
+    MAX_RISE_N,
     MAX_TILT_DEG,
     RETREAT_MM,
     RETREAT_MM_S,
@@ -334,3 +335,12 @@ def test_retreat_lifts_a_tool_too_deep_or_at_the_edge_of_the_box(x: float, y: fl
     arm = arm_at(z, lambda arm: 0.0)
     arm.pose = (x, y, *arm.pose[2:])
     assert retreated(arm).pose[:3] == (x, y, pytest.approx(50 + RETREAT_MM))
+
+
+@pytest.mark.parametrize(("more_n", "is_allowed"), [(0.9 * MAX_RISE_N, True), (1.2 * MAX_RISE_N, False)])
+def test_retreat_allows_a_force_the_error_of_its_sensor(more_n: float, is_allowed: bool) -> None:
+    """The force reads more than at first as the tool begins to move, and none from 2 mm on."""
+    arm = arm_at(DEEP_MM, lambda arm: 80.0 + more_n * (arm.pose[2] > DEEP_MM) if arm.pose[2] < DEEP_MM + 2 else 0.0)
+    with contextlib.nullcontext() if is_allowed else pytest.raises(RigFault, match="the force does not fall"):
+        retreated(arm)
+    assert arm.stops == (not is_allowed)

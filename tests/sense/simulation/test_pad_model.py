@@ -20,6 +20,7 @@ from padforge.sense.simulation.pad_model import (
     divider_voltage,
     probe_motion,
     quantize,
+    simulate_readings,
     superpose_strain,
 )
 from padforge.sense.simulation.residual_indentation import RETURNED, replaced_residues
@@ -157,3 +158,17 @@ def test_live_pad_responds_in_proportion_to_depth() -> None:
     assert touched.any()
     assert ((full < half) & (half < rest))[touched].all()
     assert np.array_equal(full[~touched], rest[~touched])
+
+
+def test_held_presses_scatter_by_the_floor_in_millivolts() -> None:
+    """Of fibres that rest near half of the supply; elsewhere a change of resistance shows less."""
+    rig = quiet_rig(floor_mv=20.0)
+    none, presses = np.zeros((400, 6)), 400
+    readings = simulate_readings(
+        PressParts(none, none, none, none), np.zeros((presses, 2)), CYCLE, rig, np.random.default_rng(0)
+    )
+    cycles = readings.reshape(presses, CYCLE.readings, 6)
+    rest_v, held_v = cycles[:, CYCLE.down_index - 1], cycles[:, -1]
+    middle = rest_v.mean(axis=0)
+    expected_v = 0.02 * 4 * middle * (SUPPLY_V - middle) / SUPPLY_V**2
+    np.testing.assert_allclose((held_v - rest_v).std(axis=0), expected_v, rtol=0.12)

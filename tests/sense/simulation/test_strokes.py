@@ -56,6 +56,7 @@ def test_strokes_go_straight_at_their_speed_and_stay_on_the_pad(pad: Morphology,
     assert (speeds <= speed * (1 + 1e-9)).all()
     assert np.median(speeds) == pytest.approx(speed) or speed > 20
     assert np.abs(strokes.positions_mm).max() <= reach_mm + 1
+    np.testing.assert_array_equal(strokes.recording.presses_mm, strokes.positions_mm[:, -1])  # where they end
 
 
 def test_the_same_seed_gives_the_same_strokes(pad: Morphology) -> None:

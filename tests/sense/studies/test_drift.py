@@ -120,3 +120,60 @@ def test_study_of_the_published_pad_and_recording(published: Path, tmp_path: Pat
     assert document["idle"][0]["idle_percent"] == pytest.approx(58, abs=1)
     assert max(errors(document, "built", "baseline")) < min(errors(document, "built", "none"))
     assert max(errors(document, "built", "published")) < min(errors(document, "built", "none"))
+
+
+def test_drift_study_summarizes_the_errors_of_networks_and_of_idle_fibres(recorded: Recording) -> None:
+    """Two networks; the errors of those that were trained on a filter's readings are the number of the filter more."""
+    test, last = np.array([[1.0, 2.0, 9.0], [3.0, 4.0, 11.0]]), np.array([[5.0, 7.0], [6.0, 10.0]])
+    study = drift_study({}, {"real": recorded})
+    count = len(COMPENSATIONS)
+    states = [
+        {
+            **{f"test_{k}": test + number + k for k in range(count)},
+            **{f"last_{k}": last + number + 2 * (count - k) for k in range(count)},
+            "seconds": np.array(0.25 + number),
+            "idle": np.array(0.125 + number / 8),
+            **{"fibre": np.array(1), "readings": np.zeros((3, 1))},
+            **{"samples": np.zeros((1, 3, 2)), "levels": np.zeros((1, 3))},
+        }
+        for number in range(len(FILTERS))
+    ]
+    result = study.conclude(states)
+    rows = {(row["filter"], row["compensation"]): row for row in result.rows}
+    assert list(rows) == list(product(FILTERS, COMPENSATIONS))
+    row = rows["median of 15", "published"]
+    errors_mm = {name: row[f"{name}_mm"] for name in ("mean", "median", "p95", "std", "mean_last", "std_last")}
+    assert errors_mm == pytest.approx(
+        {"mean": 9, "median": 7.5, "p95": 4 + 10.5, "std": 1, "mean_last": 7 + 1 + 4, "std_last": 1}
+    )
+    assert (row["seconds_per_10000"], rows["none", "published"]["seconds_per_10000"]) == (1.25, None)
+    # of raw readings and of those filtered as published, which is the third filter
+    assert [share["idle_percent"] for share in result.extra["idle"]] == [12.5, 37.5]
+    assert "that of 'none' of raw readings, 5.00 mm (standard deviation over networks 1.00 mm)" in result.text[1]
+    assert "on the last ones that of 'windows' of raw readings, 9.00 mm" in result.text[1]
+    assert "a fibre is idle in 12.5 % (real, recorded readings) and 37.5 %" in result.text[2]
+
+
+def test_drift_study_draws_levels_by_minute_and_readings_by_second(recorded: Recording) -> None:
+    excerpt = {"recording": "real", "kind": "recorded", "fibre": 1, "levels": [[120.0, 1.0, 2.0], [240.0, 1.5, 2.5]]}
+    excerpt |= {"readings": [[60.0, 61.0, 62.0], [1.0, 1.1, 1.2], [0.9, 1.0, 1.1]]}
+    excerpt |= {"samples": [[[60.5, 1.0], [61.0, 2.0], [61.5, 1.1]]]}
+    row = {"mean_mm": 3.0, "std_mm": 0.5, "mean_last_mm": 4.0, "std_last_mm": 1.0, "kind": "recorded"}
+    cases = [{"recording": "real", "filter": name, "compensation": each} for name in FILTERS for each in COMPENSATIONS]
+    document = {"rows": [row | case for case in cases], "excerpts": [excerpt]}
+    axes: list[Any] = drift_study({}, {"real": recorded}).draw(document).axes
+    levels, readings, errors = axes
+    before, pressed = (np.asarray(dots.get_offsets()).tolist() for dots in levels.collections)
+    assert (before, pressed) == ([[2.0, 1.0], [4.0, 1.5]], [[2.0, 2.0], [4.0, 2.5]])
+    assert (levels.get_title("left"), levels.get_xlabel()) == ("real, fibre 2", "time (min)")
+    lines = {line.get_label(): line.get_xydata().tolist() for line in readings.lines}
+    assert lines["readings"] == [[0.0, 1.0], [1.0, 1.1], [2.0, 1.2]]
+    assert lines["filtered"] == [[0.0, 0.9], [1.0, 1.0], [2.0, 1.1]]
+    assert (lines["before"], lines["pressed"], lines["after"]) == ([[0.5, 1.0]], [[1.0, 2.0]], [[1.5, 1.1]])
+    assert readings.get_xlabel() == "time since 1.0 min (s)"
+    dots = [line for line in errors.lines if line.get_marker() == "o"]
+    for random, last in zip(dots[::2], dots[1::2], strict=True):
+        assert (set(random.get_xdata()), set(last.get_xdata())) == ({3.0}, {4.0})
+        assert (random.get_markerfacecolor() == "none", last.get_markerfacecolor()) == (False, "none")
+        np.testing.assert_array_equal(np.rint(random.get_ydata()), np.arange(len(COMPENSATIONS)))
+    assert [label.get_text() for label in errors.get_yticklabels()] == list(COMPENSATIONS)

@@ -45,7 +45,10 @@ def test_study_compares_both_methods_and_maps_a_chosen_set(localizer: LocalizerM
     cells = one.maps[-1]["by_position"]
     mean_of_map_mm = np.average([cell["mean_mm"] for cell in cells], weights=[cell["presses"] for cell in cells])
     assert mean_of_map_mm == pytest.approx(mean_mm)
-    assert len(fibre_loss.fibre_loss_lines(result)) == 6
+    lines = [line.split() for line in fibre_loss.fibre_loss_lines(result)]
+    assert len(lines) == 6
+    row = one.errors[1]
+    assert lines[3] == [*ONE.split(), "1", "4", *(f"{row[f'{name}_mm']:.2f}" for name in ("mean", "std", "max"))]
 
 
 def test_study_rejects_fibres_that_cannot_fail(localizer: LocalizerModel, recording: Recording) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from padforge.design import Contact, InputError, Morphology
@@ -53,3 +54,25 @@ def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path) ->
     means = {tuple(row[key] for key in keys): row["mean"] for row in document["rows"]}
     assert means[1.0, 30, 1.0, 30] < 0.5 * means[0.6, 30, 0.6, 30]
     assert means[1.0, 30, 0.6, 30] > 1.5 * means[0.6, 30, 0.6, 30]
+
+
+def test_sensitivity_study_compares_radii_over_depths_and_depths_over_radii() -> None:
+    """Networks err by 1, 2 or 3 units for the radii, twice as much at the second depth, and by 60 for other objects."""
+    study = sensitivity_study(PADS)
+    sizes, others = study.settings["tool_radius_mm"], study.settings["depth_mm"]
+    trained = np.outer([1.0, 2.0], np.arange(1.0, len(sizes) + 1)).ravel()
+    assert (len(study.tasks), len(others)) == (len(trained), 2)
+    states = []
+    for number, error in enumerate(trained):
+        errors = np.full((2, len(trained)), 60.0)
+        errors[:, number] = error - 0.5, error + 0.5
+        states.append({"errors": errors})
+    result = study.conclude(states)
+    unit_mm = PADS["square"].unit_mm
+    row = result.rows[len(trained) + 1]
+    names = ("trained_tool_radius_mm", "trained_depth_mm", "tool_radius_mm", "depth_mm", "mean", "std", "mean_mm")
+    assert [row[name] for name in names] == pytest.approx([sizes[1], others[0]] * 2 + [2.0, 0.5, 2 * unit_mm])
+    assert f"{1.5 * unit_mm:.3f} with a radius of {sizes[0]:g} mm, {4.5 * unit_mm:.3f} with" in result.text[1]
+    assert "depths differ by 100 %" in result.text[1]
+    assert f"not trained with is {60 * unit_mm:.3f}, at worst {60 * unit_mm:.3f}, instead of" in result.text[1]
+    assert result.text[1].endswith(f"instead of {3 * unit_mm:.3f}.")

@@ -39,7 +39,10 @@ def test_fit_contact_recovers_scale_and_shares(base: Base) -> None:
 
 
 def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
-    """Gains take up any other: twice the squeeze and stretch are twice the results, and as uncertain as a share."""
+    """Gains take up any other: twice the squeeze and stretch are twice the results, and as uncertain as a share.
+
+    A layer half as large is the same at twice the scale, which is twice as uncertain.
+    """
     responses = press(Contact(squeeze=0.7, stretch=1.3), PlanTransform(), 24)
     pad = AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), (0, 1, 2, 3), PlanTransform(), 0.5)
     noise_v = 0.05 * np.sqrt(responses.variance)
@@ -49,6 +52,12 @@ def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
     for name in ("squeeze", "stretch", "shares_std"):
         assert getattr(double, name) == pytest.approx(2 * getattr(single, name), rel=1e-3)
     assert (double.scale, double.scale_std) == pytest.approx((single.scale, single.scale_std), rel=1e-3)
+    sizes = {name: getattr(Contact(), name) / 2 for name in ("tool_radius_mm", "depth_mm", "thickness_mm")}
+    first_mm, second_mm = Contact().fibre_depths_mm
+    halved = Contact(**sizes, fibre_depths_mm=(first_mm / 2, second_mm / 2), scale=2.0)
+    small = fit_contact(pad, halved, responses, responses, noise_v)
+    assert small.scale == pytest.approx(2 * double.scale, rel=1e-3)
+    assert small.scale_std == pytest.approx(2 * double.scale_std, rel=0.05)
 
 
 def test_elements_of_a_pad_sum_to_its_lengths_and_follow_its_offsets() -> None:

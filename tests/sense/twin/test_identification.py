@@ -165,7 +165,7 @@ def test_identification_lines_count_from_1_and_state_millivolts_for_a_percent() 
     row |= {"lateral_offset_mm": 0.3, "lateral_offset_std_mm": 0.1}
     document = {"presses": 10, "channels": [row], "explained": 0.9, "explained_on_plan": 0.8, "noise": 0.01}
     frame = {"mirrored": False, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
-    document |= {"n_alternatives": 0, "explained_by_straight": None, "frame": frame}
+    document |= {"n_alternatives": 0, "doubts": [], "frame": frame}
     lines = [line.split() for line in identification_lines(document, Path())]
     assert ["1", "2", "3", "-0.5", "2.00", "0.90", "0.30", "±", "0.10"] in lines
 

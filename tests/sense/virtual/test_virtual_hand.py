@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design import Contact, Morphology
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual.virtual_hand import LIGHT, MISHAPS, REACTION_S, SHORT_S, Finger, FingerStroke
+from padforge.sense.virtual.virtual_hand import LIGHT, MISHAPS, REACTION_S, SHORT_S, SLIDE_MM, Finger, FingerStroke
 
 RATE_HZ = 50.0
 
@@ -46,7 +46,7 @@ def test_finger_presses_where_asked_lifts_and_errs() -> None:
     assert of_kind["short"].up_s - of_kind["short"].down_s == pytest.approx(SHORT_S)
     assert of_kind["light"].depth_mm < 1.2 * LIGHT * RigSettings().depth_mm
     slid, still = (of_kind[kind].contact(of_kind[kind].down_s + 1)[0] for kind in ("slide", "double"))
-    assert np.linalg.norm(slid - of_kind["slide"].position_mm) > 10
+    assert slid - of_kind["slide"].position_mm == pytest.approx([-SLIDE_MM, 0])  # to the other half of the pad
     np.testing.assert_array_equal(still, of_kind["double"].position_mm)
     stroke = FingerStroke("press", np.zeros(2), 4.0, down_s=1.0, up_s=2.0)  # it sinks in and leaves
     assert [stroke.contact(at_s)[1] for at_s in (0.5, 1.5, 2.2)] == [0, 4, 0]

@@ -411,3 +411,22 @@ def test_connect_refuses_registers_that_another_client_writes(robots: Any, host:
         assert other.recv(100)
         with pytest.raises(RigFault, match="lets another program write input_int_register_25"):
             arm.connect()
+
+
+@pytest.mark.parametrize(("top_mm", "height_mm"), [(300.0, 110.0), (104.0, 104.0)])
+def test_arm_of_settings_retreats_above_the_pad_within_its_workspace(
+    monkeypatch: pytest.MonkeyPatch, top_mm: float, height_mm: float
+) -> None:
+    """By 10 mm, at 10 mm/s, and up to 1 mm beside the box."""
+    told: list[object] = []
+
+    def refuse(*arguments: object) -> None:
+        told.extend(arguments)
+        raise RigFault("refused", "no arm")
+
+    monkeypatch.setattr(ur5, "RtdeWorker", refuse)
+    box_mm = (-50.0, 60.0, -450.0, -350.0, 95.0, top_mm)
+    rig = RigSettings(host="192.0.2.1", box_mm=box_mm, contact_mm=100.0)
+    with pytest.raises(RigFault, match="no arm"):
+        UR5.from_settings(rig, "urscript").connect()
+    assert told == ["192.0.2.1", "urscript", Retreat(height_mm, (-51.0, 61.0), (-451.0, -349.0), 10.0)]
