@@ -10,7 +10,14 @@ import torch
 from padforge.design import Contact, Morphology, signals
 from padforge.design.common.validation import InputError
 from padforge.design.contact_comparison import alternative_contacts, beside_straight, errors_by_contact
-from padforge.design.networks import SimulatedPresses, fresh_presses, localisation_error, training_presses
+from padforge.design.networks import (
+    FailureError,
+    SimulatedPresses,
+    fresh_presses,
+    initial_weights,
+    localisation_error,
+    training_presses,
+)
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
 
 
@@ -145,3 +152,21 @@ def test_networks_ignore_the_signals_of_failed_fibres():
     changed[:, failed] = np.nan
     errors = presses.position_errors(network, failed, changed, presses.test_positions)
     np.testing.assert_array_equal(errors, presses.test_errors(network, failed))
+
+
+def test_errors_by_contact_are_means_in_mm(monkeypatch):
+    levels = [FailureError(0, 1, 0.25, 0.0, 0.25), FailureError(1, 4, 0.5, 0.125, 0.75)]
+    monkeypatch.setattr(SimulatedPresses, "failure_errors", lambda *_: levels)
+    [found] = errors_by_contact({"pad": Morphology.straight(2, 8.0)}, {"contact": PUBLISHED_CONTACT}, *ASKED)
+    assert found.errors_mm == (2.0, 4.0)
+
+
+@pytest.mark.parametrize("varying", [1, 2, 3])
+def test_initial_weights_are_as_long_as_nguyen_and_widrow_say(varying):
+    """0.7 H^(1/n) for n inputs; those that do not vary are none, and biases spread evenly over that length."""
+    varies = np.arange(4) < varying
+    weights = initial_weights(varies, 9, np.random.default_rng(0))
+    length = 0.7 * 9 ** (1 / varying)
+    assert np.linalg.norm(weights[:, :-1], axis=1) == pytest.approx(np.full(9, length))
+    assert not weights[:, :-1][:, ~varies].any()
+    assert np.abs(weights[:, -1]) == pytest.approx(length * np.abs(np.linspace(-1, 1, 9)))

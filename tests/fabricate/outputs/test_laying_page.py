@@ -72,8 +72,9 @@ def test_silicone_fills_straight_pad(draft_deg):
 
 def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
-    volumes = [build(pad, tmp_path, [], with_settings({"pins": pins})).silicone_volume_ml for pins in (True, False)]
-    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
+    for silicone in ({}, {"shrinkage": 0.04}):
+        made = [build(pad, tmp_path, [], with_settings({"pins": pins}, silicone=silicone)) for pins in (True, False)]
+        assert made[0].silicone_volume_ml == pytest.approx(made[1].silicone_volume_ml, abs=1e-3)
     plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
     silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
     assert silicone["thickness_mm"] == plan.silicone_mm == 3.0

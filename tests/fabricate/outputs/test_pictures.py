@@ -174,3 +174,12 @@ def test_pictures_are_small(tmp_path, published):
     draw_tracks(plan, tmp_path / "tracks")
     draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
+
+
+def test_colours_of_a_mesh_are_named_by_height_above_its_lowest_point(tmp_path, monkeypatch):
+    corners = [(x, y, z) for z, x0 in ((1, 0), (3, 0), (6, 10)) for x in (x0, x0 + 10) for y in (0, 10)]
+    faces = [(k, k + 2, k + 1) for k in (0, 4, 8)] + [(k + 1, k + 2, k + 3) for k in (0, 4, 8)]
+    figures = []
+    monkeypatch.setattr("padforge.design.common.plotting.save_figure", lambda figure, *_: figures.append(figure))
+    draw_findings(np.array(corners, float), faces, [], tmp_path / "mesh.png")
+    assert [text.get_text() for text in figures[0].axes[1].texts] == ["2 mm", "5 mm above the lowest point"]

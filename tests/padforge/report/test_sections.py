@@ -13,7 +13,7 @@ from markupsafe import escape
 
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import Fault, InputError
-from padforge.design.contact import contact_press
+from padforge.design.contact import FIBRE_BLUR_MM, contact_press
 from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
 from padforge.design.report import contact_line, draw_press
@@ -321,3 +321,12 @@ def test_fibre_loss_lists_mean_errors_of_the_sets_that_a_fibre_is_in() -> None:
     (section,) = fibre_loss_sections(Path(), {"by_subset": by_subset})
     words = " ".join(re.sub("<[^>]*>", " ", " ".join(section.body)).split())
     assert "alone (mm) with one fibre more 1 2.00 15.00 2 4.00 20.00 3 8.00 25.00" in words
+
+
+def test_drawn_fibres_sink_by_the_strain_below_them() -> None:
+    contact = Contact()
+    press, height_mm = contact_press(contact), contact.thickness_mm - contact.fibre_depths_mm[0]
+    heights_mm = (np.arange(40) + 0.5) / 40 * height_mm
+    x, drawn = (np.asarray(part, float) for part in draw_press(contact, 11.25).axes[0].lines[2].get_data())
+    sunk = sum(press.strains(np.abs(x), z, FIBRE_BLUR_MM).compressive for z in heights_mm) * height_mm / 40
+    np.testing.assert_allclose(drawn, height_mm - sunk, atol=0.01 * sunk.max())
