@@ -14,7 +14,6 @@ from padforge.design.networks import (
     FailureError,
     SimulatedPresses,
     fresh_presses,
-    initial_weights,
     localisation_error,
     training_presses,
 )
@@ -159,14 +158,3 @@ def test_errors_by_contact_are_means_in_mm(monkeypatch):
     monkeypatch.setattr(SimulatedPresses, "failure_errors", lambda *_: levels)
     [found] = errors_by_contact({"pad": Morphology.straight(2, 8.0)}, {"contact": PUBLISHED_CONTACT}, *ASKED)
     assert found.errors_mm == (2.0, 4.0)
-
-
-@pytest.mark.parametrize("varying", [1, 2, 3])
-def test_initial_weights_are_as_long_as_nguyen_and_widrow_say(varying):
-    """0.7 H^(1/n) for n inputs; those that do not vary are none, and biases spread evenly over that length."""
-    varies = np.arange(4) < varying
-    weights = initial_weights(varies, 9, np.random.default_rng(0))
-    length = 0.7 * 9 ** (1 / varying)
-    assert np.linalg.norm(weights[:, :-1], axis=1) == pytest.approx(np.full(9, length))
-    assert not weights[:, :-1][:, ~varies].any()
-    assert np.abs(weights[:, -1]) == pytest.approx(length * np.abs(np.linspace(-1, 1, 9)))

@@ -20,6 +20,7 @@ from padforge.fabricate.mould import (
     holder_body,
     lid_body,
     mould_body,
+    registration_pins,
     sizes,
 )
 from padforge.fabricate.plan import Plan
@@ -182,6 +183,10 @@ def test_lid_has_holes_for_pins_vents_and_spout():
     read = as_read(mould_body(plan))
     assert read.bounds[1, 2] == pytest.approx(8 + pin)
     assert_one_closed_body(read)
+    holes = [hole.area for hole in lid_body(plan).cuts]
+    for peg in registration_pins(plan):  # a printed hole comes out narrower than drawn
+        (around,) = (hole for hole in holes if hole.intersects(peg.area))
+        assert around.boundary.distance(peg.area) >= 0.1
     spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
     assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
     lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))  # just room enough

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, InputError, Morphology
-from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.published import published_terms
 from padforge.design.objectives.score import ScoredPad, score
-from padforge.design.settings import PadSettings, RulesSettings, Scatter, SearchSettings
+from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -63,11 +62,3 @@ def test_score_refuses_invalid_arguments_in_one_line(pad, asked, message):
     with pytest.raises(InputError, match=message) as refused:
         score(pad, **asked)
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_score_has_the_expected_error_of_its_scatter():
-    pad, size = Morphology.straight(1), PadSettings(grid=1)
-    search = SearchSettings(max_failures=0, noise=0.05, scatter=0.3, scatter_common=0.8)
-    [error] = expected_errors(pad, Contact(), search, size)
-    scored = score(pad, max_failures=0, size=size, scatter=Scatter(0.05, 0.3, 0.8))
-    assert scored["expected_error_mm_0"] == pytest.approx(pad.unit_mm * error)

@@ -74,6 +74,8 @@ def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
     for silicone in ({}, {"shrinkage": 0.04}):
         made = [build(pad, tmp_path, [], with_settings({"pins": pins}, silicone=silicone)) for pins in (True, False)]
+        box_ml = made[1].sizes["tray_mm"] ** 2 * made[1].sizes["tray_height_mm"] / 1000
+        assert made[1].silicone_volume_ml == pytest.approx(box_ml - made[1].mould_volume_ml, abs=1e-3)
         assert made[0].silicone_volume_ml == pytest.approx(made[1].silicone_volume_ml, abs=1e-3)
     plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
     silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
@@ -173,6 +175,13 @@ def test_page_lists_masses_and_cut_lengths():
         assert float(row[5].split()[0]) == pytest.approx(fibre["cut_mm"], abs=0.051)
     assert "of PLA" in page
     assert "4 hours" in page
+
+
+@pytest.mark.parametrize(("resin", "plastic"), [(False, "124 g of PLA"), (True, "110 g of resin")])
+def test_page_weighs_the_mould(resin, plastic):
+    document = fabrication_document(Plan(Morphology.straight(1), with_settings(printer={"resin": resin})))
+    page = laying_page(document | {"mould_volume_ml": 100.0})
+    assert f"takes 100.0 ml, {plastic} if solid" in page
 
 
 def test_page_lists_resistance_and_fixed_resistor_of_every_fibre():
