@@ -241,3 +241,11 @@ def test_crossing_gap_is_a_lower_bound(knots, seed):
     assert isinstance(stated, float)
     for c in plan.crossings:
         assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4
+
+
+def test_vents_of_a_small_lid_are_at_its_quarters():
+    plan = Plan(Morphology.straight(1, 5.0), with_settings({"lid": True}))
+    quarter = (plan.cavity.bounds[2] - plan.cavity.bounds[0]) / 4
+    vents = {(hole.area.centroid.x, hole.area.centroid.y) for hole in lid_body(plan).cuts}
+    corners = [(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)]
+    assert np.array(sorted(vents)) == pytest.approx(np.array(corners))

@@ -200,6 +200,14 @@ def test_toolpath_svg_shows_every_fibre_with_its_number_turn_and_depth(pad):
     assert min(float(text.get("y", "")) for text in written) - 1.25 > end  # the box does not run through it
 
 
+def test_toolpath_svg_has_the_box_about_the_middle_of_the_pad():
+    plan = Plan(Morphology.straight(1), with_settings(dispenser={"origin_mm": [60.0, 100.0]}))
+    root = ElementTree.fromstring(toolpath_svg(plan, plan_toolpath(plan, 0.3)))
+    (box,) = (path for path in root.findall(f"{SVG}path") if path.get("id") == "box")
+    box.set("d", box.attrib["d"].removesuffix("Z"))
+    assert points(box).tolist() == [[-60, -100], [160, -100], [160, 120], [-60, 120]]  # of 0 to 220 mm
+
+
 def test_script_cuts_corners_by_no_more_and_no_less_than_the_tolerance():
     """An arc that begins b before a turn by t passes its corner at R (1 / cos(t / 2) - 1), R = b / tan(t / 2)."""
     plan = Plan(Morphology.straight(1))

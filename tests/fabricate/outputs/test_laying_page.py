@@ -302,3 +302,9 @@ def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
 def test_ridge_is_whole_lines(ridge, nozzle, width, why):
     mould, printer = MouldSettings(ridge_width_mm=ridge), PrinterSettings(nozzle_mm=nozzle)
     assert print_setting("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
+
+
+@pytest.mark.parametrize(("layer", "layers"), [(0.1, 8), (0.2, 4), (0.3, 3), (0.5, 2)])
+def test_solid_layers_hide_the_infill_below_them(layer, layers):
+    value, _ = print_setting("Solid layers, Top", MouldSettings(), PrinterSettings(layer_mm=layer))
+    assert value.startswith(f"{layers}; ")  # 0.8 mm or more

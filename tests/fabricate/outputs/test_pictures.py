@@ -185,6 +185,13 @@ def figures(monkeypatch) -> list[Figure]:
     return saved
 
 
+def test_mould_picture_has_the_size_of_the_mould_as_title(tmp_path, figures):
+    draw_mould(Plan(Morphology.straight((1, 2), (12.0, 10.0))), [], tmp_path / "mould.png")
+    walls = 2 * (2 + 2 + 6 * np.tan(np.radians(2)))
+    size = f"{3 * 12 + walls:.4g} x {2 * 10 + walls:.4g} x 8 mm"  # with a floor of 2 mm below 6 mm of silicone
+    assert figures[0].axes[0].get_title(loc="left") == f"Mould from above, {size}"
+
+
 def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
     draw_tracks(Plan(level_pad(1.0, 2.0), with_settings(fibre={"diameter_mm": 2.0})), tmp_path / "tracks.png")
     [axes] = figures[0].axes
