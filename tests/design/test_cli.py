@@ -17,7 +17,8 @@ from padforge.design.contact import half_width_mm
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
-from padforge.design.optimize.search import settings_for_twin, state_folders
+from padforge.design.objectives.rules import Violation
+from padforge.design.optimize.search import SearchResult, settings_for_twin, state_folders
 from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
@@ -69,6 +70,17 @@ def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
         Path("out/pad/design.json").write_text(json.dumps(document | change))
         with pytest.raises(InputError, match="not as padforge writes it"):
             load_result(Path("out/pad"))
+
+
+def test_design_summary_counts_the_rules_that_it_does_not_list():
+    broken = [Violation("max_length_mm", (fibre,), 600.0, 500.0) for fibre in range(1, 31)]
+    errors = {"expected_error_mm_0": 0.5}
+    result = SearchResult(Morphology.straight(15), errors, broken, "start 1", {"expected_error_mm_0": 1.0})
+    lines = summary_lines(result, Path("out/pad"))
+    listed = [line for line in lines if line.startswith("  broken: ")]
+    assert listed == [f"  broken: {violation}" for violation in broken[: len(listed)]]
+    assert lines[-1] == f"  ... and {30 - len(listed)} more"
+    assert len(summary_lines(replace(result, violations=broken[: len(listed)]), Path("out/pad"))) == len(lines) - 1
 
 
 @pytest.fixture(scope="module")

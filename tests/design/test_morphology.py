@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design import Contact, InputError, Morphology, signals
-from padforge.design.morphology import assemble_knots
+from padforge.design.morphology import MAX_KNOTS, assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.common.damage import damages, read_damaged
 from tests.design.wild_pads import SEEDS, wild_pads
@@ -102,3 +102,9 @@ def test_tiled_pads_respond_alike_in_every_tile():
         found = signals(tiled, places, contact)
         # by other spans, of which quadrature sees the edge of the contact more or less finely
         np.testing.assert_allclose(found, signals(straight, places, contact), rtol=0, atol=3e-7)
+
+
+def test_knots_are_limited_with_the_ends_of_fibres_counted():
+    most = MAX_KNOTS // 8 - 2
+    with pytest.raises(InputError, match=rf"^knots is {most + 1}, .*{most}"):
+        Morphology.random(4, most + 1)

@@ -10,7 +10,13 @@ import torch
 from padforge.design import Contact, Morphology, signals
 from padforge.design.common.validation import InputError
 from padforge.design.contact_comparison import alternative_contacts, beside_straight, errors_by_contact
-from padforge.design.networks import SimulatedPresses, fresh_presses, localisation_error, training_presses
+from padforge.design.networks import (
+    FailureError,
+    SimulatedPresses,
+    fresh_presses,
+    localisation_error,
+    training_presses,
+)
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
 
 
@@ -145,3 +151,10 @@ def test_networks_ignore_the_signals_of_failed_fibres():
     changed[:, failed] = np.nan
     errors = presses.position_errors(network, failed, changed, presses.test_positions)
     np.testing.assert_array_equal(errors, presses.test_errors(network, failed))
+
+
+def test_errors_by_contact_are_means_in_mm(monkeypatch):
+    levels = [FailureError(0, 1, 0.25, 0.0, 0.25), FailureError(1, 4, 0.5, 0.125, 0.75)]
+    monkeypatch.setattr(SimulatedPresses, "failure_errors", lambda *_: levels)
+    [found] = errors_by_contact({"pad": Morphology.straight(2, 8.0)}, {"contact": PUBLISHED_CONTACT}, *ASKED)
+    assert found.errors_mm == (2.0, 4.0)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized
 from padforge.design.contact import signals_sparse
 from padforge.design.objectives.ambiguity import ambiguities
+from padforge.design.objectives.published import information
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
@@ -143,3 +144,9 @@ def test_load_refuses_invalid_rectangles_in_one_line(tmp_path, change):
     path.write_text(json.dumps(PAD.to_dict() | change))
     with pytest.raises(InputError, match=r"pad\.json: "):
         Morphology.load(path)
+
+
+def test_information_of_a_transposed_rectangle():
+    pad, contact = Morphology.random(Layout.create((2, 4), (6.0, 15.0)), 3, 1), Contact(model="profile")
+    turned_bits = information(turned(pad), contact, noise=50.0, side=5)
+    assert information(pad, contact, noise=50.0, side=5) == pytest.approx(turned_bits, rel=1e-6)

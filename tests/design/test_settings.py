@@ -15,6 +15,7 @@ from padforge.design.settings import (
     MEASURED_PROFILE,
     PUBLISHED_CONTACT,
     Layout,
+    Scatter,
     read_contact,
     sensed_rectangle,
 )
@@ -271,3 +272,10 @@ def test_other_contacts_do_not_depend_on_the_mould():
 def test_contact_refuses_mould_too_thin_for_press():
     with pytest.raises(InputError, match=r"^pad: \[contact\] .*depth_mm is 5, the pad is 4 mm thick"):
         read_contact(Spec({"mould": {"silicone_mm": 4.0}}, "pad"))
+
+
+def test_gains_scatter_by_their_share_and_have_the_common_part_of_its_variance():
+    gains = Scatter(floor=0.5, share=0.2, common=0.36).sample_gains((50_000, 3), np.random.default_rng(0))
+    assert gains.mean(axis=0) == pytest.approx([1, 1, 1], abs=0.005)
+    assert gains.std(axis=0) == pytest.approx([0.2] * 3, rel=0.02)
+    assert np.corrcoef(gains.T)[np.triu_indices(3, 1)] == pytest.approx([0.36] * 3, abs=0.02)

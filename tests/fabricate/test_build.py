@@ -4,6 +4,7 @@ import errno
 import json
 import logging
 import math
+import zipfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -318,3 +319,10 @@ def test_provenance_is_of_the_input_at_the_start(tmp_path, monkeypatch):
 
     monkeypatch.setattr(export, "check_plan", meanwhile)
     assert build(PAD, tmp_path, [], inputs=[pad]).provenance["inputs"] == {"morphology.json": read}
+
+
+def test_3mf_names_the_pad_by_its_fibres_and_both_pitches(tmp_path):
+    """As `pitch_mm` has them: along x, of the verticals, and along y."""
+    build(Morphology.straight((1, 2), (12.0, 10.0)), tmp_path, ["3mf"])
+    model = zipfile.ZipFile(tmp_path / "mould.3mf").read("3D/3dmodel.model").decode()
+    assert "mould, for a pad of 1 + 2 fibres 12 and 10 mm apart" in model

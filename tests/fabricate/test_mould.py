@@ -20,6 +20,7 @@ from padforge.fabricate.mould import (
     holder_body,
     lid_body,
     mould_body,
+    registration_pins,
     sizes,
 )
 from padforge.fabricate.plan import Plan
@@ -182,6 +183,10 @@ def test_lid_has_holes_for_pins_vents_and_spout():
     read = as_read(mould_body(plan))
     assert read.bounds[1, 2] == pytest.approx(8 + pin)
     assert_one_closed_body(read)
+    holes = [hole.area for hole in lid_body(plan).cuts]
+    for peg in registration_pins(plan):  # a printed hole comes out narrower than drawn
+        (around,) = (hole for hole in holes if hole.intersects(peg.area))
+        assert around.boundary.distance(peg.area) >= 0.1
     spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
     assert_one_closed_body(as_read(lid_body(spout)), genus=4 + 1)
     lid_body(Plan(Morphology.straight(1, 9.6), with_settings({"lid": True, "spout": True})))  # just room enough
@@ -236,3 +241,11 @@ def test_crossing_gap_is_a_lower_bound(knots, seed):
     assert isinstance(stated, float)
     for c in plan.crossings:
         assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4
+
+
+def test_vents_of_a_small_lid_are_at_its_quarters():
+    plan = Plan(Morphology.straight(1, 5.0), with_settings({"lid": True}))
+    quarter = (plan.cavity.bounds[2] - plan.cavity.bounds[0]) / 4
+    vents = {(hole.area.centroid.x, hole.area.centroid.y) for hole in lid_body(plan).cuts}
+    corners = [(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)]
+    assert np.array(sorted(vents)) == pytest.approx(np.array(corners))

@@ -8,11 +8,12 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.fabricate.mould import mould_body
-from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number
+from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number, fibre_layers
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
@@ -178,3 +179,11 @@ def test_numbers_of_the_mould_are_legible_on_the_pad(pad):
                 seen = x + half + (across / 4 - 0.5) * height, y + height * (0.5 - down / 4), 0.0
                 (place,), _ = lying.tip(np.array([seen]))
                 assert floor.covers(shapely.Point(place)) == (cell == "#"), (number, down, across)
+
+
+def test_layers_of_a_family_are_the_paler_the_shallower():
+    layers = fibre_layers(Plan(level_pad(1.8, 1.2)))
+    assert [(layer.family, layer.depth_mm) for layer in layers] == [(0, 2.0), (0, 1.2), (1, 0.4)]
+    white = 0.7 / 2  # of the most, as one of two layers is deeper
+    red, green, blue = (round(part + white * (255 - part)) for part in bytes.fromhex(HORIZONTAL[1:]))
+    assert [layer.colour for layer in layers] == [HORIZONTAL, f"#{red:02x}{green:02x}{blue:02x}", VERTICAL]

@@ -63,6 +63,8 @@ def test_invalid_keys_are_refused_in_one_line(section, keys, parts):
         ({"spout": True}, 11.25, "[mould] spout: "),
         ({"exit_width_mm": 0.3}, 11.25, "[mould] exit_width_mm: "),
         ({}, 3.0, "[mould] exit_width_mm: "),
+        # the walls on both sides of a slot lean outwards, by 6 mm tan(2 degrees) each
+        ({}, 3.3, "[mould] exit_width_mm: got 3, allowed is less than the pitch between slots, 2.88"),
         (
             {"shallow_ridge_height_mm": 1.2},
             11.25,

@@ -1,6 +1,7 @@
 """`padforge design compare`: which pad to make."""
 
 import json
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -28,6 +29,20 @@ def test_compare_evaluates_finished_pads(tmp_path):
     assert plain["contact"]["model"] == "layer"
     assert (tmp_path / "both" / "plain" / "mould.stl").exists()
     assert (tmp_path / "both" / "comparison.png").stat().st_size > 10_000
+
+
+def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_differs():
+    plain = {"name": "plain", "fibres": [2, 3], "knots": 0, "length_mm": 1234.0, "crossings": 6, "mould_ml": 12.34}
+    plain |= {"errors_mm": [1.0, 1.5], "straight_mm": [1.0, 1.5]}
+    bent = plain | {"name": "bent", "knots": 4, "errors_mm": [0.5, 0.75], "half_width_mm": 5.678}
+    lines = comparison.comparison_lines({"rows": [plain, bent]})
+    costs = "half width (mm)", "mould (ml)", "0 failed (mm)", "1 failed (mm)"
+    assert [re.split(r"\s\s+", line.strip()) for line in lines] == [
+        ["pad", "fibres", "knots", "fibre (m)", "crossings", *costs],
+        ["plain", "2 + 3", "0", "1.23", "6", "-", "12.3", "1.00", "1.50"],
+        ["bent", "2 + 3", "4", "1.23", "6", "5.68", "12.3", "0.50", "0.75"],
+        ["straight fibres", "1.00", "1.50"],
+    ]
 
 
 def test_compare_designs_every_variant_in_its_folder(tmp_path):

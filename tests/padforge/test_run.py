@@ -122,6 +122,12 @@ def test_resume_repeats_stages_of_changed_settings(
     assert {name for name in watched if after[name] != before[name]} == others
 
 
+def test_resume_with_another_seed_searches_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("padforge.design.design_run.run_design", breaks)
+    assert called("run", "--resume", cwd=folder).code == 0
+    assert called("run", "--resume", "--seed", "1", cwd=folder).code == 130
+
+
 def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
     before = digests(folder)
     (folder / "out" / "pad" / "mould.stl").unlink()

@@ -39,9 +39,19 @@ def test_view_has_rules_and_ambiguity(tmp_path):
     assert [rule["text"] for rule in view["rules"]] == [str(rule) for rule in check_rules(pad, RulesSettings(), size)]
     ambiguity = np.array(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size))
     assert view["ambiguity_mm"] == pytest.approx(pad.unit_mm * ambiguity, rel=0.01)
+    straight = np.array(ambiguities(Morphology.straight(pad.layout), Contact(), 1, AMBIGUITY_NOISE, size))
+    assert view["straight_mm"] == pytest.approx(pad.unit_mm * straight, rel=0.01)
     assert np.mean(view["ambiguity_map_mm"], axis=1) == pytest.approx(view["ambiguity_mm"], abs=1e-4)
     assert np.array(view["fibres"][2]["knots"]) == pytest.approx(pad.to_mm(pad.knots[2]), abs=1e-4)
     assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
+    assert view["half_mm"] == pytest.approx([27.0 / 2, 24.0 / 2])
+
+
+@pytest.mark.parametrize(("deep_family", "family"), [("horizontal", 0), ("vertical", 1)])
+def test_view_names_the_deep_family_as_its_fibres_do(tmp_path, deep_family, family):
+    _, views = session(tmp_path, grid=1, deep_family=deep_family)
+    assert views[-1]["deep_family"] == family
+    assert [fibre["family"] for fibre in views[-1]["fibres"]] == [0, 1]
 
 
 def test_move_clips_knot_and_gestures_are_undone_together(tmp_path):

@@ -73,3 +73,14 @@ def test_genetic_search_reaches_the_published_objective(knots, bar):
     breeding, objectives = bred(50, SearchSettings(method="genetic", knots=knots), pad=PadSettings())
     assert breeding.done
     assert objectives[-1] <= bar
+
+
+def test_half_of_the_first_generation_has_fibres_near_their_levels():
+    """Across, with a standard deviation of 1; those of the other half lie anywhere, on a pad of side 5 in units."""
+    search = SearchSettings(method="genetic", population=20, knots=12)
+    breeding, _ = bred(1, search, pad=PadSettings())
+    knots = breeding.state()["population"].reshape(20, 2, 4, 12, 2)  # family, fibre, knot, coordinate
+    across = np.stack([knots[:, family, :, :, 1 - family] for family in (0, 1)], axis=1)
+    variance = np.sort(((across - np.arange(1, 5)[:, None]) ** 2).mean(axis=(1, 2, 3)))
+    assert variance[9] < 1.2  # the pad's edges cut some off
+    assert variance[10] > 25 / 12

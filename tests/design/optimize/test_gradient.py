@@ -9,6 +9,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Contact, Morphology
 from padforge.design.contact import fibre_axes
+from padforge.design.morphology import MARGIN
 from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
@@ -18,6 +19,7 @@ from padforge.design.optimize.gradient import (
     ZIGZAG_START,
     GradientSearch,
     Parametrization,
+    border_width,
     initial_paths,
 )
 from padforge.design.optimize.problem import SearchProblem
@@ -178,3 +180,11 @@ def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
     monkeypatch.setattr(gradient, "penalties", penalties)
     advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings()), 4)
     assert weights == pytest.approx(np.geomspace(*PENALTY_WEIGHT, 4))
+
+
+def test_border_of_knots_is_that_of_the_rules_and_leaves_room_on_the_narrow_side():
+    pad = PadSettings(horizontals=2, verticals=5, pitch_mm=(10.0, 8.0))  # 60 by 24 mm
+    unit_mm, side_mm = pad.layout.unit_mm, min(pad.layout.size_mm)
+    assert border_width(pad, RulesSettings(border_mm=3.0)) == pytest.approx(3.0 / unit_mm)
+    assert border_width(pad, RulesSettings(border_mm=50.0)) == pytest.approx(0.45 * side_mm / unit_mm)
+    assert border_width(pad, RulesSettings(border_mm=3.0, enforce=False)) == MARGIN

@@ -1,6 +1,7 @@
 """Searches that end before they are done, and that go on where they were broken off: here, by process, on a cluster."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -110,6 +111,13 @@ def test_search_within_a_time_budget_returns_the_best_so_far(time_budget):
     assert (result.stopped, result.violations) == ("out of time", [])
     assert result.morphology.knots.shape == (2, 5, 2)
     assert result.seconds < 30
+
+
+def test_little_of_a_time_budget_is_left_for_repair():
+    stop = stopping.Stop(10.0, 200.0)
+    assert stop.end == 210.0
+    assert 10.0 + 0.75 * 200.0 <= stop.deadline < stop.end
+    assert stopping.Stop(10.0, None).deadline == math.inf
 
 
 def test_search_out_of_time_returns_the_start_that_is_best_by_now(tmp_path):

@@ -1,5 +1,6 @@
 """Drawings as pads: our own come back, others are placed and read, and what is none is told in one line."""
 
+import json
 import re
 import time
 from pathlib import Path
@@ -137,6 +138,7 @@ REFUSED = [
     (instead("M -20 -6 C 30 0 -30 0 20 -6"), r"w0: turns back at \(.*\) mm, expected .* along x"),
     (instead("M -20 -6 L 0 -40 L 20 -6"), r"w0: leaves the pad at"),
     (instead("M -20 -6 L 10 -6"), r"w0: runs from .*, 10 mm from where horizontal 2 ends"),
+    (paths(*WAYS[:4], "M 13 18 L 13 -18"), r"w4: runs from \(13.0, -18.0\) mm to \(13.0, 18.0\) mm, 3 mm from"),
     (instead("M -20 -3 L 20 -3"), r"w0: runs from \(-20.0, 3.0\) mm to \(20.0, 3.0\) mm, 3 mm from"),
     ('<rect id="pad" width="1" height="7"/>' + PATHS, "pad is drawn 1 by 7, expected the shape of 40 by 36"),
     (PATHS + "".join(f'<line x1="-20" y1="-6" x2="{x}" y2="0"/>' for x in (-18, -17)), "more than two"),
@@ -295,3 +297,19 @@ def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monk
     assert list(pad.provenance["inputs"]) == ["plan.svg"]
     Path("pad.toml").write_text(stated + "max_length_mm = 38\n")
     assert CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False).exit_code == 1
+
+
+def test_import_command_states_error_and_shift_of_every_fibre(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pad.toml").write_text("[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n")
+    svg(tmp_path, paths(*(way.replace("20 -6", "20 -6.03") for way in WAYS)))
+    said, document = (
+        CliRunner().invoke(design, ["import", "plan.svg", *more], catch_exceptions=False).output
+        for more in ((), ("--json",))
+    )
+    fibres = json.loads(document)["fibres"]
+    shifts = ["", ", ends moved by 0.030 mm", "", "", ""]
+    assert said.splitlines()[2:7] == [
+        f"  fibre {number}: {fibre['name']}, within {fibre['max_error_mm']:.3f} mm{shift}"
+        for number, (fibre, shift) in enumerate(zip(fibres, shifts, strict=True), 1)
+    ]

@@ -157,3 +157,13 @@ def test_min_bend_radius_of_a_bent_pad():
         assert penalties(travel, cross, size, rules)["min_bend_radius_mm"].item() == pytest.approx(
             expected * float((travel[:, -1] / travel[:, -1].mean()).mean()), abs=1e-9
         )
+
+
+def test_fibres_are_back_at_their_levels_after_a_keep_out_by_the_wall():
+    """Beside the wall there is less room to turn aside than behind the keep-out to turn back."""
+    size = kept_off(square(-18.0, 4.0, 10.0), counts=(2, 6))
+    paths = straight_paths(size, RulesSettings(), 4)[:2]
+    along, across = paths[:, 1:-1, 0], paths[:, 1:-1, 1]
+    assert (along[:, 1] - along[:, 0] < along[:, 3] - along[:, 2]).all()
+    np.testing.assert_allclose(across[:, [0, 3]], size.layout.levels[:2, None] * [1, 1], atol=1e-3)
+    assert np.abs(across[:, 1:3] - size.layout.levels[:2, None]).max() > 0.2

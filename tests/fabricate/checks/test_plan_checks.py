@@ -135,6 +135,7 @@ class TestFibres:
         assert (kinks.status, bends.status) == (status, status)
         assert kinks.measured == pytest.approx(np.degrees(angle))
         assert kinks.limit == pytest.approx(np.degrees(0.5))
+        assert kinks.message.endswith("; fibre 1")
         assert bends.measured == pytest.approx(min(0.5 / angle, 1.0), rel=2e-3)
         if status == "fail":
             assert len(kinks.positions_mm) == len(bends.positions_mm) == 1

@@ -10,7 +10,7 @@ import pytest
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import Fabrication
-from padforge.fabricate.fibre_placement import gcode, plan_toolpath, urscript
+from padforge.fabricate.fibre_placement import gcode, plan_toolpath, summary_lines, urscript
 from padforge.fabricate.outputs.drawings import toolpath_svg
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
@@ -200,6 +200,14 @@ def test_toolpath_svg_shows_every_fibre_with_its_number_turn_and_depth(pad):
     assert min(float(text.get("y", "")) for text in written) - 1.25 > end  # the box does not run through it
 
 
+def test_toolpath_svg_has_the_box_about_the_middle_of_the_pad():
+    plan = Plan(Morphology.straight(1), with_settings(dispenser={"origin_mm": [60.0, 100.0]}))
+    root = ElementTree.fromstring(toolpath_svg(plan, plan_toolpath(plan, 0.3)))
+    (box,) = (path for path in root.findall(f"{SVG}path") if path.get("id") == "box")
+    box.set("d", box.attrib["d"].removesuffix("Z"))
+    assert points(box).tolist() == [[-60, -100], [160, -100], [160, 120], [-60, 120]]  # of 0 to 220 mm
+
+
 def test_script_cuts_corners_by_no_more_and_no_less_than_the_tolerance():
     """An arc that begins b before a turn by t passes its corner at R (1 / cos(t / 2) - 1), R = b / tan(t / 2)."""
     plan = Plan(Morphology.straight(1))
@@ -216,3 +224,24 @@ def test_script_cuts_corners_by_no_more_and_no_less_than_the_tolerance():
     assert passes[:3] == pytest.approx(0.005, rel=0.01)
     # no longer than the shorter side has room, and none at the end
     assert 1000 * blends[3:] == pytest.approx([0.4 * 6.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("counts", "leads", "where"),
+    [
+        ((2, 3), "edges", "fibre 1 starts on the right, nearest"),
+        ((0, 3), "edges", "fibre 1 starts on the right, at the near side"),
+        ((2, 3), "one side", "fibre 1 starts at the near edge"),
+    ],
+)
+def test_programs_say_where_the_first_fibre_starts(counts, leads, where):
+    """In words; by its positions all other fibres of its family start farther left or farther away."""
+    plan = Plan(Morphology.straight(counts), with_settings(pad={"leads": leads}))
+    steps = plan_toolpath(plan, 0.3)
+    assert any(line.endswith(where) for line in summary_lines(plan, steps))
+    starts = {stroke.fibre: stroke.positions_mm[0] for step in steps for stroke in step.strokes}
+    family = [starts[fibre] for fibre in range(counts[0] or counts[1])]
+    near = min(y for _, y in family)
+    if "right" in where:
+        assert starts[0][0] == max(x for x, _ in family)
+    assert starts[0][1] == pytest.approx(near)

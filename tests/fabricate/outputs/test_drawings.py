@@ -12,6 +12,7 @@ import ezdxf
 import numpy as np
 import pytest
 import shapely
+from ezdxf.colors import aci2rgb
 from ezdxf.document import Drawing
 from ezdxf.entities import LWPolyline
 from scipy.interpolate import PchipInterpolator
@@ -184,6 +185,10 @@ def test_tracks_dxf_is_valid_and_complete(tmp_path):
     assert {layer.dxf.name for layer in document.layers} - {"0", "Defpoints"} == names
     colours = [document.layers.get(name).rgb for name in ("horizontal-2", "horizontal-1.2", "vertical-0.4")]
     assert len({tuple(colour) for colour in colours if colour}) == 3
+    # readers without true colour have the families' blue and orange as well
+    blue, orange = (aci2rgb(document.layers.get(name).color) for name in ("horizontal-2", "vertical-0.4"))
+    assert blue.b > blue.r
+    assert orange.r > orange.g > orange.b
     space = document.modelspace()
     (edge,) = space.query("LWPOLYLINE")
     assert isinstance(edge, LWPolyline)

@@ -72,8 +72,11 @@ def test_silicone_fills_straight_pad(draft_deg):
 
 def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
-    volumes = [build(pad, tmp_path, [], with_settings({"pins": pins})).silicone_volume_ml for pins in (True, False)]
-    assert volumes[0] == pytest.approx(volumes[1], abs=1e-3)
+    for silicone in ({}, {"shrinkage": 0.04}):
+        made = [build(pad, tmp_path, [], with_settings({"pins": pins}, silicone=silicone)) for pins in (True, False)]
+        box_ml = made[1].sizes["tray_mm"] ** 2 * made[1].sizes["tray_height_mm"] / 1000
+        assert made[1].silicone_volume_ml == pytest.approx(box_ml - made[1].mould_volume_ml, abs=1e-3)
+        assert made[0].silicone_volume_ml == pytest.approx(made[1].silicone_volume_ml, abs=1e-3)
     plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
     silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
     assert silicone["thickness_mm"] == plan.silicone_mm == 3.0
@@ -172,6 +175,13 @@ def test_page_lists_masses_and_cut_lengths():
         assert float(row[5].split()[0]) == pytest.approx(fibre["cut_mm"], abs=0.051)
     assert "of PLA" in page
     assert "4 hours" in page
+
+
+@pytest.mark.parametrize(("resin", "plastic"), [(False, "124 g of PLA"), (True, "110 g of resin")])
+def test_page_weighs_the_mould(resin, plastic):
+    document = fabrication_document(Plan(Morphology.straight(1), with_settings(printer={"resin": resin})))
+    page = laying_page(document | {"mould_volume_ml": 100.0})
+    assert f"takes 100.0 ml, {plastic} if solid" in page
 
 
 def test_page_lists_resistance_and_fixed_resistor_of_every_fibre():
@@ -292,3 +302,9 @@ def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
 def test_ridge_is_whole_lines(ridge, nozzle, width, why):
     mould, printer = MouldSettings(ridge_width_mm=ridge), PrinterSettings(nozzle_mm=nozzle)
     assert print_setting("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
+
+
+@pytest.mark.parametrize(("layer", "layers"), [(0.1, 8), (0.2, 4), (0.3, 3), (0.5, 2)])
+def test_solid_layers_hide_the_infill_below_them(layer, layers):
+    value, _ = print_setting("Solid layers, Top", MouldSettings(), PrinterSettings(layer_mm=layer))
+    assert value.startswith(f"{layers}; ")  # 0.8 mm or more

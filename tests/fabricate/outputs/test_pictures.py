@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
@@ -174,3 +175,34 @@ def test_pictures_are_small(tmp_path, published):
     draw_tracks(plan, tmp_path / "tracks")
     draw_findings(*mesh_of(plan), findings, tmp_path / "mesh")
     assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
+
+
+@pytest.fixture
+def figures(monkeypatch) -> list[Figure]:
+    """Figures that would have been written."""
+    saved: list[Figure] = []
+    monkeypatch.setattr("padforge.design.common.plotting.save_figure", lambda figure, *_: saved.append(figure))
+    return saved
+
+
+def test_mould_picture_has_the_size_of_the_mould_as_title(tmp_path, figures):
+    draw_mould(Plan(Morphology.straight((1, 2), (12.0, 10.0))), [], tmp_path / "mould.png")
+    walls = 2 * (2 + 2 + 6 * np.tan(np.radians(2)))
+    size = f"{3 * 12 + walls:.4g} x {2 * 10 + walls:.4g} x 8 mm"  # with a floor of 2 mm below 6 mm of silicone
+    assert figures[0].axes[0].get_title(loc="left") == f"Mould from above, {size}"
+
+
+def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
+    draw_tracks(Plan(level_pad(1.0, 2.0), with_settings(fibre={"diameter_mm": 2.0})), tmp_path / "tracks.png")
+    [axes] = figures[0].axes
+    x_min, x_max = axes.get_xlim()
+    points_per_mm = 72 * figures[0].get_figwidth() * axes.get_position().width / (x_max - x_min)
+    widths = [line.get_linewidth() for line in axes.lines if line.get_color() in (HORIZONTAL, VERTICAL)]
+    assert widths == pytest.approx([2.0 * points_per_mm] * 4, rel=1e-3)
+
+
+def test_colours_of_a_mesh_are_named_by_height_above_its_lowest_point(tmp_path, figures):
+    corners = [(x, y, z) for z, x0 in ((1, 0), (3, 0), (6, 10)) for x in (x0, x0 + 10) for y in (0, 10)]
+    faces = [(k, k + 2, k + 1) for k in (0, 4, 8)] + [(k + 1, k + 2, k + 3) for k in (0, 4, 8)]
+    draw_findings(np.array(corners, float), faces, [], tmp_path / "mesh.png")
+    assert [text.get_text() for text in figures[0].axes[1].texts] == ["2 mm", "5 mm above the lowest point"]

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from padforge.fabricate.outputs import report
-from padforge.fabricate.outputs.report import PackedMesh, pack_mesh
+from padforge.fabricate.outputs.report import PackedMesh, fabrication_sections, pack_mesh
 from padforge.report import write_report
 from tests.helpers.chromium import SOFTWARE_GL, Chromium
 
@@ -43,6 +43,20 @@ def test_large_mesh_uses_wide_indices(tmp_path: Path, monkeypatch) -> None:
     assert mesh
     assert mesh.triangles.max() + 1 == len(mesh.vertices) > 65536
     assert volume(mesh) == pytest.approx(sphere.volume, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("deep", "key"),
+    [
+        ("horizontal", "Tops of horizontal ridges are blue, of vertical ones and the numbers orange."),
+        ("vertical", "Tops of horizontal ridges and the numbers are blue, of vertical ones orange."),
+    ],
+)
+def test_numbers_have_the_colour_of_the_shallow_family(made: Path, deep: str, key: str) -> None:
+    document = json.loads((made / "fabrication.json").read_text())
+    document["settings"]["pad"]["deep_family"] = deep
+    mould, _ = fabrication_sections(made, document)
+    assert key in "".join(mould.body)
 
 
 def test_oversized_mesh_is_simplified_or_omitted(made: Path, pad: Path, monkeypatch) -> None:

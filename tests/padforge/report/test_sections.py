@@ -13,10 +13,10 @@ from markupsafe import escape
 
 from padforge.design.common.files import provenance
 from padforge.design.common.validation import Fault, InputError
-from padforge.design.contact import contact_press
+from padforge.design.contact import FIBRE_BLUR_MM, contact_press
 from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
-from padforge.design.report import contact_line, draw_press
+from padforge.design.report import contact_line, draw_press, press_sections
 from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report
@@ -341,3 +341,25 @@ def test_loss_chart_has_two_failed_fibres_in_the_column_of_the_first_and_the_row
         assert float(row[0]) < corners["1"][0]
         assert float(column[0]) == pytest.approx(x + 19)
         assert float(column[1]) > corners["3"][1] + 40
+
+
+def test_drawn_fibres_sink_by_the_strain_below_them() -> None:
+    contact = Contact()
+    press, height_mm = contact_press(contact), contact.thickness_mm - contact.fibre_depths_mm[0]
+    heights_mm = (np.arange(40) + 0.5) / 40 * height_mm
+    x, drawn = (np.asarray(part, float) for part in draw_press(contact, 11.25).axes[0].lines[2].get_data())
+    sunk = sum(press.strains(np.abs(x), z, FIBRE_BLUR_MM).compressive for z in heights_mm) * height_mm / 40
+    np.testing.assert_allclose(drawn, height_mm - sunk, atol=0.01 * sunk.max())
+
+
+def test_press_stretches_fibres_by_the_greater_of_both_strains_in_the_plane() -> None:
+    contact = Contact(tool="flat", tool_radius_mm=5.0, depth_mm=1.0, fibre_depths_mm=(0.8, 0.8))
+    press = contact_press(contact)
+    r = np.linspace(0, 2 * press.contact_radius_mm, 100)
+    strains = press.strains(r, contact.thickness_mm - 0.8, FIBRE_BLUR_MM)
+    greatest = sorted((strains.radial.max(), strains.hoop.max()))
+    assert greatest[1] > 1.2 * greatest[0]
+    document = {"provenance": {"settings": {"contact": contact.model_dump(mode="json"), "pad": {}}}}
+    (section,) = press_sections(document, None)
+    cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section.body[-1], re.S)]
+    assert [row[4] for row in cells if row] == [f"{greatest[1]:.0%}"] * 2
