@@ -6,7 +6,7 @@ that fails within a recording is detected by `fault_detector`.
 """
 
 from dataclasses import dataclass, replace
-from math import exp, hypot
+from math import exp, hypot, sqrt
 
 import numpy as np
 
@@ -23,7 +23,10 @@ REST_MARGIN = 0.25  # of the range of rests in calibration, by which the median 
 WANDER, COMMON_WANDER = 0.045, 0.03
 """Standard deviation of the logarithm of a gain that wanders in minutes on an unchanged pad: of a fibre of the
 published pad, and of all six together."""
-STANDARD_DEVIATIONS = 4.0  # of wander and of chance together, up to which a gain is usual
+LEARNT = 0.8
+"""Standard deviation of the same by what is learnt from one press: the expected responses become surer with the root of
+the presses of the training."""
+STANDARD_DEVIATIONS = 4.0  # of wander, training and chance together, up to which a gain is usual
 MIN_PRESSES, MAX_PRESSES = 100, 1000
 """From which a gain is estimated, since of a few presses one or two stretch a fibre most; and that are looked at."""
 
@@ -70,7 +73,7 @@ def detect_shifts(
     check_type("health", health, HealthModel)
     shifts = _rest_shifts(health, recording, fibre_mask)
     if check_type("localizer", localizer, LocalizerModel).features == "windows":
-        shifts += _gain_shifts(localizer, recording, fibre_mask)
+        shifts += _gain_shifts(localizer, health.presses, recording, fibre_mask)
     return shifts
 
 
@@ -91,7 +94,7 @@ def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) ->
     return shifts
 
 
-def _gain_shifts(localizer: LocalizerModel, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
+def _gain_shifts(localizer: LocalizerModel, training: int, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
     """Compare responses with those expected at the predicted positions: all fibres together, or else each of them.
 
     A single fibre is compared at the positions that the others predict, since it would pull them towards itself.
@@ -101,13 +104,14 @@ def _gain_shifts(localizer: LocalizerModel, recording: Recording, fibre_mask: Ma
     presses = replace(presses[rows], fibre_mask=presses.fibre_mask[rows] & fibre_mask[rows])
     fibres = tuple(range(localizer.fibres))
     moment, energy = _compare(localizer, presses)
-    together = _gain_shift(fibres, moment.sum(axis=1), energy.sum(axis=1), COMMON_WANDER)
+    learnt = LEARNT / sqrt(training)
+    together = _gain_shift(fibres, moment.sum(axis=1), energy.sum(axis=1), hypot(COMMON_WANDER, learnt))
     if together or len(fibres) == 1:
         return [together] if together else []
     shifts = []
     for fibre in fibres:
         moment, energy = _compare(localizer, presses, (fibre,))
-        shifts.append(_gain_shift((fibre,), moment[:, fibre], energy[:, fibre], WANDER))
+        shifts.append(_gain_shift((fibre,), moment[:, fibre], energy[:, fibre], hypot(WANDER, learnt)))
     return [shift for shift in shifts if shift]
 
 
