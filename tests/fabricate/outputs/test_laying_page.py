@@ -72,8 +72,9 @@ def test_silicone_fills_straight_pad(draft_deg):
 
 def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
-    for silicone in ({}, {"shrinkage": 0.04}):
-        made = [build(pad, tmp_path, [], with_settings({"pins": pins}, silicone=silicone)) for pins in (True, False)]
+    for shrinkage in (0.0, 0.04):
+        settings = [with_settings({"pins": pins}, silicone={"shrinkage": shrinkage}) for pins in (True, False)]
+        made = [build(pad, tmp_path, [], each) for each in settings]
         box_ml = made[1].sizes["tray_mm"] ** 2 * made[1].sizes["tray_height_mm"] / 1000
         assert made[1].silicone_volume_ml == pytest.approx(box_ml - made[1].mould_volume_ml, abs=1e-3)
         assert made[0].silicone_volume_ml == pytest.approx(made[1].silicone_volume_ml, abs=1e-3)
