@@ -91,7 +91,7 @@ def test_another_pad_is_doubted_and_the_recorded_one_is_not(seed: int) -> None:
     right, wrong = (identified(built, told, rig) for told in (built, Morphology.random(3, knots=4, seed=seed + 10)))
     assert find_doubts(right) == []
     assert right.fit.pad.fibres == (0, 1, 2, 3, 4, 5)
-    assert any("does not fit" in doubt for doubt in find_doubts(wrong))
+    assert any("is it the recording of this pad?" in doubt for doubt in find_doubts(wrong))
 
 
 @pytest.mark.slow
