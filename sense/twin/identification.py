@@ -40,8 +40,10 @@ from padforge.sense.twin.press_parts import smooth_maps, split_presses
 from padforge.sense.twin.responses import (
     Responses,
     compute_responses,
-    explained_by_gp,
+    explained_by_gps,
     fit_gp,
+    fit_gps,
+    noise_and_evidence,
     normalize,
     select_one_depth,
 )
@@ -237,7 +239,8 @@ def identify_pad(
     rows = rng.permutation(np.flatnonzero(~held_out_mask))[:MAX_PRESSES]
 
     # 2. Live channels
-    noise_v, log_bayes_factor = fit_gp(responses.select(rows), pad.unit_mm)
+    gps = fit_gps(responses.select(rows), pad.unit_mm)
+    noise_v, log_bayes_factor = noise_and_evidence(gps)
     live = np.flatnonzero(log_bayes_factor > MIN_LOG_BAYES_FACTOR)
     if not len(live):
         raise InputError("no channel of the recording responds to where the pad is pressed")
@@ -284,7 +287,7 @@ def identify_pad(
         live=live,
         explained=held_out.explained_variance(fit.pad.predict(held_out.positions_mm)),
         explained_on_plan=_explained_on_plan(candidates, plan, training, held_out),
-        explained_smooth=explained_by_gp(training, held_out, pad.unit_mm),
+        explained_smooth=explained_by_gps([gps[channel] for channel in live], held_out, pad.unit_mm),
         noise_v=noise_v,
         noise=float(noise_v[live].mean() / full_scale_v.mean()),
         alternatives=[

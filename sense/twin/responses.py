@@ -153,14 +153,18 @@ def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess | None
 
 def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
     """Return the `noise_v` (C,), NaN where too few presses are valid, and `log_bayes_factor` (C,) of `fit_gps`."""
-    gps = fit_gps(responses, unit_mm)
+    return noise_and_evidence(fit_gps(responses, unit_mm))
+
+
+def noise_and_evidence(gps: list[GaussianProcess | None]) -> tuple[Array, Array]:
+    """Return the `noise_v` (C,) of Gaussian processes, NaN where there is none, and their `log_bayes_factor` (C,)."""
     noise_v = np.array([np.nan if gp is None else gp.noise_v for gp in gps])
     return noise_v, np.array([0.0 if gp is None else gp.log_bayes_factor for gp in gps])
 
 
-def explained_by_gp(training: Responses, held_out: Responses, unit_mm: float) -> Array:
-    """Return the share of the variance of held-out responses that a smooth function of the position explains; (C,)."""
-    gps, points = fit_gps(training, unit_mm), held_out.positions_mm / unit_mm
+def explained_by_gps(gps: list[GaussianProcess | None], held_out: Responses, unit_mm: float) -> Array:
+    """Return the share of the variance of held-out responses that smooth functions of the position explain; (C,)."""
+    points = held_out.positions_mm / unit_mm
     predicted = [np.zeros(len(points)) if gp is None else gp.predict(points) for gp in gps]
     return held_out.explained_variance(np.column_stack(predicted))
 

@@ -1,8 +1,8 @@
 """Search for the wiring and pose of a pad: which fibre each channel reads, and how the pad lay under the arm.
 
-There is no first guess. Transforms on a grid are tried, each scored by correlations of responses with those of a
-Gaussian profile on the plan, and the best are refined. Fibres that run nearly straight leave open which way the pad
-lay, and correlations may miss the right one: the `images` of a wiring by the symmetries of straight fibres.
+Transforms on a grid are tried, each scored by correlations of responses with those of a Gaussian profile on the plan,
+and the best are refined. Where fibres run nearly straight, correlations may miss the right one. It is then one of the
+`images` of the best by the symmetries of straight fibres, or the one that is `as_stated`.
 """
 
 from dataclasses import dataclass, replace
@@ -126,7 +126,7 @@ def _centred(transform: PlanTransform, responses: Responses, unit_mm: float) -> 
 
 
 def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
-    """Return the wirings by which a pad of straight fibres would respond as by this one, which is not among them.
+    """Return the other wirings by which a pad of straight fibres would respond as by this one.
 
     They are those of the pad mirrored, turned by half, or by quarters if it is square.
     """
