@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common.files import read_json, write_json
-from padforge.design.common.validation import InputError, check_array, check_float, check_int, check_mapping, check_type
+from padforge.design.common.validation import (
+    InputError,
+    check_array,
+    check_float,
+    check_int,
+    check_mapping,
+    check_type,
+    short_repr,
+)
 from padforge.design.common.validation import check_path as as_path
 from padforge.design.contact import check_presses
 from padforge.design.kernels.geometry import EUCLIDEAN, profile_law
@@ -285,7 +293,12 @@ class Twin:
 
         Returns:
             Relative stretch; shape (Q, F); 0 for a fibre that no channel reads.
+
+        Raises:
+            InputError: the twin has no such part, or positions are not (Q, 2).
         """
+        if part is not None and check_type("part", part, str) not in self.parts:
+            raise InputError(f"part is {short_repr(part)}, allowed are {', '.join(self.parts) or 'none, of this twin'}")
         pressed_mm = check_array("positions_mm", positions_mm, MAX_MM)
         if pressed_mm.shape[1:] != (2,):
             raise InputError(f"positions_mm have shape {pressed_mm.shape}, expected (Q, 2)")

@@ -6,6 +6,7 @@ import numpy as np
 
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.twin.identification import Identification
+from padforge.sense.twin.wiring import Wiring, planned_paths_mm
 
 MAX_UNEXPLAINED, MAX_UNEXPLAINED_MEAN = 0.10, 0.025
 """Share of the variance of held-out responses that a smooth function of the position may explain beyond the twin: of a
@@ -16,6 +17,9 @@ rotated and shrunk until it fits."""
 MAX_OFFSET_MM, MAX_OFFSET = 3.0, 0.5
 """How far a fibre may lie beside its plan, rms in mm and in grid units, whichever is less. Pads are laid to a
 millimetre or two, and beyond half a pitch the plan of another fibre is nearer."""
+SAME_PLAN_MM = 1.0
+"""How far apart, rms, two wirings plan the fibres of a pad that no press tells apart: a fibre is laid to a millimetre.
+Straight fibres are planned where those of the pad turned over are, and the wiring is then as stated."""
 
 
 def find_doubts(result: Identification) -> list[str]:
@@ -71,12 +75,21 @@ def _channels_that_do_not_fit(result: Identification) -> Iterator[tuple[int, str
 
 
 def _other_wirings(result: Identification) -> Iterator[str]:
-    if not result.alternatives:
+    built = result.fit.pad
+    planned_mm = planned_paths_mm(built.plan, built.transform, built.fibres)
+
+    def apart_mm(other: Wiring) -> float:
+        paths_mm = planned_paths_mm(built.plan, other.transform, other.fibres)
+        # a fibre may run either way
+        squares = [((planned_mm - paths) ** 2).sum(axis=2).mean(axis=1) for paths in (paths_mm, paths_mm[:, ::-1])]
+        return float(np.sqrt(np.minimum(*squares).mean()))
+
+    others = [other for other in result.alternatives if apart_mm(other) > SAME_PLAN_MM]
+    if not others:
         return
-    count = len(result.alternatives)
-    others = "pose or wiring explains" if count == 1 else "poses or wirings explain"
-    yield f"{count} other {others} the presses nearly as well"
-    for row, fibre in enumerate(result.fit.pad.fibres):
-        if read := sorted({wiring.fibres[row] + 1 for wiring in result.alternatives} - {fibre + 1}):
+    say = "pose or wiring explains" if len(others) == 1 else "poses or wirings explain"
+    yield f"{len(others)} other {say} the presses nearly as well"
+    for row, fibre in enumerate(built.fibres):
+        if read := sorted({other.fibres[row] + 1 for other in others} - {fibre + 1}):
             fibres = " or ".join(map(str, read))
             yield f"channel {result.live[row] + 1} may read fibre {fibres} in place of {fibre + 1}"

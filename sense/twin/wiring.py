@@ -149,6 +149,17 @@ def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
     return out[1:]
 
 
+def planned_paths_mm(plan: PadPlan, transform: PlanTransform, fibres: tuple[int, ...]) -> Array:
+    """Return where the fibres that channels read were planned under the arm (C, E, 2), mm from the middle of the pad.
+
+    The pad is taken to have lain in whole quarter turns, so that poses which differ as plans do not are the same.
+    """
+    mirrored, turn_deg = transform.mirrored, 90.0 * round(transform.turn_deg / 90)
+    from_plan = PlanTransform(mirrored, turn_deg if mirrored else -turn_deg)  # the inverse of such a transform
+    paths_mm = (plan.paths[list(fibres)] - np.array(plan.layout.extent) / 2) * plan.layout.unit_mm
+    return from_plan.rotate(paths_mm)
+
+
 def _refine(scorer: _Scorer, wiring: Wiring, unit_mm: float) -> Wiring:
     """Return the best wiring near one."""
     start, unit = wiring.transform, FIRST_STEPS * [1, unit_mm, unit_mm, 1, 1]

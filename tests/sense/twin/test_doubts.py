@@ -9,10 +9,10 @@ import pytest
 from padforge.design import Morphology
 from padforge.sense import RigSettings, simulate
 from padforge.sense.twin import identification
-from padforge.sense.twin.as_built import OFFSET, channel_indices
+from padforge.sense.twin.as_built import OFFSET, PadPlan, channel_indices
 from padforge.sense.twin.doubts import find_doubts
 from padforge.sense.twin.identification import Identification, identify_pad
-from padforge.sense.twin.wiring import Wiring
+from padforge.sense.twin.wiring import Wiring, images
 from tests.helpers.rigs import ideal_rig
 
 from .conftest import PLAN
@@ -83,6 +83,21 @@ def test_a_second_wiring_is_told_of_the_channels_that_it_changes(result: Identif
     assert channels == ["channel 1 may read fibre 2 in place of 1", "channel 2 may read fibre 1 in place of 2"]
 
 
+def test_no_second_wiring_is_told_of_that_plans_each_fibre_where_it_was(result: Identification) -> None:
+    straight = Morphology.straight(2)
+    pad = replace(result.fit.pad, plan=PadPlan.from_morphology(straight), fibres=(0, 1, 2, 3))
+    lain = Wiring(pad.transform, 0.5, pad.fibres, 0.9)
+    images_of_it, swapped = images(lain, straight.layout), replace(lain, fibres=(0, 1, 3, 2))
+    of_straight_fibres = replace(result, fit=replace(result.fit, pad=pad), alternatives=images_of_it)
+    assert len(images_of_it) == 7
+    assert not any("pose" in doubt for doubt in find_doubts(of_straight_fibres))
+    count, *_ = (doubt for doubt in find_doubts(replace(of_straight_fibres, alternatives=[swapped])) if "pose" in doubt)
+    assert count.startswith("1 other")
+    # the courses of PLAN are no images of each other
+    count, *_ = find_doubts(replace(result, alternatives=images_of_it))
+    assert count.startswith("7 other")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_another_pad_is_doubted_and_the_recorded_one_is_not(seed: int) -> None:
@@ -92,6 +107,14 @@ def test_another_pad_is_doubted_and_the_recorded_one_is_not(seed: int) -> None:
     assert find_doubts(right) == []
     assert right.fit.pad.fibres == (0, 1, 2, 3, 4, 5)
     assert any("is it the recording of this pad?" in doubt for doubt in find_doubts(wrong))
+
+
+@pytest.mark.slow
+def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
+    pad = Morphology.straight(3)
+    result = identified(pad, pad, RigSettings(presses=250, seed=7))
+    assert find_doubts(result) == []
+    assert result.alternatives  # as good, and planned where the stated one is
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from padforge.design import Contact, Morphology, signals
 from padforge.design.twin import PlanTransform
 from padforge.sense.twin.as_built import PadPlan
 from padforge.sense.twin.responses import Responses
-from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images
+from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, planned_paths_mm
 
 from .conftest import PLAN
 
@@ -42,6 +42,21 @@ def test_images_of_a_wiring_respond_alike_on_straight_fibres(fibres, pitch_mm, c
     )
     for other in others:
         np.testing.assert_allclose(other, expected, atol=1e-9)
+    plan = PadPlan.from_morphology(pad, 5)
+    planned, *others = (planned_paths_mm(plan, wiring.transform, wiring.fibres) for wiring in wirings)
+    for other in others:  # each from one end or the other
+        same, reverse = np.abs(planned - other).max((1, 2)), np.abs(planned - other[:, ::-1]).max((1, 2))
+        np.testing.assert_allclose(np.minimum(same, reverse), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("turn_deg", [-180, -90, 0, 90])
+def test_planned_paths_lie_under_the_arm_where_the_transform_takes_them_to_the_plan(mirrored, turn_deg) -> None:
+    plan, fibres = PadPlan.from_morphology(PLAN, 5), (2, 0)
+    expected = (plan.paths[[2, 0]] - np.array(plan.layout.extent) / 2) * plan.layout.unit_mm
+    paths_mm = planned_paths_mm(plan, PlanTransform(mirrored, turn_deg + 8.0, (3.0, 1.0), 1.1), fibres)
+    on_plan = [PlanTransform(mirrored, turn_deg).to_plan(path) for path in paths_mm]
+    np.testing.assert_allclose(on_plan, expected, atol=1e-9)
 
 
 def test_the_stated_wiring_reads_fibres_in_order_of_a_pad_in_the_middle_of_what_was_pressed(responses) -> None:
