@@ -172,6 +172,8 @@ class Spec:
         Raises:
             InputError: an unknown key or a value out of range, with key, value and what is allowed.
         """
+        if not (isinstance(model, type) and issubclass(model, Settings)):
+            raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
         changes = {key: value for key, value in overrides.items() if value is not None}
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
 
@@ -182,7 +184,7 @@ class Spec:
             tables: the values, by section and key.
             source: what errors call the result; as these settings if empty.
         """
-        Spec(tables, source := source or self.source)
+        Spec(tables, source := check_type("source", source, str) or self.source)
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
@@ -195,7 +197,7 @@ class Spec:
         if isinstance(model, type) and issubclass(model, Settings):
             model = model.section()
         if not isinstance(model, str):
-            raise InputError(f"model is {short_repr(model)}, expected a section such as Pad")
+            raise InputError(f"model is {short_repr(model)}, expected a section such as Pad or its name")
         return self._tables.get(model, {})
 
 

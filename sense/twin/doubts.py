@@ -17,9 +17,11 @@ rotated and shrunk until it fits."""
 MAX_OFFSET_MM, MAX_OFFSET = 3.0, 0.5
 """How far a fibre may lie beside its plan, rms in mm and in grid units, whichever is less. Pads are laid to a
 millimetre or two, and beyond half a pitch the plan of another fibre is nearer."""
-SAME_PLAN_MM = 1.0
-"""How far apart, rms, two wirings plan the fibres of a pad that no press tells apart: a fibre is laid to a millimetre.
-Straight fibres are planned where those of the pad turned over are, and the wiring is then as stated."""
+SAME_PLAN_MM, LAID_MM = 1.0, 1.2
+"""How far apart, rms, two wirings plan the fibres of a pad that no press tells apart, and how far, rms, all fibres lie
+beside their plan at most: a fibre is laid to a millimetre. Straight fibres are planned where those of the pad turned
+over are, and the wiring is then as stated; but fibres that are not straight fit a straight plan eight ways alike, too.
+"""
 
 
 def find_doubts(result: Identification) -> list[str]:
@@ -84,7 +86,9 @@ def _other_wirings(result: Identification) -> Iterator[str]:
         squares = [((planned_mm - paths) ** 2).sum(axis=2).mean(axis=1) for paths in (paths_mm, paths_mm[:, ::-1])]
         return float(np.sqrt(np.minimum(*squares).mean()))
 
-    others = [other for other in result.alternatives if apart_mm(other) > SAME_PLAN_MM]
+    beside_mm = np.concatenate([offset[within] for offset, _, within in result.lateral_offsets_mm()])
+    is_laid = np.sqrt((beside_mm**2).mean()) <= LAID_MM
+    others = [other for other in result.alternatives if not (is_laid and apart_mm(other) <= SAME_PLAN_MM)]
     if not others:
         return
     say = "pose or wiring explains" if len(others) == 1 else "poses or wirings explain"

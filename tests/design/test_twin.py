@@ -77,6 +77,8 @@ def test_as_built_stretch_matches_the_contact_model(twin):
             twin.as_built_stretch(none)
     with pytest.raises(InputError, match="part is 'of', allowed are none, of this twin"):
         twin.as_built_stretch(PLACES, "of")
+    with pytest.raises(InputError, match="part is"):
+        twin.as_built_stretch(PLACES, np.zeros(2))
     assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
         np.array([[0.0, -4.0]])
     )

@@ -16,7 +16,7 @@ _ENDS = {0: "done", 1: "a check fails", 2: "refused", 130: "interrupted", -2: "i
 """What an exit code means; a program that is interrupted while it begins or ends dies of the signal."""
 _REFUSED = ("padforge: ", "Usage: ")
 _TOO_MUCH = "this takes more memory than there is"
-_OF_ANY_NAME = (b"press,", b"# padf")
+_OF_ANY_NAME = (b"press,", b"# padf", b'{\n "fo')
 """What tables of places and settings begin with, which are written to whatever name is asked for, as pictures are."""
 _BEGIN = {".json": b"{[", ".png": b"\x89", ".svg": b"<", ".html": b"<"}
 """Bytes that a file of a kind begins with, one of them; with another one it is no part of such a file."""

@@ -93,6 +93,13 @@ def test_no_second_wiring_is_told_of_that_plans_each_fibre_where_it_was(result: 
     assert not any("pose" in doubt for doubt in find_doubts(of_straight_fibres))
     count, *_ = (doubt for doubt in find_doubts(replace(of_straight_fibres, alternatives=[swapped])) if "pose" in doubt)
     assert count.startswith("1 other")
+    # fibres that lie 1.7 mm beside a straight plan are those of another pad
+    values = pad.values.copy()
+    for channel in range(4):
+        values[channel_indices(channel)[OFFSET]] += 0.15
+    fit = replace(of_straight_fibres.fit, pad=replace(pad, values=values))
+    count, *_ = find_doubts(replace(of_straight_fibres, fit=fit))
+    assert count.startswith("7 other")
     # the courses of PLAN are no images of each other
     count, *_ = find_doubts(replace(result, alternatives=images_of_it))
     assert count.startswith("7 other")
