@@ -211,7 +211,9 @@ def fit_health_model(
     pca, inputs, targets = TracePCA.fit_transform(traces)
     # Each member is trained without its fold, since a network predicts the presses that it was trained on too well.
     presses = np.arange(len(traces))
-    fold = presses // min(BLOCK, len(presses) // (4 * MEMBERS)) % MEMBERS
+    # Trained on few presses it also knows the drift of rests near them, so then each fold is one block.
+    is_short = len(presses) < MIN_GAIN_PRESSES
+    fold = presses * MEMBERS // len(presses) if is_short else presses // BLOCK % MEMBERS
     is_warm = presses >= WARM_UP
     rows = [np.flatnonzero(is_warm & (fold != member)) for member in range(MEMBERS)]
     weights = train_networks(inputs, targets, rows, rng)
@@ -240,7 +242,7 @@ def fit_health_model(
             subsets.append(llr)
         llrs.append((np.concatenate([each[0] for each in subsets]), np.concatenate([each[1] for each in subsets])))
     exceedance = ExceedanceModel.fit(llrs)
-    if len(traces) < MIN_GAIN_PRESSES:
+    if is_short:
         exceedance.level[:, HYPOTHESES.index("reduced_gain")] = MAX_HEIGHT
     rests = traces[:, :, :REST].mean(axis=2)
     return HealthModel(

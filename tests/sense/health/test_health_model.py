@@ -10,8 +10,10 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import FaultDetector, HealthModel, Recording
 from padforge.sense.arrays import MIN_SCALE_V
+from padforge.sense.health import health_model
 from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
-from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, find_dead_fibres
+from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, WARM_UP, find_dead_fibres
+from padforge.sense.health.trace_model import LEVEL_RATE, MEMBERS
 from padforge.sense.localizer.model_files import files_of
 from tests.sense.health.pads import detect_later, fit, part_of, plant
 
@@ -98,6 +100,30 @@ def test_fit_refuses_few_presses_and_dead_pads(pad: Recording) -> None:
         fit(pad.readings, pad, MIN_PRESSES - 1)
     with pytest.raises(InputError, match="all 6 fibres are dead"):
         fit(0 * pad.readings, pad)
+
+
+@pytest.mark.parametrize("presses", [MIN_PRESSES, 340, 599])
+def test_presses_are_held_out_in_blocks_beyond_the_memory_of_the_level(
+    pad: Recording, presses: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Among presses that the networks are trained on, drift shows in their neighbours: residuals would be too small."""
+    trained: list[np.ndarray] = []
+
+    def stop_before_training(inputs: object, targets: object, rows: list[np.ndarray], rng: object) -> None:
+        trained.extend(rows)
+        raise InterruptedError
+
+    monkeypatch.setattr(health_model, "train_networks", stop_before_training)
+    with pytest.raises(InterruptedError):
+        fit(pad.readings, pad, presses)
+    held_out = np.ones((MEMBERS, presses), dtype=bool)
+    for member, rows in enumerate(trained):
+        held_out[member, rows] = False
+    held_out = held_out[:, WARM_UP:]
+    assert (held_out.sum(axis=0) == 1).all()
+    changes = np.flatnonzero(held_out[:, 1:].argmax(axis=0) != held_out[:, :-1].argmax(axis=0)) + 1 + WARM_UP
+    assert np.diff(changes, prepend=0, append=presses).min() >= 2 / LEVEL_RATE
+    assert np.ptp(held_out.sum(axis=1)) <= WARM_UP + 1
 
 
 @pytest.mark.slow
