@@ -179,6 +179,7 @@ def train_members(
         remaining_s = max(0.0, time_budget - (time.monotonic() - begin))
         in_turn = [remaining_s * part / makespan(all_steps, cores) for part in all_steps]
         totals, seconds = [max(1, round(each)) for each in in_turn], list[float | None](in_turn)
+    on_progress(0, sum(totals), "")
     joint = JointProgress(totals, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
 
