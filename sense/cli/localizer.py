@@ -83,7 +83,9 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
 
     localizer = LocalizerModel.load(model)
     levels = range(min(max_failures, localizer.fibres - 1) + 1)
-    document = evaluation.evaluate(localizer, read_recording(recording), levels).to_dict()
+    opened = read_recording(recording)
+    with common.progress_bar("evaluating") as show:
+        document = evaluation.evaluate(localizer, opened, levels, on_progress=show).to_dict()
     lines = [*evaluation.calibration_lines(document), *evaluation.moment_lines(document["by_moment"])]
     common.show_result(document, lines, as_json)
 

@@ -7,13 +7,15 @@ run of equal positions; where no line or every line has one, presses are detecte
 """
 
 import csv
+from collections.abc import Iterator
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 
 from padforge.design.common.files import atomic_file, reraise_write_error
 from padforge.design.common.validation import InputError, short_repr
-from padforge.sense.arrays import MAX_FIBRES
+from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.columns import (
     MEASURES,
@@ -85,13 +87,6 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     path = check_export(recording, path)
     measures = {name: getattr(recording, MEASURES[quantity]) for name, quantity in _MEASURED.items()}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}
-    of_readings = [[""] * (2 + len(measures))] * len(recording.times_s)
-    of_presses = zip(
-        recording.presses_mm, *measures.values(), recording.down_command, recording.up_command, strict=True
-    )
-    for (x, y), *press_measures, down, up in of_presses:
-        cells = ["?", "?"] if np.isnan(x) else [float(x), float(y)]
-        of_readings[down:up] = [cells + _cells(press_measures)] * int(up - down)
     with (
         reraise_write_error(path),
         atomic_file(path) as temporary,
@@ -99,8 +94,22 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     ):
         writer = csv.writer(file)
         writer.writerow(["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures])
-        for time, volts, press in zip(recording.times_s.tolist(), recording.readings, of_readings, strict=True):
-            writer.writerow([time, *_cells(volts), *press])
+        press_cells = _press_cells(recording, list(measures.values()))
+        for time, volts, press in zip(recording.times_s, recording.readings, press_cells, strict=True):
+            writer.writerow([float(time), *_cells(volts), *press])
+
+
+def _press_cells(recording: Recording, measures: list[Array]) -> Iterator[list[float | str]]:
+    """Yield the cells of each reading that say where and how the pad is pressed; empty while it is not."""
+    idle: list[float | str] = [""] * (2 + len(measures))
+    end = 0
+    of_presses = zip(recording.presses_mm, *measures, recording.down_command, recording.up_command, strict=True)
+    for (x, y), *press_measures, down, up in of_presses:
+        yield from repeat(idle, int(down) - end)
+        cells = ["?", "?"] if np.isnan(x) else [float(x), float(y)]
+        end = int(up)
+        yield from repeat(cells + _cells(press_measures), end - int(down))
+    yield from repeat(idle, len(recording.times_s) - end)
 
 
 def _cells(values: "np.ndarray | list") -> list[float | str]:

@@ -30,6 +30,7 @@ STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])  # calibrations of 
 MIN_INNOVATION = 1e-3  # least standard deviation of the innovation of a rest, since it is divided by
 MAX_HEIGHT = 1e5  # a height that no sum reaches
 MIN_PEAKS = 30
+_CHUNK = 64  # presses that are compared with the library at once
 MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
 
 
@@ -127,8 +128,10 @@ class FaultLikelihoods:
         response, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
         std = self._calibrated(std)[..., :COMPONENTS]
         gains = [_log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1) for gain in GAINS]
-        others = _log_t(response[..., None, :, :], self.library_mean, self.library_std).sum(axis=-1)
-        other = np.logaddexp.reduce(others, axis=-2) - np.log(LIBRARY)
+        # In parts: with all of the library a press takes kilobytes a fibre.
+        parts = (response[first : first + _CHUNK, None] for first in range(0, len(response), _CHUNK))
+        others = (_log_t(part, self.library_mean, self.library_std).sum(axis=-1) for part in parts)
+        other = np.concatenate([np.logaddexp.reduce(each, axis=1) for each in others]) - np.log(LIBRARY)
         inconsistent = np.logaddexp(other, _log_t(response, mean, STD_FACTOR * std).sum(axis=-1)) - np.log(2)
         return [hypothesis - healthy for hypothesis in (*gains, inconsistent)]
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.localizer.features import NOW
@@ -179,14 +180,20 @@ class BayesianLocalizer:
 
 
 def fit_stages(
-    table: Any, inputs: Any, fibre_mask: Mask, positions: Any, n_timed: int
+    table: Any,
+    inputs: Any,
+    fibre_mask: Mask,
+    positions: Any,
+    n_timed: int,
+    on_progress: OnProgress = ignore_progress,
 ) -> tuple[BayesianLocalizer, ...]:
     """Fit a localizer for each of `STAGES`, or one if `n_timed` = K is 0; arguments as in `BayesianLocalizer.fit`.
 
     The first K features are windows in the order in which they are complete; two more say where the finger is now.
     """
-    stages = []
-    for n_complete in STAGES if n_timed else (0,):
+    stages, numbers = [], STAGES if n_timed else (0,)
+    for n_complete in numbers:
+        on_progress(len(stages), len(numbers), "Bayesian localizer")
         unused = slice(n_complete, n_timed + len(NOW) if n_timed else 0)
         kept = table.copy()
         kept[:, :, :, unused] = 0

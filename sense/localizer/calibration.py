@@ -80,7 +80,8 @@ def calibrate(
         options: how to train; the defaults if None.
         time_budget: seconds to train for, with as many members as that is good for; the result then depends on the
             pace of the machine. None for the length and the members of `options`.
-        on_progress: called with (steps done, steps in all, ""); with a time budget, with seconds.
+        on_progress: called with (steps done, steps in all, "") in the training, with a time budget in seconds; before
+            and after it with what is being done.
 
     Returns:
         The localizer, and its evaluation on the test presses.
@@ -103,7 +104,7 @@ def calibrate(
         model = fit_recording(recording, training, options, rng, on_progress, time_budget)
     model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
     with stage("evaluate"):
-        evaluation = evaluate(model, recording, range(_n_levels(options, recording.fibres)))
+        evaluation = evaluate(model, recording, range(_n_levels(options, recording.fibres)), on_progress=on_progress)
     evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())
     return replace(model, errors=evaluation.errors), evaluation
 
@@ -119,6 +120,7 @@ def fit_recording(
     """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
     from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
 
+    on_progress(0, 0, "features")
     readings, commands = recording.readings, (recording.down_command, recording.up_command)
     detected, measures = None, {}
     if options.method == "ensemble":
@@ -163,6 +165,7 @@ def fit_model(
     n_timed = data.features.seen.shape[1]
     phases = MODULATED if n_timed else ()
     positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
+    on_progress(0, 0, "response model")
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures, data.rate_hz)
     bayes, residual_network = (), {}
@@ -190,7 +193,7 @@ def fit_model(
         moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
     positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
-    return calibrate_uncertainty(model, moments, positions_mm, _n_levels(options, model.fibres), measures)
+    return calibrate_uncertainty(model, moments, positions_mm, _n_levels(options, model.fibres), measures, on_progress)
 
 
 def calibrate_uncertainty(
@@ -199,6 +202,7 @@ def calibrate_uncertainty(
     positions_mm: Array,
     levels: int,
     measures: Mapping[str, Array] | None = None,
+    on_progress: OnProgress = ignore_progress,
 ) -> LocalizerModel:
     """Calibrate the expected errors of the members, and `interval_factors`, on presses never trained on.
 
@@ -206,21 +210,18 @@ def calibrate_uncertainty(
     are as in `evaluation.conformal`.
     """
     if model.method == "ensemble":
-        model = _calibrate_scales(model, moments, positions_mm, levels)
+        model = _calibrate_scales(model, moments, positions_mm, levels, on_progress)
     plain, n_sets = replace(model, interval_factors=np.ones_like(model.interval_factors)), INTERVAL_SUBSETS
     if len(moments) > 1:
         n_sets = MOMENT_SUBSETS
-    factors = [
-        [
-            conformal(
-                [plain.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)],
-                positions_mm,
-                measures,
-            )
+    factors = []
+    for presses in moments:
+        on_progress(len(factors), len(moments), "radii")
+        predictions = (
+            [plain.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)]
             for level in range(levels)
-        ]
-        for presses in moments
-    ]
+        )
+        factors.append([conformal(each, positions_mm, measures) for each in predictions])
     factors = factors[:1] * (len(moments) > 1) + factors  # before any window is complete, nothing is predicted
     return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6))
 
@@ -230,7 +231,11 @@ def _n_levels(options: LocalizerSettings, fibres: int) -> int:
 
 
 def _calibrate_scales(
-    model: LocalizerModel, moments: Sequence[ScaledFeatures], positions_mm: Array, levels: int
+    model: LocalizerModel,
+    moments: Sequence[ScaledFeatures],
+    positions_mm: Array,
+    levels: int,
+    on_progress: OnProgress,
 ) -> LocalizerModel:
     """Scale the expected errors of the positions of members to those on presses never trained on.
 
@@ -240,7 +245,9 @@ def _calibrate_scales(
     targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
     ratios: dict[str, list[Array]] = {}
-    for n_complete, presses in enumerate(moments, int(len(moments) > 1)):
+    first = int(len(moments) > 1)
+    for n_complete, presses in enumerate(moments, first):
+        on_progress(n_complete - first, len(moments), "expected errors")
         rows = np.flatnonzero(count_complete(presses.seen) == n_complete)  # not those that the next press cuts off
         for failed in subsets if len(rows) else ():
             fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)

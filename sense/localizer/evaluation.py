@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
@@ -61,7 +62,13 @@ class Evaluation:
         return {"format": FORMAT} | {name: value for name, value in vars(self).items() if value is not None}
 
 
-def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] = (0, 1, 2, 3)) -> Evaluation:
+def evaluate(
+    model: LocalizerModel,
+    recording: Recording,
+    levels: Iterable[int] = (0, 1, 2, 3),
+    *,
+    on_progress: OnProgress = ignore_progress,
+) -> Evaluation:
     """Evaluate a localizer for every set of failed fibres of some sizes.
 
     Of the recording of the training, only the presses that were held back count; of any other, all of known position.
@@ -70,6 +77,7 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         model: to evaluate.
         recording: of a pad with the fibres and the rate of the training.
         levels: numbers of failed fibres.
+        on_progress: called with (steps done, total, what is evaluated).
 
     Raises:
         InputError: no level, one that leaves no fibre, no press of known position, or a recording that does not suit
@@ -89,7 +97,12 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
     features, positions_mm = model.scaled_features(recording)[test], recording.presses_mm[test]
     measures = {name: values[test] for name, values in recording.measures.items()}
     rows, by_subset = errors_by_loss(
-        model.fibres, levels, lambda failed: model.predict_features(features, failed), positions_mm, measures
+        model.fibres,
+        levels,
+        lambda failed: model.predict_features(features, failed),
+        positions_mm,
+        measures,
+        on_progress,
     )
     prediction = model.predict_features(features)
     return Evaluation(
@@ -98,7 +111,7 @@ def evaluate(model: LocalizerModel, recording: Recording, levels: Iterable[int] 
         test_presses=len(test),
         by_subset=by_subset,
         by_position=errors_by_position(prediction.positions_mm, positions_mm),
-        **errors_by_moment(model, recording, test, levels),
+        **errors_by_moment(model, recording, test, levels, on_progress),
         idle_share=idle_share(recording).tolist(),
         test={
             "press": test.tolist(),
@@ -139,17 +152,21 @@ def errors_by_loss(
     predict: Callable[[tuple[int, ...]], Localization],
     positions_mm: Array,
     measures: Measures | None = None,
+    on_progress: OnProgress = ignore_progress,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return `errors` and `by_subset` of an evaluation; `predict` predicts presses without the fibres of its indices.
 
     True positions are (Q, 2), and depths and forces (Q,), NaN where unknown.
     """
     rows, by_subset = [], []
-    for level in levels:
-        n_failed = check_int("n_failed", level, 0, fibres - 1)
-        subsets = failure_subsets(fibres, n_failed)
-        predictions = [predict(subset) for subset in subsets]
-        rows.append(error_row(n_failed, predictions, positions_mm, measures))
+    by_level = [failure_subsets(fibres, check_int("n_failed", level, 0, fibres - 1)) for level in levels]
+    total = sum(map(len, by_level))
+    for subsets in by_level:
+        predictions = []
+        for subset in subsets:
+            on_progress(len(by_subset) + len(predictions), total, "sets of failed fibres")
+            predictions.append(predict(subset))
+        rows.append(error_row(len(subsets[0]), predictions, positions_mm, measures))
         by_subset += [
             {"failed": list(subset), "mean_mm": float(distances(each.positions_mm, positions_mm).mean())}
             for subset, each in zip(subsets, predictions, strict=True)
@@ -158,7 +175,7 @@ def errors_by_loss(
 
 
 def errors_by_moment(
-    model: LocalizerModel, recording: Recording, presses: Indices, levels: Iterable[int]
+    model: LocalizerModel, recording: Recording, presses: Indices, levels: Iterable[int], on_progress: OnProgress
 ) -> dict[str, Any]:
     """Return the errors of presses at `MOMENTS`, while they are read, for up to `MOMENT_SETS` sets of failed fibres.
 
@@ -176,6 +193,7 @@ def errors_by_moment(
     measures = {name: values[presses] for name, values in recording.measures.items()}
     history, rows, intact = model.raw_features(recording).history, [], []
     for moment in MOMENTS:
+        on_progress(len(intact), len(MOMENTS), "moments of a press")
         until = moment.until(touched, recording.up_command)
         raw = compute_features(recording.readings, *commands, until, history=history)
         features = model.scaler.transform(raw[presses])

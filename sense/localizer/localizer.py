@@ -99,7 +99,7 @@ class Localizer:
             X: a recording; or (Q, C, F) features of presses, V, NaN where a fibre gave none.
             y: (Q, 2) positions, mm, with arrays.
             time_budget: seconds to train for, with as many members as that is good for.
-            on_progress: called with (steps done, steps in all, ""); with a time budget, with seconds.
+            on_progress: as in `calibrate`.
 
         Raises:
             InputError: an option or array out of range, too few presses, or a training that diverged.

@@ -33,7 +33,7 @@ from padforge.sense.settings import LocalizerSettings
 
 WARM_UP = 0.2  # share of the steps in which the learning rate rises
 AVERAGE_DECAY = 0.998  # decay of the exponential moving average of the weights
-REPORTS = 40  # calls of `on_progress` in a training
+REPORTS = 200  # calls of `on_progress` in a training
 
 
 def one_cycle(share: float) -> float:
@@ -95,11 +95,15 @@ class JointProgress:
         self._lock, self._stopped = Lock(), Event()
 
     def update(self, number: int, done: int, total: int, what: str) -> None:
-        """Report the progress of one training, in its own steps; raise StoppedError if the `with` block has ended."""
+        """Report the progress of one training, in its own steps; raise StoppedError if the `with` block has ended.
+
+        `what` names work before or after these, which leaves the steps as they are.
+        """
         if self._stopped.is_set():
             raise StoppedError
         with self._lock:
-            self._done[number] = round(done / total * self._totals[number])
+            if not what:
+                self._done[number] = round(done / total * self._totals[number])
             self._on_progress(sum(self._done), sum(self._totals), what)
 
     def __enter__(self) -> None:
@@ -162,7 +166,8 @@ def train_members(
             pace_s = _Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
         has_bayes = not presses.depth_gain
         members = max(1, min(round(cores * time_budget / (pace_s * MIN_LENGTHS * steps * length)), MAX_MEMBERS))
-    bayes = fit_stages(table, presses.inputs, presses.fibre_mask, presses.targets, n_timed) if has_bayes else ()
+    fitted = presses.inputs, presses.fibre_mask, presses.targets
+    bayes = fit_stages(table, *fitted, n_timed, on_progress) if has_bayes else ()
     # Long trainings begin first, so that no core is idle at the end.
     by_length = sorted(phases.items(), key=lambda item: -item[1].length)
     tasks = [(name, phase) for name, phase in by_length for _ in range(members)]
@@ -174,6 +179,7 @@ def train_members(
         remaining_s = max(0.0, time_budget - (time.monotonic() - begin))
         in_turn = [remaining_s * part / makespan(all_steps, cores) for part in all_steps]
         totals, seconds = [max(1, round(each)) for each in in_turn], list[float | None](in_turn)
+    on_progress(0, sum(totals), "")
     joint = JointProgress(totals, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
 

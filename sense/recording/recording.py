@@ -45,6 +45,7 @@ from padforge.sense.recording.run_directory import (
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64)
 _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
+_CHUNK_BYTES, _CHUNK_PRESSES = 2**18, 2**12  # of readings and presses that are written at once
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
@@ -206,14 +207,19 @@ class Recording:
                 sync(path.parent)
 
     def _write(self, path: Path, provenance: Mapping[str, Any]) -> None:
+        step = max(1, _CHUNK_BYTES // (8 * (1 + self.fibres)))
         with Recorder(path, self.fibres, self.source, provenance) as recorder:
-            recorder.append(self.times_s, self.readings)
-            measures = np.column_stack([getattr(self, name) for name in _MEASURES]).tolist()
+            for first in range(0, len(self.readings), step):
+                recorder.append(self.times_s[first : first + step], self.readings[first : first + step])
+            measures = np.column_stack([getattr(self, name) for name in _MEASURES])
             presses = zip(self.presses_mm, self.down_command, self.up_command, measures, strict=True)
-            for position_mm, down, up, (depth, reached, force) in presses:
+            for number, (position_mm, down, up, measured) in enumerate(presses, 1):
+                depth, reached, force = measured.tolist()
                 recorder.begin(position_mm, int(down), **({} if isnan(depth) else {"depth_mm": depth}))
                 at_mm = {} if isnan(reached) else {"at_mm": [None, None, reached]}
                 recorder.finish(int(up), **at_mm, **({} if isnan(force) else {"force_n": force}))
+                if number % _CHUNK_PRESSES == 0:
+                    recorder.sync()  # only now its lines leave the memory
 
 
 def check_replaceable(path: Path) -> None:

@@ -8,6 +8,7 @@ when a recording is created: a folder without it holds nothing, and a recording 
 """
 
 import contextlib
+import io
 import json
 import os
 import stat
@@ -57,15 +58,14 @@ class Press(NamedTuple):
 
 def read_journal(path: Path) -> dict[int, Press]:
     """Return the presses that are done by their numbers, ascending; one that was repeated counts as begun last."""
-    try:
-        text = read_bytes(path).decode()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: no journal ({error})") from error
-    started: dict[int, Mapping[str, Any]] = {}
+    content = read_bytes(path)
+    started: dict[int, Mapping[str, Any]] = {}  # and neither done nor aborted: entries take much memory
     done: dict[int, Press] = {}
-    for line_number, line in enumerate(text.split("\n")[:-1], start=1):  # after the last newline is a torn line
+    for line_number, line in enumerate(io.BytesIO(content), start=1):
+        if not line.endswith(b"\n"):
+            break  # a torn line
         try:
-            event = json.loads(line)
+            event = json.loads(line.decode())
             if not isinstance(event, dict):
                 raise ValueError(f"{shortened(event)}, expected an object")
             press, kind = _index(event, "press"), event.get("event")
@@ -76,9 +76,9 @@ def read_journal(path: Path) -> dict[int, Press]:
                 started[press] = event
                 done.pop(press, None)
             elif kind == "done" and press in started:
-                done[press] = _finished_press(started[press], event)
-            elif kind == "aborted" and press in started:
-                del started[press]
+                done[press] = _finished_press(started.pop(press), event)
+            elif kind == "aborted" and (press in started or press in done):
+                started.pop(press, None)
                 done.pop(press, None)
             else:
                 raise ValueError(f"event {shortened(kind)} of press {press}")

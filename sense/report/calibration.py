@@ -52,7 +52,7 @@ def calibrate_into(
         out: folder.
         options: of the localizer.
         time_budget: seconds to train for, see `calibrate`.
-        on_progress: called with (training steps done, total, ""), and with (0, 0, "health") when that is learnt.
+        on_progress: as in `calibrate`, and called with (0, 0, "health") when that is learnt.
         force: whether a localizer is replaced that other files in `out` were made from.
 
     Returns:

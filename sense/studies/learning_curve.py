@@ -73,7 +73,7 @@ def learning_curve(
         recording: with presses of known position.
         options: how to train; a single member is, so errors are somewhat above those of a calibration. The defaults if
             None.
-        on_progress: called with (steps done, total, "").
+        on_progress: called with (steps done, total, what is done beside the steps).
 
     Raises:
         InputError: too few presses for a curve.

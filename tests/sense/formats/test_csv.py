@@ -1,5 +1,6 @@
 """Recordings from and to CSV."""
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,3 +168,14 @@ def test_csv_table_reads_large_files_in_batches(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(csv_table, "MAX_VALUES", 100)
     with pytest.raises(InputError, match="more than 100 values"):
         import_csv(tmp_path / "r.csv", "time=t,fibres=a,press=down")
+
+
+def test_export_csv_needs_little_memory(tmp_path: Path) -> None:
+    """The cells of presses are not kept for every reading."""
+    times_s, down = np.arange(12_000.0), np.arange(1, 12_000, 8)
+    recording = Recording(np.ones((12_000, 2)), times_s, np.zeros((len(down), 2)), down, down + 4)
+    tracemalloc.start()
+    export_csv(recording, tmp_path / "r.csv")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1.5 * recording.readings.nbytes

@@ -278,22 +278,41 @@ def test_calibrate_gives_radii_for_every_moment(recording: Recording, localizer:
 
 @pytest.mark.slow
 def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
-    seen: list[tuple[int, int, str]] = []
+    seen: list[tuple[int, int]] = []
     begin = time.monotonic()
     options = SHORT.model_copy(update={"epochs": 10**5})
-    localizer, evaluation = calibrate(recording, options, time_budget=2, on_progress=lambda *step: seen.append(step))
+
+    def show(done: int, total: int, what: str) -> None:
+        if not what:
+            seen.append((done, total))
+
+    localizer, evaluation = calibrate(recording, options, time_budget=2, on_progress=show)
     assert time.monotonic() - begin < 60  # with what is done before and after, on a machine that does other things
     assert localizer.bayes
     networks = len(localizer.residual_network["first.w"])
     networks += sum(len(weights["first.w"]) for weights in localizer.networks.values())
-    assert [done for done, *_ in seen] == sorted(done for done, *_ in seen)
+    assert seen == sorted(seen)
     assert seen[-1][0] == seen[-1][1] <= 2 * networks
     assert evaluation.errors[0]["mean_mm"] < 9
 
 
 def test_calibrate_takes_a_step_without_time(recording: Recording) -> None:
-    localizer, _ = calibrate(recording, SHORT, time_budget=0)
+    """Progress is shown before and after it, too."""
+    steps: dict[str, list[int]] = {}
+    totals: dict[str, int] = {}
+
+    def show(done: int, total: int, what: str) -> None:
+        steps.setdefault(what, []).append(done)
+        totals[what] = total
+
+    localizer, _ = calibrate(recording, SHORT, time_budget=0, on_progress=show)
     assert np.isfinite(localizer.predict_features(localizer.scaled_features(recording)).positions_mm).all()
+    before, after = ("features", "response model", "Bayesian localizer"), ("expected errors", "radii")
+    assert list(steps) == [*before, "", *after, "sets of failed fibres", "moments of a press"]
+    for what in ("Bayesian localizer", *after, "sets of failed fibres", "moments of a press"):
+        assert steps[what] == list(range(totals[what])), what
+    assert steps[""] == sorted(steps[""])
+    assert (steps[""][0], steps[""][-1]) == (0, totals[""])
 
 
 TINY: dict[str, Any] = {"hidden": 16, "layers": 1, "epochs": 5, "batch": 64}
