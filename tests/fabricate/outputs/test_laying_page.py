@@ -458,7 +458,9 @@ def test_page_says_what_the_settings_ask_for():
         "- Print the lid as well.",
         "- The mould called `conductive` is for casting a conductive material in place of fibres.",
     ]
-    assert section(lid, "Cast")[2].endswith("to the top of the walls. Lay the lid on: air and surplus leave by its vents.")
+    assert section(lid, "Cast")[2].endswith(
+        "to the top of the walls. Lay the lid on: air and surplus leave by its vents."
+    )
     assert section(lid, "Lay")[0] == "1. Turn the casting over, as drawn above: the tracks lie on top."
     pillars = page(pad={"keep_out_mm": [[0.0, 0.0, 5.0, 5.0]], "leads": "one side"})
     assert "along the walls and around every pillar, then" in section(pillars, "Cast")[-1]
