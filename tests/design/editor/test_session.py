@@ -87,7 +87,11 @@ def test_add_and_remove_change_one_fibre(tmp_path):
     assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
     for other in (0, 2, 3):
         assert more["fibres"][other]["knots"] == before["fibres"][other]["knots"]
-    assert len(ask(editor, do="add", fibre=2)["fibres"][1]["knots"]) == 9
+    x = np.array(more["fibres"][1]["knots"])[:, 0]
+    longest = int(np.diff(x).argmax())
+    middle = ask(editor, do="add", fibre=2)
+    assert (len(middle["fibres"][1]["knots"]), middle["selected"]) == (9, (1, longest + 1))
+    assert middle["fibres"][1]["knots"][longest + 1][0] == pytest.approx(x[longest : longest + 2].mean(), abs=1e-3)
     ask(editor, do="undo")
     fewer = ask(editor, do="remove", fibre=2, knot=knot)
     assert fewer["fibres"][1]["knots"] == before["fibres"][1]["knots"]

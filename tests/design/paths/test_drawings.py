@@ -89,6 +89,14 @@ def test_import_moves_ends_within_the_tolerance(tmp_path: Path) -> None:
         (f'<rect id="pad" x="-20" y="-18" width="40" height="36"/>{PATHS}', 'viewBox="0 0 9 9"'),
         (f'<path d="M -20 0 H 20"/><g id="fibres">{PATHS}</g>', HEAD),
         (f'<svg x="-20" y="-18" width="40" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        # what has another shape than its viewBox is scaled alike both ways, and lies in the middle
+        (PATHS, 'viewBox="-20 -18 40 36" width="60mm" height="36mm"'),
+        (f'<svg x="-30" y="-18" width="60" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (f'<svg x="-20" y="-28" width="40" height="56" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (
+            f'<g transform="scale(2 1)">{PATHS}</g>',
+            'viewBox="-40 -18 80 36" width="40mm" height="36mm" preserveAspectRatio="none"',
+        ),
         (f'{PATHS}<text>no fibre</text><path d="M0 0L1 0L1 1Z"/><path style="display: none" d="M0 0L1 1"/>', HEAD),
         (paths(*(re.sub("M -20 (-?6)", r"M -25 \1 L -20 \1", way) for way in WAYS)), HEAD),  # they begin outside
     ],

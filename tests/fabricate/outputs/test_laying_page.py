@@ -470,7 +470,8 @@ def test_page_says_what_the_settings_ask_for():
     assert section(alone, "Orientation")[0] == orientation_sentence((0, 3), "edges")
     bent = {"name": "fibre_strain", "status": "pass", "message": "fibres stretch by 3 %", "positions_mm": []}
     assert section(page(findings=[bent]), "Orientation")[1] == (
-        "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards: fibres stretch by 3 %."
+        "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards: fibres stretch"
+        " by 3 %."
     )
     plain = document["fibre"] | {"max_strain": None, "min_bend_radius_mm": None}
     assert section(page(fibre=plain), "Lay")[1].endswith("with 20 mm out at both ends.")

@@ -12,6 +12,7 @@ import pytest
 from markupsafe import escape
 
 from padforge.design.common.files import provenance
+from padforge.design.common.plotting import ALARM
 from padforge.design.common.validation import Fault, InputError
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press
 from padforge.design.layer import Tool
@@ -364,3 +365,29 @@ def test_press_stretches_fibres_by_the_greater_of_both_strains_in_the_plane() ->
     (section,) = press_sections(document, None)
     cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section.body[-1], re.S)]
     assert [row[4] for row in cells if row] == [f"{greatest[1]:.0%}"] * 2
+
+
+def test_loss_chart_of_many_fibres_is_as_legible_and_has_the_scale_of_its_colours() -> None:
+    """Cells have no numbers then, and every fifth fibre a label; letters grow with the chart."""
+    charts = {}
+    for fibres in (16, 17, 60):
+        single = {(fibre,): 1.0 + fibre for fibre in range(fibres)}
+        pairs = {(first, second): 100.0 for first in range(fibres) for second in range(first + 1, fibres)}
+        text = loss_chart({(): 0.25} | single | pairs, fibres)
+        width, height = map(float, re.findall(r'viewBox="0 0 (\d+) (\d+)"', text)[0])
+        labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" font-size="(\d+)">(\d+)</text>', text)
+        sizes = {int(size) for *_, size, _ in labels}
+        charts[fibres] = (width, max(sizes), len(labels))
+        numbers = [str(n) for n in range(1, fibres + 1) if fibres == 16 or n % 5 == 0]
+        assert [number for *_, number in labels] == [number for number in numbers for _ in range(2)]
+        assert "0.25</text>" in text  # the least
+        assert "100.00 mm</text>" in text  # and the greatest
+        assert all(0 <= float(x) <= width and 0 <= float(y) <= height for x, y, *_ in labels)
+        shades = re.findall(r'height="\d+" fill="#(\w+)"/>', text)
+        assert len(shades) == 5
+        reds_alike = [int(shade[2:4], 16) for shade in shades]  # greens fall as the colour becomes ALARM
+        assert reds_alike == sorted(reds_alike, reverse=True)
+        assert f"#{shades[-1]}" == ALARM.lower()
+    assert [count for *_, count in charts.values()] == [32, 6, 24]
+    legible = charts[16][1] / charts[16][0]
+    assert all(size / width > 0.9 * legible for width, size, _ in charts.values())
