@@ -187,3 +187,10 @@ def test_assemble_raises_for_repeatedly_impossible_times(before_us: int, after: 
     with pytest.raises(RigFault, match=match) as caught:
         read(after, assembler)
     assert caught.value.cause == "data"
+
+
+def test_assemble_gives_volts_of_the_inputs_asked_for_in_their_order() -> None:
+    """The highest count of 10 bits, 1023, is the reference."""
+    assembler = LineAssembler(LineHeader(1000, 10, 5.0, 3), (2, 0, 2))
+    samples = assembler.assemble([(1.0, [LineSample(1000, (0, 1, 1023)), LineSample(2000, (341, 5, 682))])])
+    np.testing.assert_allclose(samples.volts, [[5, 0, 5], [10 / 3, 5 / 3, 10 / 3]])
