@@ -144,6 +144,8 @@ REFUSED = [
     (paths(*WAYS[1:]).replace("w0", "w4"), "no curve is horizontal 2"),
     (f'{PATHS}<path id="again" d="M-20-6.01 20-6.01"/>', "w0 and again: both are horizontal 2"),
     (instead("M -20 -6 C 30 0 -30 0 20 -6"), r"w0: turns back at \(.*\) mm, expected .* along x"),
+    # from (-9, 9) down to (-8, 0) mm, where y points up
+    (paths(*WAYS[:2], "M-10 18L-9-9-8 0-10-18", *WAYS[3:]), r"w2: turns back at \(-8.5, 4.5\) mm, .* along y"),
     (instead("M -20 -6 L 0 -40 L 20 -6"), r"w0: leaves the pad at"),
     (instead("M -20 -6 L 10 -6"), r"w0: runs from .*, 10 mm from where horizontal 2 ends"),
     (paths(*WAYS[:4], "M 13 18 L 13 -18"), r"w4: runs from \(13.0, -18.0\) mm to \(13.0, 18.0\) mm, 3 mm from"),
