@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -280,3 +281,22 @@ def test_title_of_a_mesh_has_its_sides(tmp_path, figures):
     draw_findings([[0, 0, 1], [30, 0, 1], [30, 10, 6.5]], [[0, 1, 2]], [finding("warn", (4, 5))], tmp_path / "a.png")
     assert figures[0].axes[0].get_title(loc="left") == "Mesh from above, 30 x 10 x 5.5 mm"
     assert list(legend_of(figures[0])) == ["warn: wall (1)"]
+
+
+@pytest.mark.parametrize("count", [0, 3, 4])
+def test_legend_has_room_below_the_axes(tmp_path, figures, count):
+    """In rows of three: neither it nor the note reaches the label of the axes or the edge of the picture."""
+    names = [finding("warn", (1.0, 1.0), name=f"check_{number}") for number in range(count)]
+    draw_findings([[0, 0, 1], [30, 0, 1], [30, 10, 6.5]], [[0, 1, 2]], names, tmp_path / "mesh.png")
+    draw_tracks(PLAN, tmp_path / "tracks.png")
+    for figure in figures:
+        figure.draw_without_rendering()
+        label = figure.axes[0].xaxis.label.get_window_extent()
+        boxes = [each.get_window_extent() for each in (*figure.legends, *figure.texts)]
+        assert len(figure.legends) == (count > 0 or figure is figures[1])
+        for box in boxes:
+            assert 0 <= box.y0 < box.y1 < label.y0
+            assert all(box.y1 < bar.get_window_extent().y0 + 2 for bar in figure.axes[1:])  # of colours
+        notes = [text.get_window_extent() for text in figure.texts]
+        assert all(lower.y1 <= upper.y0 + 2 for upper, lower in pairwise(notes))
+        assert all(note.y1 <= legend.get_window_extent().y0 + 2 for note in notes for legend in figure.legends)
