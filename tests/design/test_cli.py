@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -207,6 +208,7 @@ def test_plan_is_drawn_in_mm_with_numbers_crossings_and_broken_rules():
     knots = np.array([[[0, 1], [1, 2.2], [2, 0.8], [3, 1]], [[0, 2], [1, 1], [2, 2.2], [3, 2]]])
     pad = Morphology(np.concatenate([knots, knots[:, :, ::-1]]), 10.0)
     violations = [Violation("min_gap_mm", (1, 2), 1.0, 2.0, (3.0, -4.0))]
+    axes: Any
     [axes] = draw_plan(pad, Contact(), violations).axes
     lines = {line.get_gid(): line for line in axes.lines}
     assert list(lines) == ["horizontal-1", "horizontal-2", "vertical-1", "vertical-2"]

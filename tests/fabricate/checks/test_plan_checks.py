@@ -342,7 +342,7 @@ def test_contact_of_settings_counts_if_the_pad_has_none():
 
 
 def test_messages_of_findings_have_their_lengths_in_mm():
-    mould = {"ridge_width_mm": 0.45, "deep_ridge_height_mm": 1.3, "silicone_mm": 5.5}
+    mould: dict[str, object] = {"ridge_width_mm": 0.45, "deep_ridge_height_mm": 1.3, "silicone_mm": 5.5}
     plan = Plan(Morphology.straight(2), with_settings(mould, fibre={"diameter_mm": 0.35}))
     messages = {finding.name: finding.message for finding in check_plan(plan)}
     expected = {
@@ -373,7 +373,7 @@ def test_fibre_bend_is_that_of_the_tightest_fibre():
     knots = [np.array([[0, 1], [0.9, 1], [0.9 + run, 1.05], [1.5, 1.05], [2, 1]]) for run in (0.08, 0.03)]
     pads = [Morphology(np.stack([first, second[:, ::-1]]), 11.25) for first, second in (knots, knots[::-1])]
     gentle, tight = (Morphology(np.stack([each, each[:, ::-1]]), 11.25) for each in knots)
-    radii = [find(pad, "fibre_bend").measured for pad in (gentle, tight)]
+    radii = [float(np.asarray(find(pad, "fibre_bend").measured)) for pad in (gentle, tight)]
     assert radii[1] < 0.7 * radii[0] < 0.6
     for pad in pads:
         both = find(pad, "fibre_bend")

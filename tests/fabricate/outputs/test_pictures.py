@@ -2,6 +2,7 @@ from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,7 +213,7 @@ def test_colours_of_a_mesh_are_named_by_height_above_its_lowest_point(tmp_path, 
     assert [text.get_text() for text in figures[0].axes[1].texts] == ["2 mm", "5 mm above the lowest point"]
 
 
-def legend_of(figure: Figure) -> dict[str, object]:
+def legend_of(figure: Figure) -> dict[str, Any]:
     """Return the entries of a legend with their handles."""
     [legend] = figure.legends
     return dict(zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True))

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -161,7 +161,7 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
         for failed in ([], [2])
     ]
     study = robustness_study(PADS, max_failures=1, presses=16)
-    figure = study.draw({"settings": settings, "rows": rows, "maps": maps})
+    figure: Any = study.draw({"settings": settings, "rows": rows, "maps": maps})
     bars, *panels = figure.axes
     assert [patch.get_height() for patch in bars.patches] == [0.1, 0.3, 0.05, 0.2]
     middles = [patch.get_x() + patch.get_width() / 2 for patch in bars.patches]
