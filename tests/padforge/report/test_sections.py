@@ -142,6 +142,21 @@ def test_provenance_compares_inputs_with_files_here(pad: Path) -> None:
     assert text.index("Files of different pads") < text.index("Design rules"), "first thing on the page"
 
 
+def test_provenance_names_inputs_elsewhere_and_opens_none(pad: Path) -> None:
+    """A file of another folder is not this one's, though it could be found from here; a computed input is a command."""
+    (pad.parent / "spec.toml").write_text("secret")
+    document = json.loads((pad / "fabrication.json").read_text())
+    inputs = {"../spec.toml": "ab12", "pad.toml": "cd34", "twin": {"command": "padforge sense identify"}}
+    document["provenance"] |= {"inputs": inputs, "command": "made so", "seed": 7, "versions": {"numpy": "2.0"}}
+    (pad / "pad.toml").write_text("[pad]")
+    written(pad / "fabrication.json", document)
+    text = re.sub(r"\s*<[^>]*>\s*", "|", write_report(pad).read_text())
+    assert (
+        "|made so||7||numpy 2.0||../spec.toml ab12; pad.toml cd34 (not the one here); twin: padforge sense identify|"
+        in text
+    )
+
+
 def test_report_warns_of_design_of_other_pad(pad: Path) -> None:
     document = json.loads((pad / "design.json").read_text())
     digest = hashlib.sha256((pad / "morphology.json").read_bytes()).hexdigest()

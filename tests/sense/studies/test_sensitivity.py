@@ -42,6 +42,11 @@ def test_depths_beyond_the_thickness_are_left_out() -> None:
     assert len(shallow.tasks) == 9
 
 
+def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact() -> None:
+    settings = sensitivity_study(PADS, contact=Contact(tool_radius_mm=4.0, depth_mm=2.0)).settings
+    assert (settings["tool_radius_mm"], settings["depth_mm"]) == ([2, 4, 6], [1, 2, 3])
+
+
 def test_profile_has_no_size_to_vary() -> None:
     with pytest.raises(InputError, match=r"\[contact\] model is profile, allowed are layer and shape"):
         sensitivity_study(PADS, contact=Contact(model="profile"))
