@@ -151,10 +151,8 @@ def test_provenance_names_inputs_elsewhere_and_opens_none(pad: Path) -> None:
     (pad / "pad.toml").write_text("[pad]")
     written(pad / "fabrication.json", document)
     text = re.sub(r"\s*<[^>]*>\s*", "|", write_report(pad).read_text())
-    assert (
-        "|made so||7||numpy 2.0||../spec.toml ab12; pad.toml cd34 (not the one here); twin: padforge sense identify|"
-        in text
-    )
+    read = "../spec.toml ab12; pad.toml cd34 (not the one here); twin: padforge sense identify"
+    assert f"|made so||7||numpy 2.0||{read}|" in text
 
 
 def test_report_warns_of_design_of_other_pad(pad: Path) -> None:
