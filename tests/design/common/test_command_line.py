@@ -103,3 +103,20 @@ def test_errors_end_in_one_line(
     assert command_line.run_to_end(fail, "padforge", {}) == code
     out, err = capsys.readouterr()
     assert (out, err.lstrip("\n")) == ("", f"padforge: {line}\n")  # click ends the line of a ^C
+
+
+def test_help_lists_a_command_a_line_under_its_heading() -> None:
+    """However narrow the terminal is, and in the order in which they were added."""
+    group = command_line.SectionedGroup()
+    told = "Say in many words what this one does, so that no terminal has room for all of them on a line of its own."
+    headings = {"zeta": "First", "alpha-and-more": "Second", "beta": "First"}
+    for name, heading in headings.items():
+        group.add_command(click.Command(name, help=told), heading=heading)
+    for width in (60, 80):
+        formatter = click.HelpFormatter(width=width)
+        group.format_commands(click.Context(group), formatter)
+        lines = [line for line in formatter.getvalue().splitlines() if line]
+        assert [line.split()[0] for line in lines] == ["First:", "zeta", "beta", "Second:", "alpha-and-more"]
+        assert {line.index("Say") for line in lines if "Say" in line} == {2 + len("alpha-and-more") + 2}
+        assert all(len(line) <= width for line in lines)
+        assert all(line.endswith("...") for line in lines if "Say" in line)

@@ -297,6 +297,8 @@ def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
         (0.4, 0.4, "0.4 mm", "0.4 mm wide is one line"),
         (0.5, 0.4, "0.5 mm", "0.5 mm wide is one line"),
         (0.8, 0.4, "0.4 mm", "0.8 mm wide is 2 lines"),
+        (0.65, 0.4, "0.65 mm", "0.65 mm wide is one line"),  # two would be narrower than 0.85 nozzles
+        (0.68, 0.4, "0.34 mm", "0.68 mm wide is 2 lines"),
         (0.4, 0.6, "0.51 mm", "0.4 mm wide is narrower than the nozzle: see the checks"),
     ],
 )
