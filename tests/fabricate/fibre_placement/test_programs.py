@@ -249,7 +249,7 @@ def test_programs_say_where_the_first_fibre_starts(counts, leads, where):
 
 def test_head_of_a_program_has_lengths_times_and_depths() -> None:
     """Of straight fibres 20 mm apart: sides of three and two pitches, borders, tongues and leads."""
-    mould = {"border_mm": 2.0, "exit_mm": 3.0, "lead_mm": 40.0}
+    mould: dict[str, object] = {"border_mm": 2.0, "exit_mm": 3.0, "lead_mm": 40.0}
     settings = with_settings(mould, fibre={"diameter_mm": 0.3}, dispenser={"feed_mm_s": 5.0, "tip_mm": 0.35})
     plan = Plan(Morphology.straight((1, 2), 20.0), settings)
     steps = Fabrication(plan, [], []).toolpath

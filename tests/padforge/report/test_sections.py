@@ -500,8 +500,8 @@ def test_press_is_drawn_with_weights_lengthwise_and_crosswise() -> None:
         (("horizontal", HORIZONTAL), ("vertical", VERTICAL)), profile_weights(contact), strict=True
     ):
         along, across = lines[f"{name}, lengthwise"], lines[f"{name}, crosswise"]
-        np.testing.assert_allclose(along.get_data(), (distance, plain + directed))
-        np.testing.assert_allclose(across.get_data(), (distance, plain))
+        np.testing.assert_allclose(np.array(along.get_data(), float), (distance, plain + directed))
+        np.testing.assert_allclose(np.array(across.get_data(), float), (distance, plain))
         assert along.get_color() == across.get_color() == colour
     assert (weights.get_xlabel(), weights.get_ylabel()) == ("distance from the press (mm)", "weight of an element")
 

@@ -204,7 +204,8 @@ def test_line_board_has_every_input_that_is_named() -> None:
             assert samples.volts.shape[1] == 4
             assert (samples.volts > 0.1).all()  # a fibre is on each
             tip = np.array(robot.true_positions(time.monotonic())[0]) + rig.tcp_mm
-            assert tip == pytest.approx([*rig.pad_mm, rig.contact_mm + 2 * rig.clearance_mm])
+            (x, y), z = rig.pad_mm or (0, 0), rig.contact_mm or 0
+            assert tip == pytest.approx([x, y, z + 2 * rig.clearance_mm])
 
 
 @pytest.mark.parametrize("rig", ["printer"], indirect=True)

@@ -199,7 +199,7 @@ def test_assemble_gives_volts_of_the_inputs_asked_for_in_their_order() -> None:
 def test_assemble_follows_a_resonator_that_is_off_by_3_in_a_thousand() -> None:
     """Blocks of a tenth of a second over half a minute; they come up to 2 ms late."""
     rng, assembler = np.random.default_rng(1), LineAssembler(LineHeader(100, 10, 5.0, 1), (0,))
-    last_s = 0.0
+    last_s, samples = 0.0, assembler.assemble([])
     for block in range(300):
         times_us = 10_000 * (10 * block + np.arange(10))
         last_s = 50 + float(times_us[-1]) * 1e-6 * 1.003
