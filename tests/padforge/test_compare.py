@@ -47,6 +47,7 @@ def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
         assert (square.get_marker(), square.get_xydata().tolist()) == ("s", [[length_m, last]])
     assert [axes.get_xlabel() for axes in drawn[0].axes] == ["failed fibres", "length of fibre (m)"]
     assert {axes.get_ylabel() for axes in drawn[0].axes} == {"mean error (mm)"}
+    assert {axes.get_ylim()[0] for axes in drawn[0].axes} == {0}
     assert [axes.texts[0].get_text() for axes in drawn[0].axes] == [
         "lines: as designed; dotted: straight fibres",
         "dot: no failed fibres; square: most failed fibres",

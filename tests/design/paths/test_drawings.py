@@ -89,6 +89,9 @@ def test_import_moves_ends_within_the_tolerance(tmp_path: Path) -> None:
         (f'<rect id="pad" x="-20" y="-18" width="40" height="36"/>{PATHS}', 'viewBox="0 0 9 9"'),
         (f'<path d="M -20 0 H 20"/><g id="fibres">{PATHS}</g>', HEAD),
         (f'<svg x="-20" y="-18" width="40" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (PATHS, 'viewBox="-20 -18 40 36" width="113.38583pt" height="102.04724pt"'),  # of 1/72 inch
+        (PATHS, 'viewBox="-20 -18 40 36" width="9.448819pc" height="8.503937pc"'),  # of 1/6 inch
+        (PATHS, 'viewBox="-20 -18 40 36" width="1.5748031in" height="144q"'),
         # what has another shape than its viewBox is scaled alike both ways, and lies in the middle
         (PATHS, 'viewBox="-20 -18 40 36" width="60mm" height="36mm"'),
         (f'<svg x="-30" y="-18" width="60" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
