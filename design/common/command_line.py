@@ -253,7 +253,7 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
             raise
         return _fail(name, message)
     except MemoryError as error:
-        return _fail(name, f"this takes more memory than there is ({error or 'no more is given'})")
+        return _fail(name, f"this takes more memory than there is ({str(error) or 'no more is given'})")
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:

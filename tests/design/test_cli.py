@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from matplotlib.patches import Circle, Polygon
 from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec, Twin, draw_plan, score, search
 from padforge.design.cli import design
 from padforge.design.common.files import sha256
+from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.design.common.settings import commented_toml
 from padforge.design.contact import half_width_mm
 from padforge.design.design_run import load_result, summary_lines
@@ -19,6 +21,7 @@ from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult, settings_for_twin, state_folders
+from padforge.design.paths.curves import crossings
 from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 
@@ -199,3 +202,28 @@ def test_plan_draws_keep_outs_and_half_width_of_contact():
         assert drawn == [np.array(hole).tolist() for hole in holes]
         (press,) = (patch for patch in patches if isinstance(patch, Circle))
         assert press.radius == pytest.approx(radius_mm, rel=0.01)
+
+
+def test_plan_is_drawn_in_mm_with_numbers_crossings_and_broken_rules():
+    knots = np.array([[[0, 1], [1, 2.2], [2, 0.8], [3, 1]], [[0, 2], [1, 1], [2, 2.2], [3, 2]]])
+    pad = Morphology(np.concatenate([knots, knots[:, :, ::-1]]), 10.0)
+    violations = [Violation("min_gap_mm", (1, 2), 1.0, 2.0, (3.0, -4.0))]
+    axes: Any
+    [axes] = draw_plan(pad, Contact(), violations).axes
+    lines = {line.get_gid(): line for line in axes.lines}
+    assert list(lines) == ["horizontal-1", "horizontal-2", "vertical-1", "vertical-2"]
+    assert [line.get_color() for line in lines.values()] == [HORIZONTAL] * 2 + [VERTICAL] * 2
+    for fibre, line in enumerate(lines.values()):
+        np.testing.assert_allclose(line.get_xydata()[[0, -1]], pad.to_mm(pad.knots[fibre, [0, -1]]))
+        number = axes.texts[fibre]
+        family = pad.layout.family(fibre)
+        assert (number.get_text(), number.get_position()[family]) == (str(fibre + 1), pytest.approx(15.3))
+    dots, rings, crosses = axes.collections
+    same = [c for c in crossings(pad) if pad.layout.family(c.first) == pad.layout.family(c.second)]
+    np.testing.assert_allclose(rings.get_offsets(), [pad.to_mm(c.position) for c in same])
+    assert len(dots.get_offsets()) == len(crossings(pad)) - len(same)
+    assert crosses.get_offsets().tolist() == [[3, -4]]
+    title = f"2 + 2 fibres, pitch 10 mm, {len(crossings(pad))} crossings, {len(same)} within a family, 1 rules broken"
+    assert axes.get_title() == title
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "y (mm)")
+    assert (axes.get_xlim(), axes.get_ylim()) == ((-16.2, 16.2), (-16.2, 16.2))

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -6,7 +7,7 @@ from PIL import Image
 
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.fabricate.cli import fabricate
+from padforge.fabricate.cli import fabricate, mould_lines
 from tests.fabricate.planted import level_pad
 
 FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg"}
@@ -115,3 +116,23 @@ def test_check_lists_three_positions_and_counts_the_others(tmp_path):
     [line] = [line for line in result.stdout.splitlines() if "ridges are 0.4 mm wide" in line]
     assert line.count("(") == 3
     assert line.endswith(" and 2 more places")
+
+
+def finding_of(status, *positions, name="wall"):
+    return {"name": name, "status": status, "message": f"is {status}", "positions_mm": list(positions)}
+
+
+def test_mould_lines_count_checks_that_pass_and_name_the_others():
+    places = [(1.04, -2.06), (3.0, 4.0), (5.0, 6.0), (7.0, 8.0), (9.0, 0.0)]
+    findings = [finding_of("pass"), finding_of("warn", *places, name="thin"), finding_of("pass"), finding_of("fail")]
+    document = {"size_mm": [60.123, 50.5, 8.0], "silicone_volume_ml": 20.06, "files": ["mould.3mf", "tracks.svg"]}
+    assert mould_lines(document | {"findings": findings}, Path("out")) == [
+        f"mould: 60.12 x 50.5 x 8 mm, 20.1 ml of silicone -> {Path('out/mould.3mf')}",
+        "  2 checks passed",
+        "  warn thin: is warn at (1.0, -2.1) (3.0, 4.0) (5.0, 6.0) and 2 more places",
+        "  FAIL wall: is fail",
+    ]
+    assert mould_lines(document | {"findings": findings[::2], "files": []}, Path("out")) == [
+        f"mould: 60.12 x 50.5 x 8 mm -> {Path('out/fabrication.json')}",
+        "  2 checks passed, no warnings",
+    ]

@@ -49,6 +49,10 @@ def test_read_mesh_returns_what_was_written(tmp_path, suffix):
     vertices, triangles = read_mesh(written(tmp_path / f"box{suffix}", moved))
     assert vertices[triangles] == pytest.approx(moved[TRIANGLES].astype("f4"))
     assert {finding.status for finding in check_mesh(tmp_path / f"box{suffix}")} == {"pass"}
+    if suffix == ".stl":  # of 80 bytes, then the number of triangles, then each with its normal, outwards
+        triangle = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+        records = np.frombuffer((tmp_path / "box.stl").read_bytes(), triangle, offset=84)
+        np.testing.assert_allclose(records["normal"], BOX.face_normals, atol=1e-6)
 
 
 def test_3mf_escapes_text_and_read_mesh_converts_units(tmp_path):

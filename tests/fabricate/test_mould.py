@@ -249,3 +249,18 @@ def test_vents_of_a_small_lid_are_at_its_quarters():
     vents = {(hole.area.centroid.x, hole.area.centroid.y) for hole in lid_body(plan).cuts}
     corners = [(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)]
     assert np.array(sorted(vents)) == pytest.approx(np.array(corners))
+
+
+def test_pins_are_on_three_corners_so_that_a_lid_fits_one_way() -> None:
+    """Half as wide as the corner they stand on, as high as wide; the far corner at the right has none."""
+    plan = Plan(Morphology.straight(2), with_settings({"wall_mm": 3.0, "exit_mm": 2.0, "pins": True}))
+    pins = registration_pins(plan)
+    places = [pin.area.centroid.coords[0] for pin in pins]
+    middle = plan.tray.bounds[2] - plan.corner_mm / 2
+    assert np.array(places) == pytest.approx(np.array([(-1, -1), (1, -1), (-1, 1)]) * middle, abs=1e-6)
+    top = plan.settings.mould.floor_mm + plan.silicone_mm
+    for pin in pins:
+        x_min, _, x_max, _ = pin.area.bounds
+        assert x_max - x_min == pytest.approx(plan.corner_mm / 2, abs=0.1)
+        assert pin.top_mm - top == pytest.approx(x_max - x_min, abs=1e-6)
+        assert pin.bottom_mm < top

@@ -187,3 +187,17 @@ def test_layers_of_a_family_are_the_paler_the_shallower():
     white = 0.7 / 2  # of the most, as one of two layers is deeper
     red, green, blue = (round(part + white * (255 - part)) for part in bytes.fromhex(HORIZONTAL[1:]))
     assert [layer.colour for layer in layers] == [HORIZONTAL, f"#{red:02x}{green:02x}{blue:02x}", VERTICAL]
+
+
+@pytest.mark.parametrize("step", [0.05, 0.3, 1.0])
+def test_trace_turns_by_the_step_at_most(step):
+    """Headings are the directions of the sampled path; leads to one side turn by a quarter."""
+    plan = Plan(Morphology.random(2, 2, seed=3), with_settings(pad={"leads": "one side"}))
+    for points, headings in plan.trace(step, 5.0):
+        moves = np.diff(points, axis=0)
+        assert np.abs(np.diff(headings)[np.hypot(*moves.T) > 0]).max() <= 1.001 * step
+        assert len(points) == len(headings)
+        long = np.hypot(*moves.T) > 1e-9
+        between = np.arctan2(moves[long, 1], moves[long, 0])
+        mean = (headings[1:] + headings[:-1])[long] / 2
+        assert np.abs((between - mean + np.pi) % (2 * np.pi) - np.pi).max() < max(0.02, step / 2)

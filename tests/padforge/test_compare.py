@@ -8,13 +8,18 @@ import pytest
 
 from padforge.design import Contact, Morphology, Spec
 from padforge.design import compare as comparison
+from padforge.design.common.plotting import save_figure
 from padforge.design.contact import half_width_mm
 from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called
 
 
-def test_compare_evaluates_finished_pads(tmp_path):
+def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        comparison, "save_figure", lambda figure, path: drawn.append(figure) or save_figure(figure, path)
+    )
     Morphology.straight((2, 3), (8.0, 15.0)).save(tmp_path / "plain.json")
     Morphology.random(2, 3, seed=1).save(tmp_path / "bent.json")
     result = called("design", "compare", "plain.json", "bent.json", "--out", "both", "--json", cwd=tmp_path)
@@ -29,6 +34,24 @@ def test_compare_evaluates_finished_pads(tmp_path):
     assert plain["contact"]["model"] == "layer"
     assert (tmp_path / "both" / "plain" / "mould.stl").exists()
     assert (tmp_path / "both" / "comparison.png").stat().st_size > 10_000
+    by_failures, by_length = drawn[0].axes
+    lines = [line.get_xydata().tolist() for line in by_failures.lines]
+    curves = [row[key] for row in (plain, bent) for key in ("errors_mm", "straight_mm")]
+    assert lines == [[[n, error] for n, error in enumerate(errors)] for errors in curves]
+    assert [line.get_linestyle() for line in by_failures.lines] == ["-", ":"] * 2
+    assert [text.get_text() for text in by_failures.get_legend().get_texts()] == ["plain", "bent"]
+    for row, (span, dot, square) in zip((plain, bent), zip(*[iter(by_length.lines)] * 3, strict=True), strict=True):
+        length_m, first, last = row["length_mm"] / 1000, row["errors_mm"][0], row["errors_mm"][-1]
+        assert span.get_xydata().tolist() == [[length_m, first], [length_m, last]]
+        assert (dot.get_marker(), dot.get_xydata().tolist()) == ("o", [[length_m, first]])
+        assert (square.get_marker(), square.get_xydata().tolist()) == ("s", [[length_m, last]])
+    assert [axes.get_xlabel() for axes in drawn[0].axes] == ["failed fibres", "length of fibre (m)"]
+    assert {axes.get_ylabel() for axes in drawn[0].axes} == {"mean error (mm)"}
+    assert {axes.get_ylim()[0] for axes in drawn[0].axes} == {0}
+    assert [axes.texts[0].get_text() for axes in drawn[0].axes] == [
+        "lines: as designed; dotted: straight fibres",
+        "dot: no failed fibres; square: most failed fibres",
+    ]
 
 
 def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_differs():

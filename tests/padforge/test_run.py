@@ -222,6 +222,7 @@ def test_run_exits_1_on_broken_rule_or_check(folder: Path, wrong: str, said: str
     ended = called("run", "--resume", "--formats", "svg", cwd=folder)
     assert ended.code == 1, ended
     assert said in ended.out
+    assert ended.out.splitlines()[-1] == f"report: {Path('out/pad/report.html')}"  # it is written nevertheless
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,10 +20,13 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.arms.ur5 import UR5, Driver
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.twin import identification as twin_identification
+from padforge.sense.twin.identification import Identification, identify_pad
 from padforge.sense.virtual import virtual_rig
 from padforge.sense.virtual.ur5 import EmulatedUR5
 from padforge.sense.virtual.ur5_controller import Series
 from tests.helpers.once import Once
+from tests.helpers.rigs import ideal_rig
 
 QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)
 
@@ -32,6 +36,20 @@ def recording(once: Once) -> Recording:
     """300 presses on a pad whose fibres wind."""
     rig = sense_settings.RigSettings(presses=300, seed=1)
     return once("recording", lambda folder: simulate(Morphology.random(2, knots=3, seed=5), rig))
+
+
+def identified(built: Morphology, told: Morphology, rig: sense_settings.RigSettings) -> Identification:
+    """Identify a simulated pad by a plan; its contact and the parts of presses, which take longest, do not count."""
+    contact = patch.object(twin_identification, "_measure_contact", lambda *_: None)
+    with contact, patch.object(twin_identification, "measure_rig_settings", lambda _: {}):
+        return identify_pad(simulate(built, rig), told, seed=1)
+
+
+@pytest.fixture(scope="session")
+def identification(once: Once) -> Identification:
+    """A pad of 2 + 2 fibres that lies as planned, without its contact and its parts."""
+    plan = Morphology.random(2, knots=3, seed=5)
+    return once("identification", lambda folder: identified(plan, plan, ideal_rig(presses=120, seed=1)))
 
 
 @pytest.fixture(scope="session")

@@ -2,11 +2,15 @@
 
 import logging
 import re
+from contextlib import nullcontext
+from pathlib import Path
+from unittest.mock import Mock
 
 import click
 import pytest
 
 from padforge.design.common import command_line
+from padforge.design.common.validation import InputError
 
 _log = logging.getLogger("padforge.sense.somewhere")
 
@@ -47,3 +51,72 @@ def test_log_record_is_on_a_line_of_its_own_above_a_progress_bar(
     lines = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err).replace("\r", "\n").split("\n")
     assert "a warning" in lines
     assert [line for line in lines if line.startswith("training")]
+
+
+def test_text_table_aligns_text_to_the_left_and_numbers_to_the_right() -> None:
+    rows = [["pad", "mm", "note"], ["a", "10.5", "x"], ["longer", "9"]]
+    assert command_line.text_table(rows) == ["pad       mm  note", "a       10.5     x", "longer     9     -"]
+    assert command_line.text_table(rows, (0, 2)) == ["pad       mm  note", "a       10.5  x   ", "longer     9  -   "]
+    assert command_line.text_table([["1", "22"], ["333", "4"]], ()) == ["  1  22", "333   4"]
+
+
+def test_results_without_out_go_beside_their_pad(tmp_path: Path) -> None:
+    names = {"mine/morphology.json": "mine", "5.mat": "out/5", "data/twin.JSON": "data", "drawn.svg": "out/drawn"}
+    assert {name: str(command_line.pad_folder(Path(name))) for name in names} == names
+    assert command_line.pad_folder() == Path("out/pad")
+    (tmp_path / "pad").mkdir()
+    assert command_line.pad_folder(tmp_path / "pad") == tmp_path
+
+
+def test_progress_counts_what_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    bar = Mock()
+    monkeypatch.setattr(command_line, "progress", lambda: nullcontext(bar))
+    with command_line.progress_bar("presses") as show:
+        show(3, 8, "pressing")
+        show(0, 0, "waiting")
+    first, second = (each.kwargs for each in bar.update.call_args_list)
+    assert (first["completed"], first["total"], first["note"]) == (3, 8, "3 of 8  pressing")
+    assert (second["total"], second["note"]) == (None, "waiting")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (InputError("got 3, allowed is 2"), 2, "got 3, allowed is 2"),
+        (click.UsageError("no such option"), 2, "no such option"),
+        (KeyboardInterrupt(), 130, "interrupted; what was finished is kept"),
+        (KeyboardInterrupt("2 pads are there"), 130, "interrupted; 2 pads are there"),
+        (FileNotFoundError(2, "No such file", "pad.json"), 2, "pad.json: No such file"),
+        (OSError("full"), 2, "full"),
+        (MemoryError(), 2, "this takes more memory than there is (no more is given)"),
+        (InputError("two\nlines \x1b[31m"), 2, r"two lines \x1b[31m"),
+    ],
+)
+def test_errors_end_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: int, line: str
+) -> None:
+    @click.command()
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr("sys.argv", ["padforge"])
+    assert command_line.run_to_end(fail, "padforge", {}) == code
+    out, err = capsys.readouterr()
+    assert (out, err.lstrip("\n")) == ("", f"padforge: {line}\n")  # click ends the line of a ^C
+
+
+def test_help_lists_a_command_a_line_under_its_heading() -> None:
+    """However narrow the terminal is, and in the order in which they were added."""
+    group = command_line.SectionedGroup()
+    told = "Say in many words what this one does, so that no terminal has room for all of them on a line of its own."
+    headings = {"zeta": "First", "alpha-and-more": "Second", "beta": "First"}
+    for name, heading in headings.items():
+        group.add_command(click.Command(name, help=told), heading=heading)
+    for width in (60, 80):
+        formatter = click.HelpFormatter(width=width)
+        group.format_commands(click.Context(group), formatter)
+        lines = [line for line in formatter.getvalue().splitlines() if line]
+        assert [line.split()[0] for line in lines] == ["First:", "zeta", "beta", "Second:", "alpha-and-more"]
+        assert {line.index("Say") for line in lines if "Say" in line} == {2 + len("alpha-and-more") + 2}
+        assert all(len(line) <= width for line in lines)
+        assert all(line.endswith("...") for line in lines if "Say" in line)

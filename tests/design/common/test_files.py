@@ -152,6 +152,19 @@ def test_interrupted_move_reads_as_the_new_set_and_the_next_run_completes_it(tmp
         assert contents(tmp_path) == dict.fromkeys("abcd", "new") | {"mine": "old"}
 
 
+def test_documents_that_hold_digests_move_last(tmp_path, monkeypatch):
+    """Whoever reads one finds the files that it names."""
+    moved, replace = [], Path.replace
+
+    def noted(self, target):
+        moved.append(self.name)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", noted)
+    replaced(tmp_path, "a.json", "z.stl", "c.json", "b.png")
+    assert moved == ["b.png", "z.stl", "a.json", "c.json"]
+
+
 LINUX = pytest.mark.skipif(
     sys.platform != "linux", reason="files are named by their descriptors, synchronised by fsync"
 )

@@ -78,6 +78,16 @@ def test_move_clips_knot_and_gestures_are_undone_together(tmp_path):
     assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
 
 
+def test_move_clips_knots_to_both_sides_of_a_rectangle(tmp_path):
+    """27 mm wide and 24 mm high."""
+    pad = Morphology.random((1, 2), 4, 1, (9.0, 12.0))
+    editor, _ = session(tmp_path, pad)
+    for y_mm, edge_mm in ((900.0, 12.0), (-900.0, -12.0)):
+        assert move(editor, 1, 2, 0.0, y_mm)["fibres"][0]["knots"][2][1] == pytest.approx(edge_mm)
+    for x_mm, edge_mm in ((900.0, 13.5), (-900.0, -13.5)):
+        assert move(editor, 3, 2, x_mm, 0.0)["fibres"][2]["knots"][2][0] == pytest.approx(edge_mm)
+
+
 def test_add_and_remove_change_one_fibre(tmp_path):
     editor, views = session(tmp_path, Morphology.random(2, 5, 3))
     before = views[-1]
@@ -87,7 +97,11 @@ def test_add_and_remove_change_one_fibre(tmp_path):
     assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
     for other in (0, 2, 3):
         assert more["fibres"][other]["knots"] == before["fibres"][other]["knots"]
-    assert len(ask(editor, do="add", fibre=2)["fibres"][1]["knots"]) == 9
+    x = np.array(more["fibres"][1]["knots"])[:, 0]
+    longest = int(np.diff(x).argmax())
+    middle = ask(editor, do="add", fibre=2)
+    assert (len(middle["fibres"][1]["knots"]), middle["selected"]) == (9, (1, longest + 1))
+    assert middle["fibres"][1]["knots"][longest + 1][0] == pytest.approx(x[longest : longest + 2].mean(), abs=1e-3)
     ask(editor, do="undo")
     fewer = ask(editor, do="remove", fibre=2, knot=knot)
     assert fewer["fibres"][1]["knots"] == before["fibres"][1]["knots"]

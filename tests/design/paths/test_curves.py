@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, crossings, flatten
 from padforge.design.kernels.pchip import pchip_sample as sample_curve
-from padforge.design.paths.curves import beziers, crossing_angles, lengths, slope_beziers, slopes
+from padforge.design.paths.curves import beziers, common_stretches, crossing_angles, lengths, slope_beziers, slopes
 from padforge.design.torch_signals import pchip_sample
 from tests.design.wild_pads import SEEDS, longest_signals, wild_pads
 
@@ -127,3 +127,13 @@ def test_crossings_of_the_published_pads(published, name, all_, family):
     found = crossings(Morphology.load(published / f"{name}.mat"))
     assert len(found) == all_
     assert sum((c.first < 4) == (c.second < 4) for c in found) == family
+
+
+def test_common_stretches_of_one_line_with_two_others_stay_two() -> None:
+    """One runs beside its end and the other beside its beginning, 0.5 from it: near within sqrt(1 - 0.25)."""
+    line, beside = np.array([[0.0, 0.0], [10.0, 0.0]]), np.sqrt(0.75)
+    others = [np.array([[8.0, 0.5], [12.0, 0.5]]), np.array([[-3.0, 0.5], [2.0, 0.5]])]
+    stretches = common_stretches([line], others, 1.0)
+    assert (stretches.line.tolist(), stretches.other.tolist()) == ([0, 0], [0, 1])
+    np.testing.assert_allclose(stretches.begin, [8 - beside, 0])
+    np.testing.assert_allclose(stretches.end, [10, 2 + beside])

@@ -89,6 +89,17 @@ def test_import_moves_ends_within_the_tolerance(tmp_path: Path) -> None:
         (f'<rect id="pad" x="-20" y="-18" width="40" height="36"/>{PATHS}', 'viewBox="0 0 9 9"'),
         (f'<path d="M -20 0 H 20"/><g id="fibres">{PATHS}</g>', HEAD),
         (f'<svg x="-20" y="-18" width="40" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (PATHS, 'viewBox="-20 -18 40 36" width="113.38583pt" height="102.04724pt"'),  # of 1/72 inch
+        (PATHS, 'viewBox="-20 -18 40 36" width="9.448819pc" height="8.503937pc"'),  # of 1/6 inch
+        (PATHS, 'viewBox="-20 -18 40 36" width="1.5748031in" height="144q"'),
+        # what has another shape than its viewBox is scaled alike both ways, and lies in the middle
+        (PATHS, 'viewBox="-20 -18 40 36" width="60mm" height="36mm"'),
+        (f'<svg x="-30" y="-18" width="60" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (f'<svg x="-20" y="-28" width="40" height="56" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
+        (
+            f'<g transform="scale(2 1)">{PATHS}</g>',
+            'viewBox="-40 -18 80 36" width="40mm" height="36mm" preserveAspectRatio="none"',
+        ),
         (f'{PATHS}<text>no fibre</text><path d="M0 0L1 0L1 1Z"/><path style="display: none" d="M0 0L1 1"/>', HEAD),
         (paths(*(re.sub("M -20 (-?6)", r"M -25 \1 L -20 \1", way) for way in WAYS)), HEAD),  # they begin outside
     ],
@@ -136,6 +147,8 @@ REFUSED = [
     (paths(*WAYS[1:]).replace("w0", "w4"), "no curve is horizontal 2"),
     (f'{PATHS}<path id="again" d="M-20-6.01 20-6.01"/>', "w0 and again: both are horizontal 2"),
     (instead("M -20 -6 C 30 0 -30 0 20 -6"), r"w0: turns back at \(.*\) mm, expected .* along x"),
+    # from (-9, 9) down to (-8, 0) mm, where y points up
+    (paths(*WAYS[:2], "M-10 18L-9-9-8 0-10-18", *WAYS[3:]), r"w2: turns back at \(-8.5, 4.5\) mm, .* along y"),
     (instead("M -20 -6 L 0 -40 L 20 -6"), r"w0: leaves the pad at"),
     (instead("M -20 -6 L 10 -6"), r"w0: runs from .*, 10 mm from where horizontal 2 ends"),
     (paths(*WAYS[:4], "M 13 18 L 13 -18"), r"w4: runs from \(13.0, -18.0\) mm to \(13.0, 18.0\) mm, 3 mm from"),

@@ -49,7 +49,10 @@ def test_write_step_keeps_shapes_names_colours_and_positions(file):
         assert [*part.color] == pytest.approx([*Color(expected.colour)], abs=2e-3)
         assert part.volume == pytest.approx(volumes[part.label], rel=1e-9)
     assert (parts["drum"].center() - Vector(4, 4, 4.5)).length < 1e-6
-    assert "PRODUCT('a block','a block'" in file.read_text(encoding="utf-8")
+    text = file.read_text(encoding="utf-8")
+    assert "PRODUCT('a block','a block'" in text
+    assert re.search(r"FILE_NAME\(\s*'whole',", text)
+    assert re.search(r"LENGTH_UNIT\(\)\s*NAMED_UNIT\(\*\)\s*SI_UNIT\(\.MILLI\.,\.METRE\.\)", text)
 
 
 def test_written_file_is_shorter_than_the_kernels_and_has_as_many_faces(file, tmp_path):

@@ -339,3 +339,43 @@ def test_contact_of_settings_counts_if_the_pad_has_none():
     for contact in ({"radius": 0.6}, {}):
         settings = FabricationSettings.from_spec(Spec(tables | {"contact": contact}))
         assert "silicone_thickness" not in {finding.name for finding in check_plan(Plan(pad, settings))}
+
+
+def test_messages_of_findings_have_their_lengths_in_mm():
+    mould: dict[str, object] = {"ridge_width_mm": 0.45, "deep_ridge_height_mm": 1.3, "silicone_mm": 5.5}
+    plan = Plan(Morphology.straight(2), with_settings(mould, fibre={"diameter_mm": 0.35}))
+    messages = {finding.name: finding.message for finding in check_plan(plan)}
+    expected = {
+        "ridge_width": "ridges are 0.45 mm wide, the nozzle 0.4 mm",
+        "track_size": "the tightest track is 0.4 mm, the fibre 0.35 mm",
+        "layers": "every step is a whole number of 0.1 mm layers",
+        "slenderness": "the tallest ridges, 1.3 mm, are 2.9 times as tall as wide",
+        "crossing_gap": "0.550 mm lie between fibres of neighbouring depths where they cross",  # 1.3 - 0.4 - 0.35
+        "same_family_crossings": "0 crossings of fibres of one family",
+        "cover": "4.2 mm of silicone lie beyond the deepest tracks",
+        "fibre_bend": "no fibre bends below 1 mm",
+        "lead_kinks": "fibres meet their leads at corners of 0.0 degrees at most, allowed are 28.6; fibre 1",
+        "numbers": "every number has room",
+    }
+    assert {name: messages[name] for name in expected} == expected
+    resin = find(plan.pad, "ridge_width", with_settings(printer=RESIN))
+    assert resin.message == "ridges are 0.4 mm wide, two pixels 0.4 mm"
+    crossed = find(level_pad(1.8, 1.2), "same_family_crossings")
+    assert crossed.message == "2 crossings of fibres of one family, kept apart by 3 depths instead of 2"
+    thicker = find(level_pad(1.8, 1.2), "cover", with_settings({"silicone_mm": 2.5}))
+    assert thicker.message == (
+        "1 mm of silicone lie beyond the deepest tracks; for 3 depths the pad is 3 mm thick, not 2.5"
+    )
+
+
+def test_fibre_bend_is_that_of_the_tightest_fibre():
+    """Of two, one turns within 0.3 mm and the other within 0.9 mm: both are tighter than allowed."""
+    knots = [np.array([[0, 1], [0.9, 1], [0.9 + run, 1.05], [1.5, 1.05], [2, 1]]) for run in (0.08, 0.03)]
+    pads = [Morphology(np.stack([first, second[:, ::-1]]), 11.25) for first, second in (knots, knots[::-1])]
+    gentle, tight = (Morphology(np.stack([each, each[:, ::-1]]), 11.25) for each in knots)
+    radii = [float(np.asarray(find(pad, "fibre_bend").measured)) for pad in (gentle, tight)]
+    assert radii[1] < 0.7 * radii[0] < 0.6
+    for pad in pads:
+        both = find(pad, "fibre_bend")
+        assert (both.measured, len(both.positions_mm)) == (pytest.approx(radii[1], rel=1e-3), 2)
+        assert both.message == f"fibres 1, 2 bent as tightly as {radii[1]:.2f} mm"

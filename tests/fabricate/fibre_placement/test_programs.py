@@ -245,3 +245,19 @@ def test_programs_say_where_the_first_fibre_starts(counts, leads, where):
     if "right" in where:
         assert starts[0][0] == max(x for x, _ in family)
     assert starts[0][1] == pytest.approx(near)
+
+
+def test_head_of_a_program_has_lengths_times_and_depths() -> None:
+    """Of straight fibres 20 mm apart: sides of three and two pitches, borders, tongues and leads."""
+    mould: dict[str, object] = {"border_mm": 2.0, "exit_mm": 3.0, "lead_mm": 40.0}
+    settings = with_settings(mould, fibre={"diameter_mm": 0.3}, dispenser={"feed_mm_s": 5.0, "tip_mm": 0.35})
+    plan = Plan(Morphology.straight((1, 2), 20.0), settings)
+    steps = Fabrication(plan, [], []).toolpath
+    lines = list(summary_lines(plan, steps))
+    length_m = sum(float(stroke.steps_mm.sum()) for step in steps for stroke in step.strokes) / 1000
+    assert length_m == pytest.approx((3 * 20 + 2 * 2 * 20 + 3 * (2 * 5 + 2 * 40)) / 1000)
+    minutes = 1000 * length_m / 5 / 60
+    assert lines[1] == f"3 fibres in 2 layers, {length_m:.2f} m; {minutes:.1f} minutes of laying"
+    assert lines[3].endswith("y away from you; fibre 1 starts on the right, nearest")
+    assert lines[4] == "z is 0 where the needle touches the upper face; it goes down to -0.900 mm"  # 0.3 - 1.2
+    assert lines[5] == "needle of at most 0.35 mm, pad 6 mm thick"

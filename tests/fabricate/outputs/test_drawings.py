@@ -265,6 +265,9 @@ def test_panels_match_frame_of_rig(pad, name):
         (label,) = (position for text, position in texts if text == axis)
         to = np.array(frame.pose(unit, 0.0)[:2]) * (1, -1)
         np.testing.assert_allclose((label - shift) / np.hypot(*(label - shift)), to, atol=0.01)
+        # beyond the tip of an arrow of 0.45 half sides
+        length_mm = 0.45 * np.sqrt(np.prod(plan.cavity.bounds[2:]))
+        assert np.hypot(*(label - shift)) / scale == pytest.approx(1.2 * length_mm, abs=0.05)
 
 
 def test_side_views_number_fibres_as_panels():

@@ -1,16 +1,21 @@
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from PIL import Image
 
 from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, INK, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
+from padforge.fabricate.outputs.drawings import orientation_sentence
 from padforge.fabricate.outputs.pictures import (
     CARE,
     FLOOR,
@@ -206,3 +211,93 @@ def test_colours_of_a_mesh_are_named_by_height_above_its_lowest_point(tmp_path, 
     faces = [(k, k + 2, k + 1) for k in (0, 4, 8)] + [(k + 1, k + 2, k + 3) for k in (0, 4, 8)]
     draw_findings(np.array(corners, float), faces, [], tmp_path / "mesh.png")
     assert [text.get_text() for text in figures[0].axes[1].texts] == ["2 mm", "5 mm above the lowest point"]
+
+
+def legend_of(figure: Figure) -> dict[str, Any]:
+    """Return the entries of a legend with their handles."""
+    [legend] = figure.legends
+    return dict(zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True))
+
+
+def test_legend_of_the_mould_names_every_colour_with_its_height(tmp_path, figures):
+    plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 5.5}))
+    findings = [finding("warn", (1, 2), (3, 4), name="bend"), finding("fail", (5, 6)), finding("pass", (7, 8))]
+    draw_mould(plan, findings, tmp_path / "mould.png")
+    entries = legend_of(figures[0])
+    colours = {layer.depth_mm: layer.colour for layer in fibre_layers(plan)}
+    patches = {label: to_hex(entry.get_facecolor()) for label, entry in entries.items() if isinstance(entry, Patch)}
+    assert patches == {
+        "floor": PAPER,
+        "wall, 5.5 mm": FAINT,
+        "mirrored numbers, 0.4 mm": "#8a867d",
+        "horizontal ridges, 2 mm": colours[2.0],
+        "horizontal ridges, 1.2 mm": colours[1.2],
+        "vertical ridges, 0.4 mm": colours[0.4],
+    }
+    assert list(entries)[len(patches) :] == ["fail: wall (1)", "warn: bend (2)"]
+    [axes] = figures[0].axes
+    marks = {line.get_label(): line for line in axes.lines if not str(line.get_label()).startswith("_")}
+    assert {label: (line.get_marker(), line.get_markeredgecolor()) for label, line in marks.items()} == {
+        "fail: wall (1)": ("o", ALARM),
+        "warn: bend (2)": ("D", CARE),
+    }
+    assert np.array(marks["warn: bend (2)"].get_xydata()).tolist() == [[1, 2], [3, 4]]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "y (mm)")
+    x_min, y_min, x_max, y_max = plan.tray.bounds
+    assert (*axes.get_xlim(), *axes.get_ylim()) == pytest.approx((x_min, x_max, y_min, y_max))
+    draw_mould(Plan(plan.pad, with_settings({"number_mm": 0.0})), [], tmp_path / "mould.png")
+    assert not any("numbers" in label for label in legend_of(figures[1]))
+
+
+@pytest.mark.parametrize("leads", ["edges", "one side"])
+def test_tracks_are_labelled_by_depth_with_a_number_at_every_start(tmp_path, figures, leads):
+    plan = Plan(level_pad(1.8, 1.2), with_settings(pad={"leads": leads}))
+    draw_tracks(plan, tmp_path / "tracks.png")
+    [axes] = figures[0].axes
+    crossings = len(plan.crossings)
+    assert axes.get_title(loc="left") == f"Fibres as they lie in the tray, from above: 4 fibres, {crossings} crossings"
+    entries = legend_of(figures[0])
+    layers = fibre_layers(plan)
+    labels = [f"{('horizontal', 'vertical')[layer.family]}, {layer.depth_mm:g} mm deep" for layer in layers]
+    assert list(entries) == [*labels, "2 crossings of one family"]
+    assert [entries[label].get_color() for label in labels] == [layer.colour for layer in layers]
+    numbers = [text for text in axes.texts if text.get_text().isdigit()]
+    ends = 1 + (leads == "one side")
+    assert sorted(text.get_text() for text in numbers) == sorted(list("1234") * ends)
+    for text in numbers:
+        fibre = int(text.get_text()) - 1
+        line = np.array(plan.lines[fibre].coords)
+        assert np.hypot(*(line[[0, -1]][:ends] - text.xy).T).min() < 3.5  # within the wall
+        assert text.get_color() == (HORIZONTAL, VERTICAL)[plan.family(fibre)]
+        below = leads == "one side" or plan.family(fibre) == 1
+        assert (text.get_ha(), text.get_va()) == (("center", "top") if below else ("right", "center"))
+    bar = axes.lines[-1].get_xdata()
+    assert bar[1] - bar[0] == pytest.approx(10)
+    assert [text.get_text() for text in axes.texts if "mm" in text.get_text()] == ["10 mm"]
+    note = " ".join(text.get_text() for text in figures[0].texts)
+    assert note == orientation_sentence((2, 2), leads)
+
+
+def test_title_of_a_mesh_has_its_sides(tmp_path, figures):
+    draw_findings([[0, 0, 1], [30, 0, 1], [30, 10, 6.5]], [[0, 1, 2]], [finding("warn", (4, 5))], tmp_path / "a.png")
+    assert figures[0].axes[0].get_title(loc="left") == "Mesh from above, 30 x 10 x 5.5 mm"
+    assert list(legend_of(figures[0])) == ["warn: wall (1)"]
+
+
+@pytest.mark.parametrize("count", [0, 3, 4])
+def test_legend_has_room_below_the_axes(tmp_path, figures, count):
+    """In rows of three: neither it nor the note reaches the label of the axes or the edge of the picture."""
+    names = [finding("warn", (1.0, 1.0), name=f"check_{number}") for number in range(count)]
+    draw_findings([[0, 0, 1], [30, 0, 1], [30, 10, 6.5]], [[0, 1, 2]], names, tmp_path / "mesh.png")
+    draw_tracks(PLAN, tmp_path / "tracks.png")
+    for figure in figures:
+        figure.draw_without_rendering()
+        label = figure.axes[0].xaxis.label.get_window_extent()
+        boxes = [each.get_window_extent() for each in (*figure.legends, *figure.texts)]
+        assert len(figure.legends) == (count > 0 or figure is figures[1])
+        for box in boxes:
+            assert 0 <= box.y0 < box.y1 < label.y0
+            assert all(box.y1 < bar.get_window_extent().y0 + 2 for bar in figure.axes[1:])  # of colours
+        notes = [text.get_window_extent() for text in figure.texts]
+        assert all(lower.y1 <= upper.y0 + 2 for upper, lower in pairwise(notes))
+        assert all(note.y1 <= legend.get_window_extent().y0 + 2 for note in notes for legend in figure.legends)

@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.colors import to_rgb
 
+from padforge.design.common.files import sha256
+from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.fabricate.outputs import report
 from padforge.fabricate.outputs.report import PackedMesh, fabrication_sections, pack_mesh
 from padforge.report import write_report
@@ -43,6 +46,40 @@ def test_large_mesh_uses_wide_indices(tmp_path: Path, monkeypatch) -> None:
     assert mesh
     assert mesh.triangles.max() + 1 == len(mesh.vertices) > 65536
     assert volume(mesh) == pytest.approx(sphere.volume, rel=1e-4)
+
+
+def test_view_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_path: Path) -> None:
+    """Tops of ridges are where the family has its height above the floor, wherever the mesh begins."""
+    document = json.loads((made / "fabrication.json").read_text())
+    mould = trimesh.load_mesh(made / "mould.stl", process=False)
+    mould.apply_translation((3.0, 4.0, 100.0))
+    mould.export(tmp_path / "mould.stl")
+    document["sha256"] = {"mould.stl": sha256(tmp_path / "mould.stl")}
+    document["settings"]["mould"]["floor_mm"] = 1.5
+    section, _ = fabrication_sections(tmp_path, document)
+    data = json.loads("".join(section.body).partition('id="mould-mesh">')[2].partition("</script>")[0])
+    colours = {"horizontal": HORIZONTAL, "vertical": VERTICAL}
+    tops = {fibre["ridge_mm"]: colours[fibre["fibre"].split()[0]] for fibre in document["fibres"]}
+    expected = [[101.5 + height, *to_rgb(colour)] for height, colour in sorted(tops.items())]
+    assert np.array(data["tops"]) == pytest.approx(np.array(expected))
+    assert data["low"] == pytest.approx(mould.bounds[0], abs=1e-4)
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(mould.vertices, axis=0))
+    assert f"The mould, {size} mm. Tops of" in "".join(section.body)
+
+
+def test_section_counts_checks_and_gives_first_positions(made: Path) -> None:
+    document = json.loads((made / "fabrication.json").read_text())
+    place = [[1.04, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0], [9.0, 9.0]]
+    row = {"measured": 1.0, "limit": 2.0, "message": "told"}
+    rest = [row | {"name": f"is_{status}", "status": status, "positions_mm": []} for status in ("pass", "pass", "warn")]
+    document["findings"] = [*rest, row | {"name": "so_thin", "status": "fail", "positions_mm": place}]
+    document["silicone_volume_ml"] = 12.34
+    section, _ = fabrication_sections(made, document)
+    assert list(section.figures) == [("2 / 4", "mould checks passed"), ("12.3 ml", "silicone to cast")]
+    text = re.sub(r"\s*<[^>]*>\s*", "|", "".join(section.body))
+    assert "2 of 4 checks passed." in text
+    assert "so thin||fail||told||(1.0, 2.0) (3.0, 4.0) (5.0, 6.0) and 2 more" in text
+    assert text.index("so thin") < text.index("is warn") < text.index("Checks that pass") < text.index("is pass")
 
 
 @pytest.mark.parametrize(

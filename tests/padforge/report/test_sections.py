@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -12,17 +13,23 @@ import pytest
 from markupsafe import escape
 
 from padforge.design.common.files import provenance
+from padforge.design.common.plotting import ALARM, HORIZONTAL, VERTICAL
 from padforge.design.common.validation import Fault, InputError
-from padforge.design.contact import FIBRE_BLUR_MM, contact_press
+from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_widths_mm, profile_weights
 from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
-from padforge.design.report import contact_line, draw_press, press_sections
-from padforge.design.settings import Contact
+from padforge.design.report import contact_line, contact_sections, design_sections, draw_press, press_sections
+from padforge.design.settings import Contact, RulesSettings
 from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from padforge.sense.report.sections import fibre_loss_sections, loss_chart
+from padforge.sense.report.sections import (
+    calibration_sections,
+    fibre_loss_sections,
+    loss_chart,
+    recording_sections,
+)
 from tests.padforge.report.conftest import (
     HOSTILE,
     PAD,
@@ -139,6 +146,19 @@ def test_provenance_compares_inputs_with_files_here(pad: Path) -> None:
     text = (pad / "report.html").read_text()
     assert "(not the one here)" in text
     assert text.index("Files of different pads") < text.index("Design rules"), "first thing on the page"
+
+
+def test_provenance_names_inputs_elsewhere_and_opens_none(pad: Path) -> None:
+    """A file of another folder is not this one's, though it could be found from here; a computed input is a command."""
+    (pad.parent / "spec.toml").write_text("secret")
+    document = json.loads((pad / "fabrication.json").read_text())
+    inputs = {"../spec.toml": "ab12", "pad.toml": "cd34", "twin": {"command": "padforge sense identify"}}
+    document["provenance"] |= {"inputs": inputs, "command": "made so", "seed": 7, "versions": {"numpy": "2.0"}}
+    (pad / "pad.toml").write_text("[pad]")
+    written(pad / "fabrication.json", document)
+    text = re.sub(r"\s*<[^>]*>\s*", "|", write_report(pad).read_text())
+    read = "../spec.toml ab12; pad.toml cd34 (not the one here); twin: padforge sense identify"
+    assert f"|made so||7||numpy 2.0||{read}|" in text
 
 
 def test_report_warns_of_design_of_other_pad(pad: Path) -> None:
@@ -364,3 +384,196 @@ def test_press_stretches_fibres_by_the_greater_of_both_strains_in_the_plane() ->
     (section,) = press_sections(document, None)
     cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section.body[-1], re.S)]
     assert [row[4] for row in cells if row] == [f"{greatest[1]:.0%}"] * 2
+
+
+def test_loss_chart_of_many_fibres_is_as_legible_and_has_the_scale_of_its_colours() -> None:
+    """Cells have no numbers then, and every fifth fibre a label; letters grow with the chart."""
+    charts = {}
+    for fibres in (16, 17, 60):
+        single = {(fibre,): 1.0 + fibre for fibre in range(fibres)}
+        pairs = {(first, second): 100.0 for first in range(fibres) for second in range(first + 1, fibres)}
+        text = loss_chart({(): 0.25} | single | pairs, fibres)
+        width, height = map(float, re.findall(r'viewBox="0 0 (\d+) (\d+)"', text)[0])
+        labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" font-size="(\d+)">(\d+)</text>', text)
+        sizes = {int(size) for *_, size, _ in labels}
+        charts[fibres] = (width, max(sizes), len(labels))
+        numbers = [str(n) for n in range(1, fibres + 1) if fibres == 16 or n % 5 == 0]
+        assert [number for *_, number in labels] == [number for number in numbers for _ in range(2)]
+        assert "0.25</text>" in text  # the least
+        assert "100.00 mm</text>" in text  # and the greatest
+        assert all(0 <= float(x) <= width and 0 <= float(y) <= height for x, y, *_ in labels)
+        shades = re.findall(r'height="\d+" fill="#(\w+)"/>', text)
+        assert len(shades) == 5
+        reds_alike = [int(shade[2:4], 16) for shade in shades]  # greens fall as the colour becomes ALARM
+        assert reds_alike == sorted(reds_alike, reverse=True)
+        assert f"#{shades[-1]}" == ALARM.lower()
+    assert [count for *_, count in charts.values()] == [32, 6, 24]
+    legible = charts[16][1] / charts[16][0]
+    assert all(size / width > 0.9 * legible for width, size, _ in charts.values())
+
+
+def words(body: Sequence[str]) -> str:
+    """Return the text of HTML elements, with a bar where one ends."""
+    return re.sub(r"\s*(<[^>]*>\s*)+", "|", "".join(body))
+
+
+def test_design_section_has_errors_rules_and_terms() -> None:
+    document = design_document()
+    settings = document["provenance"]["settings"]
+    settings["rules"] = RulesSettings().model_dump(mode="json")
+    settings["pad"] = {"horizontals": 2, "verticals": 3, "pitch_mm": [8.0, 15.0]}
+    settings["search"] |= {"scatter": 0.184, "noise": 0.0123}
+    violation = {"rule": "min_gap_mm", "fibres": [1, 3], "place_mm": [1.04, -2.0], "measured": 0.5, "limit": 2.0}
+    pad_rule = {"rule": "max_crossings", "fibres": [], "place_mm": None, "measured": 9, "limit": 4}
+    document |= {
+        "terms": {"expected_error_mm_1": 2.346, "expected_error_mm_0": 1.0, "sharpness": 0.25},
+        "straight": {"expected_error_mm_1": 4.0, "expected_error_mm_0": 12.34},
+        "descriptions": {"sharpness": "how sharp"},
+        "violations": [violation, pad_rule],
+    }
+    [section] = design_sections(Path("none"), document)
+    text = words(section.body)
+    # half a pitch beyond the outermost of 3 verticals, 8 mm apart, and of 2 horizontals, 15 mm apart
+    assert list(section.figures) == [
+        ("2 + 3", "fibres on 24 x 30 mm"),
+        ("2 broken", "design rules"),
+        ("1.00 mm", "expected error of the design"),
+    ]
+    assert "|failed fibres|expected error (mm)|straight fibres (mm)|0|1.00|12.3|1|2.35|4.00|" in text
+    assert "vary by 18% of their value from press to press, plus 1.2% of full scale." in text
+    assert "Checked on the exact curves: 2 broken." in text
+    assert "|broken rule|fibres|position (mm)|measured|limit|min_gap_mm|1, 3|(1.0, -2.0)|0.5|2" in text
+    assert "|max_crossings|pad|-|9|4|" in text
+    assert "|sharpness|0.25|how sharp|" in text
+    results = {name: result for result, name in re.findall(r"\|(pass|fail|not enforced)\|(\w+)(?=\|)", text)}
+    assert {name for name, result in results.items() if result == "fail"} == {"min_gap_mm", "max_crossings"}
+    assert set(results) == set(settings["rules"]) - {"enforce"}
+    settings["rules"]["enforce"] = False
+    [section] = design_sections(Path("none"), document | {"violations": []})
+    assert ("not enforced", "design rules") in section.figures
+
+
+def test_contact_section_and_line_compare_pads_by_contact() -> None:
+    document = contacts_document()
+    [section] = contact_sections(Path(), document)
+    text = words(section.body)
+    assert "with a scatter of 18% of the response and 2.0% of full scale" in text
+    head = "|contact|fibres|0 failed|1 failed|"
+    assert f"{head}as assumed|designed|0.50|0.75|as assumed|straight|1.00|1.50|" in text
+    assert "|published disc, K = 0.6|designed|4.00|6.00|published disc, K = 0.6|straight|3.00|5.00|" in text
+    third = [{"contact": "half", "pad": pad, "errors_mm": [error]} for pad, error in (("designed", 2), ("straight", 7))]
+    assert contact_line(document | {"rows": document["rows"] + third}) == (
+        "contact: mean error of a small network 0.50 mm under the assumed contact, 2.00 to 4.00 mm otherwise; of"
+        " straight fibres 1.00 mm under the assumed contact, 3.00 to 7.00 mm otherwise"
+    )
+
+
+def test_press_section_states_what_the_press_does_to_each_family() -> None:
+    document = design_document()
+    contact = Contact(depth_mm=2.0, thickness_mm=8.0, tool_radius_mm=10.0, fibre_depths_mm=(1.5, 0.5))
+    document["provenance"]["settings"]["contact"] = contact.model_dump(mode="json")
+    press = contact_press(contact)
+    [section] = press_sections(document, 0.5)
+    text = words(section.body)
+    assert (
+        f"A dome of 10 mm, pressed 2 mm deep into silicone of 8 mm, touches it within {press.contact_radius_mm:.1f} mm"
+        f" and takes {press.force_n():.1f} N on EcoFlex 00-20."
+    ) in text
+    r_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
+    for name, depth, width in zip(("horizontal", "vertical"), (1.5, 0.5), half_widths_mm(contact), strict=True):
+        strains = press.strains(r_mm, 8 - depth, FIBRE_BLUR_MM)
+        squeeze, stretch = strains.compressive.max(), max(strains.radial.max(), strains.hoop.max())
+        assert f"|{name}|{depth:g}|{width:.1f}|{squeeze:.0%}|{stretch:.0%}|50%|pass|" in text
+    assert "|-|-|" in words(press_sections(document, None)[0].body)
+
+
+def test_press_is_drawn_with_weights_lengthwise_and_crosswise() -> None:
+    contact = Contact(depth_mm=2.0, thickness_mm=8.0)
+    section, weights = draw_press(contact, 11.25).axes
+    assert (section.get_xlabel(), section.get_ylabel()) == ("x (mm)", "height (mm)")
+    assert section.texts[-1].get_text() == f"{contact.tool} of {contact.tool_radius_mm:g} mm, 2 mm deep"
+    ends = np.asarray(section.lines[-1].get_xdata(), float)
+    assert np.diff(ends) == pytest.approx(11.25)
+    assert 0 in ends
+    lines = {str(line.get_label()): line for line in weights.lines if str(line.get_label())[0] != "_"}
+    for (name, colour), (distance, plain, directed) in zip(
+        (("horizontal", HORIZONTAL), ("vertical", VERTICAL)), profile_weights(contact), strict=True
+    ):
+        along, across = lines[f"{name}, lengthwise"], lines[f"{name}, crosswise"]
+        np.testing.assert_allclose(np.array(along.get_data(), float), (distance, plain + directed))
+        np.testing.assert_allclose(np.array(across.get_data(), float), (distance, plain))
+        assert along.get_color() == across.get_color() == colour
+    assert (weights.get_xlabel(), weights.get_ylabel()) == ("distance from the press (mm)", "weight of an element")
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (
+            {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}},
+            "the simulated rig, 13.3 a second; presses 5",
+        ),
+        (
+            {"kind": "rig", "rig": {"rate_hz": 50, "depths_mm": [4.0, 1.5]}},
+            "a rig, 50 a second; presses 1.5 to 4 mm",
+        ),
+        ({"kind": "hand", "rig": {"rate_hz": 10, "depth_mm": 5.0}}, "presses by hand, 10 a second."),
+        ({"kind": "published", "file": "5.mat"}, "from 5.mat."),
+        ({"kind": "simulated", "twin": {}}, "the simulated rig, by the twin of a printed pad."),
+    ],
+)
+def test_recording_section_says_where_readings_are_from(tmp_path: Path, source: dict, said: str) -> None:
+    [section] = recording_sections(tmp_path, {"source": source, "fibres": 7})
+    text = words(section.body)
+    assert "Readings of 7 fibres, from " in text
+    assert said in text
+
+
+def test_calibration_section_has_a_row_a_number_of_failed_fibres(tmp_path: Path) -> None:
+    """Of distinct numbers, none of which may stand in the place of another."""
+    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
+    rows = [
+        {"n_failed": n, "subsets": 1 + 3 * n}
+        | {name: 1.0 + n + 0.1 * k for k, name in enumerate(names)}
+        | {"within_r50": 0.51 + 0.01 * n, "within_r90": 0.91 + 0.01 * n}
+        | {"depth_mean_mm": 0.21 + n, "depth_p95_mm": 0.43 + n, "depth_within_r90": 0.87 + 0.01 * n}
+        | {"force_mean_n": 3.1 + n, "force_p95_n": 6.2 + n, "force_within_r90": 0.77 + 0.01 * n}
+        for n in (0, 1)
+    ]
+    moments = [
+        {"since": since, "time_s": time_s, "n_failed": n, "mean_mm": time_s + n, "within_r90": 0.9 + 0.01 * n}
+        for since, time_s in (("touch", 0.25), ("lift", 0.5))
+        for n in (0, 1)
+    ]
+    document = {"errors": rows, "by_moment": moments, "idle_share": [0.1, 0.256], "split": "chronological"}
+    document |= {"test_presses": 12, "provenance": {"recording_kind": "rig"}, "by_subset": []}
+    section, *_ = calibration_sections(tmp_path, document)
+    text = words(section.body)
+    assert "Errors on 12 presses never trained on (the last ones). One network serves all failures." in text
+    assert "|failed|sets|mean (mm)|std|worst|median|95 %|in r50|in r90|" in text
+    assert "|0|1|1.00|1.10|1.20|1.30|1.40|51.0%|91.0%|1|4|2.00|2.10|2.20|2.30|2.40|52.0%|92.0%|" in text
+    assert "|failed|depth, mean (mm)|95 %|in r90|0|0.21|0.43|87.0%|1|1.21|1.43|88.0%|" in text
+    assert "|failed|force, mean (N)|95 %|in r90|0|3.10|6.20|77.0%|1|4.10|7.20|78.0%|" in text
+    assert "|since|time (s)|0 failed (mm)|in r90|1 failed (mm)|in r90|" in text
+    assert "|touch|0.25|0.25|90.0%|1.25|91.0%|lift|0.50|0.50|90.0%|1.50|91.0%|" in text
+    assert "|fibre|1|2|idle|10%|26%|" in text
+    assert list(section.figures) == [
+        ("1.00 mm", "mean error on presses, all fibres"),
+        ("2.00 mm", "mean error on presses, 1 fibre failed"),
+    ]
+    document |= {"provenance": {"recording_kind": "simulated"}, "split": "random", "errors": rows[:1], "by_moment": []}
+    section, *_ = calibration_sections(tmp_path, document)
+    text = words(section.body)
+    assert "12 simulated presses never trained on (drawn at random). Every position" in text
+    assert "with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses." in text
+    assert list(section.figures) == [("1.00 mm", "mean error on simulated presses, all fibres")]
+
+
+def test_worst_losses_are_named_in_words_and_ranked() -> None:
+    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 3.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 5.0}
+    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
+    (section,) = fibre_loss_sections(Path(), {"by_subset": by_subset})
+    text = words(section.body)
+    assert "The worst loss: of one fibre, 2 (4.00 mm); of two fibres, 1 and 3 (20.00 mm)." in text
+    assert "With all fibres the error is 1.00 mm." in text
+    assert "|failed|mean (mm)|1 and 3|20.00|1 and 2|10.00|2 and 3|5.00|2|4.00|3|3.00|1|2.00|" in text

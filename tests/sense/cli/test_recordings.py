@@ -1,12 +1,17 @@
 """`import` and `export`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
 import scipy.io
 from mcap.reader import make_reader
 
+from padforge.design.common.validation import InputError
 from padforge.sense import Recording, export_csv
+from padforge.sense.cli import options
 
 
 def test_import_reads_csv(padforge_sense, brief: Recording) -> None:
@@ -64,3 +69,19 @@ def test_export_writes_a_lerobot_dataset(few) -> None:
     info = json.loads(Path("set/meta/info.json").read_text())
     assert info["total_episodes"] == 60
     assert "observation.touch" in info["features"]
+
+
+def test_recording_line_counts_what_is_unknown_and_missing() -> None:
+    times_s = np.arange(40) / 8
+    readings = np.full((40, 3), 1.5)
+    readings[3:5, 1] = np.nan
+    presses_mm = np.array([[1.0, 2.0], [np.nan, np.nan]])
+    recording = Recording(readings, times_s, presses_mm, np.array([10, 30]), np.array([15, 35]))
+    line = "2 presses (1 of unknown position), 40 readings of 3 fibres, 2 values missing, at 8.0 Hz -> out"
+    assert options.recording_line(recording, Path("out")) == line
+    slow = replace(recording, times_s=100 * times_s, readings=np.full((40, 3), 1.5), presses_mm=np.zeros((2, 2)))
+    assert options.recording_line(slow, Path("out")) == "2 presses, 40 readings of 3 fibres at 0.08 Hz -> out"
+    assert options.fibre_indices((3, 1), 3) == (2, 0)
+    for number in (0, 4):
+        with pytest.raises(InputError, match=f"fibre {number}: no such fibre, allowed are 1 to 3"):
+            options.fibre_indices((number,), 3)

@@ -18,6 +18,7 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.rig import operation
+from padforge.sense.rig.doctor import Diagnosis
 from padforge.sense.settings import RigSettings
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
@@ -158,3 +159,33 @@ def test_doctor_examines_the_board_alone_for_a_hand(padforge_sense) -> None:
     assert code == 0
     assert "name padforge-due" in out
     assert "arm" not in out
+
+
+def test_doctor_prints_a_line_a_finding_and_ends_as_they_are(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = [Diagnosis("board", "ok", "name it"), Diagnosis("rate", "warn", "slow")]
+    examined = Mock(return_value=said)
+    monkeypatch.setattr(operation, "diagnose", examined)
+    monkeypatch.setattr(operation, "make_board", lambda rig, inputs: list(inputs))
+    monkeypatch.setattr(operation, "make_arm", lambda name, config, inputs: (name, list(inputs)))
+    Path("rig.toml").write_text("[pad]\ngrid = 2\n[rig]\nchannels = [3, 1, 4, 0]\n")
+    assert padforge_sense("doctor", "--rig", "ur5", "--spec", "rig.toml") == (
+        0,
+        "ok   board: name it\nwarn rate: slow\n",
+        "",
+    )
+    make_board, make_arm = examined.call_args.args
+    assert (make_board(), make_arm()) == ([3, 1, 4, 0], ("ur5", [3, 1, 4, 0]))
+    said.append(Diagnosis("arm", "fail", "gone"))
+    code, out, _ = padforge_sense("doctor", "--rig", "hand", "--spec", "rig.toml", "--json")
+    assert (code, json.loads(out)["passed"]) == (1, False)
+    assert json.loads(out)["diagnoses"][2] == {"name": "arm", "status": "fail", "message": "gone"}
+    assert len(examined.call_args.args) == 1  # a hand has no arm
+
+
+def test_record_by_hand_takes_no_arm(padforge_sense) -> None:
+    PAD.save("pad.json")
+    Path("model").mkdir()
+    for words in (("--dry-run",), ("--model", "model")):
+        code, out, err = padforge_sense("record", "--rig", "hand", "--morphology", "pad.json", *words)
+        assert (code, out) == (2, "")
+        assert err == "padforge: --dry-run and --model need an arm, allowed with --rig hand are --plan and --resume\n"

@@ -35,6 +35,8 @@ def test_parse_columns_reads_names_and_units() -> None:
     ]
     factors = [entry.factor for entry in parse_columns("time=t:min,fibres=c:V,positions=p:um,depth=d:m,force=f:mN")]
     assert factors == [60, 1, 1e-3, 1000, 1e-3]
+    factors = [entry.factor for entry in parse_columns("time=t,fibres=adc*:0.000806,x=px:-1,y=py:-2e1")]
+    assert factors == [None, 0.000806, -1, -20]  # an axis may point the other way
 
 
 def test_match_columns_by_name_and_pattern() -> None:

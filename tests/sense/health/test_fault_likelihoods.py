@@ -165,6 +165,18 @@ def test_step_filters_are_matched_and_scaled_for_heavy_tails() -> None:
     assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == MEDIAN_T
 
 
+def test_noise_is_the_mean_step_of_quiet_readings_but_for_the_largest_quarter() -> None:
+    """Of the rest, and of the last ten readings held and released: 27 steps, of which 20 count."""
+    quiet = np.concatenate([np.arange(10), np.arange(20, 30), np.arange(40, 50)])
+    trace = np.full(TRACE, 7.0)
+    trace[quiet] = 0.01 * (quiet % 2)
+    assert estimate_noise(trace) == pytest.approx(0.01)
+    trace[[5, 25, 45]] = 3.0  # 6 steps beside them, all of a quarter
+    assert estimate_noise(np.stack([trace, 2 * trace])[:, None]) == pytest.approx(np.array([[0.01], [0.02]]))
+    trace[[3, 23]] = 3.0
+    assert estimate_noise(trace) > 0.1
+
+
 def test_exceedance_fit_has_the_mean_excess_of_the_highest_tenth() -> None:
     """400 peaks of one press each with known heights; the level makes the highest no rarer than once."""
     heights = np.random.default_rng(0).permutation(np.linspace(0.1, 40, 400))

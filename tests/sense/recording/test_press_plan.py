@@ -90,6 +90,14 @@ def test_make_plan_depths_do_not_depend_on_the_position(plan, presses):
             assert len(set(plan_.depths_mm[plan_.positions_mm[:, axis] == value])) == 5
 
 
+def test_make_plan_depths_alternate_along_rows_that_begin_with_the_next(tmp_path):
+    """A serpentine has the depths of the columns, whichever way it goes."""
+    grid, serpentine = (plan_of(presses=9, plan=kind, depths_mm=[1.0, 2.0, 3.0]) for kind in ("grid", "serpentine"))
+    assert grid.depths_mm.tolist() == [1, 2, 3, 2, 3, 1, 3, 1, 2]
+    assert serpentine.depths_mm.tolist() == [1, 2, 3, 1, 3, 2, 3, 1, 2]
+    assert plan_of(presses=5, plan="uniform", depths_mm=[1.0, 2.0]).depths_mm.tolist() == [1, 2, 1, 2, 1]
+
+
 @pytest.mark.parametrize(
     ("content", "line"),
     [

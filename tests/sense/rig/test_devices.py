@@ -1,5 +1,6 @@
 """Devices by their names, their ports, and processes that run padforge's own code."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -58,6 +59,10 @@ def test_start_imports_nothing_from_the_current_folder(
     ("error", "match"),
     [
         (serial.SerialException(13, "Permission denied"), "no permission.*dialout"),
+        (serial.SerialException(errno.EPERM, "Operation not permitted"), "no permission.*dialout"),
+        (serial.SerialException(errno.EBUSY, "Device or resource busy"), "another program uses it"),
+        (serial.SerialException(errno.EAGAIN, "Resource temporarily unavailable"), "another program uses it"),
+        (serial.SerialException(errno.ENOENT, "No such file or directory"), "no such port"),
         (serial.SerialException("could not open port 'COM7': PermissionError(13, 'Access is denied.')"), "another"),
         (serial.SerialException("could not open port 'COM7': FileNotFoundError(2, '...')"), "no such port"),
         (serial.SerialException("a device attached to the system is not functioning"), "not functioning.*right port"),

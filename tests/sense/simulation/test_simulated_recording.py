@@ -9,9 +9,14 @@ import pytest
 from padforge.design import Contact, InputError, Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
-from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual
+from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter
 from padforge.sense import Recording, RigSettings, simulate
-from padforge.sense.simulation.simulated_recording import measure_rig_settings, model_twin
+from padforge.sense.simulation.simulated_recording import (
+    measure_rig_settings,
+    measured_rig,
+    model_like_twin,
+    model_twin,
+)
 from tests.helpers.rigs import ideal_rig, quiet_rig
 
 GRID = Morphology.straight(4)
@@ -139,6 +144,22 @@ def test_simulate_like_twin_has_its_profile_and_median_gain() -> None:
     assert recording.source["contact"] == twin.contact().model_dump(mode="json")
     assert recording.source["twin"]["presses"] == 900
     assert np.abs(recording.presses_mm).max() == pytest.approx(13.5, rel=0.02)
+
+
+def test_a_pad_like_a_twin_has_the_median_of_its_gains_and_noise() -> None:
+    """Of live channels: the dead one has most noise, and counts not; gains have the sign of most."""
+    twin = replace(twin_of(), scatter=TwinScatter(floor=0.5, share=0.1, common=0.2))
+    noise_v = (0.01, 0.9, 0.02, 0.09)
+    channels = tuple(replace(each, noise_v=v) for each, v in zip(twin.channels, noise_v, strict=True))
+    other = Morphology.straight(3)
+    model = model_like_twin(other, replace(twin, channels=channels), ideal_rig())
+    assert model.noise_v == pytest.approx(np.full(6, 0.5 * 0.02))
+    positions_mm = np.array([[1.0, 2.0], [-5.0, 4.0]])
+    half = model.responses(positions_mm, np.full(2, 2.5)).held
+    expected = -0.05 / 2 * relative_stretch(other, other.to_grid(positions_mm), twin.contact())
+    assert half == pytest.approx(expected, abs=1e-5)
+    measured = measured_rig(replace(twin, channels=channels), ideal_rig())
+    assert (measured.scatter, measured.scatter_common) == (0.1, 0.2)
 
 
 def test_simulate_refuses_wrong_arguments() -> None:

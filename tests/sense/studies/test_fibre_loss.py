@@ -4,6 +4,7 @@ import errno
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -161,3 +162,29 @@ def test_draw_fibre_loss_has_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
     assert image.origin == "lower"
     assert np.asarray(image.get_array())[-1, 0] == 9.0
     assert image.get_extent()[3] > 5
+
+
+def test_errors_by_loss_are_bars_side_by_side_with_a_dot_a_set() -> None:
+    errors = [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}, {"n_failed": 1, "subsets": 2, "mean_mm": 3.0}]
+    by_subset = [
+        {"failed": [], "mean_mm": 1.0},
+        {"failed": [1], "mean_mm": 4.0},
+        {"failed": [0], "mean_mm": 2.0},
+    ]
+    methods = {name: MethodErrors(errors, by_subset, []) for name in ("one network", "retrained")}
+    axes: Any = Figure().add_subplot()
+    fibre_loss.draw_errors_by_loss(axes, methods, "Fibre loss, 9")
+    middles = [patch.get_x() + patch.get_width() / 2 for patch in axes.patches]
+    assert middles == pytest.approx([-0.18, 0.82, 0.18, 1.18])
+    assert [patch.get_height() for patch in axes.patches] == [1, 3, 1, 3]
+    for dots, middle in zip(axes.collections, middles, strict=True):
+        x, y = dots.get_offsets().T
+        assert x.mean() == pytest.approx(middle)
+        assert y.tolist() in ([1], [2, 4])
+        assert len(set(x.tolist())) == len(x)
+    assert [text.get_text() for text in axes.texts[:4]] == ["1.00", "3.00", "1.00", "3.00"]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["all fibres\n1 set", "1 failed\n2 sets"]
+    assert axes.get_legend_handles_labels()[1] == ["one network", "retrained"]
+    assert axes.get_title("left") == "Fibre loss, 9 presses never trained on\n"
+    assert axes.get_ylabel() == "mean error (mm)"
+    assert axes.texts[-1].get_text() == "bar: mean over the sets of failed fibres; dot: one set"

@@ -4,15 +4,17 @@ import csv
 import json
 import os
 import signal
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology
+from padforge.design.networks import SimulatedPresses
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import robustness_study
 from padforge.sense.studies.study import load_pads, run
@@ -125,3 +127,52 @@ def test_maps_cover_the_pressed_rectangle(tmp_path: Path) -> None:
     left, right, low, high = document["maps"][0]["extent"]
     assert ((right - left) * pad.unit_mm, (high - low) * pad.unit_mm) == pytest.approx((8, 30))
     assert document["rows"][0]["mean_mm"] == pytest.approx(document["rows"][0]["mean"] * np.sqrt(8 * 15))
+
+
+def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One set of failed fibres takes 16, four take 4 each, and six 3."""
+    fit, trained = SimulatedPresses.fit, Counter[tuple[int, ...]]()
+
+    def counted(presses: SimulatedPresses, failures: list, hidden: int, repeat: int = 0) -> list:
+        trained.update(failures)
+        return fit(presses, failures, hidden, repeat)
+
+    monkeypatch.setattr(SimulatedPresses, "fit", counted)
+    monkeypatch.setattr(robustness, "HIDDEN", 1)
+    document = run(robustness_study({"a": PADS["square"]}, max_failures=2, presses=16), tmp_path)
+    by_size = {size: {count for failed, count in trained.items() if len(failed) == size} for size in range(3)}
+    assert by_size == {0: {16}, 1: {4}, 2: {3}}
+    assert [row["of"] for row in document["rows"]] == [1, 4, 6]
+
+
+def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
+    rows = []
+    for pad, means in (("plain", (0.1, 0.3)), ("bent", (0.05, 0.2))):
+        rows += [
+            {"pad": pad, "n_failed": n, "subsets": 1, "of": 1 + n, "mean": mean, "mean_mm": 10 * mean}
+            | {"std": 0.01 + n, "max": 2 * mean}
+            for n, mean in enumerate(means)
+        ]
+    settings = {"pads": {"plain": {}, "bent": {}}, "hidden": 7, "presses": 16, "test": 9, "signals": "exact"}
+    cells = np.arange(robustness.SIDE**2).reshape(robustness.SIDE, -1) / 1000
+    maps = [
+        {"pad": pad, "failed": failed, "extent": [0, 1, 0, 1], "errors": cells.tolist()}
+        for pad in ("plain", "bent")
+        for failed in ([], [2])
+    ]
+    study = robustness_study(PADS, max_failures=1, presses=16)
+    figure: Any = study.draw({"settings": settings, "rows": rows, "maps": maps})
+    bars, *panels = figure.axes
+    assert [patch.get_height() for patch in bars.patches] == [0.1, 0.3, 0.05, 0.2]
+    middles = [patch.get_x() + patch.get_width() / 2 for patch in bars.patches]
+    assert middles == pytest.approx([-0.2, 0.8, 0.2, 1.2])
+    assert [container.get_label() for container in bars.containers if container.get_label()[0] != "_"] == [
+        "plain",
+        "bent",
+    ]
+    dashes = [each.get_offsets()[:, 1].tolist() for each in bars.collections if len(each.get_offsets()) == 2]
+    assert dashes[-2:] == [[0.2, 0.6], [0.1, 0.4]]
+    assert [label.get_text() for label in bars.get_xticklabels()] == ["all fibres", "1 failed"]
+    assert bars.get_ylabel() == "mean error (grid units)"
+    assert bars.get_title("left") == "bar: mean over the sets; line: their standard deviation; dash: the worst set"
+    assert len([panel for panel in panels if panel.images]) == 4

@@ -1,6 +1,7 @@
 """The study of sensitivity to the object, in small."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +42,11 @@ def test_depths_beyond_the_thickness_are_left_out() -> None:
     assert len(shallow.tasks) == 9
 
 
+def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact() -> None:
+    settings = sensitivity_study(PADS, contact=Contact(tool_radius_mm=4.0, depth_mm=2.0)).settings
+    assert (settings["tool_radius_mm"], settings["depth_mm"]) == ([2, 4, 6], [1, 2, 3])
+
+
 def test_profile_has_no_size_to_vary() -> None:
     with pytest.raises(InputError, match=r"\[contact\] model is profile, allowed are layer and shape"):
         sensitivity_study(PADS, contact=Contact(model="profile"))
@@ -76,3 +82,29 @@ def test_sensitivity_study_compares_radii_over_depths_and_depths_over_radii() ->
     assert "depths differ by 100 %" in result.text[1]
     assert f"not trained with is {60 * unit_mm:.3f}, at worst {60 * unit_mm:.3f}, instead of" in result.text[1]
     assert result.text[1].endswith(f"instead of {3 * unit_mm:.3f}.")
+
+
+def test_figure_has_errors_by_size_and_a_matrix_of_trained_by_tested_objects() -> None:
+    """Of sizes 2 and 4 mm, 1 and 3 mm deep: in the curves every object is tested with itself."""
+    objects = [(size, depth) for depth in (1.0, 3.0) for size in (2.0, 4.0)]
+    matrix = np.arange(1.0, 17).reshape(4, 4)
+    rows = [
+        {"pad": "a", "trained_tool_radius_mm": trained[0], "trained_depth_mm": trained[1]}
+        | {"tool_radius_mm": tested[0], "depth_mm": tested[1], "mean_mm": float(matrix[i, j])}
+        for i, trained in enumerate(objects)
+        for j, tested in enumerate(objects)
+    ]
+    settings = {"pads": {"a": {}}, "contact": Contact().model_dump(mode="json")}
+    settings |= {"tool_radius_mm": [2.0, 4.0], "depth_mm": [1.0, 3.0]}
+    figure: Any = sensitivity_study(PADS).draw({"rows": rows, "settings": settings})
+    by_size, errors = figure.axes
+    assert [line.get_xydata().tolist() for line in by_size.lines] == [[[2, 1], [4, 6]], [[2, 11], [4, 16]]]
+    assert [text.get_text() for text in by_size.get_legend().get_texts()] == ["a, 1 mm deep", "a, 3 mm deep"]
+    assert by_size.get_xlabel() == "radius of the tool, trained and tested with (mm)"
+    assert by_size.get_ylabel() == "mean error (mm)"
+    assert errors.images[0].get_array().tolist() == matrix.tolist()
+    numbers = {text.get_position(): text.get_text() for text in errors.texts}
+    assert (numbers[1, 0], numbers[0, 1]) == ("2.00", "5.00")  # the column is what is tested with
+    for labels in (errors.get_xticklabels(), errors.get_yticklabels()):
+        assert [text.get_text() for text in labels] == ["2/1", "4/1", "2/3", "4/3"]
+    assert (errors.get_xlabel(), errors.get_ylabel()) == ("tested with radius/depth", "trained with radius/depth")

@@ -1,34 +1,23 @@
 """What is said of pads that are not the one recorded, and not said of those that are."""
 
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from padforge.design import Morphology
-from padforge.sense import RigSettings, simulate
-from padforge.sense.twin import identification
+from padforge.sense import RigSettings
 from padforge.sense.twin.as_built import OFFSET, PadPlan, channel_indices
 from padforge.sense.twin.doubts import find_doubts
-from padforge.sense.twin.identification import Identification, identify_pad
+from padforge.sense.twin.identification import Identification
 from padforge.sense.twin.wiring import Wiring, images
-from tests.helpers.rigs import ideal_rig
-
-from .conftest import PLAN
+from tests.sense.conftest import identified
 
 
-@pytest.fixture(scope="module")
-def result() -> Identification:
+@pytest.fixture
+def result(identification: Identification) -> Identification:
     """A pad that lies as planned, without its contact and its parts."""
-    return identified(PLAN, PLAN, ideal_rig(presses=120, seed=1))
-
-
-def identified(built: Morphology, told: Morphology, rig: RigSettings) -> Identification:
-    """Identify a simulated pad by a plan; its contact and the parts of presses, which take longest, do not count."""
-    contact = patch.object(identification, "_measure_contact", lambda *_: None)
-    with contact, patch.object(identification, "measure_rig_settings", lambda _: {}):
-        return identify_pad(simulate(built, rig), told, seed=1)
+    return identification
 
 
 def moved(pad: Morphology, fibre: int, pitches: float) -> Morphology:

@@ -27,6 +27,7 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
     board = VirtualPad(pad, rig, PUBLISHED_CONTACT, time)
     with pytest.raises(RigFault, match="not connected"):
         board.read()
+    started_s = time()
     assert board.connect().items() >= {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}.items()
     samples = []
     for pause_s in [0.0, 0.3, 0.01, 5.0] + 30 * [1.0]:
@@ -35,6 +36,7 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
     volts = np.concatenate([each.volts for each in samples])
     times_s = np.concatenate([each.times_s for each in samples])
     np.testing.assert_allclose(np.diff(times_s), 1 / rig.rate_hz)
+    assert times_s[0] == pytest.approx(started_s + 1 / rig.rate_hz)
     # The same fibres at rest, and as many presses that answer as strongly.
     np.testing.assert_array_equal(volts[:19], recorded.readings[:19])
     swings = np.abs(volts - volts[0]).sum(axis=1)

@@ -236,3 +236,15 @@ def test_assemble_raises_for_impossible_block(second: DueBlock) -> None:
     for other in (assembler((0, 1, 2, 3)), assembler(averaging=2)):
         with pytest.raises(RigFault, match="other channels"):
             other.assemble([(1.0, block(0))])
+
+
+def test_assemble_gives_volts_of_the_inputs_asked_for_in_their_order() -> None:
+    """Blocks hold the inputs in ascending order; full scale is the supply, whatever is summed."""
+    counts = np.array([[0, 4 * 4095, 4095], [4, 8, 12]], np.uint16)
+    mask = 1 << 2 | 1 << 5 | 1 << 7
+    due = DueAssembler(BoardSettings(500_000, mask, 4), (7, 2, 5, 2))
+    samples = due.assemble([(1.0, DueBlock(counts, 4, mask, 0, 3, 3000, 0))])
+    expected = np.array([[4095 / 4, 0, 4095, 0], [3, 1, 2, 1]]) * STEP_V
+    np.testing.assert_allclose(samples.volts, expected)
+    assert samples.missing.tolist() == [3, 0]
+    assert np.diff(samples.times_s) == pytest.approx([0.5e-3], rel=1e-3)

@@ -187,3 +187,23 @@ def test_assemble_raises_for_repeatedly_impossible_times(before_us: int, after: 
     with pytest.raises(RigFault, match=match) as caught:
         read(after, assembler)
     assert caught.value.cause == "data"
+
+
+def test_assemble_gives_volts_of_the_inputs_asked_for_in_their_order() -> None:
+    """The highest count of 10 bits, 1023, is the reference."""
+    assembler = LineAssembler(LineHeader(1000, 10, 5.0, 3), (2, 0, 2))
+    samples = assembler.assemble([(1.0, [LineSample(1000, (0, 1, 1023)), LineSample(2000, (341, 5, 682))])])
+    np.testing.assert_allclose(samples.volts, [[5, 0, 5], [10 / 3, 5 / 3, 10 / 3]])
+
+
+def test_assemble_follows_a_resonator_that_is_off_by_3_in_a_thousand() -> None:
+    """Blocks of a tenth of a second over half a minute; they come up to 2 ms late."""
+    rng, assembler = np.random.default_rng(1), LineAssembler(LineHeader(100, 10, 5.0, 1), (0,))
+    last_s, samples = 0.0, assembler.assemble([])
+    for block in range(300):
+        times_us = 10_000 * (10 * block + np.arange(10))
+        last_s = 50 + float(times_us[-1]) * 1e-6 * 1.003
+        lines = [LineSample(int(time_us), (1,)) for time_us in times_us]
+        samples = assembler.assemble([(last_s + rng.uniform(0, 2e-3), lines)])
+    assert samples.times_s[-1] == pytest.approx(last_s, abs=1e-3)
+    assert np.diff(samples.times_s) == pytest.approx(0.01003, rel=1e-2)
