@@ -38,6 +38,7 @@ def test_mesh_in_report_is_the_mould(made: Path, page: Path) -> None:
     assert len(vertices) < len(mould.vertices) / 4
 
 
+@pytest.mark.slow
 def test_large_mesh_uses_wide_indices(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(report, "MAX_BYTES", 10**8)
     sphere = trimesh.creation.uv_sphere(radius=30, count=[257, 257])

@@ -14,7 +14,8 @@ from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, 
 from .conftest import PLAN
 
 
-@pytest.mark.parametrize("missing", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow  # the quick tests of `identify` find wirings, too
+@pytest.mark.parametrize("missing", [False, True])
 def test_find_wirings_puts_the_true_one_first(printed, responses, missing) -> None:
     if missing:
         volts, valid = responses.volts.copy(), responses.valid.copy()
