@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -123,13 +124,12 @@ class _StageCache:
         stage: str,
         files: Callable[[Result], Iterable[str]],
         compute: Callable[[Callable[[Result], None]], Result],
-        load: Callable[[], Result] | None = None,
+        load: Callable[[], Result],
         **inputs: Any,
     ) -> Result:
         """Return the result of a stage: loaded if an earlier run had the same settings and inputs, else computed.
 
-        `compute` may note a result with its files, as soon as they are written; one without files is not noted. Without
-        `load` the first of the files is the result.
+        `compute` may note a result with its files, as soon as they are written; one without files is not noted.
         """
         from padforge.design.settings import Contact
 
@@ -147,7 +147,7 @@ class _StageCache:
             is_finished = entry.get("cache_key") == key and dict(entry["files"]) == self._digests(entry["files"])
         if is_finished:
             self.reused.append(stage)
-            return load() if load else json.loads((run.out / next(iter(entry["files"]))).read_bytes())
+            return load()
 
         def note(result: Result) -> None:
             if digests := self._digests(files(result)):
@@ -251,6 +251,9 @@ def run_stages(
         with training_progress() as report:
             return calibrate_into(recording, out, options, time_budget=budget, on_progress=report, force=True)
 
+    def read_document(name: str) -> dict[str, Any]:
+        return json.loads((out / name).read_bytes())
+
     design = cache.get(
         "design",
         lambda result: [] if result.stopped == "interrupted" else ["design.json", PAD],
@@ -268,6 +271,7 @@ def run_stages(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
         lambda note: build(pad, out, run.formats, settings, source).to_dict(),
+        partial(read_document, "fabrication.json"),
         pad=digest,
         formats=sorted(run.formats),
     )
@@ -286,10 +290,15 @@ def run_stages(
         "contacts",
         lambda document: ["contacts.json"],
         lambda note: compare_contacts(spec, pad, out, run.seed),
+        partial(read_document, "contacts.json"),
         pad=digest,
     )
     calibration = cache.get(
-        "calibration", lambda document: ["calibration.json", *FILES], calibrate, recording=recording.digest
+        "calibration",
+        lambda document: ["calibration.json", *FILES],
+        calibrate,
+        partial(read_document, "calibration.json"),
+        recording=recording.digest,
     )
     on_result("\n".join(f"  {line}" for line in calibration_lines(calibration)))
     on_result(contact_line(contacts))

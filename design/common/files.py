@@ -57,7 +57,7 @@ def reraise_as_input_error(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"{path}: not as padforge writes it ({error!r})") from error
+        raise InputError(f"{path}: not as padforge writes it ({short_repr(error)})") from error
 
 
 @contextmanager

@@ -95,6 +95,15 @@ def test_resume_reuses_finished_run(folder: Path) -> None:
     assert digests(folder) == before
 
 
+def test_resume_reuses_files_in_whatever_order_they_are_noted(folder: Path) -> None:
+    note = folder / "out" / "pad" / "run.json"
+    document = json.loads(note.read_text())
+    for stage in document["stages"].values():
+        stage["files"] = dict(reversed(stage["files"].items()))
+    note.write_text(json.dumps(document))
+    assert resumed(folder) == ALL
+
+
 def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing of an earlier run counts as finished once it has begun."""
     monkeypatch.setattr("padforge.design.design_run.run_design", breaks)
