@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -634,7 +634,11 @@ class PadSettings(Settings):
 def _layout(fields: Mapping[str, Any]) -> Layout:
     """Return the layout of the fields of `[pad]`."""
     horizontals, verticals = (fields["grid"] if fields[x] is None else fields[x] for x in ("horizontals", "verticals"))
-    return Layout.create((horizontals, verticals), fields["pitch_mm"])
+    return _create_layout((horizontals, verticals), fields["pitch_mm"])
+
+
+_create_layout = lru_cache(Layout.create)
+"""A search asks for the layout of its pad many times a step."""
 
 
 def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:

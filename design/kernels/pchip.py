@@ -1,10 +1,12 @@
-"""PCHIP curves: slopes and samples, in grid units."""
+"""PCHIP curves: slopes, samples and lengths, in grid units, and their gradients by knots."""
 
 import math
 from typing import Any
 
 import numpy as np
 from numba import njit
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 @njit(cache=True, error_model="numpy")
@@ -62,6 +64,87 @@ def pchip_slopes(t: Any, v: Any, d: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream: float, out: Any) -> None:
+    """Add the derivatives of `_end_slope` by its arguments, times `upstream`, to out (4,)."""
+    d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
+    if d * m0 <= 0:
+        return
+    if m0 * m1 <= 0 and abs(d) > 3 * abs(m0):
+        out[2] += 3 * upstream
+        return
+    share = upstream / (h0 + h1)
+    out[0] += share * (2 * m0 - m1 - d)
+    out[1] += share * (m0 - d)
+    out[2] += share * (2 * h0 + h1)
+    out[3] -= share * h0
+
+
+@njit(cache=True, error_model="numpy")
+def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: Any) -> None:
+    """Add the gradient of sum(upstream * d) of `pchip_slopes`, by t and by v."""
+    n = len(t)
+    by_h, by_m, change = np.zeros(n - 1), np.zeros(n - 1), np.empty(4)
+    if n == 2:
+        by_m[0] = upstream[0] + upstream[1]
+    else:
+        for k in range(1, n - 1):
+            if d[k] == 0:
+                continue
+            h0, h1 = t[k] - t[k - 1], t[k + 1] - t[k]
+            m0, m1 = (v[k] - v[k - 1]) / h0, (v[k + 1] - v[k]) / h1
+            w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+            share = upstream[k] * d[k] / (w0 + w1)
+            by_m[k - 1] += share * d[k] * w0 / m0**2
+            by_m[k] += share * d[k] * w1 / m1**2
+            by_w0, by_w1 = share * (1 - d[k] / m0), share * (1 - d[k] / m1)
+            by_h[k - 1] += by_w0 + 2 * by_w1
+            by_h[k] += by_w1 + 2 * by_w0
+        for end, beside in ((0, 1), (n - 2, n - 3)):
+            h0, h1 = t[end + 1] - t[end], t[beside + 1] - t[beside]
+            m0, m1 = (v[end + 1] - v[end]) / h0, (v[beside + 1] - v[beside]) / h1
+            change[:] = 0
+            _add_end_slope_gradient(h0, h1, m0, m1, upstream[0 if end == 0 else n - 1], change)
+            by_h[end] += change[0]
+            by_h[beside] += change[1]
+            by_m[end] += change[2]
+            by_m[beside] += change[3]
+    for k in range(n - 1):
+        h = t[k + 1] - t[k]
+        rise = by_m[k] / h
+        run = by_h[k] - rise * (v[k + 1] - v[k]) / h
+        by_v[k] -= rise
+        by_v[k + 1] += rise
+        by_t[k] -= run
+        by_t[k + 1] += run
+
+
+@njit(cache=True, error_model="numpy")
+def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]:
+    """Return value and slope of the curve through (t, v) with slopes d at 0 <= s <= 1 of span j."""
+    h, r = t[j + 1] - t[j], 1 - s
+    m = (v[j + 1] - v[j]) / h
+    value = v[j] + h * s * (m * s * (3 - 2 * s) + r * (d[j] * r - d[j + 1] * s))
+    return value, 6 * m * s * r + d[j] * r * (1 - 3 * s) - d[j + 1] * s * (2 - 3 * s)
+
+
+@njit(cache=True, error_model="numpy")
+def add_value_gradient(
+    t: Any, v: Any, d: Any, j: int, s: float, by_value: float, by_slope: float, by_t: Any, by_v: Any, by_d: Any
+) -> None:
+    """Add the gradient of by_value * value + by_slope * slope of `pchip_value`, for s held, by t, by v and by d."""
+    h, r = t[j + 1] - t[j], 1 - s
+    m = (v[j + 1] - v[j]) / h
+    rise = by_value * s * s * (3 - 2 * s) + by_slope * 6 * s * r / h
+    by_v[j] += by_value - rise
+    by_v[j + 1] += rise
+    by_d[j] += by_value * h * s * r * r + by_slope * r * (1 - 3 * s)
+    by_d[j + 1] -= by_value * h * s * s * r + by_slope * s * (2 - 3 * s)
+    run = by_value * s * r * (d[j] * r - d[j + 1] * s) - by_slope * 6 * m * s * r / h
+    by_t[j] -= run
+    by_t[j + 1] += run
+
+
+@njit(cache=True, error_model="numpy")
 def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
     """Sample the PCHIP interpolant of (t, v) at 0, step, 2 step, ... into `out`; the last sample is the last knot."""
     d = np.empty(len(t))
@@ -87,3 +170,73 @@ def population_slopes(along: Any, across: Any) -> Any:
         for f in range(along.shape[1]):
             pchip_slopes(along[p, f], across[p, f], out[p, f])
     return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sample_spans(along: Any, across: Any, slope: Any, shares: Any, points: Any, slopes: Any) -> None:
+    """Sample fibres (F, n) at the `shares` (K,) of every span, and at the last knot.
+
+    Written are `points` (F, P, 2), along and across, and `slopes` (F, P), with P = K (n - 1) + 1.
+    """
+    count, n = len(shares), along.shape[1]
+    for f in range(len(along)):
+        t, v, d = along[f], across[f], slope[f]
+        for j in range(n - 1):
+            for k in range(count):
+                i = j * count + k
+                points[f, i, 0] = t[j] + (t[j + 1] - t[j]) * shares[k]
+                points[f, i, 1], slopes[f, i] = pchip_value(t, v, d, j, shares[k])
+        points[f, -1, 0], points[f, -1, 1], slopes[f, -1] = t[n - 1], v[n - 1], d[n - 1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_samples_gradient(
+    along: Any, across: Any, slope: Any, shares: Any, by_points: Any, by_slopes: Any, by_along: Any, by_across: Any,
+    by_slope: Any,
+) -> None:
+    """Add the gradient of sum(by_points * points) + sum(by_slopes * slopes) of `sample_spans` (F, n), by knots, slopes."""
+    count, n = len(shares), along.shape[1]
+    for f in range(len(along)):
+        t, v, d, by_t, by_v, by_d = along[f], across[f], slope[f], by_along[f], by_across[f], by_slope[f]
+        for j in range(n - 1):
+            for k in range(count):
+                i = j * count + k
+                by_t[j] += by_points[f, i, 0] * (1 - shares[k])
+                by_t[j + 1] += by_points[f, i, 0] * shares[k]
+                add_value_gradient(t, v, d, j, shares[k], by_points[f, i, 1], by_slopes[f, i], by_t, by_v, by_d)
+        by_t[n - 1] += by_points[f, -1, 0]
+        by_v[n - 1] += by_points[f, -1, 1]
+        by_d[n - 1] += by_slopes[f, -1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) -> Any:
+    """Compute the gradient (2, F, n) of sum(upstream * slope), by along and by across, of the slopes of a pad (F, n)."""
+    out = np.zeros((2, *along.shape))
+    for f in range(len(along)):
+        add_slopes_gradient(along[f], across[f], slope[f], upstream[f], out[0, f], out[1, f])
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
+    """Compute the arc lengths (F,) of fibres (F, n), to 1e-3 where they are steep, and their gradient into out (3, F, n).
+
+    It is by along, across and slope, each fibre's by its own.
+    """
+    lengths = np.zeros(len(along))
+    out[:] = 0
+    for f in range(len(along)):
+        t, v, d = along[f], across[f], slope[f]
+        for j in range(along.shape[1] - 1):
+            h = t[j + 1] - t[j]
+            for k in range(len(_NODES)):
+                s, weight = 0.5 * _NODES[k] + 0.5, 0.5 * _WEIGHTS[k]
+                rate = pchip_value(t, v, d, j, s)[1]
+                speed = math.sqrt(1 + rate * rate)
+                lengths[f] += weight * h * speed
+                out[0, f, j] -= weight * speed
+                out[0, f, j + 1] += weight * speed
+                by_rate = weight * h * rate / speed
+                add_value_gradient(t, v, d, j, s, 0.0, by_rate, out[0, f], out[1, f], out[2, f])
+    return lengths

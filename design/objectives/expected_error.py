@@ -29,6 +29,7 @@ from torch import Tensor
 
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import grid_positions, relative_stretch
+from padforge.design.kernels.error_bound import error_bound
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares
 from padforge.design.paths.keep_outs import is_outside
@@ -225,8 +226,7 @@ def expected_error(
     """
     positions, masks = (x.to(responses.dtype) for x in (positions, masks))
     count = len(free)
-    # squares of slopes over a faint noise overflow in single precision, and one direction would hide the other
-    bound = _bound(responses[:, :count].double(), step.double(), free, masks.double(), scatter).to(responses.dtype)
+    bound = _Bound.apply(responses[:, :count], step, free, masks, scatter)
     rows = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(positions))])
     middle = positions[:count].mean(dim=0)
     weighted = (responses * weights[:, None].to(responses))[:, rows] / WIDTH
@@ -246,33 +246,31 @@ def aggregate_failures(errors: Tensor, masks: Tensor, shares: tuple[float, ...])
     return (logs @ weights / weights.sum()).exp()
 
 
-def _corners(values: Tensor) -> Tensor:
-    """Return values (Q, ...) of a grid at the corners (4, P, ...) of its cells, row by row from below."""
-    side = math.isqrt(len(values))
-    grid = values.reshape(side, side, *values.shape[1:])
-    return torch.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]]).flatten(1, 2)
+class _Bound(torch.autograd.Function):
+    """B with its gradient."""
 
+    @staticmethod
+    def forward(ctx: Any, responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
+        """Return B (L,) for responses (F, Q) on a grid, over its free cells."""
+        # squares of slopes over a faint noise overflow in single precision, and one direction would hide the other
+        values, steps, working = (x.detach().cpu().double().numpy() for x in (responses, step, masks))
+        side = math.isqrt(len(free))
+        grid = free.cpu().numpy().reshape(side, side)
+        row, column = np.nonzero(grid[:-1, :-1] & grid[:-1, 1:] & grid[1:, :-1] & grid[1:, 1:])
+        gradient = np.zeros((len(working), len(values) if responses.requires_grad else 0, len(free)))
+        bound = np.zeros(len(working))  # no more than slits between keep-outs
+        if len(row):
+            prior = 12 / (steps * side) ** 2
+            where = np.ascontiguousarray(values), steps, row * side + column, working
+            bound = error_bound(*where, (scatter.floor, scatter.share, scatter.common), prior, gradient)
+        ctx.gradient = torch.from_numpy(gradient)
+        return torch.from_numpy(bound).to(responses)
 
-def _bound(responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
-    """Return B (L,) for responses (F, Q) on a grid, over its free cells."""
-    cells = _corners(free).all(dim=0)
-    if not cells.any():  # no more than slits between keep-outs
-        return masks.new_zeros(len(masks))
-    middle = _corners(responses.T).mean(dim=0)[cells]
-    deviation = (scatter.floor**2 + scatter.share**2 * (1 - scatter.common) * middle**2).sqrt()
-    a, b, c, d = _corners(responses.T)
-    slopes = torch.stack([(b + d - a - c) / (2 * step[0]), (c + d - a - b) / (2 * step[1])], dim=-1)
-    jacobian = slopes[cells] / deviation[..., None]
-    gain = math.sqrt(scatter.common) * scatter.share * middle / deviation
-    information = torch.einsum("lk,qki,qkj->lqij", masks, jacobian, jacobian)
-    shared = torch.einsum("lk,qk,qki->lqi", masks, gain, jacobian)
-    total = 1 + torch.einsum("lk,qk->lq", masks, gain**2)
-    # Sherman and Morrison: (1 + u u')^-1 = 1 - u u' / (1 + u'u)
-    xx, yy, xy = (information[..., i, j] - shared[..., i] * shared[..., j] / total for i, j in ((0, 0), (1, 1), (0, 1)))
-    prior_x, prior_y = 12 / (step * math.isqrt(len(free))) ** 2
-    # under faint noise the first difference cancels where one direction alone is observed; the prior must not with it
-    volume = (xx * yy - xy**2).clamp(min=0) + prior_x * yy + prior_y * xx + prior_x * prior_y
-    return ((xx + yy + prior_x + prior_y) / volume).sqrt().mean(dim=1)
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the gradient by the responses."""
+        by_responses = torch.einsum("l,lkq->kq", upstream[0].cpu().double(), ctx.gradient)
+        return by_responses.to(upstream[0]), None, None, None, None
 
 
 class _LeaveOneOut(torch.autograd.Function):

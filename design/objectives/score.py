@@ -112,8 +112,8 @@ def _ambiguities(scored: ScoredPad) -> list[float]:
 
 
 def _penalties(scored: ScoredPad) -> dict[object, float]:
-    along, across = (torch.tensor(axis[0]) for axis in fibre_axes(scored.pad)[:2])
-    return {rule: value.item() for rule, value in penalties(along, across, scored.size, scored.rules).items()}
+    along, across = (axis[0] for axis in fibre_axes(scored.pad)[:2])
+    return {**penalties(along, across, scored.size, scored.rules).values}
 
 
 def _joint_entropy(scored: ScoredPad) -> float:

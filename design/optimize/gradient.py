@@ -276,8 +276,7 @@ class GradientSearch:
         self._optimiser.step()
 
     def _penalty(self, along: Tensor, across: Tensor, margin: float) -> Tensor:
-        values = penalties(along, across, self.problem.pad, self.problem.rules, margin)
-        return torch.stack(list(values.values())).sum()
+        return _Penalty.apply(along, across, self.problem.pad, self.problem.rules, margin)  # pyright: ignore[reportReturnType]
 
     def _adam(self) -> torch.optim.Adam:
         return torch.optim.Adam([self.fibres.spans, self.fibres.across], lr=LEARNING_RATE)
@@ -322,3 +321,18 @@ class GradientSearch:
                     searched = SearchedPad(on_device, along, across, length, pad)
                     total = total + weight * term.loss(searched).to(search.device)
         return total.cpu() / len(self.problem.contacts)
+
+
+class _Penalty(torch.autograd.Function):
+    """The sum of all `penalties` as a torch function of the knots."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        along, across, pad, rules, margin = inputs
+        values, *gradient = penalties(along.detach().numpy(), across.detach().numpy(), pad, rules, margin)
+        ctx.gradient = [torch.from_numpy(by) for by in gradient]
+        return torch.tensor(sum(values.values()), dtype=along.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return *(upstream[0] * by for by in ctx.gradient), None, None, None

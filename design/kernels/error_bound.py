@@ -1,0 +1,86 @@
+"""Cramer-Rao bound of the localisation error on the cells of a grid of presses, with its gradient by the responses.
+
+Of a cell between four presses, J = dx / dp are the slopes of the responses, and S = diag(deviation^2) + u u' their
+covariance, with deviation^2 = floor^2 + (1 - common) (share x)^2 and u = sqrt(common) share x. The bound is
+sqrt(trace F^-1) with F = J' S^-1 J + prior, S^-1 by Sherman and Morrison's formula.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any, prior: Any, gradient: Any) -> Any:
+    """Compute the mean bound (L,) over cells for sets of working fibres, and its gradient into `gradient` (L, F, Q).
+
+    Args:
+        responses: of F fibres to the Q presses of a square grid, row by row; shape (F, Q).
+        step: between neighbours of the grid; shape (2,).
+        cells: index of the first, lower left, press of each cell that counts, one or more; shape (C,).
+        masks: 1 for a fibre that works, 0 for a failed one; shape (L, F).
+        scatter: floor, share and common.
+        prior: information before the press; shape (2,).
+        gradient: overwritten; may be of no fibres (L, 0, Q), then it is not computed.
+    """
+    floor, share, common = scatter
+    fibres, side = len(responses), int(math.sqrt(responses.shape[1]) + 0.5)
+    own, shared = share * share * (1 - common), math.sqrt(common) * share
+    out = np.zeros(len(masks))
+    gradient[:] = 0
+    is_asked = gradient.shape[1] > 0
+    middle, deviation, x, y, u = np.empty((5, fibres))
+    for first in cells:
+        # 1. what all sets have in common: slopes in deviations, and the shared part
+        for f in range(fibres):
+            a, b = responses[f, first], responses[f, first + 1]
+            c, d = responses[f, first + side], responses[f, first + side + 1]
+            middle[f] = (a + b + c + d) / 4
+            deviation[f] = math.sqrt(floor * floor + own * middle[f] * middle[f])
+            x[f] = (b + d - a - c) / (2 * step[0]) / deviation[f]
+            y[f] = (c + d - a - b) / (2 * step[1]) / deviation[f]
+            u[f] = shared * middle[f] / deviation[f]
+        for k in range(len(masks)):
+            xx = yy = xy = ux = uy = 0.0
+            total = 1.0
+            for f in range(fibres):
+                if masks[k, f] > 0:
+                    xx += x[f] * x[f]
+                    yy += y[f] * y[f]
+                    xy += x[f] * y[f]
+                    ux += u[f] * x[f]
+                    uy += u[f] * y[f]
+                    total += u[f] * u[f]
+            xx, yy, xy = xx - ux * ux / total, yy - uy * uy / total, xy - ux * uy / total
+            # 2. under faint noise the product cancels where one direction alone is observed; the prior must not with it
+            product = xx * yy - xy * xy
+            volume = max(product, 0.0) + prior[0] * yy + prior[1] * xx + prior[0] * prior[1]
+            trace = xx + yy + prior[0] + prior[1]
+            bound = math.sqrt(trace / volume)
+            out[k] += bound / len(cells)
+            if not is_asked:
+                continue
+            # 3. backwards, in the same order
+            by_trace, by_volume = bound / (2 * trace * len(cells)), -bound / (2 * volume * len(cells))
+            whole = 1.0 if product > 0 else 0.0
+            by_xx = by_trace + by_volume * (whole * yy + prior[1])
+            by_yy = by_trace + by_volume * (whole * xx + prior[0])
+            by_xy = -2 * by_volume * whole * xy
+            by_ux = -(2 * by_xx * ux + by_xy * uy) / total
+            by_uy = -(2 * by_yy * uy + by_xy * ux) / total
+            by_total = (by_xx * ux * ux + by_yy * uy * uy + by_xy * ux * uy) / (total * total)
+            for f in range(fibres):
+                if masks[k, f] > 0:
+                    by_x = 2 * by_xx * x[f] + by_xy * y[f] + by_ux * u[f]
+                    by_y = 2 * by_yy * y[f] + by_xy * x[f] + by_uy * u[f]
+                    by_u = by_ux * x[f] + by_uy * y[f] + 2 * by_total * u[f]
+                    by_deviation = -(by_x * x[f] + by_y * y[f] + by_u * u[f]) / deviation[f]
+                    by_middle = (by_u * shared + by_deviation * own * middle[f]) / deviation[f] / 4
+                    along, across = by_x / (2 * step[0] * deviation[f]), by_y / (2 * step[1] * deviation[f])
+                    gradient[k, f, first] += by_middle - along - across
+                    gradient[k, f, first + 1] += by_middle + along - across
+                    gradient[k, f, first + side] += by_middle - along + across
+                    gradient[k, f, first + side + 1] += by_middle + along + across
+    return out
