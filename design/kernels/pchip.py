@@ -191,10 +191,17 @@ def sample_spans(along: Any, across: Any, slope: Any, shares: Any, points: Any, 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_samples_gradient(
-    along: Any, across: Any, slope: Any, shares: Any, by_points: Any, by_slopes: Any, by_along: Any, by_across: Any,
+    along: Any,
+    across: Any,
+    slope: Any,
+    shares: Any,
+    by_points: Any,
+    by_slopes: Any,
+    by_along: Any,
+    by_across: Any,
     by_slope: Any,
 ) -> None:
-    """Add the gradient of sum(by_points * points) + sum(by_slopes * slopes) of `sample_spans` (F, n), by knots, slopes."""
+    """Add the gradient of sum(by_points * points) + sum(by_slopes * slopes) of `sample_spans`, by knots and slopes."""
     count, n = len(shares), along.shape[1]
     for f in range(len(along)):
         t, v, d, by_t, by_v, by_d = along[f], across[f], slope[f], by_along[f], by_across[f], by_slope[f]
@@ -211,7 +218,7 @@ def add_samples_gradient(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) -> Any:
-    """Compute the gradient (2, F, n) of sum(upstream * slope), by along and by across, of the slopes of a pad (F, n)."""
+    """Compute the gradient (2, F, n) of sum(upstream * slope) by along and by across, of the slopes of a pad."""
     out = np.zeros((2, *along.shape))
     for f in range(len(along)):
         add_slopes_gradient(along[f], across[f], slope[f], upstream[f], out[0, f], out[1, f])
@@ -220,9 +227,9 @@ def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) ->
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
-    """Compute the arc lengths (F,) of fibres (F, n), to 1e-3 where they are steep, and their gradient into out (3, F, n).
+    """Compute the arc lengths (F,) of fibres, to 1e-3 where they are steep, and their gradients into out (3, F, n).
 
-    It is by along, across and slope, each fibre's by its own.
+    These are by along, across and slope, of each fibre by its own.
     """
     lengths = np.zeros(len(along))
     out[:] = 0

@@ -1,7 +1,7 @@
 """Sums over samples of fibres by which the rules are penalised, with their gradients; grid units.
 
-Samples of F fibres are `points` (F, P, 2), along and across their axes, or `plan` (F, P, 2), along x and y; `arc` (F, P)
-are arc lengths, and `shares` (F, P) the arc length that each stands for. A sum is multiplied by `weight`, as is the
+Samples of F fibres are `points` (F, P, 2), along and across their axes, or `plan` (F, P, 2), along x and y. `arc` are
+arc lengths (F, P), and `shares` the arc length (F, P) that each stands for. A sum is multiplied by `weight`, as is the
 gradient, which is added to arrays `by_...` of the shape of what it is by.
 """
 
@@ -34,8 +34,8 @@ def sum_excess_turns(
 ) -> float:
     """Integrate the excess of the turn within `window` of arc length over window / radius, relative to that, (F, P).
 
-    Fibres go on straight from both ends, by their leads, which they may meet at a corner. They turn by `rolled` more, at
-    right angles, except where a window begins on a lead.
+    Fibres go on straight from both ends, by their leads, which they may meet at a corner. They turn by `rolled` more,
+    at right angles, except where a window begins on a lead.
     """
     fibres, n = arc.shape
     size, total = n + 4, 0.0
@@ -136,8 +136,16 @@ def sum_closeness(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sum_order(
-    along: Any, across: Any, slope: Any, lower: Any, stations: int, gap: float, weight: float, by_along: Any,
-    by_across: Any, by_slope: Any,
+    along: Any,
+    across: Any,
+    slope: Any,
+    lower: Any,
+    stations: int,
+    gap: float,
+    weight: float,
+    by_along: Any,
+    by_across: Any,
+    by_slope: Any,
 ) -> float:
     """Sum what it costs that fibres lie less than `gap` above the next `lower` ones (K,), at evenly spaced stations."""
     total, n = 0.0, along.shape[1]
@@ -177,8 +185,8 @@ def sum_crossings(
     """Count the crossings of pairs (K, 2) of fibres softly, and sum how much flatter they are than `limit`, relative.
 
     By the Kac-Rice formula the number of crossings of lines p and q is the sum of |dp x dq| delta(p - q), here with a
-    Gaussian of standard deviation `blur` for delta, so that it has a gradient: of both sums, by their `weights`, which do
-    not multiply these. `axes` (F,) are those that fibres run along, 0 for x.
+    Gaussian of standard deviation `blur` for delta, so that it has a gradient: of both sums, by their `weights`, which
+    do not multiply these. `axes` (F,) are those that fibres run along, 0 for x.
     """
     n, count, flatness, norm = plan.shape[1], 0.0, 0.0, 2 * math.pi * blur**2
     reach = REACH * blur

@@ -57,7 +57,11 @@ class Gradient:
     """The gradient of all penalties by what they are computed from, which each adds to."""
 
     def __init__(self, samples: Array, knots: Array) -> None:
-        self.points, self.slope, self.arc = np.zeros((*samples.shape, 2)), np.zeros_like(samples), np.zeros_like(samples)
+        self.points, self.slope, self.arc = (
+            np.zeros((*samples.shape, 2)),
+            np.zeros_like(samples),
+            np.zeros_like(samples),
+        )
         self.along, self.across, self.knot_slope = np.zeros((3, *knots.shape))
 
 
@@ -110,9 +114,7 @@ class FibreSamples:
         return np.concatenate([of_points[:split], of_points[split:, :, ::-1]])
 
 
-def penalties(
-    along: Array, across: Array, pad: PadSettings, rules: RulesSettings, margin: float = 1.0
-) -> Penalties:
+def penalties(along: Array, across: Array, pad: PadSettings, rules: RulesSettings, margin: float = 1.0) -> Penalties:
     """Compute the penalty of each rule that can be broken, and the gradient of their sum by the knots.
 
     The knots are (F, N + 2) coordinates along and across the fibres, grid units; `margin` is a factor on the limits.

@@ -11,7 +11,7 @@ from padforge.design.objectives.penalties import COMMON_WEIGHT, penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths, refine
 from padforge.design.settings import PadSettings, RulesSettings
-from padforge.design.torch_signals import span_samples
+from padforge.design.torch_signals import pchip_slopes
 from tests.design.objectives.pads import bent, only, swung
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -19,12 +19,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def axes(pad):
     travel, cross = fibre_axes(pad)[:2]
-    return torch.tensor(travel[0], requires_grad=True), torch.tensor(cross[0], requires_grad=True)
+    return travel[0], cross[0]
 
 
 def found(pad, rules, margin=1.0):
-    terms = penalties(*axes(pad), PadSettings(grid=pad.grid), rules, margin)
-    return {rule: value.item() for rule, value in terms.items()}
+    return penalties(*axes(pad), PadSettings(grid=pad.grid), rules, margin).values
 
 
 def slanting(shift):
@@ -74,26 +73,73 @@ def test_max_crossings_penalty_never_asks_for_fewer_than_the_families_have():
 @pytest.mark.parametrize(
     ("pad", "rules", "tolerance"),
     [
-        (Morphology.random(2, 3, seed=5), RulesSettings(min_bend_radius_mm=4, min_gap_mm=9), 0.02),
-        (Morphology.random(2, 3, seed=5), only(max_crossings=4, min_crossing_angle_deg=60), 0.02),
-        # the middle of a stretch in common moves as well, which the gradient leaves out
+        (Morphology.random(2, 3, seed=5), only(same_family_crossings=0, max_length_mm=50), 1e-5),
+        (Morphology.random(2, 3, seed=5), only(max_crossings=4, min_crossing_angle_deg=60), 1e-5),
+        (Morphology.random(3, 3, seed=2), only(same_family_crossings=1), 1e-5),
+        # the tangent at the nearest sample turns as well, which the gradient leaves out
+        (Morphology.random(2, 3, seed=5), only(min_gap_mm=9), 0.03),
+        # and the middle of a stretch in common moves
         (slanting(2.0), only(max_common_track_mm=1.6), 0.1),
     ],
 )
 def test_penalty_gradients_match_finite_differences(pad, rules, tolerance):
     """Along random directions, since a search follows it; kinks (a nearest sample that changes) are rare."""
-    travel, cross = axes(pad)
+    size, (along, across) = PadSettings(grid=pad.grid), axes(pad)
+    values, _, gradient = penalties(along, across, size, rules)
+    assert sum(values.values()) > 0
+    for seed in range(3):
+        step = 1e-7 * np.random.default_rng(seed).standard_normal(across.shape)
+        step[:, [0, -1]] = 0
+        ahead, behind = (sum(penalties(along, across + side, size, rules).values.values()) for side in (step, -step))
+        allowed = tolerance * np.abs(gradient * step).sum()
+        assert (ahead - behind) / 2 == pytest.approx((gradient * step).sum(), abs=allowed)
 
-    def total(cross):
-        return torch.stack(list(penalties(travel, cross, PadSettings(grid=pad.grid), rules).values())).sum()
 
-    total(cross).backward()
-    step = 1e-6 * torch.tensor(np.random.default_rng(4).standard_normal(cross.shape))
-    step[:, [0, -1]] = 0
-    with torch.no_grad():
-        ahead, behind = total(cross + step), total(cross - step)
-    assert cross.grad is not None
-    assert (ahead - behind).item() / 2 == pytest.approx((cross.grad * step).sum().item(), rel=tolerance)
+def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm):
+    """Both integrals with what they integrate over held, as torch differentiates them; (F, n) knots of PCHIP curves."""
+    shares = (1 - torch.cos(torch.arange(12, dtype=torch.float64) * np.pi / 12)) / 2
+    slope = pchip_slopes(along, across)
+    h, rise = along.diff(dim=1)[..., None], across.diff(dim=1)[..., None]
+    d0, d1, v0 = slope[:, :-1, None], slope[:, 1:, None], across[:, :-1, None]
+    c2, c3 = 3 * rise / h - 2 * d0 - d1, d0 + d1 - 2 * rise / h
+    columns = (
+        along[:, :-1, None] + h * shares,
+        v0 + h * shares * (d0 + shares * (c2 + shares * c3)),
+        d0 + shares * (2 * c2 + 3 * shares * c3),
+    )
+    t, v, rate = (
+        torch.cat([x.flatten(1), last[:, -1:]], dim=1) for x, last in zip(columns, (along, across, slope), strict=True)
+    )
+    pad = torch.nn.functional.pad
+    arc = pad(torch.hypot(t.diff(dim=1), v.diff(dim=1)).cumsum(dim=1), (1, 0))
+    halves = lambda at: pad(at.detach().diff(dim=1) / 2, (1, 0)) + pad(at.detach().diff(dim=1) / 2, (0, 1))  # noqa: E731
+    radius, window, run = (x / unit_mm for x in (rules.min_bend_radius_mm, rules.min_bend_radius_mm / 2, 1.0))
+    run = t[:, -1].mean().detach()
+    beyond = torch.cat([0 * arc[:, :1] - window, 0 * arc[:, :1], arc, arc[:, -1:], arc[:, -1:] + window], dim=1)
+    turned = pad(pad(rate.atan(), (2, 2)).diff(dim=1).abs().cumsum(dim=1), (1, 0))
+    after = torch.searchsorted(beyond.detach(), (beyond + window).detach()).clamp(1, beyond.shape[1] - 1)
+    a0, a1, t0, t1 = (x.gather(1, i) for x in (beyond, turned) for i in (after - 1, after))
+    angle = t0 + ((beyond + window - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
+    around = pad(torch.full_like(arc, rules.min_bend_radius_mm / 2 / bent_radius_mm), (2, 2))
+    excess = torch.relu(torch.sqrt(angle**2 + around**2 + 1e-30) * radius / window - 1)
+    in_zone = (t < rules.border_mm / unit_mm) | (t > t[:, -1:] - rules.border_mm / unit_mm)
+    border = torch.relu(rate.abs() - 1) * in_zone * halves(arc)
+    return (excess * halves(beyond)).sum(dim=1).mean() / run, border.sum(dim=1).mean() / run
+
+
+@pytest.mark.parametrize("bent_radius_mm", [1e6, 30.0])
+def test_gradients_of_turns_and_border_slopes_are_those_of_torch(bent_radius_mm):
+    """With the arc lengths that samples stand for held: their changes are left out of the gradient."""
+    pad, rules = Morphology.random(2, 4, seed=5), only(min_bend_radius_mm=9.0, border_mm=12.0)
+    along, across = (torch.tensor(axis, requires_grad=True) for axis in axes(pad))
+    expected = turns_and_border_slopes(along, across, rules, bent_radius_mm, pad.unit_mm)
+    torch.stack(expected).sum().backward()
+    values, *gradient = penalties(*axes(pad), PadSettings(grid=2, bent_radius_mm=bent_radius_mm), rules)
+    assert values["min_bend_radius_mm"] == pytest.approx(expected[0].item(), rel=1e-9)
+    assert values["border_mm"] == pytest.approx(expected[1].item(), rel=1e-9)
+    assert along.grad is not None
+    assert across.grad is not None
+    np.testing.assert_allclose(gradient, torch.stack([along.grad, across.grad]).numpy(), atol=1e-9)
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.25])
@@ -155,7 +201,7 @@ def test_min_bend_radius_penalty_integrates_the_excess_turn(margin, bent_radius_
         expected += np.trapezoid(np.maximum(over, 0), arc) / (pad.grid + 1) / 8
     rules, size = only(min_bend_radius_mm=limit_mm), PadSettings(bent_radius_mm=bent_radius_mm)
     assert expected > 0
-    assert penalties(*axes(pad), size, rules, margin)["min_bend_radius_mm"].item() == pytest.approx(expected, rel=0.05)
+    assert penalties(*axes(pad), size, rules, margin).values["min_bend_radius_mm"] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize(("cross", "travel", "fibre"), [(1.9, 0.3, 0), (3.0, 4.6, 5)])
@@ -210,17 +256,19 @@ def test_folds_penalty_matches_dense_distances(margin):
     knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [1.1, 1.9], [1.2, 1.0], [2, 1.0]])
     straight = np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=-1)
     pad, gap = Morphology(np.stack([knots, straight])), margin * 4.0 / 11.25
-    place = span_samples(*axes(pad), 12)[0].detach().numpy()
     curve = PchipInterpolator(knots[:, 0], knots[:, 1])
-    at = np.unique(np.concatenate([np.linspace(0, 2, 20_001), place[0, :, 0]]))
+    shares = (1 - np.cos(np.arange(12) * np.pi / 12)) / 2  # samples are denser towards the ends of spans
+    samples = np.append(knots[:-1, :1] + np.diff(knots[:, :1], axis=0) * shares, 2.0)
+    place = np.column_stack([samples, curve(samples)])
+    at = np.unique(np.concatenate([np.linspace(0, 2, 20_001), samples]))
     line = np.column_stack([at, curve(at)])
     arc = np.append(0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
     expected = 0.0
-    for point in place[0]:
+    for point in place:
         here = arc[np.searchsorted(at, point[0])]
         far = np.abs(arc - here) >= np.pi / 2 * gap
         close = max(1 - np.linalg.norm(line[far] - point, axis=1).min() / gap, 0)
-        expected += (close + 10 * close**2) / place[..., 0].size
+        expected += (close + 10 * close**2) / (2 * len(place))
     rules = only(min_gap_mm=4.0)
     assert found(pad, rules, margin)["folds"] == pytest.approx(expected, rel=0.2)
     assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}

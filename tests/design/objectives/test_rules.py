@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import InputError, Morphology, Spec, crossings
@@ -202,8 +201,8 @@ def test_min_bend_radius_passes_lead_kinks_up_to_half_a_radian(rise, breaks, fam
     angle = np.arctan(slopes(pad)[family, end])
     found = check_rules(pad, rules)
     assert (abs(angle) > 0.5) == breaks
-    along, across = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
-    assert (penalties(along, across, PadSettings(grid=1), rules)["min_bend_radius_mm"] > 0) == breaks
+    along, across = (axis[0] for axis in fibre_axes(pad)[:2])
+    assert (penalties(along, across, PadSettings(grid=1), rules).values["min_bend_radius_mm"] > 0) == breaks
     assert [v.fibres for v in found] == ([(family + 1,)] if breaks else [])
     if breaks:
         assert found[0].measured == pytest.approx(0.5 / abs(angle), rel=0.02)

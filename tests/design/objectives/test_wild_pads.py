@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from padforge.design import Contact, Morphology
 from padforge.design.objectives.penalties import penalties
@@ -62,9 +61,7 @@ def test_penalties_and_gradients_of_wild_pads_are_finite(kind, seed):
     for rules in RULES:
         fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.01)
         assert np.isfinite(fibres.knots()).all()
-        terms = penalties(*fibres.axes(), PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
-        torch.stack(list(terms.values())).sum().backward()
-        assert all(value.isfinite() and value >= 0 for value in terms.values())
-        for variable in (fibres.spans, fibres.across):
-            assert variable.grad is not None
-            assert variable.grad.isfinite().all()
+        axes = [axis.detach().numpy() for axis in fibres.axes()]
+        values, *gradient = penalties(*axes, PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
+        assert all(np.isfinite(value) and value >= 0 for value in values.values())
+        assert np.isfinite(gradient).all()

@@ -13,7 +13,6 @@ from padforge.design.morphology import MARGIN
 from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
-from padforge.design.optimize import gradient
 from padforge.design.optimize.gradient import (
     PENALTY_WEIGHT,
     ZIGZAG_START,
@@ -172,12 +171,12 @@ def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
     """By equal factors from the first weight to the last: the derivative of what is minimised by a penalty."""
     weights = []
 
-    def penalties(along, across, *_):
+    def penalty(_, along, across, margin):
         value = 0 * (along.sum() + across.sum())
         value.register_hook(lambda weight: weights.append(weight.item()))
-        return {"a rule": value}
+        return value
 
-    monkeypatch.setattr(gradient, "penalties", penalties)
+    monkeypatch.setattr(GradientSearch, "_penalty", penalty)
     advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings()), 4)
     assert weights == pytest.approx(np.geomspace(*PENALTY_WEIGHT, 4))
 

@@ -1,16 +1,22 @@
-"""The three forms of a PCHIP curve (compiled, torch, Bezier) against SciPy's."""
+"""The forms of a PCHIP curve (samples, values in spans, Bezier) against SciPy's."""
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, crossings, flatten
+from padforge.design.contact import fibre_axes
+from padforge.design.kernels.pchip import (
+    add_samples_gradient,
+    arc_lengths_gradient,
+    fibre_slopes_gradient,
+    population_slopes,
+    sample_spans,
+)
 from padforge.design.kernels.pchip import pchip_sample as sample_curve
 from padforge.design.paths.curves import beziers, common_stretches, crossing_angles, lengths, slope_beziers, slopes
-from padforge.design.torch_signals import pchip_sample
 from tests.design.wild_pads import SEEDS, longest_signals, wild_pads
 
 pads = st.builds(Morphology.random, st.integers(1, 3), st.integers(0, 10), SEEDS)
@@ -25,10 +31,11 @@ def scipy_curve(pad, fibre):
 @settings(max_examples=15)
 def test_slopes_samples_and_beziers_match_scipy(pad):
     at = np.linspace(0, pad.grid + 1, 200)
-    axes = [0] * pad.grid + [1] * pad.grid
-    t = torch.tensor(np.array([k[:, a] for k, a in zip(pad.knots, axes, strict=True)]))
-    v = torch.tensor(np.array([k[:, 1 - a] for k, a in zip(pad.knots, axes, strict=True)]))
-    smooth, _ = pchip_sample(t, v, torch.tensor(at))
+    shares = np.array([0.0, 0.2, 0.7])
+    along, across = (axis[0] for axis in fibre_axes(pad)[:2])
+    slope = np.empty((len(along), 3 * (along.shape[1] - 1) + 1))
+    points = np.empty((*slope.shape, 2))
+    sample_spans(along, across, slopes(pad), shares, points, slope)
     for fibre in range(2 * pad.grid):
         curve = scipy_curve(pad, fibre)
         expected = curve(at)
@@ -36,7 +43,8 @@ def test_slopes_samples_and_beziers_match_scipy(pad):
         compiled = np.empty(len(at))
         sample_curve(curve.x, curve(curve.x), at[1], compiled)
         np.testing.assert_allclose(compiled, expected, atol=1e-9)
-        np.testing.assert_allclose(smooth[fibre].numpy(), expected, atol=1e-9)
+        np.testing.assert_allclose(points[fibre, :, 1], curve(points[fibre, :, 0]), atol=1e-9)
+        np.testing.assert_allclose(slope[fibre], curve.derivative()(points[fibre, :, 0]), atol=1e-6)
     u = np.linspace(0, 1, 7)[:, None]
     for fibre, spans in enumerate(beziers(pad)):
         axis, curve = 0 if fibre < pad.grid else 1, scipy_curve(pad, fibre)
@@ -45,11 +53,32 @@ def test_slopes_samples_and_beziers_match_scipy(pad):
             np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)
 
 
-def test_torch_gradients_pass_the_finite_difference_test():
-    t = torch.tensor([[0.0, 0.6, 1.1, 2.0, 3.0]], dtype=torch.float64, requires_grad=True)
-    v = torch.tensor([[1.0, 1.7, 2.1, 1.2, 1.0]], dtype=torch.float64, requires_grad=True)
-    at = torch.linspace(0.05, 2.95, 9, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda t, v: pchip_sample(t, v, at), (t, v))
+@pytest.mark.parametrize("knots", [0, 1, 5])
+def test_gradients_of_slopes_lengths_and_samples_match_finite_differences(knots):
+    along, across = (axis[0] for axis in fibre_axes(Morphology.random(2, knots, seed=3))[:2])
+    rng, shares = np.random.default_rng(0), np.array([0.0, 0.3, 0.8])
+    samples = 3 * (along.shape[1] - 1) + 1
+    by_slope, by_length = rng.standard_normal(along.shape), rng.standard_normal(len(along))
+    by_points, by_rate = rng.standard_normal((len(along), samples, 2)), rng.standard_normal((len(along), samples))
+
+    def total(along, across):
+        slope = population_slopes(along[None], across[None])[0]
+        points, rate, unused = np.empty_like(by_points), np.empty_like(by_rate), np.empty((3, *along.shape))
+        sample_spans(along, across, slope, shares, points, rate)
+        length = arc_lengths_gradient(along, across, slope, unused)
+        return (by_slope * slope).sum() + by_length @ length + (by_points * points).sum() + (by_rate * rate).sum()
+
+    slope = population_slopes(along[None], across[None])[0]
+    gradient, lengthen = np.zeros((3, *along.shape)), np.empty((3, *along.shape))
+    add_samples_gradient(along, across, slope, shares, by_points, by_rate, *gradient)
+    arc_lengths_gradient(along, across, slope, lengthen)
+    gradient += lengthen * by_length[:, None]
+    gradient[:2] += fibre_slopes_gradient(along, across, slope, gradient[2] + by_slope)
+    for row in range(2):
+        step = np.zeros((2, *along.shape))
+        step[row] = 1e-6 * rng.standard_normal(along.shape)
+        difference = total(*(np.array([along, across]) + step)) - total(*(np.array([along, across]) - step))
+        assert difference / 2 == pytest.approx((gradient[:2] * step).sum(), rel=1e-5)
 
 
 @given(pads, st.sampled_from([1e-2, 1e-3, 1e-4]))
