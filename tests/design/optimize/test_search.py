@@ -11,7 +11,7 @@ from padforge.design.networks import localisation_error
 from padforge.design.objectives.expected_error import expected_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import describe_terms, score
-from padforge.design.optimize.search import SearchOptions, search
+from padforge.design.optimize.search import SearchOptions, better_half, search
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
@@ -209,3 +209,21 @@ def test_search_bench_evaluates_what_the_search_finds(monkeypatch):
     assert [judged["failed_0"], judged["failed_1"]] == errors
     assert judged["error"] == np.mean(errors)
     assert judged["violations"] == len(check_rules(result.morphology, RulesSettings()))
+
+
+def test_half_way_the_better_half_of_the_starts_goes_on():
+    settings = SearchSettings(knots=2, starts=5, steps=45, max_failures=1)
+    found = search(PadSettings(grid=1), None, settings, RulesSettings(enforce=False))
+    histories = {}
+    for row in found.history:
+        histories.setdefault(row["run"], []).append((row["step"], row["objective"]))
+    means = {run: np.log([value for step, value in rows if step <= 20]).mean() for run, rows in histories.items()}
+    better = sorted(means, key=means.get)[:2]
+    assert {run: rows[-1][0] for run, rows in histories.items()} == {run: 45 if run in better else 20 for run in means}
+    assert found.candidate in {*better, "straight fibres"}
+
+
+def test_better_half_compares_the_last_objectives_before_a_step():
+    low, high = np.array([[10, 5.0], [20, 1.0], [30, 9.0]]), np.array([[10, 2.0], [20, 2.0], [30, 0.1]])
+    assert better_half({0: low, 1: high, 2: high + 1, 3: low * [1.0, np.nan]}, 30) == [0, 1]
+    assert better_half({0: high + 1, 1: low, 2: high}, 20) == [1, 2]

@@ -35,7 +35,7 @@ class KilledError(Exception):
 @pytest.mark.parametrize("method", ["descent", "genetic"])
 def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
-    settings = SMALL.model_copy(update={"method": method})
+    settings = SMALL.model_copy(update={"method": method, "starts": 4})
     unbroken, kills = search(PAD, None, settings, FREE), 0
 
     def attempt():
@@ -48,7 +48,7 @@ def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
 
         return search(PAD, None, settings, FREE, run=SearchOptions(report, tmp_path / "search", resume=True))
 
-    while kills < 20:
+    while kills < 30:
         try:
             resumed = attempt()
             break
