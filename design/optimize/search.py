@@ -285,7 +285,7 @@ def _open_start(problem: SearchProblem, start: int, state: State | None) -> "Gra
 
 
 def better_half(histories: Mapping[int, Array], half_way: int) -> list[int]:
-    """Return the starts of lower objectives before a step, in order, by their histories (n, 2) of step and objective."""
+    """Return the starts of lower objectives before a step, in order, by histories (n, 2) of step and objective."""
     before = {start: history[history[:, 0] <= half_way][-COMPARED:, 1] for start, history in histories.items()}
     means = {start: np.nan_to_num(np.log(values).mean(), nan=np.inf) for start, values in before.items()}
     return sorted(sorted(means, key=lambda start: means[start])[: max(len(means) // 2, MIN_STARTS)])

@@ -225,5 +225,6 @@ def test_half_way_the_better_half_of_the_starts_goes_on():
 
 def test_better_half_compares_the_last_objectives_before_a_step():
     low, high = np.array([[10, 5.0], [20, 1.0], [30, 9.0]]), np.array([[10, 2.0], [20, 2.0], [30, 0.1]])
-    assert better_half({0: low, 1: high, 2: high + 1, 3: low * [1.0, np.nan]}, 30) == [0, 1]
-    assert better_half({0: high + 1, 1: low, 2: high}, 20) == [1, 2]
+    histories = {0: low, 1: high, 2: high * [1.0, 2.0], 3: low * [1.0, np.nan]}
+    assert better_half(histories, 30) == [1, 2]
+    assert better_half(histories, 20) == [0, 1]
