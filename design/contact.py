@@ -139,7 +139,8 @@ def quick_signals(
     )
     if sensitivity is not None:
         measured_signals.weigh_elements(elements, along[0], sensitivity)
-    visited = measured_signals.element_signals(along[0], across[0], elements, centres, shape[2], out)
+    table = weight_table(contact, pad.unit_mm)
+    visited = measured_signals.element_signals(along[0], across[0], elements, centres, shape[2], table, out)
     if profiling.is_profiling():
         record_visits(along, geometry.max_offsets(across, ends), ends, centres, shape[1], visited)
     return out
@@ -385,6 +386,12 @@ def element_spacings(contact: Contact, unit_mm: float, precision: float | None =
     """
     search = measured_signals.LAYER_PRECISION if contact.model == "layer" else measured_signals.PRECISION
     return measured_signals.element_spacings(contact_law(contact, unit_mm), precision or search)
+
+
+@lru_cache(maxsize=32)
+def weight_table(contact: Contact, unit_mm: float) -> Array:
+    """Return the table of `measured_signals` for a contact with a profile, in grid units of `unit_mm`."""
+    return measured_signals.weight_table(contact_law(contact, unit_mm))
 
 
 @lru_cache(maxsize=128)  # DEPTH_STEPS of several tools

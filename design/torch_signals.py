@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from padforge.design.common import profiling
-from padforge.design.contact import element_spacings, press_shape, record_visits
+from padforge.design.contact import element_spacings, press_shape, record_visits, weight_table
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.geometry import Ends
@@ -78,10 +78,10 @@ class _PressSignals(torch.autograd.Function):
         shape, max_offsets = press_shape(contact, unit_mm), compute_max_offsets(v[None], ends)
         out = np.zeros((len(presses), len(t)))
         if contact.model != "shape":  # elements are cut once for both directions
-            law, spacings = shape[2], element_spacings(contact, unit_mm)
+            law, spacings, table = shape[2], element_spacings(contact, unit_mm), weight_table(contact, unit_mm)
             elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacings)
-            visited = element_signals(t, v, elements, presses, law, out)
-            ctx.gradient = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law)
+            visited = element_signals(t, v, elements, presses, law, table, out)
+            ctx.gradient = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)
         else:
             curves, none = (t[None], v[None], d[None]), np.empty(0, np.int64)
             where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)

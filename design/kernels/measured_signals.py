@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from padforge.design.kernels.exact_gradient import differentiate_cubic
 from padforge.design.kernels.geometry import (
     DIRECTED,
+    EPS,
     MANHATTAN,
     PLAIN,
     WeightLaw,
@@ -42,6 +43,8 @@ FAR_SPACING = 0.5
 """Spacing of elements beyond `WeightLaw.near` in a search, as a share of that distance; by the midpoint rule."""
 MAX_REFINEMENTS = 24
 """Refinements of the spacing by a fifth, from a quarter of the profile on; a steep profile needs them."""
+MIN_STEPS, MAX_STEPS = 1 << 14, 1 << 17
+"""Steps of a `weight_table`: two for each of the narrowest row of its profile, within these."""
 MAX_PIECES = 512
 """Pieces of a span, to bound memory; only a profile hundreds of times shorter than a span would need more."""
 
@@ -59,6 +62,40 @@ class Elements(NamedTuple):
     tangent_across: Array  # and across it
     share: Array  # position on its span, 0..1
     weight: Array  # quadrature weight, as a share of the span
+
+
+def weight_table(law: WeightLaw) -> Array:
+    """Return cubics of w and v in equal steps of the squared distance, with the values and slopes of the profile there.
+
+    A step of the table has the four coefficients of each in one line of the processor's cache, where the profile's
+    rows, of higher degree, have to be searched. They agree to about 1e-7 of the largest weight.
+
+    Returns:
+        Coefficients by family, step, and w before v, in shares of a step; 0 from the end on; shape (2, steps + 1, 8).
+    """
+    steps = min(max(MIN_STEPS, 2 * len(law.bins)), MAX_STEPS)
+    table = np.zeros((2, steps + 1, 8))
+    for family, profile in enumerate(law.profile):
+        _tabulate(profile, law, table[family])
+    return table
+
+
+@njit(cache=True, error_model="numpy")
+def _tabulate(profile: Any, law: Any, out: Any) -> None:
+    """Write the cubics of one family, all but the last row."""
+    steps = len(out) - 1
+    width = law.radius * law.radius / steps
+    for i in range(steps):
+        for part, column in enumerate((PLAIN, DIRECTED)):
+            low, high = i * width, min(i + 1, steps * (1 - EPS)) * width
+            first, last = find_row(low, profile, law), find_row(high, profile, law)
+            y0 = evaluate_row(profile, first, column, low - profile[first, 0])
+            y1 = evaluate_row(profile, last, column, high - profile[last, 0])
+            d0 = width * differentiate_row(profile, first, column, low - profile[first, 0])
+            d1 = width * differentiate_row(profile, last, column, high - profile[last, 0])
+            c = 4 * part
+            out[i, c], out[i, c + 1], out[i, c + 2] = y0, d0, 3 * (y1 - y0) - 2 * d0 - d1
+            out[i, c + 3] = 2 * (y0 - y1) + d0 + d1
 
 
 def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
@@ -207,12 +244,17 @@ def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, out: Any) -> int:
-    """Compute signals of one pad from its elements into `out` (Q, F); return the number of spans visited."""
+def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, table: Any, out: Any) -> int:
+    """Compute signals of one pad from its elements, by the `weight_table` of the law, into `out` (Q, F).
+
+    Returned is the number of spans visited.
+    """
     (fibres, n), end, visited = along.shape, law.radius, 0
+    steps = table.shape[1] - 1
+    rate = steps / end**2
     for f in range(fibres):
         t, v, axis = along[f], across[f], 0 if f < elements.horizontals else 1
-        profile = law.profile[axis]
+        rows = table[axis]
         bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, total = presses[q, axis], presses[q, 1 - axis], 0.0
@@ -226,14 +268,15 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                 for k in range(begin, after):
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
-                    if square < end * end:
-                        i = find_row(square, profile, law)
-                        x = square - profile[i, 0]
-                        weight = evaluate_row(profile, i, PLAIN, x)
-                        if law.directional and square > 0:
-                            way = dt * elements.tangent_along[k] + dv * elements.tangent_across[k]
-                            weight += evaluate_row(profile, i, DIRECTED, x) * (way * way / square)
-                        total += elements.length[k] * weight
+                    at = min(square * rate, 1.0 * steps)
+                    i = np.uint64(at)  # unsigned: the compiler need not look for negative indices
+                    x = at - np.int64(i)
+                    weight = rows[i, 0] + x * (rows[i, 1] + x * (rows[i, 2] + x * rows[i, 3]))
+                    if law.directional and square > 0:
+                        way = dt * elements.tangent_along[k] + dv * elements.tangent_across[k]
+                        directed = rows[i, 4] + x * (rows[i, 5] + x * (rows[i, 6] + x * rows[i, 7]))
+                        weight += directed * (way * way / square)
+                    total += elements.length[k] * weight
             out[q, f] = total
     return visited
 
@@ -251,16 +294,18 @@ def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any
 
 @njit(cache=True, error_model="numpy")
 def _differentiate_elements(
-    along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, out: Any
+    along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any, out: Any
 ) -> None:
     """Add the derivatives of sum(upstream * signals) to out (E, 5).
 
     They are by each element's along, across and length, and by both parts of its unit tangent.
     """
     (fibres, n), end = along.shape, law.radius
+    steps = table.shape[1] - 1
+    rate = steps / end**2
     for f in range(fibres):
         t, v, axis = along[f], across[f], 0 if f < elements.horizontals else 1
-        profile = law.profile[axis]
+        rows = table[axis]
         bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, up = presses[q, axis], presses[q, 1 - axis], upstream[q, f]
@@ -273,39 +318,43 @@ def _differentiate_elements(
                 for k in range(begin, after):
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
-                    if square < end * end:
-                        i = find_row(square, profile, law)
-                        x, up_length = square - profile[i, 0], up * elements.length[k]
-                        radial_derivative = 2 * up_length * differentiate_row(profile, i, PLAIN, x)
-                        weight = evaluate_row(profile, i, PLAIN, x)
-                        if law.directional and square > 0:
-                            ut, uv = elements.tangent_along[k], elements.tangent_across[k]
-                            directed = evaluate_row(profile, i, DIRECTED, x)
-                            rate = differentiate_row(profile, i, DIRECTED, x)
-                            inverse = 1 / square
-                            way = (dt * ut + dv * uv) * inverse
-                            cosine_square = way * way * square
-                            weight += directed * cosine_square
-                            radial_derivative += 2 * up_length * cosine_square * (rate - directed * inverse)
-                            turn = 2 * up_length * directed * way
-                            out[k, 0] += turn * ut
-                            out[k, 1] += turn * uv
-                            out[k, 3] += turn * dt
-                            out[k, 4] += turn * dv
-                        out[k, 0] += radial_derivative * dt
-                        out[k, 1] += radial_derivative * dv
-                        out[k, 2] += up * weight
+                    at = square * rate
+                    if at >= steps:
+                        continue
+                    i = np.uint64(at)
+                    x, up_length = at - np.int64(i), 2 * up * elements.length[k]
+                    weight = rows[i, 0] + x * (rows[i, 1] + x * (rows[i, 2] + x * rows[i, 3]))
+                    radial = up_length * rate * (rows[i, 1] + x * (2 * rows[i, 2] + x * 3 * rows[i, 3]))
+                    if law.directional and square > 0:
+                        ut, uv = elements.tangent_along[k], elements.tangent_across[k]
+                        directed = rows[i, 4] + x * (rows[i, 5] + x * (rows[i, 6] + x * rows[i, 7]))
+                        steeper = rate * (rows[i, 5] + x * (2 * rows[i, 6] + x * 3 * rows[i, 7]))
+                        inverse = 1 / square
+                        way = (dt * ut + dv * uv) * inverse
+                        cosine_square = way * way * square
+                        weight += directed * cosine_square
+                        radial += up_length * cosine_square * (steeper - directed * inverse)
+                        turn = up_length * directed * way
+                        out[k, 0] += turn * ut
+                        out[k, 1] += turn * uv
+                        out[k, 3] += turn * dt
+                        out[k, 4] += turn * dv
+                    out[k, 0] += radial * dt
+                    out[k, 1] += radial * dv
+                    out[k, 2] += up * weight
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def elements_gradient(along: Any, across: Any, slope: Any, elements: Any, presses: Any, upstream: Any, law: Any) -> Any:
+def elements_gradient(
+    along: Any, across: Any, slope: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any
+) -> Any:
     """Compute the gradient (3, F, n) of sum(upstream (Q, F) * signals) by along, across and slope of one pad.
 
     Slopes are held independent of knots; the elements are from `fibre_elements` of the same arguments.
     """
     fibres, n = along.shape
     out, element_gradient = np.zeros((3, fibres, n)), np.zeros((len(elements.length), 5))
-    _differentiate_elements(along, across, elements, presses, upstream, law, element_gradient)
+    _differentiate_elements(along, across, elements, presses, upstream, law, table, element_gradient)
     for starts in (elements.starts, elements.far_starts):
         _pass_to_knots(along, across, slope, elements, starts, element_gradient, law, out)
     return out
