@@ -45,7 +45,7 @@ SLICE_S = 1.0
 """After which a slice ends where steps are slow, so that a time budget holds."""
 MIN_STARTS, COMPARED = 2, 10
 """Half-way only the better half of the starts goes on, MIN_STARTS or more, by the geometric mean of the last COMPARED
-objectives of their histories. In 24 searches none of those left behind was the best in the end.
+objectives of their histories. In 10 searches none of those left behind was the best in the end.
 """
 REPAIR_SHARE = 0.15
 """Share of a time budget reserved for repair."""
