@@ -189,7 +189,7 @@ class _LocalizerModule(nn.Module):
         scaled, seen = self.features(readings, down_command, up_command)
         fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # or one missing reading would spoil all presses
         n_complete = seen.sum(dim=1)
-        x, _ = network_inputs(scaled, fibre_mask, seen, None)
+        x = network_inputs(scaled, fibre_mask, seen)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
         *followed, moved = self._follow(scaled, fibre_mask, seen)
         slid = (n_complete >= N_DOWN) & (moved > LEAST_SLIDE)
@@ -233,7 +233,7 @@ class _LocalizerModule(nn.Module):
         network, n_timed = self.networks[FOLLOWING], features.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
-            x, _ = network_inputs(scaled, fibre_mask, seen & (torch.arange(n_timed) < n_complete), None)
+            x = network_inputs(scaled, fibre_mask, seen & (torch.arange(n_timed) < n_complete))
             return _combine_members(network(x.expand(network.n_members, -1, -1)))
 
         targets, std = predict_from(scaled, N_DOWN)

@@ -5,25 +5,54 @@ finger that slides is the superposition of those to where it was, each as old as
 presses.
 """
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
-from torch import Tensor
+from numba import njit
 
-from padforge.sense.arrays import Floats
+from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer, stage_of
 from padforge.sense.localizer.features import DOWN, NOW
 from padforge.sense.localizer.moments import N_DOWN, Phase
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import TrainingPresses
-from padforge.sense.localizer.torch_network import network_inputs, sample_fibre_dropout
 
+FULL_SHARE = 0.25
+"""Share of training presses that keep all fibres; others lose 1 .. `max_failures`, each number as often."""
 NOW_NOISE = 0.05  # of single readings, beside that of means
 SPEEDS_MM_S = 2.0, 60.0  # range of their speeds, logarithmically uniform
 LONGER = 40  # readings beyond `DOWN` for which a finger slides
 RESIDUAL_MM = 10.0  # distance over which what a press leaves unexplained becomes another
 SUDDEN = 4  # window of `DOWN` up to which a response follows the finger; what changes later follows as much later
+N_NOW = len(NOW)
+_ENDS = np.array([0, *(end for _, end in DOWN), DOWN[-1][1] + 1])  # of windows of `DOWN`, and one before and after
+_MIDDLES = np.array([(first + end - 1) / 2 for first, end in DOWN])
+_WINDOW_OF = np.array([max(sum(first <= n for first, _ in DOWN) - 1, 0) for n in range(DOWN[-1][1])])  # a reading
+
+
+class _Source(NamedTuple):
+    """What presses are drawn from."""
+
+    table: Floats  # scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F)
+    residual: Floats  # what the table leaves unexplained of each press; shape (Q, C, F)
+    seen: Mask  # windows that are complete; shape (Q, K)
+    now_factor: Floats  # see `TrainingPresses`
+    now_offset: Floats
+    depth_gain: float  # growth of the response with the scaled depth
+    now_noise: float
+
+
+class _Moments(NamedTuple):
+    """When the presses of a batch are looked at, and how those slide that do, the first S of them."""
+
+    counts: Indices  # complete windows; shape (B,)
+    last: Indices  # the latest reading of the press; shape (B,)
+    end: Array  # the latest reading of one that slides, which may do so for longer; shape (S,)
+    velocity: Array  # scaled distance from one reading to the next; shape (S, 2)
+    reach: float  # scaled distance over which a residual becomes another
 
 
 class PressSampler:
@@ -34,137 +63,177 @@ class PressSampler:
         presses: TrainingPresses,
         table: Floats,
         max_failures: int,
-        generator: torch.Generator,
+        rng: np.random.Generator,
         phase: Phase,
         bayes: Sequence[BayesianLocalizer],
     ) -> None:
-        self.generator, self._device = generator, generator.device
-        x, self.fibre_mask, self.targets = map(self._tensor, (presses.inputs, presses.fibre_mask, presses.targets))
-        self.fibres, self.depth_gain = x.shape[1], presses.depth_gain
-        self._table, self._max_failures = self._tensor(table).flatten(2), min(max_failures, self.fibres - 1)
-        self._by_window = self._tensor(table).flatten(0, 1).swapaxes(1, 2)[:, :N_DOWN].contiguous()
-        self._residual = x - self._expected(self.targets).view_as(x)
-        self._seen, self._n_timed = self._tensor(presses.seen), presses.seen.shape[1]
-        self._bayes = tuple(stage.map_arrays(self._tensor) for stage in bayes)
-        self.n_inputs = self.fibres * (x.shape[2] + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
-        self._first, self._shares = phase.first, self._tensor(phase.shares)
-        self._sliding = phase.sliding if presses.speed else 0.0
+        self.rng, self.targets, self.depth_gain = rng, presses.targets, presses.depth_gain
+        fibres, n_features = presses.inputs.shape[1:]
+        self._fibre_mask, self._max_failures = presses.fibre_mask, min(max_failures, fibres - 1)
+        expected = interpolate_grid(table.reshape(*table.shape[:2], -1), self.targets[:, :2])
+        if self.targets.shape[1] > 2:
+            expected *= 1 + self.depth_gain * self.targets[:, 2:3]
+        residual = (presses.inputs - expected.reshape(presses.inputs.shape)).astype(np.float32)
+        now = presses.now_factor, presses.now_offset, float(self.depth_gain), NOW_NOISE
+        self._source = _Source(np.ascontiguousarray(table), residual, presses.seen, *now)
+        self._n_timed = presses.seen.shape[1]
+        self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
+        self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
+        self._phase, self._cumulated = phase, np.cumsum(phase.shares)
         self._speed, self._per_mm = presses.speed, presses.per_mm
-        self._now_factor, self._now_offset = self._tensor(presses.now_factor), self._tensor(presses.now_offset)
-        ends = [end for _, end in DOWN]
-        self._ends = self._tensor([0, *ends, ends[-1] + 1])
-        self._middle = self._tensor([(first + end - 1) / 2 for first, end in DOWN])
-        self._window = self._tensor([max(sum(first <= n for first, _ in DOWN) - 1, 0) for n in range(ends[-1])])
 
-    def draw(self, batch: int) -> Tensor:
+    def draw(self, batch: int) -> Indices:
         """Draw (B,) rows of presses."""
-        return torch.randint(len(self.targets), (batch,), generator=self.generator, device=self._device)
+        return self.rng.integers(len(self.targets), size=batch)
 
-    def normal(self, *shape: int) -> Tensor:
-        """Draw normal numbers."""
-        return torch.randn(*shape, generator=self.generator, device=self._device)
+    def inputs(self, rows: Indices, targets: Floats, noise: float) -> tuple[Floats, Floats]:
+        """Network inputs (B, D), and positions to correct, (B, 2) or 0, of presses moved to (B, 2 + T) targets."""
+        moments = self._draw_moments(len(rows))
+        fibres, n_features = self._source.residual.shape[1:]
+        fibre_mask = sample_fibre_dropout(len(rows), fibres, self._max_failures, self.rng)
+        fibre_mask &= self._fibre_mask[rows]
+        x = np.zeros((len(rows), self.n_inputs), np.float32)
+        _compute_inputs(self._source, rows, targets, fibre_mask, moments, noise, self.rng, x)
+        if not self._bayes:
+            return x, np.zeros(1, np.float32)
+        bayes = self._bayes[stage_of(int(moments.counts[0]), self._n_timed) or 0]
+        features = torch.from_numpy(x)[:, : fibres * n_features].view(-1, fibres, n_features)
+        with torch.no_grad():
+            position, summary = bayes.predict(features, torch.from_numpy(fibre_mask), torch)
+        x[:, -N_SUMMARY:] = summary.numpy()
+        return x, position.numpy()
 
-    def inputs(self, rows: Tensor, targets: Tensor, noise: float) -> tuple[Tensor, Tensor]:
-        """Network inputs (1, B, D), and positions to correct, of presses moved to (B, 2 + T) targets."""
-        residual, seen, bayes = self._residual[rows], self._seen[rows], None
-        residual = residual + noise * self.normal(*residual.shape)
-        features = self._expected(targets).view_as(residual) + residual
-        n_complete = 0
-        if self._n_timed:
-            # With a Bayesian localizer a batch is at one moment, of which only one of these is needed.
-            counts = self._draw_moments(1 if self._bayes else len(rows)).expand(len(rows))
-            n_complete = int(counts[0])
-            features = self._at(counts, features, residual, targets)
-            seen = seen & (torch.arange(self._n_timed, device=self._device) < counts[:, None])
-        if self._bayes:
-            bayes = self._bayes[stage_of(n_complete, self._n_timed) or 0]
-        dropout = sample_fibre_dropout(len(rows), self.fibres, self._max_failures, self.generator)
-        x, position = network_inputs(features, self.fibre_mask[rows] & dropout, seen, bayes)
-        return x[None], position
+    def _draw_moments(self, batch: int) -> _Moments:
+        """Draw moments of the phase, a batch of one where a Bayesian localizer answers, of which each stage has one."""
+        n_drawn, rng = 1 if self._bayes else batch, self.rng
+        drawn = np.searchsorted(self._cumulated, rng.random(n_drawn) * self._cumulated[-1], side="right")
+        counts = np.broadcast_to(self._phase.first + drawn, batch)
+        begin, end = (_ENDS[np.minimum(counts + k, N_DOWN + 1)] for k in (0, 1))
+        last = begin + (rng.random(batch) * (end - begin)).astype(np.int64) - 1
+        n_sliding = round(self._phase.sliding * batch) if self._speed and self._n_timed else 0
+        low, high = np.log(SPEEDS_MM_S)
+        speed = self._speed * np.exp(rng.uniform(low, high, n_sliding))
+        angle, longer = rng.uniform(0, 2 * math.pi, n_sliding), LONGER * rng.random(n_sliding) ** 2
+        velocity = speed[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        sliding = last[:n_sliding]
+        end = sliding + np.where(sliding >= _ENDS[N_DOWN] - 1, longer, 0.0)
+        return _Moments(np.ascontiguousarray(counts), last, end, velocity, RESIDUAL_MM * self._per_mm)
 
-    def _draw_moments(self, batch: int) -> Tensor:
-        """Draw (B,) numbers of complete windows."""
-        return self._first + torch.multinomial(self._shares, batch, replacement=True, generator=self.generator)
 
-    def _at(self, counts: Tensor, features: Tensor, residual: Tensor, targets: Tensor) -> Tensor:
-        """Return features (B, C, F + G) at the moments when so many windows (B,) are complete.
+def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.random.Generator) -> Mask:
+    """Sample (B, C) masks in which all fibres are kept, or 1 .. `max_failures` are masked, each set equally likely."""
+    count = rng.integers(1, max(max_failures, 1) + 1, (batch, 1))
+    full = rng.random((batch, 1)) < (FULL_SHARE if max_failures else 1.0)
+    rank = rng.random((batch, fibres)).argsort(axis=1)
+    return (rank >= count) | full
 
-        A finger that rests is now where it was in the windows of the latest readings.
-        """
-        begin, end = (self._ends[(counts + k).clamp(max=N_DOWN + 1)] for k in (0, 1))
-        share = torch.rand(len(begin), generator=self.generator, device=self._device)
-        last = begin + (share * (end - begin)).long() - 1  # reading of the press
-        back = torch.arange(len(NOW), device=self._device)
-        windows = self._window[(last[:, None] - back).clamp(0, len(self._window) - 1)]
-        now = torch.take_along_dim(features[:, :, :N_DOWN], windows[:, None], dim=2)
-        is_mapped = counts <= N_DOWN
-        if n_sliding := round(self._sliding * len(counts)):
-            is_mapped = is_mapped | (torch.arange(len(counts), device=self._device) < n_sliding)
-            sliding = slice(n_sliding)
-            down, of_now = self._slide(last[sliding], windows[sliding], residual[sliding], targets[sliding])
-            features = torch.cat([torch.cat([down, features[sliding, :, N_DOWN:]], dim=2), features[n_sliding:]])
-            now = torch.cat([of_now, now[n_sliding:]])
-        timed = self._n_timed
-        channels = torch.arange(self.fibres, device=self._device)[:, None]
-        factor, offset = (
-            each[channels, torch.arange(len(NOW), device=self._device), windows[:, None]]
-            for each in (self._now_factor, self._now_offset)
-        )
-        now = now * factor + offset + NOW_NOISE * self.normal(*now.shape)
-        now = torch.where(is_mapped[:, None, None], now, features[:, :, timed : timed + len(NOW)])
-        return torch.cat([features[:, :, :timed], now, features[:, :, timed + len(NOW) :]], dim=2)
 
-    def _slide(self, last: Tensor, windows: Tensor, residual: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the windows (B, C, len(DOWN)) of a finger that slides to the targets, and those of now (B, C, n)."""
-        low, high = torch.log(torch.tensor(SPEEDS_MM_S))
-        batch, down = len(last), torch.arange(N_DOWN, device=self._device)
-        speed, angle, longer = torch.rand(3, batch, 1, generator=self.generator, device=self._device)
-        speed, angle = self._speed * torch.exp(low + speed * (high - low)), 2 * torch.pi * angle
-        velocity = speed * torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)
-        end = last[:, None] + torch.where(last[:, None] >= self._ends[N_DOWN] - 1, longer.square() * LONGER, 0.0)
-        back = torch.arange(len(NOW), device=self._device)
-        time = torch.cat([self._middle.expand(batch, -1), end - back], dim=1)
-        windows = torch.cat([down.expand(batch, -1), windows], dim=1)
+@njit(cache=True, error_model="numpy", nogil=True)
+def _compute_inputs(
+    source: Any, rows: Any, targets: Any, fibre_mask: Any, moments: Any, noise: float, rng: Any, x: Any
+) -> None:
+    """Write the inputs of a network for presses (B,) of the source, moved to targets (B, 2 + T), into x, which is 0.
 
-        def distance(time: Tensor) -> Tensor:
-            """(B, n, 2) from the targets back to where the finger was, from the touch on."""
-            behind = (end - time.clamp(min=float(self._middle[1]))).clamp(min=0)
-            return behind[:, :, None] * velocity[:, None]
+    What is masked, and windows yet to come, stay 0.
+    """
+    side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.seen.shape[1]
+    own, features, of_now = np.empty(size), np.empty(size), np.empty(N_NOW)
+    seen, windows = np.ones(size, np.bool_), np.empty(N_NOW, np.int64)
+    for b, row in enumerate(rows):
+        gain = 1 + source.depth_gain * targets[b, 2] if targets.shape[1] > 2 else 1.0
+        i, j, u, v = _locate(targets[b, 0], targets[b, 1], side)
+        for k in range(n_timed):
+            seen[k] = source.seen[row, k] and k < moments.counts[b]
+            x[b, fibres * (size + 1) + k] = seen[k]
+        for k in range(N_NOW):
+            windows[k] = _WINDOW_OF[min(max(moments.last[b] - k, 0), len(_WINDOW_OF) - 1)]
+        is_sliding = b < len(moments.end)
+        is_now_mapped = n_timed > 0 and (is_sliding or moments.counts[b] <= N_DOWN)
+        if is_sliding:
+            path = _trace(targets[b], moments.velocity[b], moments.end[b], windows, moments.reach, side)
+            other = rows[b - 1] if b else rows[len(moments.end) - 1]
+        for c in range(fibres):
+            if not fibre_mask[b, c]:
+                continue
+            x[b, fibres * size + c] = 1
+            for f in range(size):
+                if f < N_DOWN or seen[f]:
+                    own[f] = source.residual[row, c, f] + noise * rng.standard_normal()
+                    features[f] = gain * _respond(source.table, i, j, u, v, c, f) + own[f]
+            if is_sliding:
+                _slide(source, path, c, gain, own, source.residual[other, c], noise, rng, features, of_now)
+            elif is_now_mapped:
+                for k in range(N_NOW):
+                    of_now[k] = features[windows[k]]
+            if is_now_mapped:
+                for k in range(N_NOW):
+                    mapped = of_now[k] * source.now_factor[c, k, windows[k]] + source.now_offset[c, k, windows[k]]
+                    features[n_timed + k] = mapped + source.now_noise * rng.standard_normal()
+            for f in range(size):
+                if seen[f]:
+                    x[b, c * size + f] = features[f]
 
-        def response(window: Tensor, time: Tensor) -> Tensor:
-            return self._window_response((targets[:, None, :2] - distance(time)).clamp(-1, 1), window)
 
-        expected = response(windows.clamp(max=SUDDEN), time)
-        for later in range(SUDDEN + 1, N_DOWN):
+@njit(cache=True, error_model="numpy")
+def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
+    """Return the cell of the table in which a position lies, or the nearest one, and how far in it along both axes."""
+    u = min(max((x + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
+    v = min(max((y + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
+    return int(u), int(v), u - int(u), v - int(v)
+
+
+@njit(cache=True, error_model="numpy")
+def _respond(table: Any, i: int, j: int, u: float, v: float, c: int, f: int) -> float:
+    """Interpolate a window of a fibre in the table."""
+    near = (1 - v) * table[i, j, c, f] + v * table[i, j + 1, c, f]
+    return (1 - u) * near + u * ((1 - v) * table[i + 1, j, c, f] + v * table[i + 1, j + 1, c, f])
+
+
+@njit(cache=True, error_model="numpy")
+def _trace(target: Any, velocity: Any, end: float, now: Any, reach: float, side: int) -> tuple[Any, Any, Any, Any]:
+    """Trace a finger that slides to its target back to its touch, for the windows of `DOWN` and those of now.
+
+    Returns:
+        Windows (J,), and the correlation (J,) of their residuals with the press's. Cells (L, J, 2) of the table and the
+        places (L, J, 2) in them, to which a window up to SUDDEN responds, and later ones one after the other.
+    """
+    count, later = N_DOWN + len(now), N_DOWN - SUDDEN
+    windows, correlation = np.empty(count, np.int64), np.empty(count)
+    cells, places = np.empty((later, count, 2), np.int64), np.empty((later, count, 2))
+    for k in range(count):
+        windows[k] = k if k < N_DOWN else now[k - N_DOWN]
+        time = _MIDDLES[k] if k < N_DOWN else end - (k - N_DOWN)
+        for n in range(later):
             # Windows of `DOWN` before it have not seen the change; those of now may have.
-            behind = time[:, later:] - (self._middle[later] - self._middle[SUDDEN])
-            window = torch.full_like(windows[:, later:], later)
-            change = response(window, behind) - response(window - 1, behind)
-            expected[:, later:] += torch.where((windows[:, later:] >= later)[:, :, None], change, 0.0)
-        if self.depth_gain:
-            expected = (1 + self.depth_gain * targets[:, None, 2:3]) * expected
-        squared_mm = distance(time).square().sum(dim=2) / self._per_mm**2
-        correlation = torch.exp(squared_mm / (-2 * RESIDUAL_MM**2))[:, None]
-        of_down = residual[:, :, :N_DOWN]
-        near, far = (torch.take_along_dim(each, windows[:, None], dim=2) for each in (of_down, of_down.roll(1, 0)))
-        slid = expected.swapaxes(1, 2) + correlation * near + (1 - correlation.square()).sqrt() * far
-        return slid[:, :, :N_DOWN], slid[:, :, N_DOWN:]
+            behind = time - (_MIDDLES[SUDDEN + n] - _MIDDLES[SUDDEN])
+            since = max(end - max(behind, _MIDDLES[1]), 0.0)
+            x = min(max(target[0] - since * velocity[0], -1.0), 1.0)
+            y = min(max(target[1] - since * velocity[1], -1.0), 1.0)
+            i, j, u, v = _locate(x, y, side)
+            cells[n, k, 0], cells[n, k, 1], places[n, k, 0], places[n, k, 1] = i, j, u, v
+            if n == 0:
+                correlation[k] = math.exp(-0.5 * (since * math.hypot(velocity[0], velocity[1]) / reach) ** 2)
+    return windows, correlation, cells, places
 
-    def _window_response(self, positions: Tensor, windows: Tensor) -> Tensor:
-        """Interpolate the responses (B, n, C) in single windows (B, n) at positions (B, n, 2)."""
-        side = self._table.shape[0]
-        cell = ((positions + 1) * ((side - 1) / 2)).clamp(0, side - 1 - 1e-3)
-        lower = cell.floor()
-        x, y = (cell - lower).unbind(-1)
-        corner = (lower[..., 0] * side + lower[..., 1]).long() * self._by_window.shape[1] + windows
-        flat, right, up = self._by_window.flatten(0, 1), self._by_window.shape[1], side * self._by_window.shape[1]
-        x, y = x[..., None], y[..., None]
-        near = (1 - y) * flat[corner] + y * flat[corner + right]
-        return (1 - x) * near + x * ((1 - y) * flat[corner + up] + y * flat[corner + up + right])
 
-    def _expected(self, targets: Tensor) -> Tensor:
-        expected = interpolate_grid(self._table, targets[:, :2], torch)
-        return expected if targets.shape[1] == 2 else (1 + self.depth_gain * targets[:, 2:3]) * expected
-
-    def _tensor(self, values: Any) -> Tensor:
-        return torch.as_tensor(values, device=self._device)
+@njit(cache=True, error_model="numpy")
+def _slide(
+    source: Any, path: Any, c: int, gain: float, own: Any, other: Any, noise: float, rng: Any, down: Any, now: Any
+) -> None:
+    """Write the windows of a fibre under a finger that slides, over those of one at rest."""
+    windows, correlation, cells, places = path
+    for k in range(len(windows)):
+        window, response = windows[k], 0.0
+        for n in range(1 + max(min(window, k) - SUDDEN, 0)):
+            i, j, u, v = cells[n, k, 0], cells[n, k, 1], places[n, k, 0], places[n, k, 1]
+            if n == 0:
+                response = _respond(source.table, i, j, u, v, c, min(window, SUDDEN))
+            else:
+                response += _respond(source.table, i, j, u, v, c, SUDDEN + n)
+                response -= _respond(source.table, i, j, u, v, c, SUDDEN + n - 1)
+        far = math.sqrt(1 - correlation[k] ** 2) * (other[window] + noise * rng.standard_normal())
+        slid = gain * response + correlation[k] * own[window] + far
+        if k < N_DOWN:
+            down[k] = slid
+        else:
+            now[k - N_DOWN] = slid

@@ -6,12 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.network import EPSILON, Weights
 from padforge.sense.settings import LocalizerSettings
-
-FULL_SHARE = 0.25
-"""Share of training presses that keep all fibres; others lose 1 .. `max_failures`, each number as often."""
 
 
 class _Affine(nn.Module):
@@ -79,28 +75,8 @@ def _activate(h: Tensor) -> Tensor:
     return functional.gelu(functional.layer_norm(h, (width,), eps=EPSILON))
 
 
-def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, generator: torch.Generator) -> Tensor:
-    """Sample (B, C) masks in which all fibres are kept, or 1 .. `max_failures` are masked, each set equally likely."""
-    device = generator.device
-    count = torch.randint(1, max(max_failures, 1) + 1, (batch, 1), generator=generator, device=device)
-    full = torch.rand(batch, 1, generator=generator, device=device) < (FULL_SHARE if max_failures else 1.0)
-    rank = torch.rand(batch, fibres, generator=generator, device=device).argsort(dim=1)
-    return (rank >= count) | full
-
-
-def network_inputs(
-    features: Tensor, fibre_mask: Tensor, seen: Tensor, bayes: BayesianLocalizer | None
-) -> tuple[Tensor, Tensor]:
-    """Return the (B, D) inputs of a network and the (B, 2) position that it corrects, or 0 without `bayes`.
-
-    The posterior summary of `bayes`, which is in tensors, is an input beside features (B, C, F) and masks (B, C) and
-    (B, K).
-    """
+def network_inputs(features: Tensor, fibre_mask: Tensor, seen: Tensor) -> Tensor:
+    """Return the (B, D) inputs of a network from features (B, C, F) and masks (B, C) and (B, K)."""
     timed = functional.pad(seen, (0, features.shape[2] - seen.shape[1]), value=True)
     masked = torch.where(fibre_mask[..., None] & timed[:, None], features, 0.0)
-    x = torch.cat([masked.flatten(1), fibre_mask.to(features.dtype), seen.to(features.dtype)], dim=1)
-    if bayes is None:
-        return x, x.new_zeros(())
-    with torch.no_grad():
-        position, summary = bayes.predict(features, fibre_mask, torch)
-    return torch.cat([x, summary], dim=1), position
+    return torch.cat([masked.flatten(1), fibre_mask.to(features.dtype), seen.to(features.dtype)], dim=1)

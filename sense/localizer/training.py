@@ -22,7 +22,7 @@ from torch import Tensor
 from padforge.design.common.parallel import makespan, one_torch_thread, run_tasks
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.networks import fit_batch
-from padforge.sense.arrays import Floats
+from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
 from padforge.sense.localizer.moments import CORRECTED, PHASES, Phase
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, N_OUTPUTS, Networks, Weights, stack_members
@@ -248,21 +248,20 @@ class _Training:
         phase: Phase,
         bayes: Sequence[BayesianLocalizer] = (),
     ) -> None:
-        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        generator = torch.Generator(device).manual_seed(seed)
-        self._presses = sampler = PressSampler(presses, table, options.max_failures, generator, phase, bayes)
+        rng = np.random.default_rng(seed)
+        self._presses = sampler = PressSampler(presses, table, options.max_failures, rng, phase, bayes)
         self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
-        self._bounds = targets[:, :3].amin(dim=0), targets[:, :3].amax(dim=0)
-        positions = targets[:, :2].unique(dim=0)
-        distance = ((self._bounds[1] - self._bounds[0])[:2].prod() / len(positions)).sqrt()
-        self._std = (
-            torch.tensor([POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION], device=device)
-            if sampler.depth_gain
-            else (AUGMENTATION * distance).expand(2)
-        )
-        centred = (targets - targets.mean(dim=0))[:, 2:]
-        self._force_per_depth = (centred[:, :1] * centred[:, 1:]).sum() / centred[:, :1].square().sum()
+        self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
+        distance = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
+        varying = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
+        self._std = np.float32(varying if sampler.depth_gain else (AUGMENTATION * distance,) * 2)
+        self._force_per_depth = 0.0
+        if sampler.depth_gain:
+            centred = (targets - targets.mean(axis=0))[:, 2:]
+            self._force_per_depth = (centred[:, :1] * centred[:, 1:]).sum() / np.square(centred[:, :1]).sum()
         n_outputs = N_OUTPUTS + 2 * (targets.shape[1] - 2)
+        self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        generator = torch.Generator(self._device).manual_seed(seed)
         self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
 
     def measure_pace(self) -> float:
@@ -278,21 +277,22 @@ class _Training:
         rows = self._presses.draw(self._batch)
         targets = self._augment_position(self._presses.targets[rows])
         x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
-        predicted, log_error = self.network.forward_bfloat16(x)[0].chunk(2, dim=1)
-        error, log_error = predicted + position - targets, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
+        inputs, wanted = (torch.from_numpy(each).to(self._device) for each in (x[None], targets - position))
+        predicted, log_error = self.network.forward_bfloat16(inputs)[0].chunk(2, dim=1)
+        error, log_error = predicted - wanted, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
         likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
         return (_loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
 
-    def _augment_position(self, targets: Tensor) -> Tensor:
+    def _augment_position(self, targets: Floats) -> Floats:
         """Move (B, 2 + T) targets at random, and their force with their depth; reflect them at the bounds."""
         low, high = self._bounds
         gain = self._presses.depth_gain
         std = self._std / (1 + gain * targets[:, 2:3]) if gain else self._std
-        moved = targets[:, :3] + std * self._presses.normal(len(targets), len(self._std))
-        moved = torch.where(moved < low, 2 * low - moved, moved)
-        moved = torch.where(moved > high, 2 * high - moved, moved).clamp(-1, 1)
+        moved = targets[:, :3] + std * self._presses.rng.standard_normal((len(targets), len(self._std)))
+        moved = np.where(moved < low, 2 * low - moved, moved)
+        moved = np.clip(np.where(moved > high, 2 * high - moved, moved), -1, 1)
         forces = targets[:, 3:] + self._force_per_depth * (moved - targets[:, :3])[:, 2:]
-        return torch.cat([moved, forces], dim=1)
+        return np.concatenate([moved, forces], axis=1).astype(np.float32)
 
 
 FINE_TUNING_STEPS, FINE_TUNING_BATCH, FINE_TUNING_RATE = 200, 128, 1e-4
@@ -317,23 +317,24 @@ def fine_tune(
     A step looks at new presses, augmented near their positions, and at the same presses moved anywhere on the pad,
     where predictions must stay as they were (Li & Hoiem 2016, Learning without forgetting).
     """
-    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+    rng = np.random.default_rng(int(rng.integers(2**63)))
     before, network = EnsembleMlp.from_numpy(weights), EnsembleMlp.from_numpy(weights)
-    sampler = PressSampler(presses, table, max_failures, generator, phase, bayes)
+    sampler = PressSampler(presses, table, max_failures, rng, phase, bayes)
     share = len(presses.inputs) / (len(presses.inputs) + PRIOR_PRESSES)
 
-    def inputs(rows: Tensor, positions: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
-        targets = torch.cat([positions, sampler.targets[rows, 2:]], dim=1)
+    def inputs(rows: Indices, positions: Array, noise: float) -> tuple[Tensor, Tensor]:
+        """Inputs of the members, and what they should answer."""
+        targets = np.concatenate([positions, sampler.targets[rows, 2:]], axis=1, dtype=np.float32)
         x, position = sampler.inputs(rows, targets, noise)
-        return x.expand(network.n_members, -1, -1), position, targets
+        return torch.from_numpy(x).expand(network.n_members, -1, -1), torch.from_numpy(targets - position)
 
     def loss_of_batch() -> Tensor:
         rows = sampler.draw(FINE_TUNING_BATCH)
-        near = (sampler.targets[rows, :2] + NEAR_STD * sampler.normal(FINE_TUNING_BATCH, 2)).clamp(-1, 1)
-        x, position, targets = inputs(rows, near, INPUT_NOISE)
-        new = _loss(network(x)[..., : targets.shape[1]] - (targets - position)).mean(dim=1).sum()
+        moves = NEAR_STD * rng.standard_normal((FINE_TUNING_BATCH, 2))
+        x, wanted = inputs(rows, (sampler.targets[rows, :2] + moves).clip(-1, 1), INPUT_NOISE)
+        new = _loss(network(x)[..., : wanted.shape[1]] - wanted).mean(dim=1).sum()
         rows = sampler.draw(FINE_TUNING_BATCH)
-        x, _, _ = inputs(rows, 2 * torch.rand(FINE_TUNING_BATCH, 2, generator=generator) - 1, FAR_NOISE)
+        x, _ = inputs(rows, rng.uniform(-1, 1, (FINE_TUNING_BATCH, 2)), FAR_NOISE)
         with torch.no_grad():
             outputs = before(x)
         change, log_change = (network(x) - outputs).chunk(2, dim=2)

@@ -214,11 +214,11 @@ def test_search_bench_evaluates_what_the_search_finds(monkeypatch):
 def test_half_way_the_better_half_of_the_starts_goes_on():
     settings = SearchSettings(knots=2, starts=5, steps=45, max_failures=1)
     found = search(PadSettings(grid=1), None, settings, RulesSettings(enforce=False))
-    histories = {}
+    histories: dict[str, list[tuple[int, float]]] = {}
     for row in found.history:
         histories.setdefault(row["run"], []).append((row["step"], row["objective"]))
     means = {run: np.log([value for step, value in rows if step <= 20]).mean() for run, rows in histories.items()}
-    better = sorted(means, key=means.get)[:2]
+    better = sorted(means, key=lambda run: means[run])[:2]
     assert {run: rows[-1][0] for run, rows in histories.items()} == {run: 45 if run in better else 20 for run in means}
     assert found.candidate in {*better, "straight fibres"}
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from padforge.sense.localizer import press_sampler
 from padforge.sense.localizer.features import DOWN, N_FEATURES, N_TIMED, NOW
@@ -40,13 +39,13 @@ def waves() -> np.ndarray:
 
 def draw(presses: TrainingPresses, table: np.ndarray, phase: Phase) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of presses, their features (B, C, F) where they were, and the masks (B, K) of complete windows."""
-    sampler = PressSampler(presses, table, 0, torch.Generator().manual_seed(0), phase, ())
+    sampler = PressSampler(presses, table, 0, np.random.default_rng(0), phase, ())
     rows = sampler.draw(BATCH)
-    x = sampler.inputs(rows, sampler.targets[rows], 0.0)[0][0].numpy()
+    x = sampler.inputs(rows, sampler.targets[rows], 0.0)[0]
     assert x.shape[1] == sampler.n_inputs
     features, mask, seen = np.split(x, [FIBRES * N_FEATURES, FIBRES * (N_FEATURES + 1)], axis=1)
     assert (mask == 1).all()
-    return rows.numpy(), features.reshape(BATCH, FIBRES, N_FEATURES), seen == 1
+    return rows, features.reshape(BATCH, FIBRES, N_FEATURES), seen == 1
 
 
 @pytest.fixture(autouse=True)
