@@ -210,11 +210,11 @@ class LocalizerSettings(Settings):
         le=64,
         description="members combined by their variances, the last of several a Bayesian localizer of the release",
     )
-    hidden: int = Field(default=256, ge=1, le=4096, description="width of the hidden layers")
+    hidden: int = Field(default=192, ge=1, le=4096, description="width of the hidden layers")
     layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")
-    epochs: int = Field(default=200, ge=1, le=100_000, description="passes through the presses, up to 11 000 steps")
+    epochs: int = Field(default=160, ge=1, le=100_000, description="passes through the presses, up to 8800 steps")
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     learning_rate: float = Field(
-        default=4e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule"
+        default=5e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule"
     )
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")

@@ -1,7 +1,7 @@
 """Networks of the localizer in NumPy, for inference; `torch_network` is the same ensemble in torch, for training.
 
 Method "ensemble": a heteroscedastic ensemble of residual MLPs whose inputs are masked features and the mask, so that
-one network serves every set of failed fibres. Residual layers are h + gelu(layer_norm(h)) W + b; the outputs are scaled
+one network serves every set of failed fibres. Residual layers are h + relu(layer_norm(h)) W + b; the outputs are scaled
 position (and depth, force) and the logarithms of their expected absolute errors. Method "published": one tanh layer.
 """
 
@@ -67,8 +67,8 @@ def forward(weights: Weights, x: Floats) -> Floats:
         targets = np.tanh(h) @ weights["last.w"] + weights["last.b"]
         return np.concatenate([targets, np.zeros_like(targets)], axis=2)
     for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
-        h = h + _gelu(_layer_norm(h)) @ w + b
-    return _gelu(_layer_norm(h)) @ weights["last.w"] + weights["last.b"]
+        h = h + _activate(h) @ w + b
+    return _activate(h) @ weights["last.w"] + weights["last.b"]
 
 
 Networks = Mapping[str, Weights]
@@ -204,21 +204,6 @@ def stack_members(members: list[Weights]) -> Weights:
     return {name: np.concatenate([each[name] for each in members], axis=axis) for name, axis in axes.items()}
 
 
-_ERF = (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
-_ERF_WIDTH = 0.3275911
-
-
-def _gelu(x: Floats) -> Floats:
-    """x Phi(x), with the error function to 1.5e-7 (M. Abramowitz and I. A. Stegun, 1964, 7.1.26)."""
-    half = np.abs(x) * np.float32(np.sqrt(0.5))
-    t = 1 / (1 + np.float32(_ERF_WIDTH) * half)
-    tail = np.float32(_ERF[4]) * t
-    for coefficient in _ERF[3::-1]:
-        tail = (tail + np.float32(coefficient)) * t
-    tail *= np.exp(-half * half)
-    return (np.float32(0.5) * (x + np.abs(x) * (1 - tail))).astype(np.float32, copy=False)
-
-
-def _layer_norm(x: Floats) -> Floats:
-    x = x - x.mean(axis=-1, keepdims=True)
-    return x / np.sqrt((x * x).mean(axis=-1, keepdims=True) + np.float32(EPSILON))
+def _activate(h: Floats) -> Floats:
+    h = h - h.mean(axis=-1, keepdims=True)
+    return np.maximum(h / np.sqrt((h * h).mean(axis=-1, keepdims=True) + np.float32(EPSILON)), np.float32(0))

@@ -107,7 +107,7 @@ class PressSampler:
         """Draw moments of the phase, a batch of one where a Bayesian localizer answers, of which each stage has one."""
         n_drawn, rng = 1 if self._bayes else batch, self.rng
         drawn = np.searchsorted(self._cumulated, rng.random(n_drawn) * self._cumulated[-1], side="right")
-        counts = np.broadcast_to(self._phase.first + drawn, batch)
+        counts = np.full(batch, self._phase.first + drawn)
         begin, end = (_ENDS[np.minimum(counts + k, N_DOWN + 1)] for k in (0, 1))
         last = begin + (rng.random(batch) * (end - begin)).astype(np.int64) - 1
         n_sliding = round(self._phase.sliding * batch) if self._speed and self._n_timed else 0
@@ -117,7 +117,7 @@ class PressSampler:
         velocity = speed[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         sliding = last[:n_sliding]
         end = sliding + np.where(sliding >= _ENDS[N_DOWN] - 1, longer, 0.0)
-        return _Moments(np.ascontiguousarray(counts), last, end, velocity, RESIDUAL_MM * self._per_mm)
+        return _Moments(counts, last, end, velocity, RESIDUAL_MM * self._per_mm)
 
 
 def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.random.Generator) -> Mask:

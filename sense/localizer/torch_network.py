@@ -72,7 +72,7 @@ class EnsembleMlp(nn.Module):
 
 def _activate(h: Tensor) -> Tensor:
     width = int(h.shape[-1])  # a plain number also where the network is traced for export
-    return functional.gelu(functional.layer_norm(h, (width,), eps=EPSILON))
+    return functional.relu(functional.layer_norm(h, (width,), eps=EPSILON))
 
 
 def network_inputs(features: Tensor, fibre_mask: Tensor, seen: Tensor) -> Tensor:

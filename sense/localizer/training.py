@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.linalg import eigh
 from torch import Tensor
 
 from padforge.design.common.parallel import makespan, one_torch_thread, run_tasks
@@ -32,15 +33,14 @@ from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings
 
 WARM_UP = 0.2  # share of the steps in which the learning rate rises
+BETAS = 0.9, 0.95  # decay of the means of gradients and of their squares
 AVERAGE_DECAY = 0.998  # decay of the exponential moving average of the weights
 REPORTS = 200  # calls of `on_progress` in a training
 
 
 def one_cycle(share: float) -> float:
-    """Return the learning rate, relative to its maximum, after `share` of the steps: linear up, cosine down to 0."""
-    if share < WARM_UP:
-        return share / WARM_UP
-    return 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
+    """Return the learning rate, relative to its maximum, after `share` of the steps: linear up, linear down to 0."""
+    return min(share / WARM_UP, (1 - share) / (1 - WARM_UP))
 
 
 def fit_network(
@@ -61,7 +61,7 @@ def fit_network(
     """
     begin = time.monotonic()
     average = [weight.detach().clone() for weight in parameters.values()]
-    optimizer = torch.optim.AdamW(parameters.values(), lr=learning_rate, weight_decay=weight_decay, fused=True)
+    optimizer = torch.optim.AdamW(parameters.values(), learning_rate, BETAS, weight_decay=weight_decay, fused=True)
     share, step, reports = 0.0, 0, 0
     while share < 1:
         step += 1
@@ -115,13 +115,16 @@ class JointProgress:
 
 MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, beside the distance
 LOG_ERROR_WEIGHT = 0.1  # weight of the likelihood of the expected error, beside the distance
+COMMON_SQUARE, COMMON_DIRECTIONS, COMMON_BATCHES = 10.0, 16, 16
+"""Mean square from which on directions of the inputs are scaled down, of the most that vary, and the batches that these
+are learnt from. Windows of a fibre vary alike, and so much that a network learns their differences late."""
 INPUT_NOISE = 0.02  # standard deviation of noise on scaled features, which are about 1
 AUGMENTATION = 2.2
 """Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm among 3000 presses on a
 pad of 45 mm, 7 mm among 240, which leave more to interpolate."""
 POSITION_AUGMENTATION, DEPTH_AUGMENTATION = 0.26, 0.3
 """Where depths vary: standard deviations in scaled position and depth, of a press of the middle depth."""
-MIN_BATCHES, MAX_STEPS, HARDER = 10, 11_000, 2
+MIN_BATCHES, MAX_STEPS, HARDER = 10, 8800, 2
 """Steps of an epoch at least, and of a training at most; how much longer training takes where depths vary, which is
 harder to learn."""
 RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
@@ -187,7 +190,7 @@ def train_members(
         name, phase = tasks[number]
         size, corrected = (options, ()) if name else (options.model_copy(update=smaller), bayes)
         training = _Training(presses, table, size, seeds[number], phase, corrected)
-        return fit_network(
+        fitted = fit_network(
             dict(training.network.named_parameters()),
             training.loss,
             all_steps[number],
@@ -195,6 +198,7 @@ def train_members(
             seconds=seconds[number],
             on_progress=partial(joint.update, number),
         )
+        return training.weights(fitted)
 
     with one_torch_thread(), joint:
         weights = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
@@ -263,6 +267,12 @@ class _Training:
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         generator = torch.Generator(self._device).manual_seed(seed)
         self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
+        self._directions, self._shrinkage = (each.to(self._device) for each in self._fit_directions())
+
+    def weights(self, fitted: Weights) -> Weights:
+        """Return the weights for inputs as they are, of `fitted` ones for scaled ones."""
+        first = self._scale_down(torch.from_numpy(fitted["first.w"]).to(self._device).mT).mT
+        return {**fitted, "first.w": np.ascontiguousarray(first.cpu().numpy())}
 
     def measure_pace(self) -> float:
         """Return the seconds that a step takes."""
@@ -274,14 +284,32 @@ class _Training:
         return float(np.median(durations))
 
     def loss(self) -> Tensor:
-        rows = self._presses.draw(self._batch)
-        targets = self._augment_position(self._presses.targets[rows])
-        x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
-        inputs, wanted = (torch.from_numpy(each).to(self._device) for each in (x[None], targets - position))
-        predicted, log_error = self.network.forward_bfloat16(inputs)[0].chunk(2, dim=1)
+        """Return the loss of the next batch."""
+        inputs, wanted = (torch.from_numpy(each).to(self._device) for each in self._draw())
+        predicted, log_error = self.network.forward_bfloat16(self._scale_down(inputs))[0].chunk(2, dim=1)
         error, log_error = predicted - wanted, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
         likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
         return (_loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
+
+    def _draw(self) -> tuple[Floats, Floats]:
+        """Draw inputs (1, B, D), and what the network should answer (B, 2 + T)."""
+        rows = self._presses.draw(self._batch)
+        targets = self._augment_position(self._presses.targets[rows])
+        x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
+        return x[None], targets - position
+
+    def _fit_directions(self) -> tuple[Tensor, Tensor]:
+        """Return the directions (D, n) in which inputs vary most, and the shares (n,) that are taken off these."""
+        x = np.concatenate([self._draw()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
+        n_inputs = x.shape[1]
+        most = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
+        squares, directions = eigh(x.T @ x / len(x), subset_by_index=most)
+        shrinkage = 1 - (1 + squares.clip(0) / COMMON_SQUARE) ** -0.5
+        return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
+
+    def _scale_down(self, x: Tensor) -> Tensor:
+        """Scale (..., D) inputs down, most in the directions in which they vary most."""
+        return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
 
     def _augment_position(self, targets: Floats) -> Floats:
         """Move (B, 2 + T) targets at random, and their force with their depth; reflect them at the bounds."""

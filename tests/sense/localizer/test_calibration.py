@@ -175,7 +175,7 @@ def test_calibrate_reports_divergence(recording: Recording, monkeypatch: pytest.
         return trained._replace(networks={**trained.networks, "settled": settled})
 
     monkeypatch.setattr(training, "train_members", diverged)
-    with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate 0.004, try a lower one"):
+    with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate 0.005, try a lower one"):
         calibrate(recording, SHORT)
 
 

@@ -235,8 +235,8 @@ def test_save_keeps_every_bit(
 def test_load_refuses_files_of_before(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     text = (tmp_path / "localizer.json").read_text()
-    (tmp_path / "localizer.json").write_text(text.replace("padforge-localizer/4", "padforge-localizer/3"))
-    with pytest.raises(InputError, match="padforge-localizer/3"):
+    (tmp_path / "localizer.json").write_text(text.replace("padforge-localizer/5", "padforge-localizer/4"))
+    with pytest.raises(InputError, match="padforge-localizer/4"):
         LocalizerModel.load(tmp_path)
 
 

@@ -132,7 +132,7 @@ def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: in
     assert bool(trained.bayes) == bool(trained.residual_network) == (members > 1)
 
 
-@pytest.mark.parametrize(("capabilities", "tolerance"), [({"avx512_bf16": True}, 0.03), ({"avx512_bf16": False}, 0.0)])
+@pytest.mark.parametrize(("capabilities", "tolerance"), [({"avx512_bf16": True}, 0.05), ({"avx512_bf16": False}, 0.0)])
 def test_forward_bfloat16_is_near_single_precision(
     monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], tolerance: float
 ) -> None:
