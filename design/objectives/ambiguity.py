@@ -10,7 +10,7 @@ posterior
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -18,13 +18,10 @@ from numba import njit
 from padforge.design.common.validation import InputError
 from padforge.design.contact import grid_positions, quick_signals, relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import failure_masks, failure_shares, failure_subsets
+from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets
 from padforge.design.paths.curves import lengths
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 SIDE, MAX_SUBSETS = 20, 64
 """Presses along a side of the grid, and sets of failed fibres of a size."""
@@ -45,47 +42,12 @@ def free_presses(size: PadSettings) -> Array:
     return presses
 
 
-def ambiguity(signals: "Tensor", presses: "Tensor", masks: "Tensor", weights: "Tensor", noise: float) -> "Tensor":
-    """Compute A of the module's formula, averaged by `weights` (L,) over sets of failed fibres; differentiable.
-
-    `signals` (F, Q) at `presses` (Q, 2) have `noise` sigma, grid units; `masks` (L, F) are 1 for a fibre that works.
-    """
-    import torch  # not above: the editor maps the ambiguity without it
-
-    scaled = masks.double()[:, None, :] * (signals.T.double() / (2 * noise))
-    # |s_a|^2 is the same for every b and cancels in the posterior; what remains is one product of matrices, in double
-    # precision since it cancels
-    log_likelihood = torch.baddbmm(-(scaled**2).sum(dim=-1)[:, None, :], scaled, scaled.mT, alpha=2)
-    posterior = torch.softmax(log_likelihood.to(presses.dtype), dim=-1)
-    distance = torch.einsum("lab,ab->l", posterior, torch.cdist(presses, presses)) / len(presses)
-    return distance @ weights
-
-
 def ambiguities(
     pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
     """Compute the ambiguity, grid units, with 0, 1, ... fibres failed on a grid of presses; noise in full scales."""
-    import torch
-
     presses = free_presses(size)
-    stretch = torch.tensor(relative_stretch(pad, presses, contact).T, dtype=torch.float32)
-    touched = stretch.any(dim=1)  # the other fibres have no information; on a large pad they are most
-    stretch = stretch[touched]
-    positions = torch.tensor(presses, dtype=torch.float32)
-    fibres = len(pad.knots)
-    values = []
-    for n_failed in range(min(len(failure_shares(max_failures)), fibres)):
-        masks = torch.tensor(failure_masks(fibres, n_failed, MAX_SUBSETS), dtype=torch.float32)[:, touched]
-        equal = torch.full((len(masks),), 1 / len(masks))
-        values.append(ambiguity(stretch, positions, masks, equal, noise * full_scale(stretch)).item())
-    return values
-
-
-def full_scale(signals: "Tensor") -> float:
-    """Return the mean over touched fibres of their largest signal, from signals (F, Q); 1 if none is touched."""
-    largest = signals.detach().amax(dim=1)
-    touched = largest[largest > 0]
-    return touched.mean().item() if len(touched) else 1.0
+    return _by_press(relative_stretch(pad, presses, contact), presses, max_failures, noise).mean(axis=1).tolist()
 
 
 def ambiguity_map(
@@ -96,7 +58,11 @@ def ambiguity_map(
     Each of the `presses` (Q, 2) may be taken for any other. Signals are exact, but for a layer or a profile within the
     PRECISION of `measured_signals`; `noise` is a share of full scale.
     """
-    stretch = quick_signals(pad, presses, contact) / lengths(pad)
+    return _by_press(quick_signals(pad, presses, contact) / lengths(pad), presses, max_failures, noise)
+
+
+def _by_press(stretch: Array, presses: Array, max_failures: int | tuple[float, ...], noise: float) -> Array:
+    """Return the ambiguity (K, Q), of relative stretches (Q, F), with noise in means of the fibres' largest ones."""
     largest = stretch.max(axis=0)
     scale = largest[largest > 0].mean() if largest.any() else 1.0
     fibres = stretch.shape[1]
@@ -104,13 +70,13 @@ def ambiguity_map(
     subsets = [failure_subsets(fibres, n_failed, MAX_SUBSETS) for n_failed in range(most + 1)]
     # rows of equal length, filled up with F
     failed = np.array([(*row, *(fibres,) * (most - len(row))) for level in subsets for row in level], dtype=np.int64)
-    values = _press_ambiguities(np.ascontiguousarray(stretch / (2 * noise * scale)), presses, failed)
+    values = press_ambiguities(np.ascontiguousarray(stretch / (2 * noise * scale)), presses, failed)
     ends = np.cumsum([len(level) for level in subsets])
     return np.stack([level.mean(axis=1) for level in np.split(values, ends[:-1], axis=1)])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
+def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
     """Compute sum_b w_ab |p_a - p_b| (Q, L) exactly, without the pairs of presses that add nothing.
 
     `signals` (Q, F) are divided by twice their noise; `failed` (L, K) are indices of failed fibres, F where fewer fail.
