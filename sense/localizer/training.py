@@ -63,6 +63,7 @@ def fit_network(
     average = [weight.detach().clone() for weight in parameters.values()]
     optimizer = torch.optim.AdamW(parameters.values(), learning_rate, BETAS, weight_decay=weight_decay, fused=True)
     share, step, reports = 0.0, 0, 0
+    torch.set_flush_denormal(True)  # of this thread: means of gradients that stay 0 fade to numbers that take long
     while share < 1:
         step += 1
         share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
