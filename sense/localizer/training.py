@@ -125,7 +125,7 @@ AUGMENTATION = 2.2
 pad of 45 mm, 7 mm among 240, which leave more to interpolate."""
 POSITION_AUGMENTATION, DEPTH_AUGMENTATION = 0.26, 0.3
 """Where depths vary: standard deviations in scaled position and depth, of a press of the middle depth."""
-MIN_BATCHES, MAX_STEPS, HARDER = 10, 8800, 2
+MIN_BATCHES, MAX_STEPS, HARDER = 9, 9900, 2
 """Steps of an epoch at least, and of a training at most; how much longer training takes where depths vary, which is
 harder to learn."""
 RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
