@@ -167,7 +167,7 @@ def train_members(
     members, cores = max(1, options.members - has_bayes), os.cpu_count() or 1
     if time_budget is not None:
         with one_torch_thread():
-            pace_s = _Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
+            pace_s = Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
         has_bayes = not presses.depth_gain
         members = max(1, min(round(cores * time_budget / (pace_s * MIN_LENGTHS * steps * length)), MAX_MEMBERS))
     fitted = presses.inputs, presses.fibre_mask, presses.targets
@@ -190,7 +190,7 @@ def train_members(
     def train(number: int) -> Weights:
         name, phase = tasks[number]
         size, corrected = (options, ()) if name else (options.model_copy(update=smaller), bayes)
-        training = _Training(presses, table, size, seeds[number], phase, corrected)
+        training = Training(presses, table, size, seeds[number], phase, corrected)
         fitted = fit_network(
             dict(training.network.named_parameters()),
             training.loss,
@@ -241,7 +241,7 @@ def _loss(error: Tensor) -> Tensor:
     return distance if error.shape[-1] == 2 else distance + MEASURE_WEIGHT * error[..., 2:].abs().sum(dim=-1)
 
 
-class _Training:
+class Training:
     """A network and its loss, on the GPU where there is one."""
 
     def __init__(
@@ -272,7 +272,7 @@ class _Training:
 
     def weights(self, fitted: Weights) -> Weights:
         """Return the weights for inputs as they are, of `fitted` ones for scaled ones."""
-        first = self._scale_down(torch.from_numpy(fitted["first.w"]).to(self._device).mT).mT
+        first = self.scale_down(torch.from_numpy(fitted["first.w"]).to(self._device).mT).mT
         return {**fitted, "first.w": np.ascontiguousarray(first.cpu().numpy())}
 
     def measure_pace(self) -> float:
@@ -286,13 +286,13 @@ class _Training:
 
     def loss(self) -> Tensor:
         """Return the loss of the next batch."""
-        inputs, wanted = (torch.from_numpy(each).to(self._device) for each in self._draw())
-        predicted, log_error = self.network.forward_bfloat16(self._scale_down(inputs))[0].chunk(2, dim=1)
+        inputs, wanted = (torch.from_numpy(each).to(self._device) for each in self.draw())
+        predicted, log_error = self.network.forward_bfloat16(self.scale_down(inputs))[0].chunk(2, dim=1)
         error, log_error = predicted - wanted, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
         likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
         return (_loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
 
-    def _draw(self) -> tuple[Floats, Floats]:
+    def draw(self) -> tuple[Floats, Floats]:
         """Draw inputs (1, B, D), and what the network should answer (B, 2 + T)."""
         rows = self._presses.draw(self._batch)
         targets = self._augment_position(self._presses.targets[rows])
@@ -301,14 +301,14 @@ class _Training:
 
     def _fit_directions(self) -> tuple[Tensor, Tensor]:
         """Return the directions (D, n) in which inputs vary most, and the shares (n,) that are taken off these."""
-        x = np.concatenate([self._draw()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
+        x = np.concatenate([self.draw()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
         n_inputs = x.shape[1]
         most = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
         squares, directions = eigh(x.T @ x / len(x), subset_by_index=most)
         shrinkage = 1 - (1 + squares.clip(0) / COMMON_SQUARE) ** -0.5
         return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
 
-    def _scale_down(self, x: Tensor) -> Tensor:
+    def scale_down(self, x: Tensor) -> Tensor:
         """Scale (..., D) inputs down, most in the directions in which they vary most."""
         return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
 

@@ -132,6 +132,25 @@ def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: in
     assert bool(trained.bayes) == bool(trained.residual_network) == (members > 1)
 
 
+def test_inputs_are_scaled_down_in_training_alone() -> None:
+    """Most where they vary most; the weights that a training returns are for inputs as they are."""
+    rng = np.random.default_rng(0)
+    table = np.zeros((3, 3, 4, N_FEATURES), np.float32)
+    common = 5 * rng.standard_normal((200, 1, 1)) + 0.1 * rng.standard_normal((200, 4, N_FEATURES))
+    presses = training_presses(common, np.ones((200, 4), bool), rng.uniform(-1, 1, (200, 2)), N_TIMED)
+    trained = training.Training(presses, table, Options(hidden=8, layers=1), 0, PHASES[N_TIMED]["released"])
+    x = torch.from_numpy(np.concatenate([trained.draw()[0] for _ in range(20)], axis=1))
+    scaled = trained.scale_down(x)
+    squares = torch.linalg.eigvalsh(scaled[0].T @ scaled[0] / x.shape[1])
+    assert torch.linalg.eigvalsh(x[0].T @ x[0] / x.shape[1])[-1] > 500
+    assert squares[-1] < 1.1
+    small = torch.linalg.eigvalsh(x[0].T @ x[0] / x.shape[1])[:50]
+    torch.testing.assert_close(squares[:50], small / training.COMMON_SQUARE, rtol=1e-2, atol=1e-4)
+    weights = {name: weight.detach().numpy() for name, weight in trained.network.named_parameters()}
+    expected = trained.network(scaled).detach().numpy()
+    np.testing.assert_allclose(network.forward(trained.weights(weights), x[0].numpy()), expected, atol=1e-4)
+
+
 @pytest.mark.parametrize(("capabilities", "tolerance"), [({"avx512_bf16": True}, 0.05), ({"avx512_bf16": False}, 0.0)])
 def test_forward_bfloat16_is_near_single_precision(
     monkeypatch: pytest.MonkeyPatch, capabilities: dict[str, bool], tolerance: float
