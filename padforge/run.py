@@ -115,7 +115,9 @@ class _StageCache:
         self._stages: dict[str, dict[str, Any]] = {}
         if run.resume and self._note.exists():
             with reraise_as_input_error(self._note):
-                self._stages = dict(read_json(self._note, FORMAT)["stages"])
+                for stage, entry in dict(read_json(self._note, FORMAT)["stages"]).items():
+                    files = {str(name): digest for name, digest in dict(entry["files"]).items()}
+                    self._stages[stage] = {"cache_key": entry["cache_key"], "files": files}
         if not self._stages:  # from now on the results of another run are replaced
             self._note.unlink(missing_ok=True)
 
@@ -142,10 +144,8 @@ class _StageCache:
             "inputs": inputs,
         }
         key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-        with reraise_as_input_error(self._note):
-            entry = self._stages.get(stage, {})
-            is_finished = entry.get("cache_key") == key and dict(entry["files"]) == self._digests(entry["files"])
-        if is_finished:
+        entry = self._stages.get(stage)
+        if entry and entry["cache_key"] == key and entry["files"] == self._digests(entry["files"]):
             self.reused.append(stage)
             return load()
 

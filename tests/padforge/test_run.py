@@ -268,9 +268,12 @@ def test_remaining_time_counts_from_the_start_of_the_run(monkeypatch: pytest.Mon
     assert Run(Spec({}), Path("pad"), started_s=100.0).remaining_s(0.5) is None
 
 
-@pytest.mark.parametrize("content", ["{}", '{"format": "padforge-run/2"}', '{"format": "padforge-run/2", "stages": 3}'])
-def test_damaged_note_is_refused(folder: Path, content: str) -> None:
-    (folder / "out" / "pad" / "run.json").write_text(content)
+@pytest.mark.parametrize(
+    "stages", ["", ', "stages": 3', ', "stages": {"sense": {"files": {}}}', ', "stages": {"sense": {"files": 3}}']
+)
+def test_damaged_note_is_refused(folder: Path, stages: str) -> None:
+    """Before a stage is done again, whichever stage's entry is damaged."""
+    (folder / "out" / "pad" / "run.json").write_text(f'{{"format": "padforge-run/2"{stages}}}')
     assert "run.json: " in refused("run", "--resume", cwd=folder)
 
 
