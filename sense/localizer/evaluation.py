@@ -17,7 +17,7 @@ from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/3"
-BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.93 / 1.16 / 1.51 / 2.25 mm"
+BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.97 / 1.20 / 1.54 / 2.32 mm"
 """What a simulated error is, beside the errors of the published recording with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # sets of failed fibres of a size that each moment is evaluated with, at most
