@@ -63,7 +63,6 @@ def search_progress() -> "Iterator[OnProgress]":
 @common.setting_option("--starts", SEARCH, int, "Random starts of the gradient search.")
 @click.option("--start-from", metavar="random|straight|FILE", help="Initial fibres (default: random).")
 @twin_option
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="Device that evaluates the objective.")
 @time_budget_option("Stop with the best pad after S seconds.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted search into the same folder.")
 @common.scheduler_option

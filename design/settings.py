@@ -471,7 +471,6 @@ class SearchSettings(Settings):
     scatter_common: float = Field(default=0.36, ge=0, le=0.99, description="share of its variance common to all fibres")
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
     contacts: Contacts = Field(default=(), description="further contacts to serve as well, each a table like [contact]")
-    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where the expected error is computed")
 
     @property
     def default_contact(self) -> Contact:

@@ -102,7 +102,8 @@ def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
                 continue
             # 2. likelihood without the terms of the failed fibres
             if total < MAX_EXPONENT:
-                factor[:fibres] = np.exp(square[:fibres])
+                for f in range(fibres):
+                    factor[f] = math.exp(square[f])
                 product = math.exp(-total)
                 for k in range(sets):
                     likelihood[k] = product

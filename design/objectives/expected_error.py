@@ -23,14 +23,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
+from numba import njit
 from numpy.typing import NDArray
-from torch import Tensor
 
-from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.kernels.error_bound import error_bound
-from padforge.design.morphology import Array, Morphology
+from padforge.design.kernels.leave_one_out import leave_one_out_errors
+from padforge.design.morphology import Array, Ints, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import (
@@ -63,8 +62,6 @@ BOUND_WEIGHT, REGRESSION_WEIGHT = 0.85, 0.47
 """Weights of both terms, by which errors agree best with those of trained networks, within 7 % over straight, gently
 and strongly curved pads: a network's mean error is below the root of a variance, and it learns better than the ridge.
 """
-EPSILON = 1e-12
-"""Squared length, so that its root has a gradient at 0."""
 DEFAULT_FULL_SCALE = 0.182
 """Full scale of straight fibres of the default pad under the default press, a relative stretch."""
 FULL_SCALE_SIDE = 24
@@ -79,12 +76,11 @@ class PressWindow(NamedTuple):
     free: NDArray[np.bool_]  # which lie in no keep-out; shape (Q,)
     far: Array  # presses over the remaining pad, none where the window is all that is pressed; shape (P, 2)
 
-    def with_partners(self, partners: Tensor) -> Tensor:
+    def with_partners(self, partners: Ints) -> Array:
         """Return (Q + P, 2) positions of the window and of far presses by their indices."""
-        return torch.tensor(np.concatenate([self.positions, self.far[partners.cpu().numpy()]]))
+        return np.concatenate([self.positions, self.far[partners]])
 
 
-@one_torch_thread()
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
     """Compute the expected errors, grid units, with 0, 1, ... fibres failed, always on the same presses.
 
@@ -102,21 +98,19 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         if not presses.free.any():
             continue
         near, far = (
-            torch.tensor(relative_stretch(pad, positions, contact).T / scale)
-            for positions in (presses.positions, presses.far)
+            relative_stretch(pad, positions, contact).T / scale for positions in (presses.positions, presses.far)
         )
-        touched = torch.cat([near, far], dim=1).any(dim=1)  # on a large pad most fibres are far from all the presses
+        touched = np.concatenate([near, far], axis=1).any(axis=1)  # on a large pad most fibres are far from the presses
         # and most sets of failed fibres are equal for the touched ones
-        sets = [np.unique(mask[:, touched.numpy()], axis=0, return_inverse=True) for mask in masks]
+        sets = [np.unique(mask[:, touched], axis=0, return_inverse=True) for mask in masks]
         weighted = [weights[touched, None] * responses[touched] for responses in (near, far)]
-        step, free = torch.tensor(presses.step), torch.tensor(presses.free)
         errors.append([])
         for unique, rows in sets:
-            mask = torch.tensor(unique)
-            partners = confusable(weighted[0], weighted[1], mask)
-            responses, positions = torch.cat([near, far[:, partners]], dim=1)[touched], presses.with_partners(partners)
-            values = expected_error(responses, positions, step, free, mask, scatter, weights[touched])
-            errors[-1].append(float(values.numpy()[rows].mean()))
+            partners = confusable(weighted[0], weighted[1], unique)
+            responses = np.concatenate([near, far[:, partners]], axis=1)[touched]
+            where = presses.with_partners(partners), presses.step, presses.free
+            values, _ = expected_error(responses, *where, unique, scatter, weights[touched], differentiate=False)
+            errors[-1].append(float(values[rows].mean()))
     return np.mean(errors, axis=0).tolist()
 
 
@@ -142,12 +136,12 @@ def scatter_of_full_scale(scatter: Scatter, contact: Contact, full_scale: float)
     )
 
 
-def kernel_weights(layout: Layout) -> Tensor:
+def kernel_weights(layout: Layout) -> Array:
     """Return weights (F,) of the fibres' responses in the kernel: by the full scale of each.
 
     The long fibres of a strip stretch little beside those across it, and a network scales its inputs.
     """
-    along = torch.tensor(np.repeat(layout.extent, layout.counts), dtype=torch.float64)
+    along = np.repeat(layout.extent, layout.counts)
     return along * (1 / along).mean()
 
 
@@ -190,116 +184,124 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
     return PressWindow(positions, (high - low) / side, is_outside(positions, size), far)
 
 
-def confusable(near: Tensor, far: Tensor, masks: Tensor) -> Tensor:
+def confusable(near: Array, far: Array, masks: Array) -> Ints:
     """Find the far presses whose responses are nearest to some press of a window, under any set of failed fibres.
 
     They are at most MAX_PARTNERS ascending indices; none at MAX_PARTNER_DISTANCE widths or more. Responses of
     the window (F, Q) and of the remaining pad (F, N) are weighted as in the kernel; `masks` are (L, F).
     """
     if not far.shape[1]:
-        return torch.empty(0, dtype=torch.int64)
-    # fibres that no press of the window stretches, most of them on a large pad, add the far response alone
-    touched = near.any(dim=1)
-    window, beyond, elsewhere = (x.detach().float().T / WIDTH for x in (near[touched], far[touched], far[~touched]))
-    distance = torch.full((far.shape[1],), torch.inf, device=far.device)
-    for mask in masks.float().unique(dim=0):
-        within = torch.cdist(beyond * mask[touched], window * mask[touched]).amin(dim=1)
-        distance = torch.minimum(distance, torch.hypot(within, (elsewhere.square() @ mask[~touched]).sqrt()))
-    best = distance.topk(min(MAX_PARTNERS, len(distance)), largest=False)
-    return best.indices[best.values < MAX_PARTNER_DISTANCE].sort().values
+        return np.empty(0, np.int64)
+    limit = MAX_PARTNER_DISTANCE * WIDTH
+    squares = least_squares(np.ascontiguousarray(near.T), np.ascontiguousarray(far.T), masks, limit**2)
+    best = np.argsort(squares, kind="stable")[:MAX_PARTNERS]
+    return np.sort(best[squares[best] < limit**2])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def least_squares(near: Any, far: Any, masks: Any, limit: float) -> Any:
+    """Compute the least squared distance (N,) of each response of far (N, F) to any of near (Q, F), under any set.
+
+    `masks` (L, F) are the sets of working fibres. Distances of `limit` or more may be given as `limit`.
+    """
+    sets, most = len(masks), int(masks.shape[1] - masks.sum(axis=1).min())
+    out, largest = np.full(len(far), limit), np.empty(most)
+    touched = np.array([f for f in range(near.shape[1]) if near[:, f].any()])
+    others = np.array([f for f in range(near.shape[1]) if not near[:, f].any()])
+    terms, beside = np.empty(len(touched)), np.empty(sets)
+    for i in range(len(far)):
+        # fibres that no press of the window stretches, most of them on a large pad, add the far response alone
+        for k in range(sets):
+            beside[k] = 0.0
+            for f in others:
+                beside[k] += masks[k, f] * far[i, f] ** 2
+        least_beside = beside.min()
+        for q in range(len(near) if least_beside < limit else 0):
+            # without the `most` largest terms it is no more than under any set
+            total = least_beside
+            largest[:] = 0.0
+            for j in range(len(touched)):
+                term = (far[i, touched[j]] - near[q, touched[j]]) ** 2
+                terms[j] = term
+                total += term
+                for k in range(most):
+                    if term > largest[k]:
+                        term, largest[k] = largest[k], term
+            if total - largest.sum() >= out[i]:
+                continue
+            for k in range(sets):
+                square = beside[k]
+                for j in range(len(touched)):
+                    square += masks[k, touched[j]] * terms[j]
+                out[i] = min(out[i], square)
+    return out
 
 
 def expected_error(
-    responses: Tensor, positions: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter, weights: Tensor
-) -> Tensor:
-    """Compute the expected error (L,), grid units, for each set of failed fibres; differentiable.
+    responses: Array,
+    positions: Array,
+    step: Array,
+    free: NDArray[np.bool_],
+    masks: Array,
+    scatter: Scatter,
+    weights: Array,
+    differentiate: bool = True,
+) -> tuple[Array, Array]:
+    """Compute the expected error (L,), grid units, for each set of failed fibres, and its gradient by the responses.
 
     Args:
         responses: in full scales of straight fibres, for the presses of a grid of Q = side^2, row by row, and P others
-            in the regression; single precision is enough; shape (F, Q + P).
+            in the regression; shape (F, Q + P).
         positions: shape (Q + P, 2), grid units.
         step: between neighbours of the grid; shape (2,), grid units.
         free: which presses of the grid count; the others lie in a keep-out; shape (Q,).
         masks: 1 for a fibre that works, 0 for a failed one; shape (L, F).
         scatter: of responses; its floor is above 0.
         weights: of responses in the kernel; shape (F,).
+        differentiate: whether to compute the gradient.
+
+    Returns:
+        Errors (L,) and their gradients (L, F, Q + P), or (L, 0, Q + P) where none is asked for.
     """
-    positions, masks = (x.to(responses.dtype) for x in (positions, masks))
-    count = len(free)
-    bound = _Bound.apply(responses[:, :count], step, free, masks, scatter)
-    rows = torch.cat([free.nonzero()[:, 0], torch.arange(count, len(positions))])
-    middle = positions[:count].mean(dim=0)
-    weighted = (responses * weights[:, None].to(responses))[:, rows] / WIDTH
-    regression = _LeaveOneOut.apply(weighted, positions[rows] - middle, masks, int(free.sum()))
-    return BOUND_WEIGHT * bound + REGRESSION_WEIGHT * regression
+    count, fibres = len(free), len(responses) if differentiate else 0
+    gradient = np.zeros((len(masks), fibres, len(positions)))
+    rows = np.concatenate([np.flatnonzero(free), np.arange(count, len(positions))])
+    # 1. the regression
+    share = weights[:, None] / WIDTH
+    scaled = np.float32(share * responses[:, rows])
+    where = np.float32(positions[rows] - positions[:count].mean(axis=0))
+    by_scaled = np.empty((len(masks), fibres, len(rows)))
+    regression = leave_one_out_errors(scaled, where, masks, int(free.sum()), RIDGE, by_scaled)
+    gradient[:, :, rows] = REGRESSION_WEIGHT * share[:fibres] * by_scaled
+    # 2. the bound, over cells whose corners all count: none where there are no more than slits between keep-outs
+    side = math.isqrt(count)
+    grid = free.reshape(side, side)
+    row, column = np.nonzero(grid[:-1, :-1] & grid[:-1, 1:] & grid[1:, :-1] & grid[1:, 1:])
+    if not len(row):
+        return REGRESSION_WEIGHT * regression, gradient
+    by_grid = np.empty((len(masks), fibres, count))
+    cells, prior = row * side + column, 12 / (step * side) ** 2
+    bound = error_bound(np.ascontiguousarray(responses[:, :count]), step, cells, masks, tuple(scatter), prior, by_grid)
+    gradient[:, :, :count] += BOUND_WEIGHT * by_grid
+    return BOUND_WEIGHT * bound + REGRESSION_WEIGHT * regression, gradient
 
 
-def aggregate_failures(errors: Tensor, masks: Tensor, shares: tuple[float, ...]) -> Tensor:
-    """Return the geometric mean of errors (L,) over numbers of failed fibres: relative gains count alike at each.
+def aggregate_failures(errors: Array, masks: Array, shares: tuple[float, ...]) -> tuple[float, Array]:
+    """Return the geometric mean of errors over numbers of failed fibres: relative gains count alike at each.
 
-    `masks` (L, F) are the sets of failed fibres, `shares` P(k) of k = 0, 1, ... failed, as far as they occur there.
+    Args:
+        errors: of each set of failed fibres; shape (L,).
+        masks: the sets; shape (L, F).
+        shares: P(k) of k = 0, 1, ... failed, as far as they occur there.
+
+    Returns:
+        The mean, and its derivatives (L,) by the errors.
     """
-    n_failed = (masks == 0).sum(dim=1)
+    n_failed = (masks == 0).sum(axis=1)
     levels = [k for k in range(len(shares)) if (n_failed == k).any()]
-    logs = torch.stack([errors[n_failed == k].mean().log() for k in levels])
-    weights = torch.tensor([shares[k] for k in levels], dtype=logs.dtype, device=logs.device)
-    return (logs @ weights / weights.sum()).exp()
-
-
-class _Bound(torch.autograd.Function):
-    """B with its gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, responses: Tensor, step: Tensor, free: Tensor, masks: Tensor, scatter: Scatter) -> Tensor:
-        """Return B (L,) for responses (F, Q) on a grid, over its free cells."""
-        # squares of slopes over a faint noise overflow in single precision, and one direction would hide the other
-        values, steps, working = (x.detach().cpu().double().numpy() for x in (responses, step, masks))
-        side = math.isqrt(len(free))
-        grid = free.cpu().numpy().reshape(side, side)
-        row, column = np.nonzero(grid[:-1, :-1] & grid[:-1, 1:] & grid[1:, :-1] & grid[1:, 1:])
-        gradient = np.zeros((len(working), len(values) if responses.requires_grad else 0, len(free)))
-        bound = np.zeros(len(working))  # no more than slits between keep-outs
-        if len(row):
-            prior = 12 / (steps * side) ** 2
-            where = np.ascontiguousarray(values), steps, row * side + column, working
-            bound = error_bound(*where, (scatter.floor, scatter.share, scatter.common), prior, gradient)
-        ctx.gradient = torch.from_numpy(gradient)
-        return torch.from_numpy(bound).to(responses)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradient by the responses."""
-        by_responses = torch.einsum("l,lkq->kq", upstream[0].cpu().double(), ctx.gradient)
-        return by_responses.to(upstream[0]), None, None, None, None
-
-
-class _LeaveOneOut(torch.autograd.Function):
-    """L with its gradient in closed form, since both come from the same inverse."""
-
-    @staticmethod
-    def forward(ctx: Any, responses: Tensor, positions: Tensor, masks: Tensor, count: int) -> Tensor:
-        """Return L (L,) over the first `count` presses, for responses (F, Q) in widths of the kernel."""
-        # differences, unlike products, do not cancel: single precision serves
-        difference = responses[:, :, None] - responses[:, None, :]
-        kernel = torch.exp(torch.mm(masks / -2, difference.square().flatten(1)).view(-1, *difference.shape[1:]))
-        ridged = kernel.clone()
-        ridged.diagonal(dim1=1, dim2=2).add_(RIDGE)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(ridged))
-        alpha = inverse @ positions
-        length = (alpha.square().sum(dim=-1) + EPSILON).sqrt()
-        ctx.save_for_backward(difference, kernel, inverse, alpha, length, masks)
-        ctx.count = count
-        return (length / inverse.diagonal(dim1=1, dim2=2))[:, :count].mean(dim=1)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradient by the responses."""
-        difference, kernel, inverse, alpha, length, masks = ctx.saved_tensors
-        diagonal = inverse.diagonal(dim1=1, dim2=2)
-        share = upstream[0][:, None] / ctx.count * (torch.arange(diagonal.shape[1]) < ctx.count).to(diagonal)
-        by_alpha, by_diagonal = alpha * (share / (length * diagonal))[..., None], -share * length / diagonal**2
-        # dC = -C dk C gives the derivative of L by every entry of k, but for the sign
-        by_kernel = torch.bmm(inverse * by_diagonal[:, None, :], inverse)
-        by_kernel += torch.bmm(inverse @ by_alpha, alpha.mT)
-        by_response = torch.mm(masks.T, (by_kernel * kernel).flatten(1)).view(difference.shape) * difference
-        return by_response.sum(dim=2) - by_response.sum(dim=1), None, None, None
+    weights = np.array([shares[k] for k in levels]) / sum(shares[k] for k in levels)
+    means = np.array([errors[n_failed == k].mean() for k in levels])
+    value, gradient = float(np.exp(np.log(means) @ weights)), np.zeros(len(errors))
+    for k, weight, mean in zip(levels, weights, means, strict=True):
+        gradient[n_failed == k] = value * weight / (mean * (n_failed == k).sum())
+    return value, gradient

@@ -2,7 +2,7 @@
 
 To add a term, write a function of a `ScoredPad` and add a row to TERMS; `score`, design.json and the report then have
 it. For a search to minimise it as well, name in the row the key of `[search]` that holds its weight (added to
-`SearchSettings`, 0 by default) and its differentiable form `loss`, a function of a `SearchedPad`.
+`SearchSettings`, 0 by default) and `loss`, its value and gradient at a step.
 
 To add a rule, see `padforge.design.objectives.rules`.
 """
@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
@@ -25,6 +23,7 @@ from padforge.design.objectives.expected_error import SEARCH_SIDE, expected_erro
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
+from padforge.design.signal_gradients import FibreCurves
 
 
 @dataclass(frozen=True)
@@ -77,17 +76,6 @@ class ScoredPad:
 
 
 @dataclass(frozen=True)
-class SearchedPad:
-    """A pad at a step of a search, with gradients by its knots; grid units."""
-
-    signals: Callable[[Array], Tensor]  # signals (F, Q) of presses (Q, 2)
-    along: Tensor  # knots (F, n) along the fibres
-    across: Tensor  # and across them
-    length: Tensor  # of the fibres (F, 1)
-    size: PadSettings  # says what is pressed
-
-
-@dataclass(frozen=True)
 class Term:
     """A row of the table of terms."""
 
@@ -95,12 +83,20 @@ class Term:
     description: str  # for people; `{}` stands for the end of the name
     compute: Callable[[ScoredPad], float | Mapping[object, float]]  # its value, or several by the end of their name
     weight: str | None = None  # key of `[search]` by which a search weighs it; None if it does not
-    loss: Callable[[SearchedPad], Tensor] | None = None  # its differentiable form
+    # its value at a step of a search, for a contact and for what is pressed, and its gradient (3, F, n) by the curves
+    loss: Callable[[FibreCurves, Contact, PadSettings], tuple[float, Array]] | None = None
 
 
-def sharpness(signals: Tensor) -> Tensor:
+def sharpness(signals: Array) -> float:
     """Return Z of signals (F, Q), grid units, as published but for the quantisation, which has no gradient."""
-    return signals.diff(n=2, dim=1).abs().mean()
+    return float(np.abs(np.diff(signals, n=2, axis=1)).mean())
+
+
+def _sharpness_loss(curves: FibreCurves, contact: Contact, size: PadSettings) -> tuple[float, Array]:
+    signals, differentiate = curves.signals(serpentine_presses(size.sensed, SEARCH_SIDE), contact)
+    signs = np.sign(np.diff(signals, n=2, axis=1))
+    by_signals = np.diff(np.pad(signs, ((0, 0), (2, 2))), n=2, axis=1)  # the transpose of a second difference is one
+    return sharpness(signals), differentiate(by_signals / signs.size)
 
 
 def _in_mm(scored: ScoredPad, values: list[float]) -> dict[object, float]:
@@ -134,9 +130,9 @@ TERMS = (
     Term(
         "sharpness",
         "mean second difference of the signals along a serpentine, grid units",
-        lambda s: sharpness(torch.tensor(s.serpentine_signals.T)).item(),
+        lambda s: sharpness(s.serpentine_signals.T),
         weight="sharpness",
-        loss=lambda pad: sharpness(pad.signals(serpentine_presses(pad.size.sensed, SEARCH_SIDE))),
+        loss=_sharpness_loss,
     ),
     Term("penalty", "penalty of {} in the gradient search", _penalties),
     Term(

@@ -6,26 +6,24 @@ them to the same bits, so that it can run in slices on any thread or machine and
 
 import json
 import math
-from functools import partial
-from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from padforge.design.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
 from padforge.design.objectives import expected_error as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.score import SearchedPad, weighted_terms
+from padforge.design.objectives.score import weighted_terms
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
-from padforge.design.torch_signals import arc_lengths, pchip_slopes, press_signals
+from padforge.design.signal_gradients import FibreCurves
 
 LEARNING_RATE = 0.04
+BETAS = 0.9, 0.999
+"""By which a step of Adam multiplies its means of gradients and of their squares."""
 INITIAL_NOISE = 2.0
 """Scatter of the first step as a multiple of the last one's."""
 PENALTY_WEIGHT = (1.0, 300.0)
@@ -34,6 +32,8 @@ RULE_MARGIN = 1.05
 """On the limits of the rules."""
 HISTORY_STEPS = 10
 """Steps between entries of the history."""
+MAX_GRADIENT = 1e150
+"""Whose square is finite."""
 REPAIR_STEPS, REPAIR_CHECKS = 600, 20
 """Most steps of repair after the last step, and steps between two exact checks."""
 REPAIR_MARGIN = 0.01
@@ -56,12 +56,12 @@ class Parametrization:
     Coordinates along a fibre are running sums of a softmax with a floor under every span, those across it a sigmoid.
     """
 
-    def __init__(self, layout: Layout, spans: Tensor, across: Tensor, floor: float, border: float) -> None:
+    def __init__(self, layout: Layout, spans: Array, across: Array, floor: float, border: float) -> None:
         self.layout, self.ends = layout, fibre_ends(layout)
         self.floor, self.border = floor, border  # least span, and least distance of a knot to the border, grid units
-        # logits of the spans (F, N + 1), and of the coordinates across the fibres (F, N)
-        self.spans, self.across = (x.detach().clone().requires_grad_() for x in (spans, across))
-        self._length, self._width, self._level = (torch.tensor(x)[:, None] for x in (*_sides(layout), layout.levels))
+        self.spans, self.across = spans, across  # logits of the spans (F, N + 1), and of the coordinates across (F, N)
+        self._length, self._width, self._level = (x[:, None] for x in (*_sides(layout), layout.levels))
+        self._free = self._length - spans.shape[1] * floor  # what the spans share; shape (F, 1)
 
     @classmethod
     def from_knots(cls, knots: Array, layout: Layout, border: float) -> "Parametrization":
@@ -70,25 +70,55 @@ class Parametrization:
         width = np.diff(along, axis=1)
         floor = min(0.1 * min(layout.extent) / (knots.shape[1] - 1), 0.5 * float(width.min()))
         unit = np.clip((across[:, 1:-1] - border) / (_sides(layout)[1][:, None] - 2 * border), 0.005, 0.995)
-        spans, logits = np.log(width - floor), np.log(unit / (1 - unit))
-        return cls(layout, torch.tensor(spans), torch.tensor(logits), floor, border)
+        return cls(layout, np.log(width - floor), np.log(unit / (1 - unit)), floor, border)
 
-    def axes(self) -> tuple[Tensor, Tensor]:
+    def axes(self) -> tuple[Array, Array]:
         """Return the coordinates of all knots along and across the fibres, ends included, both (F, N + 2)."""
-        count = self.spans.shape[1]
-        width = self.floor + (self._length - count * self.floor) * self.spans.softmax(dim=1)
-        start = torch.zeros_like(width[:, :1])
-        along = torch.cat([start, width.cumsum(dim=1)[:, :-1], start + self._length], dim=1)
-        across = self.border + (self._width - 2 * self.border) * self.across.sigmoid()
-        return along, torch.cat([self._level, across, self._level], dim=1)
+        width, unit = self.floor + self._free * self._shares(), 1 / (1 + np.exp(-self.across))
+        begin = np.zeros_like(self._length)
+        along = np.concatenate([begin, width.cumsum(axis=1)[:, :-1], self._length], axis=1)
+        across = self.border + (self._width - 2 * self.border) * unit
+        return along, np.concatenate([self._level, across, self._level], axis=1)
+
+    def gradients(self, by_along: Array, by_across: Array) -> tuple[Array, Array]:
+        """Return the derivatives by the logits of a value that has these (F, N + 2) by the coordinates of the knots."""
+        shares, unit = self._shares(), 1 / (1 + np.exp(-self.across))
+        by_shares = np.zeros_like(shares)  # each moves the knots after it, but for the last, which is fixed
+        by_shares[:, :-1] = self._free * by_along[:, -2:0:-1].cumsum(axis=1)[:, ::-1]
+        by_spans = shares * (by_shares - (shares * by_shares).sum(axis=1, keepdims=True))
+        return by_spans, by_across[:, 1:-1] * (self._width - 2 * self.border) * unit * (1 - unit)
 
     def knots(self) -> Array:
         """Return the knots (F, N + 2, 2) as `Morphology` holds them."""
-        with torch.no_grad():
-            along, across = (x.numpy() for x in self.axes())
-        inner = np.stack([along, across], axis=-1)[:, 1:-1]
+        inner = np.stack(self.axes(), axis=-1)[:, 1:-1]
         inner[self.layout.horizontals :] = inner[self.layout.horizontals :, :, ::-1]
         return assemble_knots(inner, self.layout)
+
+    def _shares(self) -> Array:
+        """Return the softmax (F, N + 1) of the spans' logits."""
+        powers = np.exp(self.spans - self.spans.max(axis=1, keepdims=True))
+        return powers / powers.sum(axis=1, keepdims=True)
+
+
+class Adam:
+    """Steps of variables in place along smoothed gradients (Kingma and Ba, ICLR 2015), with the usual constants.
+
+    `moments` are the smoothed gradients of each variable and their squares, after `steps` steps.
+    """
+
+    def __init__(self, variables: list[Array], steps: int = 0, moments: list[Array] | None = None) -> None:
+        self.variables, self.steps = variables, steps
+        self.moments = [np.zeros((2, *x.shape)) for x in variables] if moments is None else moments
+
+    def step(self, gradients: tuple[Array, ...], rate: float) -> None:
+        """Take a step of a learning rate; what is not finite of a gradient counts as 0."""
+        self.steps += 1
+        for x, (mean, square), gradient in zip(self.variables, self.moments, gradients, strict=True):
+            known = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).clip(-MAX_GRADIENT, MAX_GRADIENT)
+            mean += (1 - BETAS[0]) * (known - mean)
+            square += (1 - BETAS[1]) * (known**2 - square)
+            unbiased = mean / (1 - BETAS[0] ** self.steps), square / (1 - BETAS[1] ** self.steps)
+            x -= rate * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-8)
 
 
 def _sides(layout: Layout) -> tuple[Array, Array]:
@@ -180,7 +210,7 @@ class GradientSearch:
         gentle = problem.contacts[0].model != "shape"
         paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng, gentle)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
-        self._optimiser = self._adam()
+        self._adam = Adam([self.fibres.spans, self.fibres.across])
 
     def advance(self) -> None:
         """Take one step of the search, or of the repair after it."""
@@ -201,48 +231,43 @@ class GradientSearch:
     def state(self) -> State:
         """Return everything that the remaining search depends on, as arrays."""
         generator = json.dumps(self.rng.bit_generator.state).encode()
-        state = {
-            "spans": self.fibres.spans.detach().numpy().copy(),
-            "across": self.fibres.across.detach().numpy().copy(),
+        return {
+            "spans": self.fibres.spans.copy(),
+            "across": self.fibres.across.copy(),
             "fixed": np.array([self.fibres.floor, self.fibres.border]),
             "scales": np.array(self.scales),
             "progress": np.array([self.step, self.objective]),
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
             "generator": np.frombuffer(generator, np.uint8).copy(),
+            "adam_steps": np.array(self._adam.steps),
+            "adam_spans": self._adam.moments[0].copy(),
+            "adam_across": self._adam.moments[1].copy(),
         }
-        for variable, moments in self._optimiser.state_dict()["state"].items():
-            state |= {f"adam_{variable}_{name}": value.numpy().copy() for name, value in moments.items()}
-        return state
 
     def _restore(self, state: State) -> None:
-        logits = torch.tensor(state["spans"]), torch.tensor(state["across"])
+        variables = [state["spans"].copy(), state["across"].copy()]
         self.scales = state["scales"].tolist()
-        self.fibres = Parametrization(self.problem.pad.layout, *logits, *state["fixed"].tolist())
+        self.fibres = Parametrization(self.problem.pad.layout, *variables, *state["fixed"].tolist())
         step, self.objective = state["progress"].tolist()
         self.step, self.done = int(step), bool(state["done"])
         self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
         self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
-        self._optimiser = self._adam()
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name in state:
-            if name.startswith("adam_"):
-                _, variable, moment = name.split("_", 2)
-                moments.setdefault(int(variable), {})[moment] = torch.tensor(state[name])
-        self._optimiser.load_state_dict(self._optimiser.state_dict() | {"state": moments})
+        moments = [state["adam_spans"].copy(), state["adam_across"].copy()]
+        self._adam = Adam(variables, int(state["adam_steps"]), moments)
 
     def _descend(self) -> None:
         """Take one step on the objective and the rules, with a cosine schedule of the learning rate."""
         search = self.problem.search
         progress = self.step / max(1, search.steps - 1)
         rate = LEARNING_RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
-        along, across = self.fibres.axes()
-        total = self._objective(along, across, INITIAL_NOISE ** (1 - progress))
-        self.objective = total.item()
+        curves = self._curves()
+        self.objective, by_curves = self._objective(curves, INITIAL_NOISE ** (1 - progress))
+        gradient = curves.by_knots(by_curves)
         if self.problem.rules.enforce:
             weight = PENALTY_WEIGHT[0] * (PENALTY_WEIGHT[1] / PENALTY_WEIGHT[0]) ** progress
-            total = total + weight * self._penalty(along, across, RULE_MARGIN)
-        self._update(total, rate)
+            gradient = gradient + weight * self._penalty_gradient(curves, RULE_MARGIN)
+        self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         if self.step % HISTORY_STEPS == 0 or self.step == search.steps:
             self._history.append((self.step, self.objective))
@@ -253,86 +278,66 @@ class GradientSearch:
         """End the search; there is nothing to repair if the exact check passes."""
         self.step = self.problem.search.steps
         self.done = not self.problem.violations(self.morphology())
-        self._optimiser = self._adam()
+        self._adam = Adam([self.fibres.spans, self.fibres.across])
 
     def _repair(self) -> None:
         """Take one step on the rules alone, which moves only what breaks them; the margin grows until they hold."""
         repairs = self.step - self.problem.search.steps
         checks = repairs // REPAIR_CHECKS
         rate = min(REPAIR_RATE * REPAIR_GROWTH**checks, MAX_REPAIR_RATE)
-        self._update(self._penalty(*self.fibres.axes(), RULE_MARGIN + REPAIR_MARGIN * checks), rate)
+        gradient = self._penalty_gradient(self._curves(), RULE_MARGIN + REPAIR_MARGIN * checks)
+        self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         if (repairs + 1) % REPAIR_CHECKS == 0:
             self.done = repairs + 1 >= REPAIR_STEPS or not self.problem.violations(self.morphology())
 
-    def _update(self, total: Tensor, rate: float) -> None:
-        for group in self._optimiser.param_groups:
-            group["lr"] = rate
-        self._optimiser.zero_grad()
-        total.backward()
-        for variable in (self.fibres.spans, self.fibres.across):
-            if variable.grad is not None:  # may be NaN where no two presses are confused, or all are
-                variable.grad.nan_to_num_(0.0, 0.0, 0.0)
-        self._optimiser.step()
+    def _curves(self) -> FibreCurves:
+        return FibreCurves(*self.fibres.axes(), self.fibres.ends, self.problem.pad.layout.unit_mm)
 
-    def _penalty(self, along: Tensor, across: Tensor, margin: float) -> Tensor:
-        return _Penalty.apply(along, across, self.problem.pad, self.problem.rules, margin)  # pyright: ignore[reportReturnType]
+    def _penalty_gradient(self, curves: FibreCurves, margin: float) -> Array:
+        """Return the gradient (2, F, n) of the sum of all penalties by the knots."""
+        found = penalties(curves.along, curves.across, self.problem.pad, self.problem.rules, margin)
+        return np.stack([found.by_along, found.by_across])
 
-    def _adam(self) -> torch.optim.Adam:
-        return torch.optim.Adam([self.fibres.spans, self.fibres.across], lr=LEARNING_RATE)
+    def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
+        """Return the expected error on random presses and failures, and the weighted terms; means over the contacts.
 
-    def _objective(self, along: Tensor, across: Tensor, noise_factor: float) -> Tensor:
-        """Return the expected error on random presses and failures, and the weighted terms; means over the contacts."""
+        With it comes its gradient (3, F, n) by the curves.
+        """
         search, pad = self.problem.search, self.problem.pad
-        slope = pchip_slopes(along, across)
-        length = arc_lengths(along, across, slope)[:, None]
+        length, by_length = curves.lengths()
         # 1. a random window, all of the pad unless it is large; another one if it lies in a keep-out; random failures
         presses = None
         while presses is None or not presses.free.any():
             window = objective.place_window(pad.sensed, self.rng.random(2))
             presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
         shares = failure_shares(search.max_failures)
-        failures = sample_failures(pad.layout.fibres, shares, self.rng)
-        step, free, masks = (torch.tensor(x, device=search.device) for x in (presses.step, presses.free, failures))
-        masks, stated_scatter = masks.float(), search.response_scatter.scaled(noise_factor)
-        weights = objective.kernel_weights(pad.layout).float().to(search.device)
-        total = torch.zeros((), device=search.device)
+        masks = sample_failures(pad.layout.fibres, shares, self.rng)
+        stated_scatter, weights = search.response_scatter.scaled(noise_factor), objective.kernel_weights(pad.layout)
+        total, gradient = 0.0, np.zeros((3, *curves.along.shape))
         for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
-            model = {"contact": contact, "ends": self.fibres.ends, "unit_mm": pad.layout.unit_mm}
-            compute_signals = partial(press_signals, along, across, slope, **model)
-
-            def respond(positions: Array, compute: Any = compute_signals, scale: float = scale) -> Tensor:
-                return (compute(positions) / (scale * length)).float().to(search.device)
-
+            per_signal = 1 / (scale * length[:, None])
             # 2. far presses whose responses resemble some of the window
-            positions = torch.from_numpy(presses.positions)
+            positions = presses.positions
             if len(presses.far):
-                with torch.no_grad():
-                    near, far = (weights[:, None] * respond(x) for x in (presses.positions, presses.far))
-                    positions = presses.with_partners(objective.confusable(near, far, masks))
+                near, far = (
+                    weights[:, None] * per_signal * curves.signals(x, contact)[0]
+                    for x in (presses.positions, presses.far)
+                )
+                positions = presses.with_partners(objective.confusable(near, far, masks))
             # 3. expected error, and the terms that `[search]` weighs
             scatter = objective.scatter_of_full_scale(stated_scatter, contact, scale)
-            responses, positions = respond(positions.numpy()), positions.to(search.device)
-            errors = objective.expected_error(responses, positions, step, free, masks, scatter, weights)
-            total = total + objective.aggregate_failures(errors, masks, shares)
+            signals, differentiate = curves.signals(positions, contact)
+            responses = per_signal * signals
+            where = positions, presses.step, presses.free
+            errors, by_responses = objective.expected_error(responses, *where, masks, scatter, weights)
+            value, by_errors = objective.aggregate_failures(errors, masks, shares)
+            by_response = np.tensordot(by_errors, by_responses, axes=1)
+            total += value
+            gradient += differentiate(by_response * per_signal)
+            gradient -= ((by_response * responses).sum(axis=1) / length)[:, None] * by_length
             for weight, term in weighted_terms(search):
                 if term.loss is not None:
-                    on_device = lambda x, compute=compute_signals: compute(x).float().to(search.device)  # noqa: E731
-                    searched = SearchedPad(on_device, along, across, length, pad)
-                    total = total + weight * term.loss(searched).to(search.device)
-        return total.cpu() / len(self.problem.contacts)
-
-
-class _Penalty(torch.autograd.Function):
-    """The sum of all `penalties` as a torch function of the knots."""
-
-    @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> Tensor:
-        along, across, pad, rules, margin = inputs
-        values, *gradient = penalties(along.detach().numpy(), across.detach().numpy(), pad, rules, margin)
-        ctx.gradient = [torch.from_numpy(by) for by in gradient]
-        return torch.tensor(sum(values.values()), dtype=along.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return *(upstream[0] * by for by in ctx.gradient), None, None, None
+                    value, by_curves = term.loss(curves, contact, pad)
+                    total, gradient = total + weight * value, gradient + weight * by_curves
+        return total / len(self.problem.contacts), gradient / len(self.problem.contacts)

@@ -49,13 +49,8 @@ def build_problem(
     """Build the problem of some settings.
 
     Raises:
-        InputError: settings that do not fit each other, the origin or this machine.
+        InputError: settings that do not fit each other or the origin.
     """
-    if settings.device == "cuda":
-        import torch
-
-        if not torch.cuda.is_available():
-            raise InputError("device is 'cuda', but no such device is found; allowed here is 'cpu'")
     fibres = pad.layout.fibres
     free_presses(pad)
     if rules.enforce:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from padforge.design.common import profiling
-from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
+from padforge.design.common.parallel import Checkpoints, State, run_tasks
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_float, check_path, check_type, short_repr
@@ -148,7 +148,7 @@ def search(
         run: callbacks, checkpoints, time budget and executor; on this machine to its end if None.
 
     Raises:
-        InputError: an origin that does not fit, a missing device, or states of other settings.
+        InputError: an origin that does not fit, or states of other settings.
     """
     begin = time.perf_counter()
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
@@ -160,7 +160,7 @@ def search(
     stop = Stop(begin, run.time_budget)
     finished = sum(bool(state["done"]) for state in states.values())
     profiling.add_count("starts", len(problem.starts) - finished, len(problem.starts))
-    with profiling.stage("search"), stop_on_interrupt(stop), one_torch_thread():
+    with profiling.stage("search"), stop_on_interrupt(stop):
         starts, half_way = [*problem.starts], problem.steps // 2 // HISTORY_STEPS * HISTORY_STEPS
         if len(starts) > MIN_STARTS and half_way:
             _advance(problem, starts, half_way, states, stop, run, checkpoints)
@@ -250,7 +250,6 @@ def stop_on_interrupt(stop: Stop) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-@one_torch_thread()
 def _advance_start(problem: SearchProblem, start: int, last: int, state: State | None) -> tuple[State, int, float]:
     """Run the next slice of a start, from its beginning if `state` is None; return its state, step and objective.
 
@@ -266,7 +265,6 @@ def _advance_start(problem: SearchProblem, start: int, last: int, state: State |
     return run.state(), run.step, run.objective
 
 
-@one_torch_thread()
 def _finish_start(problem: SearchProblem, start: int, state: State | None, until: float = 0.0) -> Morphology:
     """Return the fibres of a start, with broken rules repaired until a time of `time.perf_counter`."""
     run = _open_start(problem, start, state)

@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -17,7 +16,7 @@ from padforge.design.common.profiling import profiled
 from padforge.design.contact import fibre_axes
 from padforge.design.kernels.measured_signals import PRECISION
 from padforge.design.settings import DEFAULT_PITCH_MM
-from padforge.design.torch_signals import pchip_slopes, press_signals
+from padforge.design.signal_gradients import FibreCurves
 from tests.design.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
 
 PROFILES = {
@@ -43,8 +42,7 @@ def pads():
 def searched(pad, presses, contact):
     """(Q, 2M) signals of the kind that a search takes."""
     travel, cross, ends, _ = fibre_axes(pad)
-    along, across = torch.tensor(travel[0]), torch.tensor(cross[0])
-    return press_signals(along, across, pchip_slopes(along, across), presses, contact, ends, pad.unit_mm).numpy().T
+    return FibreCurves(travel[0], cross[0], ends, pad.unit_mm).signals(presses, contact)[0].T
 
 
 def measured_oracle(pad, press, length, fibre):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -10,7 +9,6 @@ from padforge.design import Contact, Morphology
 from padforge.design.contact import relative_stretch
 from padforge.design.objectives.ambiguity import ambiguities, ambiguity_map, free_presses, press_ambiguities
 from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets, sample_failures
-from padforge.design.objectives.score import sharpness
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 
 PAIR = np.array([[0.0, 0.0], [1.0, 0.0]])
@@ -46,12 +44,6 @@ def test_ambiguities_of_presses_are_those_of_the_formula(seed, fibres, noise):
     masks = 1 - np.eye(fibres + 1, fibres)  # one fibre failed, or none
     values = press_ambiguities(signals / (2 * noise), presses, np.arange(fibres + 1)[:, None])
     assert pytest.approx(plain_ambiguities(signals, presses, masks, noise), abs=1e-7) == values.T
-
-
-def test_sharpness_has_a_closed_form_and_a_gradient():
-    assert sharpness(torch.tensor([[0.0, 1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]])).item() == pytest.approx((1 + 2) / 4)
-    signals = torch.tensor(np.random.default_rng(1).uniform(0, 1, (4, 9)), requires_grad=True)
-    assert torch.autograd.gradcheck(sharpness, signals)
 
 
 def test_failure_shares_are_equal_or_as_weighted():

@@ -7,11 +7,12 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
 from padforge.design.contact import fibre_axes
+from padforge.design.morphology import fibre_ends
 from padforge.design.objectives.penalties import COMMON_WEIGHT, penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths, refine
-from padforge.design.settings import PadSettings, RulesSettings
-from padforge.design.torch_signals import pchip_slopes
+from padforge.design.settings import Layout, PadSettings, RulesSettings
+from padforge.design.signal_gradients import FibreCurves
 from tests.design.objectives.pads import bent, only, swung
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -95,10 +96,27 @@ def test_penalty_gradients_match_finite_differences(pad, rules, tolerance):
         assert (ahead - behind) / 2 == pytest.approx((gradient * step).sum(), abs=allowed)
 
 
+class Slopes(torch.autograd.Function):
+    """The slopes of PCHIP curves as a torch function."""
+
+    @staticmethod
+    def forward(ctx, along, across):
+        ctx.curves = FibreCurves(
+            along.detach().numpy(), across.detach().numpy(), fibre_ends(Layout.create(len(along) // 2)), 1.0
+        )
+        return torch.from_numpy(ctx.curves.slope)
+
+    @staticmethod
+    def backward(ctx, *upstream):
+        by_slope = upstream[0].numpy()[None]
+        gradient = np.concatenate([np.zeros((2, *by_slope.shape[1:])), by_slope])
+        return tuple(torch.from_numpy(ctx.curves.by_knots(gradient)))
+
+
 def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm):
     """Both integrals with what they integrate over held, as torch differentiates them; (F, n) knots of PCHIP curves."""
     shares = (1 - torch.cos(torch.arange(12, dtype=torch.float64) * np.pi / 12)) / 2
-    slope = pchip_slopes(along, across)
+    slope = Slopes.apply(along, across)
     h, rise = along.diff(dim=1)[..., None], across.diff(dim=1)[..., None]
     d0, d1, v0 = slope[:, :-1, None], slope[:, 1:, None], across[:, :-1, None]
     c2, c3 = 3 * rise / h - 2 * d0 - d1, d0 + d1 - 2 * rise / h

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, InputError, Morphology
+from padforge.design.contact import fibre_axes
 from padforge.design.objectives.published import published_terms
-from padforge.design.objectives.score import ScoredPad, score
+from padforge.design.objectives.score import TERMS, ScoredPad, score, sharpness
 from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
-
-pytestmark = pytest.mark.usefixtures("one_thread")
+from padforge.design.signal_gradients import FibreCurves
 
 
 def test_score_evaluates_the_sensed_area():
@@ -62,3 +62,22 @@ def test_score_refuses_invalid_arguments_in_one_line(pad, asked, message):
     with pytest.raises(InputError, match=message) as refused:
         score(pad, **asked)
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_sharpness_has_a_closed_form():
+    assert sharpness(np.array([[0.0, 1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]])) == pytest.approx((1 + 2) / 4)
+
+
+@pytest.mark.parametrize("term", [term for term in TERMS if term.loss is not None], ids=lambda term: term.name)
+def test_losses_of_a_search_have_gradients(term):
+    travel, cross, ends, _ = fibre_axes(Morphology.random(3, 4, seed=2))
+    knots, move = np.array([travel[0], cross[0]]), np.random.default_rng(3).standard_normal((2, 6, 6))
+    size = PadSettings(grid=3)
+
+    def loss(step):
+        along, across = knots + step * move
+        curves = FibreCurves(along, across, ends, size.layout.unit_mm)
+        value, gradient = term.loss(curves, Contact(), size)
+        return value, (curves.by_knots(gradient) * move).sum()
+
+    assert (loss(1e-6)[0] - loss(-1e-6)[0]) / 2e-6 == pytest.approx(loss(0.0)[1], rel=1e-3)

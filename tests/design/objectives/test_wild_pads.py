@@ -61,7 +61,7 @@ def test_penalties_and_gradients_of_wild_pads_are_finite(kind, seed):
     for rules in RULES:
         fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.01)
         assert np.isfinite(fibres.knots()).all()
-        along, across = (axis.detach().numpy() for axis in fibres.axes())
+        along, across = fibres.axes()
         values, *gradient = penalties(along, across, PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
         assert all(np.isfinite(value) and value >= 0 for value in values.values())
         assert np.isfinite(gradient).all()

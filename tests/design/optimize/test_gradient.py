@@ -16,6 +16,7 @@ from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import (
     PENALTY_WEIGHT,
     ZIGZAG_START,
+    Adam,
     GradientSearch,
     Parametrization,
     border_width,
@@ -32,9 +33,8 @@ from padforge.design.settings import (
     RulesSettings,
     SearchSettings,
 )
-from padforge.design.torch_signals import arc_lengths, pchip_slopes
+from padforge.design.signal_gradients import FibreCurves
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False)
 BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "max_failures": 1, "knots": 6})
 
@@ -82,8 +82,53 @@ def test_refine_keeps_knots_and_curve(more, seed):
 
 def test_arc_lengths_match_lengths():
     pad = Morphology.random((2, 3), 5, seed=1, pitch_mm=(8.0, 15.0))
-    travel, cross = (torch.tensor(axis[0]) for axis in fibre_axes(pad)[:2])
-    assert arc_lengths(travel, cross, pchip_slopes(travel, cross)).numpy() == pytest.approx(lengths(pad), rel=1e-3)
+    travel, cross, ends, _ = fibre_axes(pad)
+    assert FibreCurves(travel[0], cross[0], ends, pad.unit_mm).lengths()[0] == pytest.approx(lengths(pad), rel=1e-3)
+
+
+def test_arc_length_gradients_match_differences():
+    travel, cross, ends, _ = fibre_axes(Morphology.random((2, 3), 5, seed=1))
+    knots, rng = np.array([travel[0], cross[0]]), np.random.default_rng(2)
+    move, weights = rng.standard_normal(knots.shape), rng.standard_normal(5)
+
+    def curves(step):
+        along, across = knots + step * move
+        return FibreCurves(along, across, ends, 11.25)
+
+    gradient = curves(0.0).by_knots(np.einsum("f,dfn->dfn", weights, curves(0.0).lengths()[1]))
+    ahead, behind = (weights @ curves(step).lengths()[0] for step in (1e-6, -1e-6))
+    assert (gradient * move).sum() == pytest.approx((ahead - behind) / 2e-6, rel=1e-6)
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 6), st.integers(0, 99))
+def test_gradients_by_free_variables_match_differences(knots, seed):
+    rng, pad = np.random.default_rng(seed), Morphology.random((2, 3), knots, seed, pitch_mm=(8.0, 15.0))
+    fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.02)
+    weights = rng.standard_normal((2, 5, knots + 2))
+    variables, gradients = (fibres.spans, fibres.across), fibres.gradients(*weights)
+    for variable, gradient in zip(variables, gradients, strict=True):
+        move, values = rng.standard_normal(variable.shape), []
+        for step in (1e-5, -2e-5):
+            variable += step * move
+            values.append((weights * np.array(fibres.axes())).sum())
+        variable += 1e-5 * move
+        assert (gradient * move).sum() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-5, abs=1e-7)
+
+
+def test_steps_of_adam_are_those_of_torch():
+    rng, mine = np.random.default_rng(3), np.array([0.3, -1.0, 2.0])
+    theirs = torch.tensor(mine, requires_grad=True)
+    ours, reference = Adam([mine]), torch.optim.Adam([theirs])
+    for rate in (0.1, 0.1, 0.03, 0.01):
+        gradient = rng.standard_normal(3)
+        reference.param_groups[0]["lr"], theirs.grad = rate, torch.tensor(gradient)
+        reference.step()
+        ours.step((gradient,), rate)
+        assert mine == pytest.approx(theirs.detach().numpy(), rel=1e-12)
+    before = mine.copy()
+    Adam([mine]).step((np.array([np.nan, np.inf, -np.inf]),), 0.1)
+    assert np.array_equal(mine, before)
 
 
 def test_initial_paths_from_an_origin_are_it_and_near_it():
@@ -168,15 +213,17 @@ def test_gradient_search_beats_straight_fibres_within_the_rules():
 
 
 def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
-    """By equal factors from the first weight to the last: the derivative of what is minimised by a penalty."""
+    """By equal factors from the first weight to the last."""
     weights = []
 
-    def penalty(_, along, across, margin):
-        value = 0 * (along.sum() + across.sum())
-        value.register_hook(lambda weight: weights.append(weight.item()))
-        return value
+    class Gradient:
+        """Notes by what it is multiplied."""
 
-    monkeypatch.setattr(GradientSearch, "_penalty", penalty)
+        def __rmul__(self, weight):
+            weights.append(weight)
+            return 0.0
+
+    monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: Gradient())
     advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings()), 4)
     assert weights == pytest.approx(np.geomspace(*PENALTY_WEIGHT, 4))
 

@@ -1,0 +1,75 @@
+"""Fibres at a step of a search: their lengths and signals, with the gradients of both."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from padforge.design.common import profiling
+from padforge.design.contact import element_spacings, press_shape, record_visits, weight_table
+from padforge.design.kernels.exact_gradient import signals_gradient
+from padforge.design.kernels.exact_signals import exact_signals
+from padforge.design.kernels.geometry import Ends
+from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
+from padforge.design.kernels.measured_signals import element_signals, elements_gradient, fibre_elements
+from padforge.design.kernels.pchip import arc_lengths_gradient, fibre_slopes_gradient, population_slopes
+from padforge.design.morphology import Array
+from padforge.design.settings import Contact
+
+Differentiate = Callable[[Array], Array]
+"""From the derivatives (F, Q) of a value by signals to those (3, F, n) by along, across and slope of the curves."""
+
+
+@dataclass(frozen=True)
+class FibreCurves:
+    """The PCHIP curves of a pad's fibres, grid units.
+
+    Gradients (3, F, n) are by the knots along and across the fibres and by the slopes there, as if those were
+    independent of the knots; `by_knots` then adds what the slopes depend on.
+    """
+
+    along: Array  # knots along the fibres; float64, shape (F, n)
+    across: Array  # and across them; shape (F, n)
+    ends: Ends  # where fibres end
+    unit_mm: float  # grid unit, mm
+
+    @cached_property
+    def slope(self) -> Array:
+        """Slopes at the knots; shape (F, n)."""
+        return population_slopes(self.along[None], self.across[None])[0]
+
+    def by_knots(self, gradient: Array) -> Array:
+        """Return the gradient (2, F, n) by the knots alone of a value that has the gradient (3, F, n)."""
+        return gradient[:2] + fibre_slopes_gradient(self.along, self.across, self.slope, gradient[2])
+
+    def lengths(self) -> tuple[Array, Array]:
+        """Compute the arc lengths (F,), to 1e-3 where fibres are steep, and each one's gradient (3, F, n)."""
+        gradient = np.empty((3, *self.along.shape))
+        return arc_lengths_gradient(self.along, self.across, self.slope, gradient), gradient
+
+    def signals(self, presses: Array, contact: Contact) -> tuple[Array, Differentiate]:
+        """Compute the signals (F, Q) of presses (Q, 2), grid units for weights without unit, and what differentiates.
+
+        They are exact for a shape, and within PRECISION of `measured_signals` for a layer or a profile.
+        """
+        t, v, d, ends = self.along, self.across, self.slope, self.ends
+        shape, max_offsets = press_shape(contact, self.unit_mm), compute_max_offsets(v[None], ends)
+        out = np.zeros((len(presses), len(t)))
+        if contact.model != "shape":  # elements are cut once for both directions
+            law, spacings, table = (
+                shape[2],
+                element_spacings(contact, self.unit_mm),
+                weight_table(contact, self.unit_mm),
+            )
+            elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacings)
+            visited = element_signals(t, v, elements, presses, law, table, out)
+            kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
+        else:
+            curves, none = (t[None], v[None], d[None]), np.empty(0, np.int64)
+            where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)
+            visited = exact_signals(curves, *where, out.reshape(-1))
+            kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
+        if profiling.is_profiling():
+            record_visits(t[None], max_offsets, ends, presses, shape[1], visited)
+        return out.T, lambda by_signals: np.asarray(kernel(np.ascontiguousarray(by_signals.T)))
