@@ -141,14 +141,26 @@ def _add_inner_term(
 
 @njit(cache=True, error_model="numpy")
 def _differentiate_span(
-    t: Any, v: Any, d: Any, j: int, ct: float, cv: float, shape: Any, scratch: Any, work: Any, change: Any
+    t: Any,
+    v: Any,
+    d: Any,
+    j: int,
+    ct: float,
+    cv: float,
+    shape: Any,
+    stretches: Any,
+    scratch: Any,
+    work: Any,
+    change: Any,
 ) -> None:
     """Set `change` (6,) to the derivatives of the signal of span j for a press at (ct, cv); `work` is overwritten."""
-    span, tolerance = work[0], 4 * EPS * (abs(cv) + shape[2].radius)
+    span, (chains, extents, law) = work[0], shape
     s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
-    for i in range(find_stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
-        a, b = scratch[4][i]
+    tolerance = 4 * EPS * (abs(cv) + law.radius)
+    count = find_stretches_inside(span, -s0, 1 - s0, chains, extents, law.radius, tolerance, scratch, stretches)
+    for i in range(count):
+        a, b = stretches[i]
         _add_inner_term(a, b, s0, d[j], d[j + 1], shape, work, scratch[3], change)
         for s, sign, is_knot in ((a, -1.0, a <= -s0), (b, 1.0, b >= 1 - s0)):
             if not is_knot:
@@ -167,7 +179,7 @@ def signals_gradient(
     (fibres, n), (chains, extents, law) = along.shape, shape
     out, change = np.zeros((3, fibres, n)), np.empty(6)
     work = np.empty(6), np.empty((6, 2)), np.empty((6, 2))
-    scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
+    stretches, scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     for q in range(len(presses)):
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
@@ -180,7 +192,7 @@ def signals_gradient(
                 j = piece_of(ct + extents[family, 0], t, n)
                 while j < n - 1 and t[j] < ct + extents[family, 1]:
                     if min(v[j], v[j + 1]) <= high and max(v[j], v[j + 1]) >= low:
-                        _differentiate_span(t, v, d, j, ct, cv, framed, scratch, work, change)
+                        _differentiate_span(t, v, d, j, ct, cv, framed, stretches, scratch, work, change)
                         for x in range(6):
                             out[x // 2, f, j + x % 2] += upstream[q, f] * change[x]
                     j += 1

@@ -134,11 +134,15 @@ def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
+def _manhattan_length(span: Any, a: float, b: float) -> float:
+    """Return the Manhattan length of [a, b], in closed form as spans are monotone."""
+    mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
+    return (b - a) * (span[1] + abs(mean_rise))
+
+
+@njit(cache=True, error_model="numpy")
 def _integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
-    """Integrate the density over [a, b] in closed form, or by adaptive Gauss-Kronrod on a stack of intervals."""
-    if law.weight == UNIFORM and law.length == MANHATTAN:
-        mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
-        return (b - a) * (span[1] + abs(mean_rise))
+    """Integrate the density over [a, b] by adaptive Gauss-Kronrod on a stack of intervals."""
     total, pieces = 0.0, 0
     stack[0, 0], stack[0, 1] = a, b
     top = 0
@@ -216,9 +220,11 @@ def _append_stretch(stretches: Any, count: Any, begin: float, end: float) -> int
 
 
 @njit(cache=True, error_model="numpy")
-def _find_inside_circle(span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any) -> Any:
+def _find_inside_circle(
+    span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any, stretches: Any
+) -> Any:
     """Find the stretches inside a circle, as `find_stretches_inside`."""
-    roots, work, p, _, stretches = scratch
+    roots, work, p, _ = scratch
     count = find_circle_roots(span, a, b, radius, roots, np.int64(0), work, p)
     count_inside, begin = np.int64(0), a
     for i in range(count + 1):
@@ -241,10 +247,18 @@ def _find_inside_circle(span: Any, a: float, b: float, radius: float, tolerance:
 
 @njit(cache=True, error_model="numpy")
 def _find_between_lines(
-    span: Any, start: float, after: float, lines: Any, near: Any, tolerance: float, count_inside: Any, scratch: Any
+    span: Any,
+    start: float,
+    after: float,
+    lines: Any,
+    near: Any,
+    tolerance: float,
+    scratch: Any,
+    stretches: Any,
+    count_inside: Any,
 ) -> Any:
     """Append the stretches on which the span is between two lines of which `near` ones may cross it."""
-    roots, work, p, _, stretches = scratch
+    roots, work, p, _ = scratch
     (u0, u1, l0, l1), count = lines, np.int64(0)
     if near[0]:
         count = _find_line_roots(span, start, after, u0, u1, tolerance, roots, count, work, p)
@@ -270,55 +284,111 @@ def _find_between_lines(
 
 
 @njit(cache=True, error_model="numpy")
-def find_stretches_inside(span: Any, a: float, b: float, shape: Any, tolerance: float, scratch: Any) -> Any:
-    """Find the stretches of [a, b] inside a press, into the last array of `scratch`; return their number.
+def _find_one_crossing(
+    span: Any, a: float, b: float, from_a: float, from_b: float, rise: float, tolerance: float
+) -> float:
+    """Return the share of [a, b] after which a span crosses a line once: 0 if it never does, NaN if that is not clear.
 
-    What is outside by up to `tolerance` counts as on the boundary. The chains of a circle have no breakpoints.
+    The line has a `rise`; the span ends at the distances `from_a` and `from_b` from it, above it if they are positive.
     """
-    stretches = scratch[4]
-    (chains, extents, law), r, h = shape, span[0], span[1]
-    radius, inner = law.radius, extents[4]
+    w = b - a
+    p1, p2, p3 = _rise(span, a) * w - rise, (span[4] + 3 * a * span[5]) * w * w, span[5] * w**3
+    # between both ends in Bernstein form, which tells the number of crossings
+    first, second = from_a + p1 / 3, from_b - (p1 + 2 * p2 + 3 * p3) / 3
+    if not min(abs(from_a), abs(from_b)) > tolerance:
+        return math.nan
+    if (from_a > 0) == (from_b > 0):
+        return 0.0 if (first > 0) == (second > 0) == (from_a > 0) else math.nan
+    if (first > 0) == (from_b > 0) and (second > 0) == (from_a > 0):
+        return math.nan
+    low, high, u = 0.0, 1.0, from_a / (from_a - from_b)
+    for _ in range(100):
+        value, slope = from_a + u * (p1 + u * (p2 + u * p3)), p1 + u * (2 * p2 + 3 * u * p3)
+        if value == 0:
+            break
+        if (value > 0) == (from_b > 0):
+            high = u
+        else:
+            low = u
+        after = u - value / slope if slope != 0 else low
+        if not low < after < high:
+            after = 0.5 * (low + high)
+        # what Newton's step leaves is at most this share of its square
+        is_found = (abs(p2) + 3 * abs(p3)) * (after - u) ** 2 <= EPS / 4 * abs(slope) or not low < after < high
+        u = after
+        if is_found:
+            break
+    return u
+
+
+@njit(cache=True, error_model="numpy", inline="always")  # likewise
+def find_stretches_inside(
+    span: Any, a: float, b: float, chains: Any, extents: Any, radius: float, tolerance: float, scratch: Any, out: Any
+) -> Any:
+    """Find the stretches of [a, b] inside a press of a radius, into `out`; return their number.
+
+    What is outside by up to `tolerance` counts as on the boundary. The chains of a circle have no breakpoints. What all
+    spans need is given by itself: to take an array out of a tuple costs as much as the rest.
+    """
+    r, h, inner = span[0], span[1], extents[4]
     # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
     t0, t1, v, v1 = r + h * a, r + h * b, evaluate_cubic(span, a), evaluate_cubic(span, b)
     far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v1))
     if far_t * far_t + far_v * far_v < inner * inner:
-        return _append_stretch(stretches, np.int64(0), a, b)
+        return _append_stretch(out, np.int64(0), a, b)
     near_t, near_v = max(t0, -t1, 0.0), max(min(v, v1), -max(v, v1), 0.0)
     if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
         return 0
-    breaks, upper, lower = chains
-    last = len(breaks) - 1
-    a = max(a, ((-radius if last < 0 else breaks[0]) - r) / h)
-    b = min(b, ((radius if last < 0 else breaks[last]) - r) / h)
+    last = chains.shape[1] - 1
+    a = max(a, ((-radius if last < 0 else chains[0, 0]) - r) / h)
+    b = min(b, ((radius if last < 0 else chains[0, last]) - r) / h)
     if b <= a:
         return 0
     if last < 0:
-        return _find_inside_circle(span, a, b, radius, tolerance, scratch)
-    count_inside, start, v, k = np.int64(0), a, evaluate_cubic(span, a), piece_of(r + h * a, breaks, last)
+        return _find_inside_circle(span, a, b, radius, tolerance, scratch, out)
+    count_inside, start, end, per_h = np.int64(0), a, r + h * b, 1 / h
+    t0, v, k = r + h * a, evaluate_cubic(span, a), piece_of(r + h * a, chains[0], last)
     while start < b:
-        after = b if k == last - 1 else min(b, (breaks[k + 1] - r) / h)
+        if k == last - 1 or chains[0, k + 1] >= end:
+            after, t1 = b, end
+        else:
+            t1 = chains[0, k + 1]
+            after = (t1 - r) * per_h
         if after <= start:
             k += 1
             continue
-        v_after, t0, t1 = evaluate_cubic(span, after), r + h * start, r + h * after
+        v_after = evaluate_cubic(span, after)
         far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v_after))
         if far_t * far_t + far_v * far_v < inner * inner:  # as for the whole span: no chain is near
-            count_inside, start, v, k = _append_stretch(stretches, count_inside, start, after), after, v_after, k + 1
+            count_inside = _append_stretch(out, count_inside, start, after)
+            start, t0, v, k = after, t1, v_after, k + 1
             continue
-        width = breaks[k + 1] - breaks[k]
-        x0, x1 = (t0 - breaks[k]) / width, (t1 - breaks[k]) / width
-        u0, u1 = upper[k] + (upper[k + 1] - upper[k]) * x0, upper[k] + (upper[k + 1] - upper[k]) * x1
-        l0, l1 = lower[k] + (lower[k + 1] - lower[k]) * x0, lower[k] + (lower[k + 1] - lower[k]) * x1
+        width = chains[0, k + 1] - chains[0, k]
+        x0 = 0.0 if t0 == chains[0, k] else (t0 - chains[0, k]) / width
+        x1 = 1.0 if t1 == chains[0, k + 1] else (t1 - chains[0, k]) / width
+        u0, u1 = chains[1, k] * (1 - x0) + chains[1, k + 1] * x0, chains[1, k] * (1 - x1) + chains[1, k + 1] * x1
+        l0, l1 = chains[2, k] * (1 - x0) + chains[2, k + 1] * x0, chains[2, k] * (1 - x1) + chains[2, k + 1] * x1
         least, most = min(v, v_after), max(v, v_after)
         if most <= min(u0, u1) and least >= max(l0, l1):
-            count_inside = _append_stretch(stretches, count_inside, start, after)
+            count_inside = _append_stretch(out, count_inside, start, after)
         elif least <= max(u0, u1) + tolerance and most >= min(l0, l1) - tolerance:
             near = most >= min(u0, u1), least <= max(l0, l1)
+            if near[0] != near[1]:  # mostly one line is crossed, once
+                y0, y1 = (u0, u1) if near[0] else (l0, l1)
+                share = _find_one_crossing(span, start, after, v - y0, v_after - y1, y1 - y0, tolerance)
+                if not math.isnan(share):
+                    begins_inside = (v < y0) == near[0]
+                    cut = start + share * (after - start) if share > 0 else after
+                    if begins_inside:
+                        count_inside = _append_stretch(out, count_inside, start, cut)
+                    elif cut < after:
+                        count_inside = _append_stretch(out, count_inside, cut, after)
+                    start, t0, v, k = after, t1, v_after, k + 1
+                    continue
             count_inside = _find_between_lines(
-                span, start, after, (u0, u1, l0, l1), near, tolerance, count_inside, scratch
+                span, start, after, (u0, u1, l0, l1), near, tolerance, scratch, out, count_inside
             )
-        start, v = after, v_after
-        k += 1
+        start, t0, v, k = after, t1, v_after, k + 1
     return count_inside
 
 
@@ -329,7 +399,7 @@ def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: An
     The quadrature might miss a bend between its nodes. Bends are crossed one by one where the squared distance, of
     degree 6, is monotone: from one point at which it is stationary to the next.
     """
-    roots, work, p, stack, _ = scratch
+    roots, work, p, stack = scratch
     w, profile = b - a, law.profile
     _expand_square(span, a, b, 0.0, p)
     for i in range(6):
@@ -358,7 +428,9 @@ def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: An
 @njit(cache=True, error_model="numpy")
 def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Return the signal of a stretch inside the press, split where the weight bends."""
-    roots, work, p, stack, _ = scratch
+    if law.weight == UNIFORM and law.length == MANHATTAN:
+        return _manhattan_length(span, a, b)
+    roots, work, p, stack = scratch
     if law.weight == PROFILE:
         return _compute_profile_signal(span, a, b, law, scratch)
     count = np.int64(0)
@@ -392,22 +464,35 @@ def centre_cubic(
     return s0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")  # likewise
 def _compute_fibre_signal(
-    t: Any, v: Any, d: Any, ct: float, cv: float, shape: Any, span: Any, scratch: Any
+    t: Any,
+    v: Any,
+    d: Any,
+    ct: float,
+    cv: float,
+    chains: Any,
+    extents: Any,
+    law: Any,
+    span: Any,
+    scratch: Any,
+    stretches: Any,
 ) -> tuple[float, int]:
     """Return the signal of one fibre for the press at (ct, cv), and the number of spans visited."""
-    _, extents, law = shape
     n, begin, end = len(t), ct + extents[0], ct + extents[1]
     if end <= t[0] or begin >= t[n - 1]:
         return 0.0, 0
-    tolerance = 4 * EPS * (abs(cv) + law.radius)
+    tolerance, is_plain = 4 * EPS * (abs(cv) + law.radius), law.weight == UNIFORM and law.length == MANHATTAN
     total, visited, j = 0.0, 0, piece_of(begin, t, n)
     while j < n - 1 and t[j] < end:
         if min(v[j], v[j + 1]) <= cv + extents[3] + tolerance and max(v[j], v[j + 1]) >= cv + extents[2] - tolerance:
             s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
-            for i in range(find_stretches_inside(span, -s0, 1 - s0, shape, tolerance, scratch)):
-                total += _compute_stretch_signal(span, scratch[4][i, 0], scratch[4][i, 1], law, scratch)
+            count = find_stretches_inside(span, -s0, 1 - s0, chains, extents, law.radius, tolerance, scratch, stretches)
+            for i in range(count):
+                if is_plain:
+                    total += _manhattan_length(span, stretches[i, 0], stretches[i, 1])
+                else:
+                    total += _compute_stretch_signal(span, stretches[i, 0], stretches[i, 1], law, scratch)
             visited += 1
         j += 1
     return total, visited
@@ -415,11 +500,12 @@ def _compute_fibre_signal(
 
 @njit(cache=True, error_model="numpy")
 def make_scratch(breaks: int) -> Any:
-    """Allocate one thread's work arrays: roots, root finder's stack, polynomial, quadrature's stack, stretches inside.
+    """Allocate one thread's work arrays, for stretches inside, and for roots, their stack, a polynomial, a quadrature.
 
     Each piece between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it into 7 parts.
     """
-    return np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((MAX_HALVINGS + 2, 2)), np.empty((4 * breaks + 8, 2))
+    scratch = np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((MAX_HALVINGS + 2, 2))
+    return np.empty((4 * breaks + 8, 2)), scratch
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -434,20 +520,42 @@ def exact_signals(
     Returns:
         Number of spans visited.
     """
-    (along, across, slope), (starts, fibre), (chains, extents, _) = curves, sparse, shape
-    fibres = along.shape[1]
-    span, scratch = np.empty(6), make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
-    visited = 0
+    chains = shape[0]
+    stretches, scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
+    frames, span = (select_frame(shape, 0), select_frame(shape, 1)), np.empty(6)
+    return _compute_signals(
+        curves, max_offsets, ends, presses, frames, begin, end, sparse, signal, span, stretches, scratch
+    )
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)  # else counting references takes most of the time
+def _compute_signals(
+    curves: Any,
+    max_offsets: Any,
+    ends: Any,
+    presses: Any,
+    frames: Any,
+    begin: int,
+    end: int,
+    sparse: Any,
+    signal: Any,
+    span: Any,
+    stretches: Any,
+    scratch: Any,
+) -> int:
+    """Compute `exact_signals` with the shape in both frames and work arrays given: no array may be made here."""
+    (along, across, slope), (starts, fibre) = curves, sparse
+    fibres, visited = along.shape[1], 0
     for index in range(begin, end):
         p, q = index // len(presses), index % len(presses)
         slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
-            framed = select_frame(shape, family)
-            first, last = find_touched_range(cv, extents[family], max_offsets[p, family], ends, family)
+            chains, extents, law = frames[0] if family == 0 else frames[1]
+            first, last = find_touched_range(cv, extents, max_offsets[p, family], ends, family)
             for f in range(first, last):
                 t, v, d = along[p, f], across[p, f], slope[p, f]
-                value, spans = _compute_fibre_signal(t, v, d, ct, cv, framed, span, scratch)
+                value, spans = _compute_fibre_signal(t, v, d, ct, cv, chains, extents, law, span, scratch, stretches)
                 visited += spans
                 if len(starts):
                     fibre[slot], signal[slot] = f, value
