@@ -166,11 +166,13 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
 
     Exit code 1 if the pad breaks a design rule or its mould fails a check; all files are written nevertheless.
     """
+    from padforge.compile_ahead import compile_beside
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
     run = Run(common.load_spec(spec), out, formats=formats, **options)
     check_run(run)
+    compile_beside()
     with locked_folder(out):
         code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
         if code != common.INTERRUPTED:

@@ -68,7 +68,7 @@ class PressDetector:
             raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
         self._last_s = times[-1] if len(times) else self._last_s
         events = np.empty((2 * len(times), 2), np.int64)
-        rows = np.ascontiguousarray(rows)
+        times, rows = np.array(times), np.array(rows, order="C")  # copies: for read-only arrays it is compiled anew
         count = detect(self._fibres, self._pad, times, rows, self._reject_limit, self._accept_limit, events)
         return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
 

@@ -1,0 +1,58 @@
+"""Kernels compiled beside a first run: its search compiles those of its steps, a second process the others meanwhile.
+
+Compiled kernels are shared through Numba's cache on disk. A kernel that both need at once is compiled twice, which does
+no harm.
+"""
+
+import os
+import subprocess
+import sys
+
+
+def compile_beside() -> None:
+    """Let a second process compile kernels as soon as this one has to compile one, if there is a core for it.
+
+    The process ends by itself. Where everything is read from the cache, none is started.
+    """
+    from numba.core import event
+
+    class Starter(event.Listener):
+        """Starts the process once."""
+
+        def on_start(self, event_: event.Event) -> None:
+            """Start it."""
+            event.unregister("numba:compile", self)
+            silent = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            subprocess.Popen([sys.executable, "-m", "padforge.compile_ahead"], **silent)
+
+        def on_end(self, event_: event.Event) -> None:
+            """Do nothing."""
+
+    if (os.cpu_count() or 1) > 1:
+        event.register("numba:compile", Starter())
+
+
+def main() -> None:
+    """Compile kernels by small tasks, in the order in which a run needs them, but for those that it compiles first."""
+    import numpy as np
+
+    from padforge.design.morphology import Morphology
+    from padforge.design.objectives.score import TERMS, ScoredPad
+    from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+    from padforge.fabricate.checks.surface import TriangleMesh
+    from padforge.sense.signals.press_detection import PressDetector
+
+    pad = Morphology.random(2, 2, seed=0)
+    size = PadSettings().for_layout(pad.layout)
+    scored = ScoredPad(pad, Contact(), SearchSettings(), RulesSettings(), size)
+    for term in sorted(TERMS, key=lambda term: term.name != "penalty"):  # rules end a step, all others a search
+        if not term.name.startswith("expected_error"):
+            scored.terms([term.name])
+    if hasattr(os, "nice"):
+        os.nice(10)  # what follows is not needed before the search ends, which has all cores until then
+    TriangleMesh.weld(np.eye(4, 3), [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]).find_self_intersections(1)
+    PressDetector(2).update(np.arange(9.0), np.zeros((9, 2)))
+
+
+if __name__ == "__main__":
+    main()

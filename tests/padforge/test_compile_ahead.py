@@ -1,0 +1,55 @@
+"""Kernels compiled beside a first run: only where something is to be compiled, and those that the run then finds."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+
+import padforge.compile_ahead as compile_ahead
+
+COUNT = """
+import sys
+from numba.core import event
+
+class Listener(event.Listener):
+    def on_start(self, started):
+        compiled.add(started.data["dispatcher"].py_func.__name__)
+    def on_end(self, ended):
+        pass
+
+compiled = set()
+event.register("numba:compile", Listener())
+from padforge.compile_ahead import main
+main()
+print(*sorted(compiled))
+"""
+
+
+def test_a_process_is_started_once_and_only_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: started.append(command))
+    first, second = (njit(function) for function in (lambda x: x + 1, lambda x: x + 2))
+    assert first(1) == 2
+    compile_ahead.compile_beside()
+    assert first(1) == 2
+    assert started == []
+    assert [first(1.0), second(1.0), second(np.int32(1))] == [2.0, 3.0, 3]
+    assert started == [[sys.executable, "-m", "padforge.compile_ahead"]]
+
+
+@pytest.mark.slow
+def test_kernels_compiled_ahead_are_read_from_disk(tmp_path: Path) -> None:
+    """All of them, in the next process; and those of a score among them."""
+
+    def compiled() -> set[str]:
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+        command = [sys.executable, "-c", COUNT]
+        return set(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split())
+
+    assert {"published_terms", "press_ambiguities", "sum_closeness", "detect", "_sweep"} <= compiled()
+    assert compiled() == set()

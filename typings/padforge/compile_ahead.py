@@ -1,0 +1,1 @@
+../../padforge/compile_ahead.py
