@@ -7,6 +7,7 @@ no harm.
 import os
 import subprocess
 import sys
+from typing import Any
 
 
 def compile_beside() -> None:
@@ -14,22 +15,22 @@ def compile_beside() -> None:
 
     The process ends by itself. Where everything is read from the cache, none is started.
     """
-    from numba.core import event
+    from numba.core import event as events
 
-    class Starter(event.Listener):
+    class Starter(events.Listener):
         """Starts the process once."""
 
-        def on_start(self, event_: event.Event) -> None:
+        def on_start(self, event: Any) -> None:
             """Start it."""
-            event.unregister("numba:compile", self)
-            silent = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            subprocess.Popen([sys.executable, "-m", "padforge.compile_ahead"], **silent)
+            events.unregister("numba:compile", self)
+            command, silent = [sys.executable, "-m", "padforge.compile_ahead"], subprocess.DEVNULL
+            subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent)
 
-        def on_end(self, event_: event.Event) -> None:
+        def on_end(self, event: Any) -> None:
             """Do nothing."""
 
     if (os.cpu_count() or 1) > 1:
-        event.register("numba:compile", Starter())
+        events.register("numba:compile", Starter())
 
 
 def main() -> None:
