@@ -31,7 +31,7 @@ PENALTY_WEIGHT = (1.0, 300.0)
 RULE_MARGIN = 1.05
 """On the limits of the rules."""
 HISTORY_STEPS = 10
-"""Steps between entries of the history."""
+"""Steps between entries of the history, each the geometric mean of the objectives since the last one."""
 MAX_GRADIENT = 1e150
 """Whose square is finite."""
 REPAIR_STEPS, REPAIR_CHECKS = 600, 20
@@ -200,6 +200,7 @@ class GradientSearch:
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
         self.problem, self.rng = problem, np.random.default_rng([problem.search.seed, start])
         self.step, self.objective, self.done = 0, math.inf, False  # objective of the last step, without penalties
+        self._log_sum = 0.0  # of the objectives since the last entry of the history
         self._history: list[tuple[int, float]] = []
         if state is not None:
             self._restore(state)
@@ -236,7 +237,7 @@ class GradientSearch:
             "across": self.fibres.across.copy(),
             "fixed": np.array([self.fibres.floor, self.fibres.border]),
             "scales": np.array(self.scales),
-            "progress": np.array([self.step, self.objective]),
+            "progress": np.array([self.step, self.objective, self._log_sum]),
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
             "generator": np.frombuffer(generator, np.uint8).copy(),
@@ -249,7 +250,7 @@ class GradientSearch:
         variables = [state["spans"].copy(), state["across"].copy()]
         self.scales = state["scales"].tolist()
         self.fibres = Parametrization(self.problem.pad.layout, *variables, *state["fixed"].tolist())
-        step, self.objective = state["progress"].tolist()
+        step, self.objective, self._log_sum = state["progress"].tolist()
         self.step, self.done = int(step), bool(state["done"])
         self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
         self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
@@ -269,8 +270,11 @@ class GradientSearch:
             gradient = gradient + weight * self._penalty_gradient(curves, RULE_MARGIN)
         self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
+        self._log_sum += math.log(self.objective)
         if self.step % HISTORY_STEPS == 0 or self.step == search.steps:
-            self._history.append((self.step, self.objective))
+            steps = (self.step - 1) % HISTORY_STEPS + 1
+            self._history.append((self.step, math.exp(self._log_sum / steps)))
+            self._log_sum = 0.0
         if self.step == search.steps:
             self._begin_repair()
 

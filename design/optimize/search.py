@@ -43,9 +43,10 @@ SLICE = {"descent": 20, "genetic": 2}
 """Steps or generations of a slice: about a third of a second."""
 SLICE_S = 1.0
 """After which a slice ends where steps are slow, so that a time budget holds."""
-MIN_STARTS, COMPARED = 2, 10
+MIN_STARTS, COMPARED = 2, 30
 """Half-way only the better half of the starts goes on, MIN_STARTS or more, by the geometric mean of the last COMPARED
-objectives of their histories. In 10 searches none of those left behind was the best in the end.
+entries of their histories: over fewer steps, what is random in each outweighs how starts differ. In 8 searches the best
+start that went on ended 0.15 % above the best of all on average, and 0.8 % at most.
 """
 REPAIR_SHARE = 0.15
 """Share of a time budget reserved for repair."""
