@@ -284,7 +284,7 @@ def _find_between_lines(
 
 
 @njit(cache=True, error_model="numpy")
-def _find_one_crossing(
+def find_one_crossing(
     span: Any, a: float, b: float, from_a: float, from_b: float, rise: float, tolerance: float
 ) -> float:
     """Return the share of [a, b] after which a span crosses a line once: 0 if it never does, NaN if that is not clear.
@@ -310,14 +310,15 @@ def _find_one_crossing(
             high = u
         else:
             low = u
-        after = u - value / slope if slope != 0 else low
-        if not low < after < high:
-            after = 0.5 * (low + high)
-        # what Newton's step leaves is at most this share of its square
-        is_found = (abs(p2) + 3 * abs(p3)) * (after - u) ** 2 <= EPS / 4 * abs(slope) or not low < after < high
-        u = after
-        if is_found:
+        step = value / slope if slope != 0 else math.inf
+        if (abs(p2) + 3 * abs(p3)) * step * step <= EPS / 4 * abs(slope):  # a bound of what the step leaves
+            u = min(max(u - step, 0.0), 1.0)
             break
+        u -= step
+        if not low < u < high:
+            u = 0.5 * (low + high)
+            if not low < u < high:
+                break
     return u
 
 
@@ -375,7 +376,7 @@ def find_stretches_inside(
             near = most >= min(u0, u1), least <= max(l0, l1)
             if near[0] != near[1]:  # mostly one line is crossed, once
                 y0, y1 = (u0, u1) if near[0] else (l0, l1)
-                share = _find_one_crossing(span, start, after, v - y0, v_after - y1, y1 - y0, tolerance)
+                share = find_one_crossing(span, start, after, v - y0, v_after - y1, y1 - y0, tolerance)
                 if not math.isnan(share):
                     begins_inside = (v < y0) == near[0]
                     cut = start + share * (after - start) if share > 0 else after

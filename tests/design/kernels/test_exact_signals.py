@@ -1,5 +1,6 @@
 """Exact signals against adaptive quadrature between independently found crossings, closed forms and hard geometry."""
 
+import math
 import warnings
 from itertools import pairwise
 
@@ -13,6 +14,7 @@ from scipy.optimize import brentq
 
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.contact import fibre_axes
+from padforge.design.kernels.exact_signals import find_one_crossing
 from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from tests.design import wild_pads as wild
@@ -259,3 +261,23 @@ def test_signals_refuse_invalid_presses_and_knots():
     for knots in (np.zeros((3, 2, 2)), np.full((4, 2, 2), np.nan), unsorted):
         with pytest.raises(InputError, match="knots"):
             signals(knots, [[1, 1]])
+
+
+@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6), st.integers(-12, 0))
+@settings(max_examples=300)
+def test_single_crossings_are_exact_to_rounding(drawn, exponent):
+    """Also of nearly straight curves, on which a step of Newton's method may leave the bracket by rounding."""
+    cubic = np.array([*drawn[:2], *(10.0**exponent * np.array(drawn[2:4]))])  # v = e0 + e1 s + e2 s^2 + e3 s^3
+    span, line = np.array([0.0, 1.0, *cubic]), drawn[4:]
+    above = cubic[0] - line[0], cubic.sum() - line[1]
+    share = find_one_crossing(span, 0.0, 1.0, *above, line[1] - line[0], 1e-15)
+    if math.isnan(share):  # left to a slower way
+        return
+    difference = cubic - [line[0], line[1] - line[0], 0, 0]
+    height = np.polynomial.polynomial.polyval(np.append(np.linspace(0, 1, 101), share), difference)
+    steepest = np.abs(difference[1:]) @ [1, 2, 3]
+    if share == 0:
+        assert (np.sign(height) == np.sign(above[0])).all()
+    else:
+        assert above[0] * above[1] < 0
+        assert abs(height[-1]) <= 1e-15 * (1 + steepest)
