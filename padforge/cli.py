@@ -172,8 +172,7 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
 
     run = Run(common.load_spec(spec), out, formats=formats, **options)
     check_run(run)
-    compile_beside()
-    with locked_folder(out):
+    with compile_beside(), locked_folder(out):
         code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
         if code != common.INTERRUPTED:
             with stage("report"):

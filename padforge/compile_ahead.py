@@ -7,30 +7,42 @@ no harm.
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
-def compile_beside() -> None:
-    """Let a second process compile kernels as soon as this one has to compile one, if there is a core for it.
+@contextmanager
+def compile_beside() -> Iterator[None]:
+    """Let a second process compile kernels as soon as this one has to compile one in the body, if there is a core.
 
-    The process ends by itself. Where everything is read from the cache, none is started.
+    It ends by itself, at the latest with the body. Where everything is read from the cache, none is started.
     """
     from numba.core import event as events
+
+    processes: list[subprocess.Popen[bytes]] = []
 
     class Starter(events.Listener):
         """Starts the process once."""
 
         def on_start(self, event: Any) -> None:
             """Start it."""
-            events.unregister("numba:compile", self)
-            command, silent = [sys.executable, "-m", "padforge.compile_ahead"], subprocess.DEVNULL
-            subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent)
+            if not processes and (os.cpu_count() or 1) > 1:
+                command, silent = [sys.executable, "-m", "padforge.compile_ahead"], subprocess.DEVNULL
+                processes.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
 
         def on_end(self, event: Any) -> None:
             """Do nothing."""
 
-    if (os.cpu_count() or 1) > 1:
-        events.register("numba:compile", Starter())
+    starter = Starter()
+    events.register("numba:compile", starter)
+    try:
+        yield
+    finally:
+        events.unregister("numba:compile", starter)
+        for process in processes:
+            process.terminate()
+            process.wait()
 
 
 def main() -> None:

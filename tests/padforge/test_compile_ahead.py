@@ -29,17 +29,37 @@ print(*sorted(compiled))
 """
 
 
+class Process:
+    """Stands for the second process."""
+
+    def __init__(self, command: list[str], **_: object) -> None:
+        self.log = [*command[1:]]
+        started.append(self)
+
+    def terminate(self) -> None:
+        self.log.append("terminated")
+
+    def wait(self) -> None:
+        self.log.append("waited for")
+
+
+started: list[Process] = []
+
+
 def test_a_process_is_started_once_and_only_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
-    started = []
+    started.clear()
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: started.append(command))
+    monkeypatch.setattr(subprocess, "Popen", Process)
     first, second = (njit(function) for function in (lambda x: x + 1, lambda x: x + 2))
     assert first(1) == 2
-    compile_ahead.compile_beside()
-    assert first(1) == 2
-    assert started == []
-    assert [first(1.0), second(1.0), second(np.int32(1))] == [2.0, 3.0, 3]
-    assert started == [[sys.executable, "-m", "padforge.compile_ahead"]]
+    with compile_ahead.compile_beside():
+        assert first(1) == 2
+        assert started == []
+        assert [first(1.0), second(1.0), second(np.int32(1))] == [2.0, 3.0, 3]
+        assert [process.log for process in started] == [["-m", "padforge.compile_ahead"]]
+    assert [process.log[2:] for process in started] == [["terminated", "waited for"]]
+    assert second(1j) == 2 + 1j
+    assert len(started) == 1
 
 
 @pytest.mark.slow
