@@ -322,7 +322,7 @@ def find_one_crossing(
     return u
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # likewise
+@njit(cache=True, error_model="numpy", inline="always")  # as `_density`
 def find_stretches_inside(
     span: Any, a: float, b: float, chains: Any, extents: Any, radius: float, tolerance: float, scratch: Any, out: Any
 ) -> Any:
@@ -429,8 +429,6 @@ def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: An
 @njit(cache=True, error_model="numpy")
 def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Return the signal of a stretch inside the press, split where the weight bends."""
-    if law.weight == UNIFORM and law.length == MANHATTAN:
-        return _manhattan_length(span, a, b)
     roots, work, p, stack = scratch
     if law.weight == PROFILE:
         return _compute_profile_signal(span, a, b, law, scratch)
@@ -465,7 +463,7 @@ def centre_cubic(
     return s0
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # likewise
+@njit(cache=True, error_model="numpy", inline="always")  # as `_density`
 def _compute_fibre_signal(
     t: Any,
     v: Any,
