@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
-
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markdown_it import MarkdownIt
-from markdown_it.tree import SyntaxTreeNode
 
 from padforge.design.common.files import read_bytes
 from padforge.design.common.validation import InputError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 
 def read_resource(package: str, name: str) -> str:
@@ -72,7 +71,9 @@ def page(title: str, lead: str, sections: Sequence[PageSection]) -> str:
 
 
 @cache
-def _templates() -> Environment:
+def _templates() -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     lines = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
     return Environment(loader=PackageLoader(TEMPLATES, ""), autoescape=True, undefined=StrictUndefined, **lines)
 
@@ -124,6 +125,9 @@ def render_markdown(text: str) -> Iterator[str]:
 
     Understood are paragraphs, lists, tables, headings, **bold** and `code`; anything else, HTML too, is text.
     """
+    from markdown_it import MarkdownIt
+    from markdown_it.tree import SyntaxTreeNode
+
     reader = MarkdownIt("zero", {"html": False}).enable(["heading", "list", "table", "emphasis", "backticks"])
     for block in SyntaxTreeNode(reader.parse(text)).children:
         if block.type == "heading":

@@ -80,27 +80,33 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     slope = (values[:, 1::2] - values[:, 2::2]).transpose(0, 2, 1)
     jacobian = cell / (2 * step * sigma) * slope  # (Q, F, 2)
     log_det = np.linalg.slogdet(np.eye(2) + np.einsum("aki,akj->aij", jacobian, jacobian))[1]
-    blocks = [_mean_exponential(mean, jacobian, log_det, part) for part in np.array_split(np.arange(len(mean)), side)]
-    return float((log_det.mean() / 2 - np.log(np.concatenate(blocks)).mean()) / np.log(2))
+    sums = np.zeros(len(mean))
+    for part in np.array_split(np.arange(len(mean)), side):  # each pair of cells once
+        overlaps = _overlaps(mean[part[0] :], jacobian[part[0] :], log_det[part[0] :], len(part))
+        sums[part] += overlaps.sum(axis=1)
+        sums[part[-1] + 1 :] += overlaps[:, len(part) :].sum(axis=0)
+    return float((log_det.mean() / 2 - np.log(sums / len(mean)).mean()) / np.log(2))
 
 
-def _mean_exponential(mean: Array, jacobian: Array, log_det: Array, rows: NDArray[np.int64]) -> Array:
-    """Return mean_b exp(-D_ab) for the cells a in `rows`, with means (Q, C) and covariances I + J J^T, noise units.
+def _overlaps(mean: Array, jacobian: Array, log_det: Array, count: int) -> Array:
+    """Return exp(-D_ab) of the first `count` cells a with all b: means (Q, C), covariances I + J J^T, in noise units.
 
     The mean covariance of two cells is I + W W^T with W = [J_a, J_b] / sqrt 2, four columns, so its
     determinant and inverse are those of a 4 x 4 matrix.
     """
     half = jacobian / np.sqrt(2)
-    offset = mean[rows, None] - mean[None]
+    offset = mean[:count, None] - mean[None]
     inner = np.empty((*offset.shape[:2], 4, 4))  # I + W^T W, by blocks of the two cells
     diagonal = np.eye(2) + half.transpose(0, 2, 1) @ half
-    inner[..., :2, :2], inner[..., 2:, 2:] = diagonal[rows, None], diagonal
-    inner[..., :2, 2:] = np.tensordot(half[rows], half, axes=(1, 1)).transpose(0, 2, 1, 3)
+    inner[..., :2, :2], inner[..., 2:, 2:] = diagonal[:count, None], diagonal
+    inner[..., :2, 2:] = np.tensordot(half[:count], half, axes=(1, 1)).transpose(0, 2, 1, 3)
     inner[..., 2:, :2] = inner[..., :2, 2:].swapaxes(-1, -2)
-    along = np.concatenate([offset @ half[rows], (offset.swapaxes(0, 1) @ half).swapaxes(0, 1)], axis=-1)  # W^T offset
+    along = np.concatenate(
+        [offset @ half[:count], (offset.swapaxes(0, 1) @ half).swapaxes(0, 1)], axis=-1
+    )  # W^T offset
     square = (offset**2).sum(axis=-1) - (along * np.linalg.solve(inner, along[..., None])[..., 0]).sum(axis=-1)
-    distance = square / 8 + (np.linalg.slogdet(inner)[1] - (log_det[rows, None] + log_det[None]) / 2) / 2
-    return np.exp(-distance).mean(axis=1)
+    distance = square / 8 + (np.linalg.slogdet(inner)[1] - (log_det[:count, None] + log_det[None]) / 2) / 2
+    return np.exp(-distance)
 
 
 @dataclass(frozen=True)

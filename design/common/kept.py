@@ -1,0 +1,39 @@
+"""Arrays that take long to compute, kept on disk from one process to the next, where Numba keeps compiled kernels."""
+
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from padforge.design.common.files import atomic_file
+from padforge.design.common.validation import InputError
+
+Arrays = Mapping[str, NDArray[np.float64]]
+_first: set[str] = set()  # what this process has computed first
+
+
+def kept(key: bytes, compute: Callable[[], Arrays]) -> Arrays:
+    """Return what `compute` returns, read from disk where an earlier process has kept it.
+
+    A process keeps only what it computes first: what its command is about, and not the thousands of a fit. Where the
+    folder cannot be written, nothing is kept.
+
+    Args:
+        key: all that the arrays depend on, also the code.
+        compute: called if nothing is kept by this key.
+    """
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "__pycache__")
+    path = folder / f"kept-{sha256(key).hexdigest()[:32]}.npz"
+    with suppress(OSError, ValueError, EOFError, BadZipFile), path.open("rb") as file, np.load(file) as arrays:
+        return dict(arrays)
+    computed = compute()
+    if _first <= {path.name}:
+        _first.add(path.name)
+        with suppress(OSError, InputError), atomic_file(path) as temporary:
+            np.savez(temporary, **computed)
+    return computed
