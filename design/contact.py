@@ -433,7 +433,7 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
         return ((distance, weight, np.zeros_like(weight)),)
-    return tuple(tuple(family) for family in _layer_weights(contact)["families"])
+    return tuple((distance, plain, directed) for distance, plain, directed in _layer_weights(contact)["families"])
 
 
 @lru_cache(maxsize=128)

@@ -1,45 +1,105 @@
-"""A note to users whose first command compiles kernels, since later ones read them from disk."""
+"""How kernels are compiled, and kept on disk by Numba; and a note to users whose first command compiles them."""
 
+import gc
 import logging
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
+from hashlib import sha256
+from pathlib import Path
 from threading import Timer
-from typing import Any
+from typing import Any, TypeVar, overload
+
+from numba import njit
+from numba.core import event as events
 
 PATIENCE_S = 1.5  # time spent on compiling, s, after which the user is told why nothing happens
 
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
+
+
+@overload
+def kernel(function: _Function) -> _Function: ...
+@overload
+def kernel(**options: Any) -> Callable[[_Function], _Function]: ...
+def kernel(function: Any = None, **options: Any) -> Any:
+    """Compile a function when it is first called, without Python's checks of divisions and its lock.
+
+    Args:
+        function: the function, or None to return a decorator.
+        options: further ones of `numba.njit`.
+    """
+    return njit(function, cache=True, error_model="numpy", nogil=True, **options)
+
+
+@overload
+def inner_kernel(function: _Function) -> _Function: ...
+@overload
+def inner_kernel(**options: Any) -> Callable[[_Function], _Function]: ...
+def inner_kernel(function: Any = None, **options: Any) -> Any:
+    """Compile a function that only kernels call: without what Python would call, in four fifths of the time.
+
+    Args:
+        function: the function, or None to return a decorator.
+        options: further ones of `numba.njit`.
+    """
+    return kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+
+
+def clear_stale_kernels(package: Path) -> None:
+    """Delete the compiled kernels of a package if any of its sources has changed since the last call.
+
+    Numba compares the source of a kernel alone, not of those that it inlines.
+    """
+    cached = package / "__pycache__"
+    with suppress(OSError):  # a folder that cannot be written: no kernels are cached there
+        cached.mkdir(exist_ok=True)
+        digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
+        stamp = cached / "kernels.sha256"
+        if not stamp.exists() or stamp.read_bytes() != digest:
+            for compiled in package.rglob("__pycache__/*.nb[ic]"):
+                compiled.unlink(missing_ok=True)
+            stamp.write_bytes(digest)
+
+
+class _Compilations(events.Listener):
+    """Follows compilations, which Numba runs one at a time, each with those of what it calls."""
+
+    def __init__(self) -> None:
+        self._depth, self._spent_s, self._announced = 0, 0.0, False
+
+    def on_start(self, event: Any) -> None:
+        """Start the clock."""
+        if self._depth == 0:
+            self._started_s = time.monotonic()
+            self._collects = gc.isenabled()
+            gc.disable()  # a compiler's many objects are all in use: to look for others takes a sixth of the time
+            self._timer = Timer(max(PATIENCE_S - self._spent_s, 0), self._announce)
+            self._timer.daemon = True  # does not delay the end of the program
+            self._timer.start()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        """Stop the clock."""
+        self._depth -= 1
+        if self._depth == 0:
+            self._timer.cancel()
+            self._spent_s += time.monotonic() - self._started_s
+            if self._collects:
+                gc.enable()
+
+    def _announce(self) -> None:
+        if not self._announced:
+            self._announced = True
+            _log.info("compiling kernels, which takes up to a minute and is done once")
 
 
 @cache  # registered once
 def announce_compilation() -> None:
     """Log one line when this process has compiled kernels for PATIENCE_S; none if it reads them from the cache."""
-    from numba.core import event as events
+    events.register("numba:compile", _Compilations())
 
-    class Announcer(events.Listener):
-        """Adds up the time of compilations, which numba runs one at a time, each with those of what it calls."""
 
-        def __init__(self) -> None:
-            self._depth, self._spent_s = 0, 0.0
-
-        def on_start(self, event: Any) -> None:
-            """Start the clock."""
-            if self._depth == 0:
-                self._started_s = time.monotonic()
-                self._timer = Timer(max(PATIENCE_S - self._spent_s, 0), self._announce)
-                self._timer.daemon = True  # does not delay the end of the program
-                self._timer.start()
-            self._depth += 1
-
-        def on_end(self, event: Any) -> None:
-            """Stop the clock."""
-            self._depth -= 1
-            if self._depth == 0:
-                self._timer.cancel()
-                self._spent_s += time.monotonic() - self._started_s
-
-        def _announce(self) -> None:
-            events.unregister("numba:compile", self)
-            _log.info("compiling kernels, which takes up to a minute and is done once")
-
-    events.register("numba:compile", Announcer())
+announce_compilation()

@@ -167,22 +167,6 @@ def one_torch_thread() -> Iterator[None]:
                 torch.set_num_threads(n_before)
 
 
-def clear_stale_kernels(package: Path) -> None:
-    """Delete the compiled kernels of a package if any of its sources has changed since the last call.
-
-    Numba compares the source of a kernel alone, not of those that it inlines.
-    """
-    cache = package / "__pycache__"
-    with suppress(OSError):  # a folder that cannot be written: no kernels are cached there
-        cache.mkdir(exist_ok=True)
-        digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
-        stamp = cache / "kernels.sha256"
-        if not stamp.exists() or stamp.read_bytes() != digest:
-            for compiled in package.rglob("__pycache__/*.nb[ic]"):
-                compiled.unlink(missing_ok=True)
-            stamp.write_bytes(digest)
-
-
 class Checkpoints:
     """The states of the tasks of a search, each in a small file of arrays, from which they resume after a kill.
 

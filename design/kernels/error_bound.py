@@ -9,10 +9,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from padforge.design.common.compilation import kernel
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any, prior: Any, gradient: Any) -> Any:
     """Compute the mean bound (L,) over cells for sets of working fibres, and its gradient into `gradient` (L, F, Q).
 

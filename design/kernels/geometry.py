@@ -5,9 +5,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.settings import profile_spline
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class WeightLaw(NamedTuple):
     edge: float = 0.0  # distance at which the profile bends most, the edge of a contact; 0 if there is none
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def weigh(square: float, law: Any) -> float:
     """Return the weight of a fibre element at a squared distance from the press centre, in a shape."""
     radius, weight = law.radius, law.weight
@@ -62,7 +62,7 @@ def weigh(square: float, law: Any) -> float:
     return 1 / max(math.sqrt(square), radius / 100)
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+@inner_kernel(inline="always")  # else counting references takes most of the time
 def find_row(square: float, profile: Any, law: Any) -> int:
     """Return the row of a family's profile that applies at a squared distance, below that of its end."""
     row = law.bins[int(square * law.bin_rate)]
@@ -71,7 +71,7 @@ def find_row(square: float, profile: Any, law: Any) -> int:
     return row
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+@inner_kernel(inline="always")  # else counting references takes most of the time
 def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
     """Return a polynomial of a profile, PLAIN or DIRECTED, at the excess x over the squared distance of its row."""
     c, square = column, x * x
@@ -80,7 +80,7 @@ def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
     return low + square * square * high
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+@inner_kernel(inline="always")  # else counting references takes most of the time
 def differentiate_row(profile: Any, row: int, column: int, x: float) -> float:
     """Return the derivative of `evaluate_row` by x."""
     c, square = column, x * x
@@ -91,7 +91,7 @@ def differentiate_row(profile: Any, row: int, column: int, x: float) -> float:
     return low + square * x * high
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+@inner_kernel(inline="always")  # else counting references takes most of the time
 def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
     """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
     square = dt * dt + dv * dv
@@ -106,7 +106,7 @@ def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law:
     return weight
 
 
-@njit(cache=True, error_model="numpy", inline="always")  # else counting references takes most of the time
+@inner_kernel(inline="always")  # else counting references takes most of the time
 def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> float:
     """Return the weight of an element at (t, v) from the press centre that runs along (run, rise), by a framed law."""
     if law.weight != PROFILE:
@@ -185,7 +185,7 @@ def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], 
     return (chains[0], chains[1]), radius * np.array(extents)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def select_frame(shape: Any, family: int) -> Any:
     """Return a shape (chains and extents in both frames, law) in the frame of one family."""
     chains, extents, law = shape
@@ -194,7 +194,7 @@ def select_frame(shape: Any, family: int) -> Any:
     return (chains[0] if family == 0 else chains[1]), extents[family], framed
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def max_offsets(across: Any, ends: Any) -> Any:
     """Compute the largest offset (P, 2) of the fibres of each family from their own level."""
     population, fibres, _ = across.shape
@@ -208,7 +208,7 @@ def max_offsets(across: Any, ends: Any) -> Any:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, family: int) -> tuple[int, int]:
     """Find the first fibre that a press at `cv` can touch, of all fibres, and the one to stop before.
 
@@ -222,7 +222,7 @@ def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, fa
     return before + int(first), before + int(end)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def count_touched(max_offsets: Any, presses: Any, extents: Any, ends: Any) -> Any:
     """Return the cumulative counts (Q + 1,), from 0, of fibres that presses can touch on one pad; offsets (2,)."""
     starts = np.zeros(len(presses) + 1, np.int64)
@@ -238,7 +238,7 @@ _BOX_SEGMENTS = 8
 """Segments per bounding box, which is tested before they are."""
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _clip_to_slab(
     value: float, slope: float, least: float, most: float, low: float, high: float
 ) -> tuple[float, float]:
@@ -249,7 +249,7 @@ def _clip_to_slab(
     return max(low, min(first, last)), min(high, max(first, last))
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[float, float]:
     """Clip 0..1 to where (x, y) + t (dx, dy) is within `radius` of 0; low > high where nowhere."""
     square, middle = dx * dx + dy * dy, x * dx + y * dy
@@ -260,7 +260,7 @@ def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tu
     return max(0.0, (-middle - half) / square), min(1.0, (half - middle) / square)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _clip_to_capsule(
     x: float, y: float, dx: float, dy: float, ex: float, ey: float, width: float
 ) -> tuple[float, float]:
@@ -282,7 +282,7 @@ def _clip_to_capsule(
     return low, high
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, Any]:
     """Bound every few segments of polylines: boxes (n, 4), first and last segment (n, 2), polyline (n,)."""
     count = 0
@@ -303,7 +303,7 @@ def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, A
     return sides, segments, lines
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, width: float) -> Any:
     """Find the intervals of polylines that are nearer than `width` to segments of other polylines.
 
@@ -354,7 +354,7 @@ SCRATCH = (_DEPTH + 2, _MAX_DEGREE + 3)
 """Shape of the work array of `find_unit_roots`."""
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def shell_sort(values: Any, count: Any) -> None:
     """Sort values[:count] in place (Shell 1959): NumPy's sort takes a second to compile."""
     gap = count
@@ -368,7 +368,7 @@ def shell_sort(values: Any, count: Any) -> None:
             values[j] = value
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
     """Find the one sign change of p in (low, high) by Newton's method, safeguarded by bisection."""
     u = 0.5 * (low + high)
@@ -392,7 +392,7 @@ def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> f
     return u
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
     """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
 
@@ -440,7 +440,7 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_overlaps(
     samples: Any, slope: Any, arc: Any, pairs: Any, middles: Any, half: float, width: float, gradient: Any
 ) -> float:

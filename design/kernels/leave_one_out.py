@@ -8,7 +8,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from padforge.design.common.compilation import inner_kernel, kernel
 
 _FAST = {"reassoc", "contract"}
 """Sums may be taken in another order; NaN and infinities stay what they are."""
@@ -16,7 +17,7 @@ EPSILON = np.float32(1e-12)
 """Squared length, so that its root has a gradient at 0."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 def leave_one_out_errors(responses: Any, positions: Any, masks: Any, count: int, ridge: float, gradient: Any) -> Any:
     """Compute the mean errors (L,) for sets of working fibres, and their gradients into `gradient` (L, F, N).
 
@@ -78,7 +79,7 @@ def leave_one_out_errors(responses: Any, positions: Any, masks: Any, count: int,
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=_FAST)
+@inner_kernel(fastmath=_FAST)
 def _fill_kernel(responses: Any, mask: Any, out: Any) -> None:
     """Compute exp(-|x_a - x_b|^2 / 2) over the fibres of a mask into the lower triangle of out (N, N)."""
     for a in range(len(out)):
@@ -94,7 +95,7 @@ def _fill_kernel(responses: Any, mask: Any, out: Any) -> None:
             row[b] = math.exp(np.float32(-0.5) * row[b])
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=_FAST)
+@inner_kernel(fastmath=_FAST)
 def _invert(matrix: Any, ridge: Any, out: Any, work: Any) -> None:
     """Compute the inverse of matrix + ridge 1 into `out`, from its lower triangle; all (N, N), `work` overwritten."""
     n = len(matrix)
@@ -127,7 +128,7 @@ def _invert(matrix: Any, ridge: Any, out: Any, work: Any) -> None:
             out[b, a] = out[a, b]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=_FAST)
+@inner_kernel(fastmath=_FAST)
 def _weigh(matrix: Any, weights: Any, out: Any) -> None:
     """Compute the lower triangle of matrix diag(weights) matrix into `out`, for a symmetric matrix (N, N)."""
     n = len(matrix)
@@ -140,7 +141,7 @@ def _weigh(matrix: Any, weights: Any, out: Any) -> None:
         _add_rows(factors, matrix, row, a + 1, n)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=_FAST)
+@inner_kernel(fastmath=_FAST)
 def _add_rows(factors: Any, rows: Any, out: Any, width: int, known: int) -> None:
     """Add factors (K,) times rows (K, N) to the first `width` columns of out (N,); row k is 0 from k + `known` on."""
     count = len(factors)
@@ -157,7 +158,7 @@ def _add_rows(factors: Any, rows: Any, out: Any, width: int, known: int) -> None
             out[j] += c0 * r0[j]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, fastmath=_FAST)
+@inner_kernel(fastmath=_FAST)
 def _product(x: Any, y: Any) -> Any:
     """Compute the product of two rows in single precision."""
     total = np.float32(0)

@@ -9,9 +9,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.kernels.exact_gradient import differentiate_cubic
 from padforge.design.kernels.geometry import (
     DIRECTED,
@@ -80,7 +80,7 @@ def weight_table(law: WeightLaw) -> Array:
     return table
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _tabulate(profile: Any, law: Any, out: Any) -> None:
     """Write the cubics of one family, all but the last row."""
     steps = len(out) - 1
@@ -135,7 +135,7 @@ def _spacing(profile: Array, law: WeightLaw, precision: float) -> float:
     return spacing
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any:
     """Return the weights, of any shape, of elements of a straight fibre that passes the press at a distance."""
     out = np.empty(along.shape)
@@ -144,7 +144,7 @@ def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -> int:
     """Return the number of equal pieces of a span, at most `longest` on average."""
     # the slope at which a span rises is a quadratic, which keeps within its Bezier points
@@ -152,7 +152,7 @@ def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -
     return math.ceil(min(math.hypot(h, steepest) / longest, 1.0 * MAX_PIECES))
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _count_elements(
     along: Any, across: Any, slope: Any, horizontals: int, low: Any, high: Any, nodes: int, spacing: float, total: int
 ) -> Any:
@@ -175,7 +175,7 @@ def _count_elements(
     return pieces, starts
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _place_elements(
     along: Any, across: Any, slope: Any, pieces: Any, starts: Any, nodes: Any, weights: Any, length: int, out: Any
 ) -> None:
@@ -199,7 +199,7 @@ def _place_elements(
                     k += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fibre_elements(
     along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacings: tuple[float, float]
 ) -> Any:
@@ -222,7 +222,7 @@ def fibre_elements(
     return Elements(horizontals, starts, far_starts, out[0], out[1], out[2], out[3], out[4], out[5], out[6])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
     """Multiply the lengths of elements by the sensitivity (F, K) of their fibre, given at even steps along its axis."""
     fibres, n = along.shape
@@ -236,14 +236,14 @@ def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
                 elements.length[k] *= sensitivity[f, i] + (at - i) * (sensitivity[f, i + 1] - sensitivity[f, i])
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
     """Whether span j, which lies in the box of its ends, comes within `end` of (ct, cv) along both axes."""
     is_beside = t[j] < ct + end and t[j + 1] > ct - end
     return is_beside and min(v[j], v[j + 1]) < cv + end and max(v[j], v[j + 1]) > cv - end
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, table: Any, out: Any) -> int:
     """Compute signals of one pad from its elements, by the `weight_table` of the law, into `out` (Q, F).
 
@@ -281,7 +281,7 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
     return visited
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any, family: int) -> Any:
     """Sum the weights of E elements for each press (Q,), by their points (E, 2), lengths (E,) and tangents (E, 2)."""
     out, profile = np.zeros(len(presses)), law.profile[family]
@@ -292,7 +292,7 @@ def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _differentiate_elements(
     along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any, out: Any
 ) -> None:
@@ -344,7 +344,7 @@ def _differentiate_elements(
                     out[k, 2] += up * weight
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def elements_gradient(
     along: Any, across: Any, slope: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any
 ) -> Any:
@@ -360,7 +360,7 @@ def elements_gradient(
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _pass_to_knots(
     along: Any, across: Any, slope: Any, elements: Any, starts: Any, element_gradient: Any, law: Any, out: Any
 ) -> None:

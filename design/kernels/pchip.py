@@ -4,12 +4,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from padforge.design.common.compilation import inner_kernel, kernel
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def piece_of(at: float, edges: Any, pieces: int) -> int:
     """Return the index of the piece that contains `at` by bisection of ascending `edges`; the first if none does."""
     low, high = 0, pieces
@@ -22,7 +23,7 @@ def piece_of(at: float, edges: Any, pieces: int) -> int:
     return low
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def extremes(values: Any) -> tuple[float, float]:
     """Return the smallest and the largest of (n,) values."""
     least = largest = values[0]
@@ -31,7 +32,7 @@ def extremes(values: Any) -> tuple[float, float]:
     return least, largest
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
     """Return the slope at an end knot: three-point rule, limited to preserve the shape."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
@@ -42,7 +43,7 @@ def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
     return d
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pchip_slopes(t: Any, v: Any, d: Any) -> None:
     """Compute the slopes d of the PCHIP interpolant of (t, v) at its knots (Fritsch and Butland 1984)."""
     n = len(t)
@@ -63,7 +64,7 @@ def pchip_slopes(t: Any, v: Any, d: Any) -> None:
     d[n - 1] = _end_slope(h0, h1, (v[n - 1] - v[n - 2]) / h0, (v[n - 2] - v[n - 3]) / h1)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream: float, out: Any) -> None:
     """Add the derivatives of `_end_slope` by its arguments, times `upstream`, to out (4,)."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
@@ -79,7 +80,7 @@ def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream
     out[3] -= share * h0
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: Any) -> None:
     """Add the gradient of sum(upstream * d) of `pchip_slopes`, by t and by v."""
     n = len(t)
@@ -118,7 +119,7 @@ def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: 
         by_t[k + 1] += run
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]:
     """Return value and slope of the curve through (t, v) with slopes d at 0 <= s <= 1 of span j."""
     h, r = t[j + 1] - t[j], 1 - s
@@ -127,7 +128,7 @@ def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]
     return value, 6 * m * s * r + d[j] * r * (1 - 3 * s) - d[j + 1] * s * (2 - 3 * s)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def add_value_gradient(
     t: Any, v: Any, d: Any, j: int, s: float, by_value: float, by_slope: float, by_t: Any, by_v: Any, by_d: Any
 ) -> None:
@@ -144,7 +145,7 @@ def add_value_gradient(
     by_t[j + 1] += run
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
     """Sample the PCHIP interpolant of (t, v) at 0, step, 2 step, ... into `out`; the last sample is the last knot."""
     d = np.empty(len(t))
@@ -162,7 +163,7 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
     out[-1] = v[-1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def population_slopes(along: Any, across: Any) -> Any:
     """Compute the slopes (P, F, n) of the PCHIP curves of a population."""
     out = np.empty_like(across)
@@ -172,7 +173,7 @@ def population_slopes(along: Any, across: Any) -> Any:
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sample_spans(along: Any, across: Any, slope: Any, shares: Any, points: Any, slopes: Any) -> None:
     """Sample fibres (F, n) at the `shares` (K,) of every span, and at the last knot.
 
@@ -189,7 +190,7 @@ def sample_spans(along: Any, across: Any, slope: Any, shares: Any, points: Any, 
         points[f, -1, 0], points[f, -1, 1], slopes[f, -1] = t[n - 1], v[n - 1], d[n - 1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_samples_gradient(
     along: Any,
     across: Any,
@@ -216,7 +217,7 @@ def add_samples_gradient(
         by_d[n - 1] += by_slopes[f, -1]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) -> Any:
     """Compute the gradient (2, F, n) of sum(upstream * slope) by along and by across, of the slopes of a pad."""
     out = np.zeros((2, *along.shape))
@@ -225,7 +226,7 @@ def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) ->
     return out
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
     """Compute the arc lengths (F,) of fibres, to 1e-3 where they are steep, and their gradients into out (3, F, n).
 

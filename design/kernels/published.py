@@ -4,13 +4,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.kernels.geometry import MANHATTAN, UNIFORM, select_frame, shell_sort, weigh_element
 from padforge.design.kernels.pchip import extremes, pchip_sample, piece_of
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _bisect_monotone(curve: Any, low: int, high: int, value: float, rising: bool) -> int:
     """Find the first index in [low, high) at which a monotone stretch of `curve` reaches `value`; high if none."""
     while low < high:
@@ -22,7 +22,7 @@ def _bisect_monotone(curve: Any, low: int, high: int, value: float, rising: bool
     return low
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
     """Whether (dt, dv) from the centre lies between the lower and the upper chain of a polygon."""
     breaks, upper, lower = chains
@@ -33,7 +33,7 @@ def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
     return lower[k] + x * (lower[k + 1] - lower[k]) <= dv <= upper[k] + x * (upper[k + 1] - upper[k])
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
+@inner_kernel(fastmath={"reassoc", "nsz"})
 def _sum_uniform(
     curve: Any,
     segment_lengths: Any,
@@ -77,7 +77,7 @@ def _sum_uniform(
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _sum_stretch(
     curve: Any, segment_lengths: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any
 ) -> float:
@@ -95,7 +95,7 @@ def _sum_stretch(
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _sample_fibre_signals(
     t: Any, v: Any, curve: Any, step: float, presses: Any, family: int, shape: Any, out: Any
 ) -> None:
@@ -139,7 +139,7 @@ def _sample_fibre_signals(
             j += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def quantized_signals(
     along: Any, across: Any, horizontals: int, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
 ) -> None:
@@ -160,7 +160,7 @@ def quantized_signals(
             out[p, q, f] = column[q]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def quantize(signals: Any, levels: int, out: Any) -> None:
     """Scale each column of signals (Q, C) to 0..levels, rounded up, into out; 0 for a constant column."""
     for c in range(signals.shape[1]):
@@ -172,7 +172,7 @@ def quantize(signals: Any, levels: int, out: Any) -> None:
             out[q, c] = math.ceil((signals[q, c] - low) / span * levels) if span > 0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def compute_row_entropy(rows: Any, first: Any, end: int) -> float:
     """Compute the joint entropy, bits, of rows in columns first..end by counting equal sorted hashes (FNV-1a)."""
     count = len(rows)
@@ -195,7 +195,7 @@ def compute_row_entropy(rows: Any, first: Any, end: int) -> float:
     return entropy / count
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def sum_second_differences(levels: Any) -> float:
     """Sum |second difference| over the columns of (Q, C)."""
     total = 0.0
@@ -205,7 +205,7 @@ def sum_second_differences(levels: Any) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "nsz"})
+@inner_kernel(fastmath={"reassoc", "nsz"})
 def _sum_disorder(curves: Any, horizontals: int) -> float:
     """Sum the negative parts of curve_j - curve_i over pairs i < j of each family; curves are (F, samples)."""
     total = 0.0
@@ -218,7 +218,7 @@ def _sum_disorder(curves: Any, horizontals: int) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def published_terms(
     along: Any,
     across: Any,

@@ -9,8 +9,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from padforge.design.common.compilation import kernel
 from padforge.design.kernels.pchip import add_value_gradient, pchip_value
 
 STEEPNESS = 10.0
@@ -19,7 +19,7 @@ REACH = 6.0
 """Standard deviations beyond which a crossing has no density: less than 1e-7 of it."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _closeness(distance: float, gap: float) -> tuple[float, float]:
     """Return what a distance below the gap costs, and its derivative; 0 for other ones."""
     close = 1 - distance / gap
@@ -28,7 +28,7 @@ def _closeness(distance: float, gap: float) -> tuple[float, float]:
     return close + STEEPNESS * close * close, -(1 + 2 * STEEPNESS * close) / gap
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_excess_turns(
     slope: Any, arc: Any, radius: float, window: float, rolled: float, weight: float, by_slope: Any, by_arc: Any
 ) -> float:
@@ -87,7 +87,7 @@ def sum_excess_turns(
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_closeness(
     points: Any, slope: Any, arc: Any, shares: Any, pairs: Any, gap: float, fold: float, weight: float, by_points: Any
 ) -> float:
@@ -134,7 +134,7 @@ def sum_closeness(
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_order(
     along: Any,
     across: Any,
@@ -178,7 +178,7 @@ def sum_order(
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_crossings(
     plan: Any, pairs: Any, axes: Any, blur: float, limit: float, weights: tuple[float, float], by_plan: Any
 ) -> tuple[float, float]:
@@ -237,7 +237,7 @@ def sum_crossings(
     return count, flatness
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, by_slope: Any) -> float:
     """Integrate by how much slopes are steeper than 45 degrees less than `zone` from either end of their fibre."""
     total, (fibres, n) = 0.0, slope.shape
@@ -250,7 +250,7 @@ def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight:
     return total
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def add_arc_gradient(points: Any, by_arc: Any, by_points: Any) -> None:
     """Add the gradient of sum(by_arc * arc), of the arc lengths of the polylines through points (F, P, 2)."""
     for f in range(len(points)):

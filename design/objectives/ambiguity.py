@@ -13,8 +13,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from padforge.design.common.compilation import kernel
 from padforge.design.common.validation import InputError
 from padforge.design.contact import grid_positions, quick_signals, relative_stretch
 from padforge.design.morphology import Array, Morphology
@@ -75,7 +75,7 @@ def _by_press(stretch: Array, presses: Array, max_failures: int | tuple[float, .
     return np.stack([level.mean(axis=1) for level in np.split(values, ends[:-1], axis=1)])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
     """Compute sum_b w_ab |p_a - p_b| (Q, L) exactly, without the pairs of presses that add nothing.
 

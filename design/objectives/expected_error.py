@@ -23,9 +23,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from padforge.design.common.compilation import kernel
 from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.kernels.error_bound import error_bound
 from padforge.design.kernels.leave_one_out import leave_one_out_errors
@@ -198,7 +198,7 @@ def confusable(near: Array, far: Array, masks: Array) -> Ints:
     return np.sort(best[squares[best] < limit**2])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def least_squares(near: Any, far: Any, masks: Any, limit: float) -> Any:
     """Compute the least squared distance (N,) of each response of far (N, F) to any of near (Q, F), under any set.
 

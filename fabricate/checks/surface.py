@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from shapely.geometry.base import BaseGeometry
 
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.common.validation import InputError, check_array
 from padforge.design.morphology import Array
 from padforge.fabricate.mesh import MAX_COORDINATE_MM, Numbers
@@ -172,7 +172,7 @@ _DEGENERATE_MM = 1e-6  # triangles of less height have no plane and no area to i
 _PARALLEL = 1e-16  # squared sine below which edges are parallel: their cross product is noise
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _project(points: Any, x: float, y: float, z: float) -> tuple[float, float]:
     """Return the range of the projections of points (3, 3) on an axis, times its length."""
     a = points[0, 0] * x + points[0, 1] * y + points[0, 2] * z
@@ -181,7 +181,7 @@ def _project(points: Any, x: float, y: float, z: float) -> tuple[float, float]:
     return min(a, b, c), max(a, b, c)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _is_separated(a: Any, b: Any, first: Any, second: Any) -> bool:
     """Return whether a cross product of rows of `first` and `second` separates two triangles but for PENETRATION_MM."""
     for ux, uy, uz in first:
@@ -196,7 +196,7 @@ def _is_separated(a: Any, b: Any, first: Any, second: Any) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _penetrate(corners: Any, edges: Any, normals: Any, i: int, j: int, tolerance: float) -> bool:
     """Return whether triangles i and j penetrate by more than PENETRATION_MM, by the separating axis theorem."""
     across = True
@@ -212,7 +212,7 @@ def _penetrate(corners: Any, edges: Any, normals: Any, i: int, j: int, tolerance
     return across and not _is_separated(corners[i], corners[j], edges[i], edges[j])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _sweep(corners: Any, edges: Any, normals: Any, low: Any, high: Any, tolerance: float, pairs: Any) -> int:
     """Write the penetrating pairs until `pairs` is full and return their number; triangles sorted by `low[:, 0]`."""
     count = 0

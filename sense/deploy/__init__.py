@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from padforge.design.common.parallel import clear_stale_kernels
+from padforge.design.common.compilation import clear_stale_kernels
 
 clear_stale_kernels(Path(__file__).parent)
 # read as onnxruntime is loaded, which else leaves a file with a number of its user and tells its maker what is run

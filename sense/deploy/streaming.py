@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Indices, Mask
 from padforge.sense.localizer.features import DOWN, NOW, REST, PressFeatures, interpolate_gaps
@@ -46,8 +46,6 @@ PRESSED, SUSPECTED, DOWN_COMMAND, UP_COMMAND, PREVIOUS_END, TOUCHED, N_COMPLETE,
 """State of the pad: is it pressed, did the last reading exceed the threshold, the readings with which the press began
 and ended and the press before it ended, the reading at which it was detected, how many windows of it are complete, and
 how often its position was estimated."""
-
-kernel = njit(cache=True, error_model="numpy", nogil=True)
 
 
 @kernel
@@ -128,7 +126,7 @@ def _run_stream(
     return n_presses, n_estimates
 
 
-@kernel
+@inner_kernel
 def _ingest(n: int, row: Any, ring: Any, averages: Any, missing: Any, rates: Any) -> None:
     """Store a reading; what is missing or beyond MAX_VOLTS repeats the reading before."""
     for c in range(len(row)):
@@ -197,7 +195,7 @@ def _detect(
     return change
 
 
-@kernel
+@inner_kernel
 def _store_begin(
     n: int, rest_length: int, ring: Any, averages: Any, rates: Any, pad: Any, rest: Any, history: Any
 ) -> None:
@@ -215,7 +213,7 @@ def _store_begin(
             history[c, j] = level - rest[c]
 
 
-@kernel
+@inner_kernel
 def _window_mean(c: int, origin: int, window: Any, end: int, ring: Any, pad: Any) -> Any:
     """Return the mean of a fibre over a window; what is not of the press before `end` repeats the nearest reading."""
     total = np.float32(0)

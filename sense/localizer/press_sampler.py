@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer, stage_of
 from padforge.sense.localizer.features import DOWN, NOW
@@ -128,7 +128,7 @@ def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.ran
     return (rank >= count) | full
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _compute_inputs(
     source: Any, rows: Any, targets: Any, fibre_mask: Any, moments: Any, noise: float, rng: Any, x: Any
 ) -> None:
@@ -174,7 +174,7 @@ def _compute_inputs(
                     x[b, c * size + f] = features[f]
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
     """Return the cell of the table in which a position lies, or the nearest one, and how far in it along both axes."""
     u = min(max((x + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
@@ -182,14 +182,14 @@ def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
     return int(u), int(v), u - int(u), v - int(v)
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _respond(table: Any, i: int, j: int, u: float, v: float, c: int, f: int) -> float:
     """Interpolate a window of a fibre in the table."""
     near = (1 - v) * table[i, j, c, f] + v * table[i, j + 1, c, f]
     return (1 - u) * near + u * ((1 - v) * table[i + 1, j, c, f] + v * table[i + 1, j + 1, c, f])
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def _trace(target: Any, velocity: Any, end: float, now: Any, reach: float, side: int) -> tuple[Any, Any, Any, Any]:
     """Trace a finger that slides to its target back to its touch, for the windows of `DOWN` and those of now.
 
@@ -216,7 +216,7 @@ def _trace(target: Any, velocity: Any, end: float, now: Any, reach: float, side:
     return windows, correlation, cells, places
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _slide(
     source: Any, path: Any, c: int, gain: float, own: Any, other: Any, noise: float, rng: Any, down: Any, now: Any
 ) -> None:

@@ -9,11 +9,8 @@ as a function of x_i. A reading adds its fidelity; the coupling to the next clip
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-kernel = njit(cache=True, error_model="numpy", nogil=True)
-inlined = njit(cache=True, error_model="numpy", nogil=True, forceinline=True)
-"""For operations of queues, which are short: a call takes longer than the work."""
+from padforge.design.common.compilation import inner_kernel, kernel
 
 
 @kernel
@@ -64,19 +61,19 @@ def running_median(readings: Any, before: int, after: int, out: Any) -> None:
 LOW, HIGH = 0, 1
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _end_slot(size: int, end: int) -> int:
     """Return where the smallest (LOW) or greatest (HIGH) of `size` > 0 entries is."""
     return end if size > 1 else 0
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _is_beyond(key: float, other: float, end: int) -> bool:
     """Return whether `key` is nearer to the end: strictly, so that equal keys stay where they are."""
     return key < other if end == LOW else key > other
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _push(keys: Any, values: Any, size: int, key: float, value: float) -> None:
     """Add an entry to `size` others; the arrays are longer than that."""
     slot, end = size, size % 2
@@ -94,7 +91,7 @@ def _push(keys: Any, values: Any, size: int, key: float, value: float) -> None:
     keys[slot], values[slot] = key, value
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _pop(keys: Any, values: Any, size: int, end: int) -> None:
     """Remove the smallest (LOW) or greatest (HIGH) of `size` > 0 entries."""
     size -= 1
@@ -130,13 +127,13 @@ def initial_message_l1() -> tuple[Any, Any, Any]:
     return np.zeros(2), np.empty((2, 0)), np.empty((2, 0))
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _halfway(position: float, other: float) -> float:
     """Return the middle of two positions, without overflow."""
     return 0.5 * position + 0.5 * other
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _cut_l1(positions: Any, heights: Any, size: int, end: int, excess: float) -> tuple[int, float, float]:
     """Cut the height `excess` off one end of a queue; return its size, where the cut ends, and the excess left."""
     position = np.nan
@@ -152,7 +149,7 @@ def _cut_l1(positions: Any, heights: Any, size: int, end: int, excess: float) ->
     return size, position, excess
 
 
-@inlined
+@inner_kernel(forceinline=True)
 def _minimum_l1(level: float, lower: Any, n_lower: int, upper: Any, n_upper: int) -> float:
     """Return where the message is least, the middle if that is an interval; NaN before any reading."""
     if n_lower == 0:
@@ -230,7 +227,7 @@ def initial_message_l2() -> tuple[Any, Any]:
     return np.full(1, np.nan), np.empty((4, 0))
 
 
-@kernel
+@inner_kernel
 def _cut_l2(step: int, reading: float, lams: float, lam: float, knots: Any, k: int, stop: int) -> int:
     """Cut the derivative, with a reading added, at -lam (step 1, inwards from knot k) or at lam (-1); return the knot.
 
@@ -249,7 +246,7 @@ def _cut_l2(step: int, reading: float, lams: float, lam: float, knots: Any, k: i
     return k
 
 
-@kernel
+@inner_kernel
 def _minimum_l2(lam: float, knots: Any, first: int, last: int) -> float:
     """Return where the message is least: its derivative, -lam before the first knot, is followed until it is 0."""
     total, lams, count = 0.0, 1.0, 0.0

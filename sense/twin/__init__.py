@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-from padforge.design.common.parallel import clear_stale_kernels
+from padforge.design.common.compilation import clear_stale_kernels
 
 clear_stale_kernels(Path(__file__).parent)

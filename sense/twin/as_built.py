@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from padforge.design import Morphology
+from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
 from padforge.design.twin import PlanTransform
@@ -37,7 +37,7 @@ OFFSET, SENSITIVITY = slice(2, 2 + 2 * N_OFFSET), slice(2 + 2 * N_OFFSET, N_CHAN
 SLOPE_STEP_MM = 0.5  # half of the step of the central differences by which slopes over the position are taken
 
 
-@njit(cache=True, error_model="numpy")
+@inner_kernel
 def spline_weights(f: float, out: Any) -> None:
     """Write values and derivatives at f in [0, 1) of the B-splines centred at -1, 0, 1 and 2 into out (2, 4)."""
     g = 1 - f
@@ -47,7 +47,7 @@ def spline_weights(f: float, out: Any) -> None:
     out[1, 1], out[1, 2] = (3 * f - 4) * f / 2, -(3 * g - 4) * g / 2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
     """Evaluate cubic B-splines of coefficients (n, J) from end to end of F elements.
 
@@ -70,7 +70,7 @@ def evaluate_along_fibre(coefficients: Any, elements: int) -> Any:
     return values, first, basis
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def channel_response(
     fibre: Any, lateral_offset: Any, log_sensitivity: Any, positions: Any, profile: Any, step: float
 ) -> Any:

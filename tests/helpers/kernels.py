@@ -19,7 +19,7 @@ def missing() -> bool:
     """Whether there is a file of kernels of which nothing is kept that is as new."""
     folders = [Path(folder) / package for folder in padforge.__path__ for package in PACKAGES]
     for path in (path for folder in folders for path in folder.rglob("*.py")):
-        if b"\n@njit(cache=True" in path.read_bytes():
+        if b"\n@kernel" in path.read_bytes():
             cached = (path.parent / "__pycache__").glob(f"{path.stem}.*.nbi")
             if not any(index.stat().st_mtime >= path.stat().st_mtime for index in cached):
                 return True

@@ -1,6 +1,7 @@
 """The note on kernels that are compiled: not where it is short or they are read from disk."""
 
 import logging
+import shutil
 import time
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -11,13 +12,13 @@ import pytest
 from padforge.design.common import compilation
 
 KERNELS = """
-from numba import njit
+from padforge.design.common.compilation import inner_kernel, kernel
 
-@njit(cache=True)
+@inner_kernel
 def inner(x):
     return x + 1
 
-@njit(cache=True)
+@kernel
 def outer(x):
     return inner(x) * 2
 """
@@ -53,3 +54,24 @@ def test_compilation_is_announced_unless_it_is_short_or_cached(
     monkeypatch.setattr(compilation, "PATIENCE_S", 0.0)
     assert notes(1) == []  # read from disk
     assert set(notes(1.5)) == {"compiling kernels"}  # another type is compiled
+
+
+def test_clear_stale_kernels_deletes_when_a_source_changes(tmp_path: Path) -> None:
+    package = tmp_path / "kernels"
+    (package / "room").mkdir(parents=True)
+    for name in ("inner.py", "outer.py", "room/outer.py"):
+        (package / name).write_text("x = 1")
+    kept = [folder / "__pycache__" / "outer.py311.1.nbc" for folder in (package, package / "room")]
+    compilation.clear_stale_kernels(package)
+    for path in kept:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    compilation.clear_stale_kernels(package)
+    assert all(path.exists() for path in kept)
+    (package / "inner.py").write_text("x = 2")
+    compilation.clear_stale_kernels(package)
+    assert not any(path.exists() for path in kept)
+    shutil.rmtree(package / "__pycache__")
+    (package / "__pycache__").touch()  # a folder that cannot be written
+    compilation.clear_stale_kernels(package)
+    assert (package / "__pycache__").is_file()

@@ -1,7 +1,6 @@
 """Tasks on any executor, torch on one thread, the cache of kernels, and the end of a program with running tasks."""
 
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -12,29 +11,8 @@ from functools import partial
 import pytest
 import torch
 
-from padforge.design.common.parallel import clear_stale_kernels, cluster, makespan, one_torch_thread, run_tasks
+from padforge.design.common.parallel import cluster, makespan, one_torch_thread, run_tasks
 from padforge.design.common.validation import Fault
-
-
-def test_clear_stale_kernels_deletes_when_a_source_changes(tmp_path):
-    package = tmp_path / "kernels"
-    (package / "room").mkdir(parents=True)
-    for name in ("inner.py", "outer.py", "room/outer.py"):
-        (package / name).write_text("x = 1")
-    kept = [folder / "__pycache__" / "outer.py311.1.nbc" for folder in (package, package / "room")]
-    clear_stale_kernels(package)
-    for path in kept:
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-    clear_stale_kernels(package)
-    assert all(path.exists() for path in kept)
-    (package / "inner.py").write_text("x = 2")
-    clear_stale_kernels(package)
-    assert not any(path.exists() for path in kept)
-    shutil.rmtree(package / "__pycache__")
-    (package / "__pycache__").touch()  # a folder that cannot be written
-    clear_stale_kernels(package)
-    assert (package / "__pycache__").is_file()
 
 
 @pytest.mark.parametrize("threads", [None, 1, 3])
