@@ -53,8 +53,7 @@ class FibreCurves:
 
         They are exact for a shape, and within PRECISION of `measured_signals` for a layer or a profile.
         """
-        t, v, d, ends = self.along, self.across, self.slope, self.ends
-        shape, max_offsets = press_shape(contact, self.unit_mm), compute_max_offsets(v[None], ends)
+        t, v, d, ends, shape = self.along, self.across, self.slope, self.ends, press_shape(contact, self.unit_mm)
         out = np.zeros((len(presses), len(t)))
         if contact.model != "shape":  # elements are cut once for both directions
             law, spacings, table = (
@@ -66,10 +65,11 @@ class FibreCurves:
             visited = element_signals(t, v, elements, presses, law, table, out)
             kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
         else:
+            max_offsets = compute_max_offsets(v[None], ends)
             curves, none = (t[None], v[None], d[None]), np.empty(0, np.int64)
             where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)
             visited = exact_signals(curves, *where, out.reshape(-1))
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
         if profiling.is_profiling():
-            record_visits(t[None], max_offsets, ends, presses, shape[1], visited)
+            record_visits(t[None], compute_max_offsets(v[None], ends), ends, presses, shape[1], visited)
         return out.T, lambda by_signals: np.asarray(kernel(np.ascontiguousarray(by_signals.T)))

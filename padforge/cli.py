@@ -171,12 +171,18 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
     from padforge.design.common.profiling import stage
 
     run = Run(common.load_spec(spec), out, formats=formats, **options)
-    check_run(run)
-    with compile_beside(), locked_folder(out):
-        code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
-        if code != common.INTERRUPTED:
-            with stage("report"):
-                click.echo(f"report: {write_report(out)}")
+    with compile_beside() as compile_rest:
+
+        def echo(lines: str) -> None:
+            compile_rest()  # what comes first is the result of the search
+            click.echo(lines)
+
+        check_run(run)
+        with locked_folder(out):
+            code = run_stages(run, echo, search_progress, partial(common.progress_bar, "training"))
+            if code != common.INTERRUPTED:
+                with stage("report"):
+                    click.echo(f"report: {write_report(out)}")
     context.exit(code)
 
 

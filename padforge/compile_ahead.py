@@ -1,4 +1,4 @@
-"""Kernels compiled beside a first run: its search compiles those of its steps, a second process the others meanwhile.
+"""Kernels compiled beside a first run: a part of them by a second process, meanwhile and before the run needs them.
 
 Compiled kernels are shared through Numba's cache on disk. A kernel that both need at once is compiled twice, which does
 no harm.
@@ -7,18 +7,21 @@ no harm.
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import IO, Any, cast
 
 
 @contextmanager
-def compile_beside() -> Iterator[None]:
+def compile_beside() -> Iterator[Callable[[], None]]:
     """Let a second process compile kernels as soon as this one has to compile one in the body, if there is a core.
 
-    It ends by itself, at the latest with the body. Where everything is read from the cache, none is started.
+    It compiles what a search needs, and the rest once the function is called that is yielded: after the search, which
+    has all cores. It ends by itself, at the latest with the body. Where everything is read from disk, none is started.
     """
     from numba.core import event as events
+
+    from padforge.design.common.compilation import is_compiled
 
     processes: list[subprocess.Popen[bytes]] = []
 
@@ -29,42 +32,67 @@ def compile_beside() -> Iterator[None]:
             """Start it."""
             if not processes and (os.cpu_count() or 1) > 1:
                 command, silent = [sys.executable, "-m", "padforge.compile_ahead"], subprocess.DEVNULL
-                processes.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
+                processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=silent, stderr=silent))
 
         def on_end(self, event: Any) -> None:
             """Do nothing."""
 
+    def go_on() -> None:
+        for process in processes:
+            cast(IO[bytes], process.stdin).close()
+
     starter = Starter()
     events.register("numba:compile", starter)
     try:
-        yield
+        if not is_compiled("padforge.design.kernels"):
+            starter.on_start(None)  # while this process imports what a run needs
+        yield go_on
     finally:
         events.unregister("numba:compile", starter)
         for process in processes:
             process.terminate()
             process.wait()
+        go_on()
 
 
 def main() -> None:
     """Compile kernels by small tasks, in the order in which a run needs them, but for those that it compiles first."""
     import numpy as np
 
+    from padforge.design.contact import quick_signals
     from padforge.design.morphology import Morphology
+    from padforge.design.objectives.expected_error import expected_error
     from padforge.design.objectives.score import TERMS, ScoredPad
     from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+
+    # 1. what ends a step of the search, whose signals the run compiles
+    rng, scatter = np.random.default_rng(0), SearchSettings().response_scatter
+    responses, positions = rng.random((2, 4)), rng.random((4, 2))
+    expected_error(responses, positions, np.ones(2), np.ones(4, bool), np.ones((1, 2)), scatter, np.ones(2))
+    pad, contact = Morphology.random(2, 2, seed=0), Contact()
+    size = PadSettings().for_layout(pad.layout)
+    scored = ScoredPad(pad, contact, SearchSettings(), RulesSettings(), size)
+    scored.terms(["penalty"])
+    # 2. what the run needs as soon as the search has ended
+    scored.terms([term.name for term in TERMS if not term.name.startswith("expected_error")])
     from padforge.fabricate.checks.surface import TriangleMesh
+
+    TriangleMesh.weld(np.eye(4, 3), [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]).find_self_intersections(1)
+    # 3. what it needs later
+    sys.stdin.read()
+    from padforge.sense.localizer.features import NOW
+    from padforge.sense.localizer.moments import PHASES
+    from padforge.sense.localizer.press_sampler import PressSampler
+    from padforge.sense.localizer.scaler import TrainingPresses
     from padforge.sense.signals.press_detection import PressDetector
 
-    pad = Morphology.random(2, 2, seed=0)
-    size = PadSettings().for_layout(pad.layout)
-    scored = ScoredPad(pad, Contact(), SearchSettings(), RulesSettings(), size)
-    for term in sorted(TERMS, key=lambda term: term.name != "penalty"):  # rules end a step, all others a search
-        if not term.name.startswith("expected_error"):
-            scored.terms([term.name])
-    if hasattr(os, "nice"):
-        os.nice(10)  # what follows is not needed before the search ends, which has all cores until then
-    TriangleMesh.weld(np.eye(4, 3), [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]).find_self_intersections(1)
     PressDetector(2).update(np.arange(9.0), np.zeros((9, 2)))
+    quick_signals(pad, positions, contact, sensitivity=np.ones((len(pad.knots), 2)))
+    features, now = np.ones((1, 2, 1), np.float32), np.ones((2, len(NOW), 0), np.float32)
+    known, targets = np.ones((1, 2), bool), np.zeros((1, 2), np.float32)
+    presses = TrainingPresses(features, known, known[:, :0], targets, 0.0, now, now, 1.0, 0.0)
+    sampler = PressSampler(presses, np.ones((2, 2, 2, 1), np.float32), 1, rng, PHASES[0]["press"], ())
+    sampler.inputs(sampler.draw(1), targets, 1.0)
 
 
 if __name__ == "__main__":

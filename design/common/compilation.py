@@ -2,11 +2,13 @@
 
 import gc
 import logging
+import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Timer
 from typing import Any, TypeVar, overload
@@ -39,7 +41,7 @@ def inner_kernel(function: _Function) -> _Function: ...
 @overload
 def inner_kernel(**options: Any) -> Callable[[_Function], _Function]: ...
 def inner_kernel(function: Any = None, **options: Any) -> Any:
-    """Compile a function that only kernels call: without what Python would call, in four fifths of the time.
+    """Compile a function that only kernels call, in less time: Python, if it called it, would crash.
 
     Args:
         function: the function, or None to return a decorator.
@@ -62,6 +64,14 @@ def clear_stale_kernels(package: Path) -> None:
             for compiled in package.rglob("__pycache__/*.nb[ic]"):
                 compiled.unlink(missing_ok=True)
             stamp.write_bytes(digest)
+
+
+def is_compiled(package: str) -> bool:
+    """Whether kernels of a package are kept on disk."""
+    folder, spec = os.environ.get("NUMBA_CACHE_DIR"), find_spec(package)
+    assert spec is not None
+    places = [folder] if folder else spec.submodule_search_locations or []
+    return any(True for place in places for _ in Path(place).rglob("*.nbi"))
 
 
 class _Compilations(events.Listener):

@@ -81,17 +81,6 @@ def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
 
 
 @inner_kernel(inline="always")  # else counting references takes most of the time
-def differentiate_row(profile: Any, row: int, column: int, x: float) -> float:
-    """Return the derivative of `evaluate_row` by x."""
-    c, square = column, x * x
-    low = profile[row, c + 1] + x * (2 * profile[row, c + 2] + 3 * x * profile[row, c + 3])
-    high = 4 * profile[row, c + 4] + x * (
-        5 * profile[row, c + 5] + x * (6 * profile[row, c + 6] + 7 * x * profile[row, c + 7])
-    )
-    return low + square * x * high
-
-
-@inner_kernel(inline="always")  # else counting references takes most of the time
 def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
     """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
     square = dt * dt + dv * dv
@@ -106,7 +95,7 @@ def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law:
     return weight
 
 
-@inner_kernel(inline="always")  # else counting references takes most of the time
+@inner_kernel(_nrt=False)  # as above, and its callers compile sooner than with it inlined
 def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> float:
     """Return the weight of an element at (t, v) from the press centre that runs along (run, rise), by a framed law."""
     if law.weight != PROFILE:

@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.kernels.exact_gradient import differentiate_cubic
 from padforge.design.kernels.geometry import (
+    DEGREE,
     DIRECTED,
     EPS,
     MANHATTAN,
     PLAIN,
     WeightLaw,
-    differentiate_row,
-    evaluate_row,
-    find_row,
     weigh_profile,
 )
 from padforge.design.kernels.pchip import extremes
@@ -80,22 +78,26 @@ def weight_table(law: WeightLaw) -> Array:
     return table
 
 
-@kernel
-def _tabulate(profile: Any, law: Any, out: Any) -> None:
+def _tabulate(profile: Array, law: WeightLaw, out: Array) -> None:
     """Write the cubics of one family, all but the last row."""
     steps = len(out) - 1
-    width = law.radius * law.radius / steps
-    for i in range(steps):
-        for part, column in enumerate((PLAIN, DIRECTED)):
-            low, high = i * width, min(i + 1, steps * (1 - EPS)) * width
-            first, last = find_row(low, profile, law), find_row(high, profile, law)
-            y0 = evaluate_row(profile, first, column, low - profile[first, 0])
-            y1 = evaluate_row(profile, last, column, high - profile[last, 0])
-            d0 = width * differentiate_row(profile, first, column, low - profile[first, 0])
-            d1 = width * differentiate_row(profile, last, column, high - profile[last, 0])
-            c = 4 * part
-            out[i, c], out[i, c + 1], out[i, c + 2] = y0, d0, 3 * (y1 - y0) - 2 * d0 - d1
-            out[i, c + 3] = 2 * (y0 - y1) + d0 + d1
+    width, step = law.radius * law.radius / steps, np.arange(steps)
+    low, high = step * width, np.minimum(step + 1, steps * (1 - EPS)) * width
+    for c, column in ((0, PLAIN), (4, DIRECTED)):
+        (y0, d0), (y1, d1) = (_evaluate(profile, column, square) for square in (low, high))
+        d0, d1 = width * d0, width * d1
+        out[:-1, c], out[:-1, c + 1], out[:-1, c + 2] = y0, d0, 3 * (y1 - y0) - 2 * d0 - d1
+        out[:-1, c + 3] = 2 * (y0 - y1) + d0 + d1
+
+
+def _evaluate(profile: Array, column: int, squares: Array) -> tuple[Array, Array]:
+    """Return a polynomial of a profile, PLAIN or DIRECTED, at squared distances, and its derivative, of any shape."""
+    row = profile[np.searchsorted(profile[:, 0], squares, side="right") - 1]
+    c, x = np.moveaxis(row[..., column : column + DEGREE + 1], -1, 0), squares - row[..., 0]
+    low, high = c[0] + x * (c[1] + x * (c[2] + x * c[3])), c[4] + x * (c[5] + x * (c[6] + x * c[7]))
+    slope = c[1] + x * (2 * c[2] + 3 * x * c[3])
+    slope += x * x * x * (4 * c[4] + x * (5 * c[5] + x * (6 * c[6] + 7 * x * c[7])))
+    return low + x * x * (x * x) * high, slope
 
 
 def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:

@@ -145,7 +145,7 @@ def add_value_gradient(
     by_t[j + 1] += run
 
 
-@inner_kernel
+@kernel
 def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
     """Sample the PCHIP interpolant of (t, v) at 0, step, 2 step, ... into `out`; the last sample is the last knot."""
     d = np.empty(len(t))

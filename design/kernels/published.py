@@ -231,7 +231,10 @@ def published_terms(
     end: int,
     out: Any,
 ) -> None:
-    """Compute entropy (summed over families), sharpness and disorder of pads `begin` to `end`, into `out` (P, 3)."""
+    """Compute four terms of pads `begin` to `end`, into `out` (P, 4).
+
+    They are the entropy, summed over families, sharpness and disorder, and the joint entropy of all fibres.
+    """
     fibres = along.shape[1]
     curves = np.empty((fibres, samples))
     signals, column = np.empty((len(presses), fibres)), np.empty(len(presses))
@@ -246,8 +249,8 @@ def published_terms(
             for q in range(len(presses)):  # an assignment to a slice takes two seconds to compile
                 signals[q, f] = column[q]
         quantize(signals, levels, scaled)
-        out[p, 0] = compute_row_entropy(scaled, np.int64(0), horizontals) + compute_row_entropy(
-            scaled, horizontals, fibres
-        )
+        none = np.int64(0)  # kernels are compiled anew for each literal
+        out[p, 0] = compute_row_entropy(scaled, none, horizontals) + compute_row_entropy(scaled, horizontals, fibres)
         out[p, 1] = sum_second_differences(scaled)
         out[p, 2] = _sum_disorder(curves, horizontals)
+        out[p, 3] = compute_row_entropy(scaled, none, fibres)

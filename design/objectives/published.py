@@ -117,6 +117,7 @@ class PublishedTerms:
     sharpness: float  # Z, sum of |second difference| of the converter levels along the press order
     disorder: float  # C, sum over samples and over pairs i < j of a family of the negative parts of curve_j - curve_i
     objective: float  # alpha / (1 + entropy) + beta Z + gamma C, to be minimised
+    joint_entropy: float  # of the signals of all fibres, bits, which is not in it
 
 
 @lru_cache(maxsize=16)
@@ -153,13 +154,13 @@ def published_terms(
     else:
         positions = check_presses(presses)[0]
     shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT), grid_unit_mm(pads, layout))
-    terms = np.zeros((len(along), 3))
+    terms = np.zeros((len(along), 4))
 
     def work(begin: int, end: int) -> None:
         kernels.published_terms(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
 
     map_chunks(work, len(along), min_chunk=8)
-    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c) for h, z, c in terms.tolist()]
+    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c, j) for h, z, c, j in terms.tolist()]
 
 
 def published_objective(

@@ -15,7 +15,7 @@ import numpy as np
 
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
-from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_presses, signals_quantized
+from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_presses
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives import published as formula
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
@@ -112,12 +112,6 @@ def _penalties(scored: ScoredPad) -> dict[object, float]:
     return {**penalties(along, across, scored.size, scored.rules).values}
 
 
-def _joint_entropy(scored: ScoredPad) -> float:
-    pad = scored.pad
-    responses = signals_quantized(pad, formula.published_presses(pad.layout), scored.published_contact)
-    return formula.joint_entropy(formula.quantize(responses))
-
-
 TERMS = (
     Term("expected_error_mm", "expected error with {} fibres failed, mm", lambda s: _in_mm(s, s.expected_errors)),
     Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", lambda s: _in_mm(s, _ambiguities(s))),
@@ -145,7 +139,7 @@ TERMS = (
         "published_joint_entropy",
         "joint entropy of the signals of all fibres, bits; its 49 presses limit it to log2 49 = 5.61, which straight "
         "fibres and all published pads reach",
-        _joint_entropy,
+        lambda s: s.published.joint_entropy,
     ),
 )
 

@@ -1,6 +1,8 @@
 """The note on kernels that are compiled: not where it is short or they are read from disk."""
 
+import ast
 import logging
+import re
 import shutil
 import time
 from importlib.util import module_from_spec, spec_from_file_location
@@ -9,7 +11,9 @@ from types import ModuleType
 
 import pytest
 
+import padforge
 from padforge.design.common import compilation
+from tests.helpers.kernels import PACKAGES
 
 KERNELS = """
 from padforge.design.common.compilation import inner_kernel, kernel
@@ -75,3 +79,26 @@ def test_clear_stale_kernels_deletes_when_a_source_changes(tmp_path: Path) -> No
     (package / "__pycache__").touch()  # a folder that cannot be written
     compilation.clear_stale_kernels(package)
     assert (package / "__pycache__").is_file()
+
+
+def test_inner_kernels_are_called_by_kernels_alone() -> None:
+    """Whichever name they are imported by: Python would crash."""
+    folders = [Path(folder) / package for folder in padforge.__path__ for package in PACKAGES]
+    sources, tests = (
+        [path.read_text(encoding="utf-8") for folder in where for path in folder.rglob("*.py")]
+        for where in (folders, [Path(__file__).parents[2]])
+    )
+
+    def kind(node: ast.AST) -> str:
+        decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
+        return " ".join(ast.unparse(decorator).split("(")[0] for decorator in decorators)
+
+    inner = {name for source in sources for name in re.findall(r"^@inner_kernel.*\ndef (\w+)", source, re.MULTILINE)}
+    trees = [ast.parse(source) for source in sources + tests if any(name in source for name in inner)]
+    assert {"piece_of", "select_frame"} <= inner
+    for tree in trees:
+        kernels = [node for node in ast.walk(tree) if kind(node) in ("kernel", "inner_kernel", "njit")]
+        compiled = {id(child) for node in kernels for child in ast.walk(node)}
+        for node in (node for node in ast.walk(tree) if id(node) not in compiled):
+            assert not (isinstance(node, ast.alias) and node.name in inner and node.asname)
+            assert getattr(node, "attr", getattr(node, "id", "")) not in inner
