@@ -14,12 +14,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from threading import Event, Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.linalg import eigh
 from torch import Tensor
+from torch.optim.adamw import adamw
 
 from padforge.design.common.parallel import makespan, one_torch_thread, run_tasks
 from padforge.design.common.progress import OnProgress, ignore_progress
@@ -71,20 +72,24 @@ def fit_network(
     `seconds` limit the training in place of `steps`, and `on_progress` is called with (n, `REPORTS`, "").
     """
     begin = time.monotonic()
-    average = [weight.detach().clone() for weight in parameters.values()]
-    optimizer = torch.optim.AdamW(parameters.values(), learning_rate, BETAS, weight_decay=weight_decay, fused=True)
+    weights = list(parameters.values())
+    average = [weight.detach().clone() for weight in weights]
+    # as torch.optim.AdamW, which imports its compiler: that takes a second
+    means, squares = ([torch.zeros_like(weight) for weight in weights] for _ in range(2))
+    counts = [torch.zeros((), device=weight.device) for weight in weights]
+    how: dict[str, Any] = dict(zip(("beta1", "beta2"), BETAS, strict=True))
+    how |= {"weight_decay": weight_decay, "eps": 1e-8, "amsgrad": False, "maximize": False, "fused": True}
     share, step, reports = 0.0, 0, 0
     with flushed_denormals():
         while share < 1:
             step += 1
             share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
-            optimizer.param_groups[0]["lr"] = learning_rate * one_cycle(share)
-            optimizer.zero_grad()
-            loss_of_batch().backward()
-            optimizer.step()
+            gradients = torch.autograd.grad(loss_of_batch(), weights)
+            with torch.no_grad():
+                adamw(weights, [*gradients], means, squares, [], counts, lr=learning_rate * one_cycle(share), **how)
             # The first steps are forgotten sooner than the later ones, or the average would begin at the initial draw.
             decay = min(AVERAGE_DECAY, step / (step + 9)) if averaged else 0.0
-            for mean, weight in zip(average, parameters.values(), strict=True):
+            for mean, weight in zip(average, weights, strict=True):
                 mean.lerp_(weight.detach(), 1 - decay)
             if share * REPORTS >= reports + 1:
                 reports = int(share * REPORTS)
