@@ -21,14 +21,18 @@ def kept(key: bytes, compute: Callable[[], Arrays]) -> Arrays:
     """Return what `compute` returns, read from disk where an earlier process has kept it.
 
     A process keeps only what it computes first: what its command is about, and not the thousands of a fit. Where the
-    folder cannot be written, nothing is kept.
+    folder cannot be written, nothing is kept. How BLAS rounds depends on its threads: what is read is what a process
+    of as many would compute.
 
     Args:
         key: all that the arrays depend on, also the code.
         compute: called if nothing is kept by this key.
     """
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "__pycache__")
-    path = folder / f"kept-{sha256(key).hexdigest()[:32]}.npz"
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    threads = [os.environ.get(f"{library}_NUM_THREADS") for library in ("OMP", "OPENBLAS", "MKL")]
+    digest = sha256(key + repr((np.__version__, cores, threads)).encode()).hexdigest()
+    path = folder / f"kept-{digest[:32]}.npz"
     with suppress(OSError, ValueError, EOFError, BadZipFile), path.open("rb") as file, np.load(file) as arrays:
         return dict(arrays)
     computed = compute()

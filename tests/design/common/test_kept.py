@@ -52,6 +52,13 @@ def test_arrays_are_computed_once(folder: Path) -> None:
     assert len(list(folder.iterdir())) == 1
 
 
+def test_processes_of_other_threads_compute_their_own(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their sums are rounded otherwise, and so no result depends on who came first."""
+    kept(b"a", compute)
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    assert kept(b"a", lambda: {"numbers": np.zeros(1)})["numbers"] == [0]
+
+
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"\x93NUMPY", b"no archive at all"])
 def test_a_file_that_is_no_archive_is_computed_anew(folder: Path, content: bytes) -> None:
     """A file that is torn or another's is replaced."""
