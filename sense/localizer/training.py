@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from threading import Event, Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -84,9 +84,12 @@ def fit_network(
         while share < 1:
             step += 1
             share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
-            gradients = torch.autograd.grad(loss_of_batch(), weights)
+            for weight in weights:
+                weight.grad = None
+            loss_of_batch().backward()  # lays gradients out as their weights, which a fused step takes for granted
+            gradients = [cast(Tensor, weight.grad) for weight in weights]
             with torch.no_grad():
-                adamw(weights, [*gradients], means, squares, [], counts, lr=learning_rate * one_cycle(share), **how)
+                adamw(weights, gradients, means, squares, [], counts, lr=learning_rate * one_cycle(share), **how)
             # The first steps are forgotten sooner than the later ones, or the average would begin at the initial draw.
             decay = min(AVERAGE_DECAY, step / (step + 9)) if averaged else 0.0
             for mean, weight in zip(average, weights, strict=True):

@@ -76,6 +76,25 @@ def test_fit_network_returns_the_average_of_the_last_weights() -> None:
     assert [training.one_cycle(share) for share in (0.0, 0.1, 0.2, 0.6, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
 
+def test_fit_network_takes_the_steps_of_adamw() -> None:
+    """Also for weights whose gradients come in another order in memory."""
+    goal, share = torch.arange(15.0).reshape(5, 3), torch.linspace(0, 1, 51)[1:].tolist()
+
+    def loss(w: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("ij,jk->ik", w.mT, torch.eye(3)).sub(goal).square().mean()
+
+    w = torch.ones(3, 5, requires_grad=True)
+    reference = torch.ones(3, 5, requires_grad=True)
+    fitted = training.fit_network({"w": w}, lambda: loss(w), 50, 0.1, weight_decay=0.1, averaged=False)
+    optimizer = torch.optim.AdamW([reference], 0.1, training.BETAS, weight_decay=0.1)
+    for each in share:
+        optimizer.param_groups[0]["lr"] = 0.1 * training.one_cycle(each)
+        optimizer.zero_grad()
+        loss(reference).backward()
+        optimizer.step()
+    np.testing.assert_allclose(fitted["w"], reference.detach().numpy(), rtol=1e-5)
+
+
 @settings(max_examples=20)
 @given(fibres=st.integers(1, 9), max_failures=st.integers(0, 4), seed=st.integers(0, 99))
 def test_sample_fibre_dropout_masks_up_to_max_failures(fibres: int, max_failures: int, seed: int) -> None:
