@@ -21,38 +21,39 @@ def compile_beside() -> Iterator[Callable[[], None]]:
     """
     from numba.core import event as events
 
-    from padforge.design.common.compilation import is_compiled
+    from padforge.design.common.compilation import cache_folder
 
     processes: list[subprocess.Popen[bytes]] = []
 
-    class Starter(events.Listener):
-        """Starts the process once."""
-
-        def on_start(self, event: Any) -> None:
-            """Start it."""
-            if not processes and (os.cpu_count() or 1) > 1:
-                command, silent = [sys.executable, "-m", "padforge.compile_ahead"], subprocess.DEVNULL
-                processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=silent, stderr=silent))
-
-        def on_end(self, event: Any) -> None:
-            """Do nothing."""
+    def start() -> None:
+        if not processes and (os.cpu_count() or 1) > 1:
+            command, silent = [sys.executable, "-m", "padforge.compile_ahead"], subprocess.DEVNULL
+            processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=silent, stderr=silent))
 
     def go_on() -> None:
         for process in processes:
             cast(IO[bytes], process.stdin).close()
 
-    starter = Starter()
-    events.register("numba:compile", starter)
-    try:
-        if not is_compiled("padforge.design.kernels"):
-            starter.on_start(None)  # while this process imports what a run needs
-        yield go_on
-    finally:
-        events.unregister("numba:compile", starter)
-        for process in processes:
-            process.terminate()
-            process.wait()
-        go_on()
+    class Starter(events.Listener):
+        """Starts the process, once."""
+
+        def on_start(self, event: Any) -> None:
+            """Start it."""
+            start()
+
+        def on_end(self, event: Any) -> None:
+            """Do nothing."""
+
+    with events.install_listener("numba:compile", Starter()):
+        try:
+            if not any(cache_folder().rglob("*.nbi")):
+                start()  # while this process imports what a run needs
+            yield go_on
+        finally:
+            for process in processes:
+                process.terminate()
+                process.wait()
+            go_on()
 
 
 def main() -> None:

@@ -6,12 +6,11 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import partial
 from hashlib import sha256
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Timer
-from typing import Any, TypeVar, overload
+from typing import Any, Protocol, TypeVar, overload
 
 from numba import njit
 from numba.core import event as events
@@ -22,32 +21,24 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
 
 
-@overload
-def kernel(function: _Function) -> _Function: ...
-@overload
-def kernel(**options: Any) -> Callable[[_Function], _Function]: ...
-def kernel(function: Any = None, **options: Any) -> Any:
-    """Compile a function when it is first called, without Python's checks of divisions and its lock.
+class _Decorator(Protocol):
+    """`@kernel`, or with further options of `numba.njit`, `@kernel(inline="always")`."""
 
-    Args:
-        function: the function, or None to return a decorator.
-        options: further ones of `numba.njit`.
-    """
-    return njit(function, cache=True, error_model="numpy", nogil=True, **options)
+    @overload
+    def __call__(self, function: _Function, /) -> _Function: ...
+    @overload
+    def __call__(self, **options: Any) -> Callable[[_Function], _Function]: ...
 
 
-@overload
-def inner_kernel(function: _Function) -> _Function: ...
-@overload
-def inner_kernel(**options: Any) -> Callable[[_Function], _Function]: ...
-def inner_kernel(function: Any = None, **options: Any) -> Any:
-    """Compile a function that only kernels call, in less time: Python, if it called it, would crash.
+kernel: _Decorator = partial(njit, cache=True, error_model="numpy", nogil=True)
+"""Compiles a function when it is first called, without Python's checks of divisions and its lock."""
+inner_kernel: _Decorator = partial(kernel, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Compiles a function that only kernels call, in less time: Python, if it called it, would crash."""
 
-    Args:
-        function: the function, or None to return a decorator.
-        options: further ones of `numba.njit`.
-    """
-    return kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+
+def cache_folder() -> Path:
+    """Return the folder in or below which Numba keeps the compiled kernels of `design`."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "kernels" / "__pycache__")
 
 
 def clear_stale_kernels(package: Path) -> None:
@@ -66,16 +57,11 @@ def clear_stale_kernels(package: Path) -> None:
             stamp.write_bytes(digest)
 
 
-def is_compiled(package: str) -> bool:
-    """Whether kernels of a package are kept on disk."""
-    folder, spec = os.environ.get("NUMBA_CACHE_DIR"), find_spec(package)
-    assert spec is not None
-    places = [folder] if folder else spec.submodule_search_locations or []
-    return any(True for place in places for _ in Path(place).rglob("*.nbi"))
+class Compilations(events.Listener):
+    """Follows compilations, which Numba runs one at a time, each with those of what it calls.
 
-
-class _Compilations(events.Listener):
-    """Follows compilations, which Numba runs one at a time, each with those of what it calls."""
+    It logs one line when a process has compiled kernels for PATIENCE_S; none if it reads them from the cache.
+    """
 
     def __init__(self) -> None:
         self._depth, self._spent_s, self._announced = 0, 0.0, False
@@ -106,10 +92,4 @@ class _Compilations(events.Listener):
             _log.info("compiling kernels, which takes up to a minute and is done once")
 
 
-@cache  # registered once
-def announce_compilation() -> None:
-    """Log one line when this process has compiled kernels for PATIENCE_S; none if it reads them from the cache."""
-    events.register("numba:compile", _Compilations())
-
-
-announce_compilation()
+events.register("numba:compile", Compilations())

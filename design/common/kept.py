@@ -4,12 +4,12 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from hashlib import sha256
-from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from padforge.design.common.compilation import cache_folder
 from padforge.design.common.files import atomic_file
 from padforge.design.common.validation import InputError
 
@@ -28,11 +28,10 @@ def kept(key: bytes, compute: Callable[[], Arrays]) -> Arrays:
         key: all that the arrays depend on, also the code.
         compute: called if nothing is kept by this key.
     """
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "__pycache__")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     threads = [os.environ.get(f"{library}_NUM_THREADS") for library in ("OMP", "OPENBLAS", "MKL")]
     digest = sha256(key + repr((np.__version__, cores, threads)).encode()).hexdigest()
-    path = folder / f"kept-{digest[:32]}.npz"
+    path = cache_folder() / f"kept-{digest[:32]}.npz"
     with suppress(OSError, ValueError, EOFError, BadZipFile), path.open("rb") as file, np.load(file) as arrays:
         return dict(arrays)
     computed = compute()

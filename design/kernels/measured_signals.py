@@ -91,7 +91,10 @@ def _tabulate(profile: Array, law: WeightLaw, out: Array) -> None:
 
 
 def _evaluate(profile: Array, column: int, squares: Array) -> tuple[Array, Array]:
-    """Return a polynomial of a profile, PLAIN or DIRECTED, at squared distances, and its derivative, of any shape."""
+    """Return a polynomial of a profile, PLAIN or DIRECTED, at squared distances, and its derivative, of any shape.
+
+    It is `evaluate_row` for arrays: a kernel of few calls would take longer to compile than all of them.
+    """
     row = profile[np.searchsorted(profile[:, 0], squares, side="right") - 1]
     c, x = np.moveaxis(row[..., column : column + DEGREE + 1], -1, 0), squares - row[..., 0]
     low, high = c[0] + x * (c[1] + x * (c[2] + x * c[3])), c[4] + x * (c[5] + x * (c[6] + x * c[7]))

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from numba.core import event as events
 
 import padforge
 from padforge.design.common import compilation
@@ -48,10 +49,9 @@ def test_compilation_is_announced_unless_it_is_short_or_cached(
     def notes(value: float) -> list[str]:
         """Messages while the kernels run on a number, in a process that has not announced yet."""
         caplog.clear()
-        compilation.announce_compilation.cache_clear()
-        compilation.announce_compilation()
-        assert loaded(path).outer(value) == 2 * (value + 1)
-        time.sleep(0.05)
+        with events.install_listener("numba:compile", compilation.Compilations()):
+            assert loaded(path).outer(value) == 2 * (value + 1)
+            time.sleep(0.05)
         return [record.message.split(",")[0] for record in caplog.records]
 
     assert notes(1) == []  # compiled in less than the patience
