@@ -93,8 +93,8 @@ def sum_closeness(
 ) -> float:
     """Sum what it costs that samples lie nearer than `gap` to another fibre, for pairs (K, 2) of fibre and other.
 
-    Distances are to the piece of tangent that the nearest sample stands for, half a step to both sides. A fibre paired
-    with itself is another one from `fold` of arc length away on.
+    Distances are to the piece of tangent that the nearest sample stands for, a step to both sides. A fibre paired with
+    itself is another one from `fold` of arc length away on: so is all of that piece.
     """
     n, total = points.shape[1], 0.0
     for k in range(len(pairs)):
@@ -108,7 +108,7 @@ def sum_closeness(
             nearest, least = -1, reach * reach
             j = low
             while j < n and points[g, j, 0] <= x + reach:
-                if f != g or abs(arc[f, i] - arc[f, j]) >= fold:
+                if f != g or abs(arc[f, i] - arc[f, j]) >= fold + shares[f, j]:
                     square = (points[g, j, 0] - x) ** 2 + (points[g, j, 1] - y) ** 2
                     if square < least:
                         nearest, least = j, square

@@ -21,13 +21,18 @@ from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 from padforge.design.signal_gradients import FibreCurves
 
-LEARNING_RATE = 0.04
+LEARNING_RATE, MIN_RATE = 0.04, 0.02
+"""Learning rate of the first step, and that of the last one as a share of it."""
 BETAS = 0.9, 0.999
 """By which a step of Adam multiplies its means of gradients and of their squares."""
 INITIAL_NOISE = 2.0
 """Scatter of the first step as a multiple of the last one's."""
 PENALTY_WEIGHT = (1.0, 300.0)
 """Weight of the rules at the first and at the last step."""
+COMMON_TRACKS_FROM = 0.7
+"""Share of the steps after which the rule on common tracks counts: before, it hinders crossings from moving, and what
+it asks for in the end is a small change.
+"""
 RULE_MARGIN = 1.05
 """On the limits of the rules."""
 HISTORY_STEPS = 10
@@ -42,8 +47,10 @@ REPAIR_RATE, REPAIR_GROWTH, MAX_REPAIR_RATE = 0.002, 1.15, 0.01
 """Learning rate of the repair, gentle at first, and its growth at each failed check."""
 KNOTS_PER_TURN = 3
 """Before, at and after: a turn of given radius needs its shoulders."""
-ZIGZAG_START = 3
-"""The start that is a zigzag, or the only one that is not: the last of the default's."""
+STRAIGHT_START = 3
+"""Of four starts the one that is nearly straight: zigzags lead to the better pad, but may break rules that straight
+fibres keep, as that on the angle of crossings.
+"""
 KNOT_STD = 0.1
 """Standard deviation by which knots are moved off straight paths or an origin, grid units."""
 MAX_BORDER = 0.45
@@ -132,24 +139,21 @@ def border_width(pad: PadSettings, rules: RulesSettings) -> float:
     return min(max(MARGIN, limit), MAX_BORDER * min(pad.layout.extent))
 
 
+def is_straight(start: int) -> bool:
+    """Return whether a start without an origin begins with nearly straight fibres; the others begin with zigzags."""
+    return start % 4 == STRAIGHT_START
+
+
 def initial_paths(
-    pad: PadSettings,
-    rules: RulesSettings,
-    knots: int,
-    origin: Morphology | None,
-    start: int,
-    rng: np.random.Generator,
-    gentle: bool = True,
+    pad: PadSettings, rules: RulesSettings, knots: int, origin: Morphology | None, start: int, rng: np.random.Generator
 ) -> Array:
     """Draw the knots (F, N + 2, 2) that a start of the search begins with; they pass keep-outs.
 
-    Without an origin most starts have straight fibres with knots moved by a tenth of a grid unit or so: where slopes
-    are 0 to both sides of a knot, PCHIP keeps them there and has no gradient. ZIGZAG_START has a zigzag; but where the
-    contact has a constant weight up to its edge, for which hardly curved fibres do not lead to the better pad (not
-    `gentle`), all starts but that one are zigzags. With an origin, start 0 has its very paths, later ones have them
-    with knots moved.
+    Without an origin, each start has a zigzag of its own, but for every fourth, which has straight fibres with knots
+    moved by a tenth of a grid unit or so: where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no
+    gradient. With an origin, start 0 has its very paths, later ones have them with knots moved.
     """
-    if origin is None and (start == ZIGZAG_START) == gentle:
+    if origin is None and not is_straight(start):
         return pass_keep_outs(_zigzag(pad.layout, rules, knots, rng), pad, rules)
     paths = straight_paths(pad, rules, knots) if origin is None else refine(origin.knots, knots, pad.layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
@@ -185,7 +189,7 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
         if per_turn == KNOTS_PER_TURN:
             parts = [(turn - shoulder, peak - drop[0]), *parts, (turn + shoulder, peak - drop[1])]
         points = np.moveaxis(np.array(parts), 1, -1)  # (parts, F, turns, 2), along and across
-        points = np.moveaxis(points, 0, 2).reshape(len(level), -1, 2)
+        points = np.moveaxis(points, 0, 2).reshape(len(level), turns * len(parts), 2)
         fibres.append(points if axis == 0 else points[..., ::-1])
     inner = np.clip(np.concatenate(fibres), 0.02, np.array(layout.extent) - 0.02)
     return refine(assemble_knots(inner, layout), knots, layout)
@@ -208,8 +212,7 @@ class GradientSearch:
         pad, rules = problem.pad, problem.rules
         # full scale of straight fibres under each contact
         self.scales = [objective.straight_full_scale(pad.layout, c, pad.sensed_mm) for c in problem.contacts]
-        gentle = problem.contacts[0].model != "shape"
-        paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng, gentle)
+        paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
         self._adam = Adam([self.fibres.spans, self.fibres.across])
 
@@ -258,16 +261,22 @@ class GradientSearch:
         self._adam = Adam(variables, int(state["adam_steps"]), moments)
 
     def _descend(self) -> None:
-        """Take one step on the objective and the rules, with a cosine schedule of the learning rate."""
+        """Take one step on the objective and the rules.
+
+        The learning rate falls by a squared cosine: most steps are small ones, for large ones shake fibres out of what
+        still locates with two and three failed.
+        """
         search = self.problem.search
         progress = self.step / max(1, search.steps - 1)
-        rate = LEARNING_RATE * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
+        rate = LEARNING_RATE * (MIN_RATE + (1 - MIN_RATE) * math.cos(math.pi / 2 * progress) ** 4)
         curves = self._curves()
         self.objective, by_curves = self._objective(curves, INITIAL_NOISE ** (1 - progress))
         gradient = curves.by_knots(by_curves)
-        if self.problem.rules.enforce:
+        if (rules := self.problem.rules).enforce:
+            if progress < COMMON_TRACKS_FROM:
+                rules = rules.model_copy(update={"max_common_track_mm": None})
             weight = PENALTY_WEIGHT[0] * (PENALTY_WEIGHT[1] / PENALTY_WEIGHT[0]) ** progress
-            gradient = gradient + weight * self._penalty_gradient(curves, RULE_MARGIN)
+            gradient = gradient + weight * self._penalty_gradient(curves, rules, RULE_MARGIN)
         self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         self._log_sum += math.log(self.objective)
@@ -289,7 +298,8 @@ class GradientSearch:
         repairs = self.step - self.problem.search.steps
         checks = repairs // REPAIR_CHECKS
         rate = min(REPAIR_RATE * REPAIR_GROWTH**checks, MAX_REPAIR_RATE)
-        gradient = self._penalty_gradient(self._curves(), RULE_MARGIN + REPAIR_MARGIN * checks)
+        margin = RULE_MARGIN + REPAIR_MARGIN * checks
+        gradient = self._penalty_gradient(self._curves(), self.problem.rules, margin)
         self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         if (repairs + 1) % REPAIR_CHECKS == 0:
@@ -298,9 +308,9 @@ class GradientSearch:
     def _curves(self) -> FibreCurves:
         return FibreCurves(*self.fibres.axes(), self.fibres.ends, self.problem.pad.layout.unit_mm)
 
-    def _penalty_gradient(self, curves: FibreCurves, margin: float) -> Array:
+    def _penalty_gradient(self, curves: FibreCurves, rules: RulesSettings, margin: float) -> Array:
         """Return the gradient (2, F, n) of the sum of all penalties by the knots."""
-        found = penalties(curves.along, curves.across, self.problem.pad, self.problem.rules, margin)
+        found = penalties(curves.along, curves.across, self.problem.pad, rules, margin)
         return np.stack([found.by_along, found.by_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:

@@ -290,3 +290,12 @@ def test_folds_penalty_matches_dense_distances(margin):
     rules = only(min_gap_mm=4.0)
     assert found(pad, rules, margin)["folds"] == pytest.approx(expected, rel=0.2)
     assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}
+
+
+def test_folds_penalty_spares_steep_fibres_without_folds():
+    """Whose samples lie further apart than the gap: on a straight flank, parts a gap apart are no fold."""
+    knots = np.array([[0, 1], [0.5, 1.9], [1.5, 1.9], [2, 1]])
+    pad = Morphology(np.stack([knots, np.stack([np.ones(4), np.linspace(0, 2, 4)], axis=-1)]), 11.25)
+    rules = only(min_gap_mm=0.5)
+    assert found(pad, rules)["folds"] == 0
+    assert check_rules(pad, rules) == []

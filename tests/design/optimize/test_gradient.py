@@ -11,11 +11,11 @@ from padforge.design import Contact, Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.morphology import MARGIN
 from padforge.design.objectives.expected_error import expected_errors
+from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import (
     PENALTY_WEIGHT,
-    ZIGZAG_START,
     Adam,
     GradientSearch,
     Parametrization,
@@ -25,6 +25,7 @@ from padforge.design.optimize.gradient import (
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.optimize.search import search
 from padforge.design.paths.curves import lengths, refine
+from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import (
     PUBLISHED_CONTACT,
     PUBLISHED_PAD,
@@ -143,13 +144,21 @@ def test_initial_paths_from_an_origin_are_it_and_near_it():
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 
-@pytest.mark.parametrize(("contact", "gentle"), [(Contact(), True), (PUBLISHED_CONTACT, False)])
-def test_starts_are_nearly_straight_or_zigzag_by_contact(contact, gentle):
-    """Within a tenth of a grid unit or so, and clear of the slopes without a gradient of fibres that are quite so."""
-    starts = [begun(SearchSettings(), RulesSettings(), start, None, PadSettings(), contact) for start in range(5)]
+def test_starts_are_zigzags_and_nearly_straight_fibres_in_turns():
+    """The latter within a tenth of a grid unit or so, and clear of the slopes without a gradient of straight ones."""
+    starts = [begun(SearchSettings(), RulesSettings(), start, None, PadSettings()) for start in range(4)]
     offsets = [np.abs(start.fibres.knots()[:4, :, 1] - np.arange(1, 5)[:, None]) for start in starts]
-    assert [each.max() < 0.5 for each in offsets] == [(start == ZIGZAG_START) != gentle for start in range(5)]
+    assert [each.max() < 0.5 for each in offsets] == [False, True, False, True]
     assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
+
+
+@pytest.mark.parametrize("counts", [(0, 3), (3, 0), (1, 1)])
+def test_starts_of_pads_with_one_family(counts):
+    size = PadSettings(horizontals=counts[0], verticals=counts[1])
+    for start in range(2):
+        paths = initial_paths(size, RulesSettings(), 7, None, start, np.random.default_rng(start))
+        assert paths.shape == (sum(counts), 9, 2)
+        assert not np.array_equal(paths, straight_paths(size, RulesSettings(), 7))
 
 
 def test_gradient_search_resumes_bit_for_bit():
@@ -193,7 +202,7 @@ def test_gradient_search_keeps_each_rule(rules, usual):
 
 def test_gradient_search_for_several_contacts_serves_each():
     large = Contact(radius=1.2)
-    one = BRIEF.model_copy(update={"steps": 30, "max_failures": 0, "knots": 4})
+    one = BRIEF.model_copy(update={"steps": 60, "max_failures": 0, "knots": 4})
     for_one, for_both = (finished(each, FREE) for each in (one, one.model_copy(update={"contacts": (large,)})))
     alone, together = (expected_errors(pad, large, one, PadSettings(grid=2)) for pad in (for_one, for_both))
     assert together[0] < 0.9 * alone[0]
@@ -226,6 +235,20 @@ def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
     monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: Gradient())
     advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings()), 4)
     assert weights == pytest.approx(np.geomspace(*PENALTY_WEIGHT, 4))
+
+
+def test_common_tracks_count_at_the_end_of_a_search(monkeypatch):
+    """Before, crossings may move along; the other rules count from the first step."""
+    seen = []
+
+    def noted(along, across, pad, rules, margin):
+        seen.append(rules)
+        return penalties(along, across, pad, rules, margin)
+
+    monkeypatch.setattr("padforge.design.optimize.gradient.penalties", noted)
+    rules = RulesSettings(max_common_track_mm=3.0)
+    advance(begun(SearchSettings(knots=2, steps=11, starts=1, max_failures=0), rules), 11)
+    assert seen == [rules.model_copy(update={"max_common_track_mm": None})] * 7 + [rules] * 4
 
 
 def test_border_of_knots_is_that_of_the_rules_and_leaves_room_on_the_narrow_side():
