@@ -12,7 +12,6 @@ from padforge.design.report import draw_plan
 from padforge.design.settings import PadSettings, RulesSettings
 from tests.design.wild_pads import KINDS, wild_knots
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 CONTACTS = [
     Contact(),
     Contact(radius=1e-9, sides=None),
