@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import IO, Any, cast
 
 
@@ -72,13 +73,11 @@ def main() -> None:
     expected_error(responses, positions, np.ones(2), np.ones(4, bool), np.ones((1, 2)), scatter, np.ones(2))
     pad, contact = Morphology.random(2, 2, seed=0), Contact()
     size = PadSettings().for_layout(pad.layout)
-    of_step, in_end = (
-        ScoredPad(pad, contact, SearchSettings(), RulesSettings(max_common_track_mm=limit), size)
-        for limit in (None, 2.0)
-    )
-    of_step.terms(["penalty"])
-    # 2. what the run needs in the last steps and as soon as the search has ended
-    in_end.terms([term.name for term in TERMS if not term.name.startswith("expected_error")])
+    scored = ScoredPad(pad, contact, SearchSettings(), RulesSettings(max_common_track_mm=None), size)
+    scored.terms(["penalty"])
+    # 2. what the run needs in the last steps, where common tracks count, and as soon as the search has ended
+    later = [term.name for term in TERMS if not term.name.startswith("expected_error")]
+    replace(scored, rules=RulesSettings()).terms(later)
     from padforge.fabricate.checks.surface import TriangleMesh
 
     TriangleMesh.weld(np.eye(4, 3), [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]).find_self_intersections(1)

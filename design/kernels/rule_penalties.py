@@ -93,8 +93,8 @@ def sum_closeness(
 ) -> float:
     """Sum what it costs that samples lie nearer than `gap` to another fibre, for pairs (K, 2) of fibre and other.
 
-    Distances are to the piece of tangent that the nearest sample stands for, a step to both sides. A fibre paired with
-    itself is another one from `fold` of arc length away on: so is all of that piece.
+    Distances are to the piece of tangent that the nearest sample stands for, a step to both sides. Where a fibre is
+    paired with itself, those pieces count that lie `fold` of arc length away or more from end to end.
     """
     n, total = points.shape[1], 0.0
     for k in range(len(pairs)):

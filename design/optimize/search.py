@@ -290,11 +290,10 @@ def better_half(histories: Mapping[int, Array], half_way: int) -> list[int]:
     before = {start: history[history[:, 0] <= half_way][-COMPARED:, 1] for start, history in histories.items()}
     means = {start: np.nan_to_num(np.log(values).mean(), nan=np.inf) for start, values in before.items()}
     ranked = sorted(means, key=lambda start: means[start])
-    better, rest = np.split(ranked, [max(len(ranked) // 2, MIN_STARTS)])
-    straight = [start for start in rest.tolist() if is_straight(start)]
-    if straight and not any(map(is_straight, better.tolist())):
+    better, straight = ranked[: max(len(ranked) // 2, MIN_STARTS)], [*filter(is_straight, ranked)]
+    if straight and straight[0] not in better:
         better[-1] = straight[0]
-    return sorted(better.tolist())
+    return sorted(better)
 
 
 def _advance(

@@ -153,7 +153,7 @@ def test_every_fourth_start_is_nearly_straight_the_others_zigzags():
 
 
 @pytest.mark.parametrize("counts", [(0, 3), (3, 0), (1, 1)])
-def test_starts_of_pads_with_one_family(counts):
+def test_starts_of_pads_of_one_family_or_two_fibres(counts):
     size = PadSettings(horizontals=counts[0], verticals=counts[1])
     for start in (0, 3):
         paths = initial_paths(size, RulesSettings(), 7, None, start, np.random.default_rng(start))
