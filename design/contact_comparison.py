@@ -15,7 +15,6 @@ from padforge.design.common.files import provenance, write_json
 from padforge.design.common.profiling import stage
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import SimulatedPresses
 from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import (
@@ -31,6 +30,7 @@ from padforge.design.settings import (
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
+    from padforge.design.networks import SimulatedPresses
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
@@ -99,8 +99,10 @@ def beside_straight(pad: Morphology) -> dict[str, Morphology]:
     return {"designed": pad, "straight": Morphology.straight(pad.layout)}
 
 
-def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter, seed: int) -> SimulatedPresses:
+def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter, seed: int) -> "SimulatedPresses":
     """Simulate presses with scattered responses, by the same draws for every pad of as many fibres."""
+    from padforge.design.networks import SimulatedPresses  # imports torch, which a search does without
+
     rng = np.random.default_rng([3, seed])
     scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
     scatter = scatter_of_full_scale(scatter, contact, scale)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -183,6 +184,7 @@ def check_run(run: Run) -> None:
     for name in SECTIONS:
         _read_section(run.spec, name)
     require_formats(run.formats)
+    metadata.version("torch")  # a missing one is refused here, not when contacts are compared
     FabricationSettings.from_spec(run.spec).require_consistent(run.spec.section(PadSettings).layout)
     localizer = run.spec.section(LocalizerSettings)
     if run.time_budget is not None and localizer.method == "published":

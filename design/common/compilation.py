@@ -12,6 +12,9 @@ from pathlib import Path
 from threading import Timer
 from typing import Any, Protocol, TypeVar, overload
 
+# else each overload that is tried in vain has its message coloured, a thirtieth of the time
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+
 from numba import njit
 from numba.core import event as events
 

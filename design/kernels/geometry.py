@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.design.kernels.pchip import piece_of
 from padforge.design.settings import profile_spline
 
 Array = NDArray[np.float64]
@@ -445,7 +446,7 @@ def sum_overlaps(
         f, g = fibres[k], neighbours[k]
         for side in (-half, half):
             # 1. position of the point, between two samples of its fibre, in the axes of the other fibre
-            after = min(max(np.searchsorted(arc[f], middles[k] + side), 1), n_samples - 1)
+            after = piece_of(middles[k] + side, arc[f], n_samples - 1) + 1
             share = (middles[k] + side - arc[f, after - 1]) / (arc[f, after] - arc[f, after - 1])
             dx, dy = samples[f, after, 1] - samples[f, after - 1, 1], samples[f, after, 0] - samples[f, after - 1, 0]
             x, y = samples[f, after - 1, 1] + share * dx, samples[f, after - 1, 0] + share * dy

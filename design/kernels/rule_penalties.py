@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.compilation import kernel
-from padforge.design.kernels.pchip import add_value_gradient, pchip_value
+from padforge.design.kernels.pchip import add_value_gradient, extremes, pchip_value
 
 STEEPNESS = 10.0
 """By which what is too close by a share c costs c + STEEPNESS c^2."""
@@ -99,7 +99,7 @@ def sum_closeness(
     n, total = points.shape[1], 0.0
     for k in range(len(pairs)):
         f, g = pairs[k]
-        reach = gap + shares[g].max()
+        reach = gap + extremes(shares[g])[1]
         low = 0
         for i in range(n):
             x, y = points[f, i]

@@ -98,7 +98,10 @@ def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
                 for k in range(most):
                     if term > largest[k]:
                         term, largest[k] = largest[k], term
-            if total - largest.sum() > MAX_NEG_LOG_LIKELIHOOD:  # whichever fibres fail
+            least = total
+            for k in range(most):
+                least -= largest[k]
+            if least > MAX_NEG_LOG_LIKELIHOOD:  # whichever fibres fail
                 continue
             # 2. likelihood without the terms of the failed fibres
             if total < MAX_EXPONENT:
