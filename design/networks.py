@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
 
 import numpy as np
 import torch
@@ -27,6 +28,8 @@ JITTER = 5 / 49
 MAX_PRESSES, MAX_NETWORKS = 2**20, 2**20
 BATCH = 14
 """Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
+_FIRST_CALL = Lock()
+"""Torch loads the linear algebra of a GPU at its first call, which fails where two threads make it at once."""
 
 FailureSet = tuple[int, ...]
 """Indices of failed fibres."""
@@ -120,7 +123,11 @@ def fit_batch(
 
 def best_device() -> str:
     """Return torch's name of the GPU, if there is one, else of the processor."""
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    if not torch.cuda.is_available():
+        return "cpu"
+    with _FIRST_CALL:
+        torch.linalg.cholesky_ex(torch.eye(1, device="cuda"))
+    return "cuda"
 
 
 def initial_weights(varies: NDArray[np.bool_], hidden: int, rng: np.random.Generator) -> Array:

@@ -29,20 +29,20 @@ class EnsembleMlp(nn.Module):
     def random(
         cls, n_inputs: int, n_outputs: int, options: LocalizerSettings, generator: torch.Generator
     ) -> "EnsembleMlp":
-        """Draw the first weights of one member of the size in `options`, on the device of the generator."""
-        hidden, layers, device = options.hidden, options.layers, generator.device
+        """Draw the first weights of one member of the size in `options`."""
+        hidden, layers = options.hidden, options.layers
 
         def normal(*shape: int, gain: float = 1.0) -> Tensor:
-            return torch.randn(*shape, generator=generator, device=device) * (gain / shape[-2] ** 0.5)
+            return torch.randn(*shape, generator=generator) * (gain / shape[-2] ** 0.5)
 
         return cls(
             {
                 "first.w": normal(1, n_inputs, hidden),
-                "first.b": torch.zeros(1, 1, hidden, device=device),
+                "first.b": torch.zeros(1, 1, hidden),
                 "hidden.w": normal(layers, 1, hidden, hidden, gain=0.5),
-                "hidden.b": torch.zeros(layers, 1, 1, hidden, device=device),
+                "hidden.b": torch.zeros(layers, 1, 1, hidden),
                 "last.w": normal(1, hidden, n_outputs, gain=0.3),
-                "last.b": torch.zeros(1, 1, n_outputs, device=device),
+                "last.b": torch.zeros(1, 1, n_outputs),
             }
         )
 

@@ -76,7 +76,7 @@ def fit_network(
     average = [weight.detach().clone() for weight in weights]
     # as torch.optim.AdamW, which imports its compiler: that takes a second
     means, squares = ([torch.zeros_like(weight) for weight in weights] for _ in range(2))
-    counts = [torch.zeros((), device=weight.device) for weight in weights]
+    counts = [torch.zeros(()) for _ in weights]
     how: dict[str, Any] = dict(zip(("beta1", "beta2"), BETAS, strict=True))
     how |= {"weight_decay": weight_decay, "eps": 1e-8, "amsgrad": False, "maximize": False, "fused": True}
     share, step, reports = 0.0, 0, 0
@@ -97,7 +97,7 @@ def fit_network(
             if share * REPORTS >= reports + 1:
                 reports = int(share * REPORTS)
                 on_progress(reports, REPORTS, "")
-    return {name: mean.cpu().numpy() for name, mean in zip(parameters, average, strict=True)}
+    return {name: mean.numpy() for name, mean in zip(parameters, average, strict=True)}
 
 
 class StoppedError(Exception):
@@ -261,7 +261,7 @@ def _loss(error: Tensor) -> Tensor:
 
 
 class Training:
-    """A network and its loss, on the GPU where there is one."""
+    """A network and its loss; on the CPU, as a GPU, which waits for batches and orders, takes no less time."""
 
     def __init__(
         self,
@@ -284,15 +284,14 @@ class Training:
             centred = (targets - targets.mean(axis=0))[:, 2:]
             self._force_per_depth = (centred[:, :1] * centred[:, 1:]).sum() / np.square(centred[:, :1]).sum()
         n_outputs = N_OUTPUTS + 2 * (targets.shape[1] - 2)
-        self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        generator = torch.Generator(self._device).manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
         self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
-        self._directions, self._shrinkage = (each.to(self._device) for each in self._fit_directions())
+        self._directions, self._shrinkage = self._fit_directions()
 
     def weights(self, fitted: Weights) -> Weights:
         """Return the weights for inputs as they are, of `fitted` ones for scaled ones."""
-        first = self.scale_down(torch.from_numpy(fitted["first.w"]).to(self._device).mT).mT
-        return {**fitted, "first.w": np.ascontiguousarray(first.cpu().numpy())}
+        first = self.scale_down(torch.from_numpy(fitted["first.w"]).mT).mT
+        return {**fitted, "first.w": np.ascontiguousarray(first.numpy())}
 
     def measure_pace(self) -> float:
         """Return the seconds that a step takes."""
@@ -305,7 +304,7 @@ class Training:
 
     def loss(self) -> Tensor:
         """Return the loss of the next batch."""
-        inputs, wanted = (torch.from_numpy(each).to(self._device) for each in self.draw())
+        inputs, wanted = map(torch.from_numpy, self.draw())
         predicted, log_error = self.network.forward_bfloat16(self.scale_down(inputs))[0].chunk(2, dim=1)
         error, log_error = predicted - wanted, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
         likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
