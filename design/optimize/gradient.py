@@ -6,6 +6,7 @@ them to the same bits, so that it can run in slices on any thread or machine and
 
 import json
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,14 +22,27 @@ from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 from padforge.design.signal_gradients import FibreCurves
 
-LEARNING_RATE, MIN_RATE = 0.04, 0.02
-"""Learning rate of the first step, and that of the last one as a share of it."""
+
+class Schedule(NamedTuple):
+    """How the steps of a start change from the first to the last one."""
+
+    rate: float  # learning rate of the first step
+    fall: int  # power of the cosine by which it falls
+    penalty_weights: tuple[float, float]  # weight of the rules at the first and at the last step
+
+
+GENTLE, STRICT = Schedule(0.02, 2, (0.3, 100.0)), Schedule(0.04, 4, (1.0, 300.0))
+"""Most starts are gentle: large steps and strong rules shake fibres out of what locates with two and three failed, too.
+But zigzags may tangle so that some rules stay broken, as that on the angle of crossings.
+"""
+STRICT_START = 3
+"""Of four starts the strict one, which is nearly straight at first."""
+MIN_RATE = 0.02
+"""Learning rate of the last step, as a share of that of the first one."""
 BETAS = 0.9, 0.999
 """By which a step of Adam multiplies its means of gradients and of their squares."""
 INITIAL_NOISE = 2.0
 """Scatter of the first step as a multiple of the last one's."""
-PENALTY_WEIGHT = (1.0, 300.0)
-"""Weight of the rules at the first and at the last step."""
 COMMON_TRACKS_FROM = 0.7
 """Share of the steps after which the rule on common tracks counts: before, it hinders crossings from moving, and what
 it asks for in the end is a small change.
@@ -47,10 +61,6 @@ REPAIR_RATE, REPAIR_GROWTH, MAX_REPAIR_RATE = 0.002, 1.15, 0.01
 """Learning rate of the repair, gentle at first, and its growth at each failed check."""
 KNOTS_PER_TURN = 3
 """Before, at and after: a turn of given radius needs its shoulders."""
-STRAIGHT_START = 3
-"""Of four starts the one that is nearly straight: zigzags lead to the better pad, but may break rules that straight
-fibres keep, as that on the angle of crossings.
-"""
 KNOT_STD = 0.1
 """Standard deviation by which knots are moved off straight paths or an origin, grid units."""
 MAX_BORDER = 0.45
@@ -139,9 +149,9 @@ def border_width(pad: PadSettings, rules: RulesSettings) -> float:
     return min(max(MARGIN, limit), MAX_BORDER * min(pad.layout.extent))
 
 
-def is_straight(start: int) -> bool:
-    """Return whether a start without an origin begins with nearly straight fibres; the others begin with zigzags."""
-    return start % 4 == STRAIGHT_START
+def is_strict(start: int) -> bool:
+    """Return whether a start takes large steps under strong rules."""
+    return start % 4 == STRICT_START
 
 
 def initial_paths(
@@ -149,11 +159,11 @@ def initial_paths(
 ) -> Array:
     """Draw the knots (F, N + 2, 2) that a start of the search begins with; they pass keep-outs.
 
-    Without an origin, each start has a zigzag of its own, but for every fourth, which has straight fibres with knots
+    Without an origin, each start has a zigzag of its own, but for strict ones, which have straight fibres with knots
     moved by a tenth of a grid unit or so: where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no
     gradient. With an origin, start 0 has its very paths, later ones have them with knots moved.
     """
-    if origin is None and not is_straight(start):
+    if origin is None and not is_strict(start):
         return pass_keep_outs(_zigzag(pad.layout, rules, knots, rng), pad, rules)
     paths = straight_paths(pad, rules, knots) if origin is None else refine(origin.knots, knots, pad.layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
@@ -203,6 +213,7 @@ class GradientSearch:
 
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
         self.problem, self.rng = problem, np.random.default_rng([problem.search.seed, start])
+        self._schedule = STRICT if is_strict(start) else GENTLE
         self.step, self.objective, self.done = 0, math.inf, False  # objective of the last step, without penalties
         self._log_sum = 0.0  # of the objectives since the last entry of the history
         self._history: list[tuple[int, float]] = []
@@ -261,21 +272,17 @@ class GradientSearch:
         self._adam = Adam(variables, int(state["adam_steps"]), moments)
 
     def _descend(self) -> None:
-        """Take one step on the objective and the rules.
-
-        The learning rate falls by a squared cosine: most steps are small ones, for large ones shake fibres out of what
-        still locates with two and three failed.
-        """
-        search = self.problem.search
+        """Take one step on the objective and the rules."""
+        search, (rate, fall, (first, last)) = self.problem.search, self._schedule
         progress = self.step / max(1, search.steps - 1)
-        rate = LEARNING_RATE * (MIN_RATE + (1 - MIN_RATE) * math.cos(math.pi / 2 * progress) ** 4)
+        rate *= MIN_RATE + (1 - MIN_RATE) * math.cos(math.pi / 2 * progress) ** fall
         curves = self._curves()
         self.objective, by_curves = self._objective(curves, INITIAL_NOISE ** (1 - progress))
         gradient = curves.by_knots(by_curves)
         if (rules := self.problem.rules).enforce:
             if progress < COMMON_TRACKS_FROM:
                 rules = rules.model_copy(update={"max_common_track_mm": None})
-            weight = PENALTY_WEIGHT[0] * (PENALTY_WEIGHT[1] / PENALTY_WEIGHT[0]) ** progress
+            weight = first * (last / first) ** progress
             gradient = gradient + weight * self._penalty_gradient(curves, rules, RULE_MARGIN)
         self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1

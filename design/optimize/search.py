@@ -29,7 +29,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import ScoredPad
-from padforge.design.optimize.gradient import HISTORY_STEPS, GradientSearch, is_straight
+from padforge.design.optimize.gradient import HISTORY_STEPS, GradientSearch, is_strict
 from padforge.design.optimize.problem import SearchProblem, build_problem
 from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
@@ -283,16 +283,16 @@ def _open_start(problem: SearchProblem, start: int, state: State | None) -> "Gra
 
 
 def better_half(histories: Mapping[int, Array], half_way: int) -> list[int]:
-    """Return the starts of lower objectives before a step, in order, among them the best that began nearly straight.
+    """Return the starts of lower objectives before a step, in order, among them the best of the strict ones.
 
     The latter may keep rules that the others break in the end. Histories are (n, 2), of step and objective.
     """
     before = {start: history[history[:, 0] <= half_way][-COMPARED:, 1] for start, history in histories.items()}
     means = {start: np.nan_to_num(np.log(values).mean(), nan=np.inf) for start, values in before.items()}
     ranked = sorted(means, key=lambda start: means[start])
-    better, straight = ranked[: max(len(ranked) // 2, MIN_STARTS)], [*filter(is_straight, ranked)]
-    if straight and straight[0] not in better:
-        better[-1] = straight[0]
+    better, strict = ranked[: max(len(ranked) // 2, MIN_STARTS)], [*filter(is_strict, ranked)]
+    if strict and strict[0] not in better:
+        better[-1] = strict[0]
     return sorted(better)
 
 

@@ -15,7 +15,8 @@ from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import (
-    PENALTY_WEIGHT,
+    GENTLE,
+    STRICT,
     Adam,
     GradientSearch,
     Parametrization,
@@ -221,7 +222,8 @@ def test_gradient_search_beats_straight_fibres_within_the_rules():
     assert pad["ambiguity_mm_1"] < 0.5 * grid["ambiguity_mm_1"]
 
 
-def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
+@pytest.mark.parametrize(("start", "ends"), [(0, GENTLE.penalty_weights), (3, STRICT.penalty_weights)])
+def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch, start, ends):
     """By equal factors from the first weight to the last."""
     weights = []
 
@@ -233,8 +235,8 @@ def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch):
             return 0.0
 
     monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: Gradient())
-    advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings()), 4)
-    assert weights == pytest.approx(np.geomspace(*PENALTY_WEIGHT, 4))
+    advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings(), start), 4)
+    assert weights == pytest.approx(np.geomspace(ends[0], ends[1], 4))
 
 
 def test_common_tracks_count_at_the_end_of_a_search(monkeypatch):

@@ -230,6 +230,6 @@ def test_better_half_compares_the_last_objectives_before_a_step():
     histories = {0: low, 1: high, 2: high * [1.0, 2.0], 4: low * [1.0, np.nan]}
     assert better_half(histories, 30) == [1, 2]
     assert better_half(histories, 20) == [0, 1]
-    assert better_half(histories | {3: high * [1.0, 9.0]}, 30) == [1, 3]  # nearly straight fibres go on
+    assert better_half(histories | {3: high * [1.0, 9.0]}, 30) == [1, 3]  # a strict start goes on
     assert better_half(histories | {3: high / [1.0, 9.0]}, 30) == [1, 3]
     assert better_half(dict.fromkeys(range(8), low), 30) == [0, 1, 2, 3]
