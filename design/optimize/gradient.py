@@ -27,7 +27,7 @@ class Schedule(NamedTuple):
     """How the steps of a start change from the first to the last one."""
 
     rate: float  # learning rate of the first step
-    fall: int  # power of the cosine by which it falls
+    fall: int  # power of cos(pi p / 2), by which it falls after a share p of the steps
     penalty_weights: tuple[float, float]  # weight of the rules at the first and at the last step
 
 
