@@ -261,10 +261,11 @@ class EmulatedLineBoard(SerialBoard):
         super().__init__(skew_ppm, seed)
         self._source, self._header, self._silent = source, header, silent
         self._columns = header.channels
+        self._resetting = False
 
     def reset(self) -> None:
         """Start anew, as by its button."""
-        self._start_s = None
+        self._resetting = True  # done by the board's own thread, for which the start must not vanish within a step
 
     def send_columns(self, columns: int) -> None:
         """Send this number of counts a line from now on."""
@@ -280,7 +281,8 @@ class EmulatedLineBoard(SerialBoard):
     def _sample(self) -> None:
         if self._silent:
             return
-        if self._start_s is None:
+        if self._start_s is None or self._resetting:
+            self._resetting = False
             self._start_s, self._first = time.monotonic(), 0
             self._send(format_header(self._header))
         end = int((time.monotonic() - self._start_s) / float(self.true_times(0) - self._start_s))

@@ -1,6 +1,7 @@
 """Both boards' drivers through real pseudo-terminals and real pyserial, against emulated boards and their faults."""
 
 import os
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -214,6 +215,27 @@ def test_read_raises_when_line_board_resets(garbled: float) -> None:
         board.garble(0)
         driver.connect()
         check(read_for(driver, 0.1), board)
+
+
+@pytest.fixture
+def quick_switches() -> Iterator[None]:
+    """Threads take turns between any two operations, which brings races to light."""
+    switch_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(switch_s)
+
+
+@pytest.mark.usefixtures("quick_switches")
+def test_line_board_survives_resets_at_any_moment() -> None:
+    """Also within one of its steps; a board whose thread has died would not answer again."""
+    board = EmulatedLineBoard(waves, replace(HEADER, rate_hz=10_000))
+    with connected(board, 10_000) as driver:
+        end = time.monotonic() + 0.3
+        while time.monotonic() < end:
+            board.reset()
+        driver.connect()
+        assert len(read_for(driver, 0.1).times_s) > 5
 
 
 @pytest.mark.parametrize(
