@@ -30,12 +30,21 @@ def _closeness(distance: float, gap: float) -> tuple[float, float]:
 
 @kernel
 def sum_excess_turns(
-    slope: Any, arc: Any, radius: float, window: float, rolled: float, weight: float, by_slope: Any, by_arc: Any
+    slope: Any,
+    arc: Any,
+    radius: float,
+    window: float,
+    rolled: float,
+    ways: int,
+    weight: float,
+    by_slope: Any,
+    by_arc: Any,
 ) -> float:
     """Integrate the excess of the turn within `window` of arc length over window / radius, relative to that, (F, P).
 
-    Fibres go on straight from both ends, by their leads, which they may meet at a corner. They turn by `rolled` more,
-    at right angles, except where a window begins on a lead.
+    Windows begin at samples or, half of them where `ways` is 2, end at samples: the most turn, linear between samples,
+    is in one of both. Fibres go on straight from both ends, by their leads, which they may meet at a corner. They turn
+    by `rolled` more, at right angles, except where a window begins on a lead.
     """
     fibres, n = arc.shape
     size, total = n + 4, 0.0
@@ -49,31 +58,32 @@ def sum_excess_turns(
             turned[i] = turned[i - 1] + abs(heading[i] - heading[i - 1])
         by_along[:] = 0
         by_turned[:] = 0
-        after = 1
-        for i in range(size):
-            until = along[i] + window
-            while after < size - 1 and along[after] < until:
-                after += 1
-            a0, a1, t0, t1 = along[after - 1], along[after], turned[after - 1], turned[after]
-            share = min(max((until - a0) / (a1 - a0), 0.0), 1.0)
-            in_plan = t0 + share * (t1 - t0) - turned[i]
-            beside = rolled if 2 <= i < size - 2 else 0.0
-            angle = math.hypot(in_plan, beside)
-            excess = angle * radius / window - 1
-            if excess <= 0:
-                continue
-            low, high = along[max(i - 1, 0)], along[min(i + 1, size - 1)]
-            part = weight * (high - low) / 2
-            total += part * excess
-            push = part * radius / window * in_plan / angle
-            by_turned[i] -= push
-            by_turned[after - 1] += push * (1 - share)
-            by_turned[after] += push * share
-            if 0 < share < 1:
-                pull = push * (t1 - t0) / (a1 - a0)
-                by_along[i] += pull
-                by_along[after - 1] -= pull * (1 - share)
-                by_along[after] -= pull * share
+        for way in range(ways):
+            towards, after = 1.0 - 2.0 * way, 1  # the other end of a window lies after the sample, or before it
+            for i in range(size):
+                other = along[i] + towards * window
+                while after < size - 1 and along[after] < other:
+                    after += 1
+                a0, a1, t0, t1 = along[after - 1], along[after], turned[after - 1], turned[after]
+                share = min(max((other - a0) / (a1 - a0), 0.0), 1.0)
+                in_plan = towards * (t0 + share * (t1 - t0) - turned[i])
+                on_fibre = 2 <= i < size - 2 if towards > 0 else 0 <= other <= along[size - 2]
+                angle = math.hypot(in_plan, rolled) if on_fibre else in_plan
+                excess = angle * radius / window - 1
+                if excess <= 0:
+                    continue
+                low, high = along[max(i - 1, 0)], along[min(i + 1, size - 1)]
+                part = weight * (high - low) / (2 * ways)
+                total += part * excess
+                push = towards * part * radius / window * in_plan / angle
+                by_turned[i] -= push
+                by_turned[after - 1] += push * (1 - share)
+                by_turned[after] += push * share
+                if 0 < share < 1:
+                    pull = push * (t1 - t0) / (a1 - a0)
+                    by_along[i] += pull
+                    by_along[after - 1] -= pull * (1 - share)
+                    by_along[after] -= pull * share
         by_arc[f, n - 1] += by_along[size - 2] + by_along[size - 1]
         later = 0.0  # derivative by all turns from here on
         for i in range(size - 1, 0, -1):

@@ -87,6 +87,7 @@ class FibreSamples:
     layout: Layout
     rules: RulesSettings
     margin: float  # factor on the limits, so that a curve with penalty 0 passes the exact check
+    all_bends: bool  # whether bends between samples count, too
 
     def scale(self, limit_mm: float) -> float:
         """Return a lower limit with the margin, grid units."""
@@ -114,7 +115,9 @@ class FibreSamples:
         return np.concatenate([of_points[:split], of_points[split:, :, ::-1]])
 
 
-def penalties(along: Array, across: Array, pad: PadSettings, rules: RulesSettings, margin: float = 1.0) -> Penalties:
+def penalties(
+    along: Array, across: Array, pad: PadSettings, rules: RulesSettings, margin: float = 1.0, all_bends: bool = True
+) -> Penalties:
     """Compute the penalty of each rule that can be broken, and the gradient of their sum by the knots.
 
     The knots are (F, N + 2) coordinates along and across the fibres, grid units; `margin` is a factor on the limits.
@@ -128,7 +131,7 @@ def penalties(along: Array, across: Array, pad: PadSettings, rules: RulesSetting
     points = np.empty((*slope.shape, 2))
     sample_spans(along, across, knot_slope, SPAN_SHARES, points, slope)
     arc = np.pad(np.linalg.norm(np.diff(points, axis=1), axis=-1).cumsum(axis=1), ((0, 0), (1, 0)))
-    fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, pad.layout, rules, margin)
+    fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, pad.layout, rules, margin, all_bends)
     by = Gradient(slope, along)
     found = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, by)) is not None}
     add_arc_gradient(points, by.arc, by.points)
@@ -158,8 +161,8 @@ def _bends(fibres: FibreSamples, by: Gradient) -> float | None:
         return None
     radius, window = fibres.scale(radius_mm), radius_mm / fibres.layout.unit_mm / 2
     rolled = radius_mm / 2 / (fibres.pad.bent_radius_mm or math.inf)
-    weight = 1 / len(fibres.arc) / fibres.mean_run
-    return sum_excess_turns(fibres.slope, fibres.arc, radius, window, rolled, weight, by.slope, by.arc)
+    ways, weight = 1 + fibres.all_bends, 1 / len(fibres.arc) / fibres.mean_run
+    return sum_excess_turns(fibres.slope, fibres.arc, radius, window, rolled, ways, weight, by.slope, by.arc)
 
 
 def _gaps(fibres: FibreSamples, by: Gradient) -> float | None:

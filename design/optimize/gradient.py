@@ -57,8 +57,10 @@ REPAIR_STEPS, REPAIR_CHECKS = 600, 20
 """Most steps of repair after the last step, and steps between two exact checks."""
 REPAIR_MARGIN = 0.01
 """Added to the margin at each failed check."""
-REPAIR_RATE, REPAIR_GROWTH, MAX_REPAIR_RATE = 0.002, 1.15, 0.01
-"""Learning rate of the repair, gentle at first, and its growth at each failed check."""
+REPAIR_RATE, REPAIR_GROWTH, MAX_REPAIR_RATE = 0.003, 1.1, 0.01
+"""Longest step of the repair, short at first, and its growth at each failed check."""
+REPAIR_MEMORY = 0.5
+"""By which a step of the repair multiplies its means of directions."""
 KNOTS_PER_TURN = 3
 """Before, at and after: a turn of given radius needs its shoulders."""
 KNOT_STD = 0.1
@@ -217,6 +219,7 @@ class GradientSearch:
         self.step, self.objective, self.done = 0, math.inf, False  # objective of the last step, without penalties
         self._log_sum = 0.0  # of the objectives since the last entry of the history
         self._history: list[tuple[int, float]] = []
+        self._broken = np.zeros(problem.pad.layout.fibres, bool)  # fibres that broke rules at the last check
         if state is not None:
             self._restore(state)
             return
@@ -229,14 +232,14 @@ class GradientSearch:
 
     def advance(self) -> None:
         """Take one step of the search, or of the repair after it."""
-        if self.step < self.problem.search.steps:
+        if self.step < self.problem.steps:
             self._descend()
         else:
             self._repair()
 
     def finish(self) -> None:
         """Skip the remaining steps of the search, so that the next ones are repair."""
-        if self.step < self.problem.search.steps:
+        if self.step < self.problem.steps:
             self._begin_repair()
 
     def morphology(self) -> Morphology:
@@ -258,6 +261,7 @@ class GradientSearch:
             "adam_steps": np.array(self._adam.steps),
             "adam_spans": self._adam.moments[0].copy(),
             "adam_across": self._adam.moments[1].copy(),
+            "broken": self._broken.copy(),
         }
 
     def _restore(self, state: State) -> None:
@@ -270,11 +274,12 @@ class GradientSearch:
         self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
         moments = [state["adam_spans"].copy(), state["adam_across"].copy()]
         self._adam = Adam(variables, int(state["adam_steps"]), moments)
+        self._broken = state["broken"].copy()
 
     def _descend(self) -> None:
         """Take one step on the objective and the rules."""
-        search, (rate, fall, (first, last)) = self.problem.search, self._schedule
-        progress = self.step / max(1, search.steps - 1)
+        rate, fall, (first, last) = self._schedule
+        progress = self.step / max(1, self.problem.steps - 1)
         rate *= MIN_RATE + (1 - MIN_RATE) * math.cos(math.pi / 2 * progress) ** fall
         curves = self._curves()
         self.objective, by_curves = self._objective(curves, INITIAL_NOISE ** (1 - progress))
@@ -283,41 +288,60 @@ class GradientSearch:
             if progress < COMMON_TRACKS_FROM:
                 rules = rules.model_copy(update={"max_common_track_mm": None})
             weight = first * (last / first) ** progress
-            gradient = gradient + weight * self._penalty_gradient(curves, rules, RULE_MARGIN)
+            gradient = gradient + weight * self._penalty_gradient(curves, rules, RULE_MARGIN, all_bends=False)
         self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         self._log_sum += math.log(self.objective)
-        if self.step % HISTORY_STEPS == 0 or self.step == search.steps:
+        if self.step % HISTORY_STEPS == 0 or self.step == self.problem.steps:
             steps = (self.step - 1) % HISTORY_STEPS + 1
             self._history.append((self.step, math.exp(self._log_sum / steps)))
             self._log_sum = 0.0
-        if self.step == search.steps:
+        if self.step == self.problem.steps:
             self._begin_repair()
 
     def _begin_repair(self) -> None:
         """End the search; there is nothing to repair if the exact check passes."""
-        self.step = self.problem.search.steps
-        self.done = not self.problem.violations(self.morphology())
-        self._adam = Adam([self.fibres.spans, self.fibres.across])
+        self.step = self.problem.steps
+        self._adam = Adam([self.fibres.spans, self.fibres.across])  # of which the repair needs the means alone
+        self.done = self._check()
+
+    def _check(self) -> bool:
+        """Find the fibres that break rules, all of them where one concerns the pad as a whole; return if none does."""
+        violations = self.problem.violations(self.morphology())
+        self._broken[:] = False
+        for violation in violations:
+            self._broken[[fibre - 1 for fibre in violation.fibres] or slice(None)] = True
+        return not violations
 
     def _repair(self) -> None:
-        """Take one step on the rules alone, which moves only what breaks them; the margin grows until they hold."""
-        repairs = self.step - self.problem.search.steps
+        """Take one step on the rules alone of the fibres that break some; the margin grows until they hold.
+
+        Steps are as the root of the gradient: as the gradient itself, knots of small ones would stay; all alike, as
+        nearly in Adam, knots would move that have little to do with it, which costs accuracy.
+        """
+        repairs = self.step - self.problem.steps
         checks = repairs // REPAIR_CHECKS
         rate = min(REPAIR_RATE * REPAIR_GROWTH**checks, MAX_REPAIR_RATE)
         margin = RULE_MARGIN + REPAIR_MARGIN * checks
-        gradient = self._penalty_gradient(self._curves(), self.problem.rules, margin)
-        self._adam.step(self.fibres.gradients(*gradient), rate)
+        gradient = self._penalty_gradient(self._curves(), self.problem.rules, margin) * self._broken[:, None]
+        gradients = self.fibres.gradients(*gradient)
+        largest = np.maximum(*(np.abs(by_x).max(axis=1, keepdims=True) for by_x in gradients))
+        for x, (mean, _), by_x in zip(self._adam.variables, self._adam.moments, gradients, strict=True):
+            direction = np.sign(by_x) * np.sqrt(np.abs(by_x) / np.where(largest > 0, largest, 1))
+            mean += (1 - REPAIR_MEMORY) * (direction - mean)
+            x -= rate * mean
         self.step += 1
         if (repairs + 1) % REPAIR_CHECKS == 0:
-            self.done = repairs + 1 >= REPAIR_STEPS or not self.problem.violations(self.morphology())
+            self.done = repairs + 1 >= REPAIR_STEPS or self._check()
 
     def _curves(self) -> FibreCurves:
         return FibreCurves(*self.fibres.axes(), self.fibres.ends, self.problem.pad.layout.unit_mm)
 
-    def _penalty_gradient(self, curves: FibreCurves, rules: RulesSettings, margin: float) -> Array:
+    def _penalty_gradient(
+        self, curves: FibreCurves, rules: RulesSettings, margin: float, all_bends: bool = True
+    ) -> Array:
         """Return the gradient (2, F, n) of the sum of all penalties by the knots."""
-        found = penalties(curves.along, curves.across, self.problem.pad, rules, margin)
+        found = penalties(curves.along, curves.across, self.problem.pad, rules, margin, all_bends)
         return np.stack([found.by_along, found.by_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:

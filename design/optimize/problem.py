@@ -11,6 +11,11 @@ from padforge.design.objectives.rules import Violation, check_rules
 from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
+STEPS = {"layer": 1000, "profile": 1000, "shape": 1500}
+"""Steps of a start by the model of the contact: the errors under a shape, whose signals begin and end abruptly, are
+still 4 % less after half as many steps again, under a layer 1 %.
+"""
+
 
 @dataclass(frozen=True)
 class SearchProblem:
@@ -30,7 +35,9 @@ class SearchProblem:
     @property
     def steps(self) -> int:
         """Steps of a start, or generations, without repair."""
-        return self.search.generations if self.search.method == "genetic" else self.search.steps
+        if self.search.method == "genetic":
+            return self.search.generations
+        return self.search.steps or max(STEPS[contact.model] for contact in self.contacts)
 
     def violations(self, pad: Morphology) -> list[Violation]:
         """Return the rules that a pad breaks; none if rules are not enforced."""

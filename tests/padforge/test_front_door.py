@@ -67,7 +67,7 @@ def test_init_writes_settings_that_every_command_reads(tmp_path: Path) -> None:
     for section in ("pad", "contact", "search", "rules", "mould", "printer", "dispenser", "rig", "localizer"):
         assert f"[{section}]" in text
     assert "exists already" in refused("init", cwd=tmp_path)
-    (tmp_path / "pad.toml").write_text(text.replace("steps = 1000", "steps = 0"))
+    (tmp_path / "pad.toml").write_text(text.replace('steps = "contact"', "steps = 0"))
     assert "pad.toml: [search] steps: got 0" in refused("run", cwd=tmp_path)
 
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
@@ -113,7 +115,7 @@ class Slopes(torch.autograd.Function):
         return tuple(torch.from_numpy(ctx.curves.by_knots(gradient)))
 
 
-def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm):
+def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm, all_bends):
     """Both integrals with what they integrate over held, as torch differentiates them; (F, n) knots of PCHIP curves."""
     shares = (1 - torch.cos(torch.arange(12, dtype=torch.float64) * np.pi / 12)) / 2
     slope = Slopes.apply(along, across)
@@ -135,24 +137,31 @@ def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm):
     run = t[:, -1].mean().detach()
     beyond = torch.cat([0 * arc[:, :1] - window, 0 * arc[:, :1], arc, arc[:, -1:], arc[:, -1:] + window], dim=1)
     turned = pad(pad(rate.atan(), (2, 2)).diff(dim=1).abs().cumsum(dim=1), (1, 0))
-    after = torch.searchsorted(beyond.detach(), (beyond + window).detach()).clamp(1, beyond.shape[1] - 1)
-    a0, a1, t0, t1 = (x.gather(1, i) for x in (beyond, turned) for i in (after - 1, after))
-    angle = t0 + ((beyond + window - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
-    around = pad(torch.full_like(arc, rules.min_bend_radius_mm / 2 / bent_radius_mm), (2, 2))
-    excess = torch.relu(torch.sqrt(angle**2 + around**2 + 1e-30) * radius / window - 1)
+    beside = rules.min_bend_radius_mm / 2 / bent_radius_mm
+    excess = []
+    for towards in [1, -1][: 1 + all_bends]:  # windows begin or end at samples
+        other = beyond + towards * window
+        after = torch.searchsorted(beyond.detach(), other.detach()).clamp(1, beyond.shape[1] - 1)
+        a0, a1, t0, t1 = (x.gather(1, i) for x in (beyond, turned) for i in (after - 1, after))
+        angle = t0 + ((other - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
+        begins_on_pad = (other >= 0) & (other <= arc[:, -1:])
+        around = pad(torch.full_like(arc, beside), (2, 2)) if towards > 0 else beside * begins_on_pad
+        excess.append(torch.relu(torch.sqrt(angle**2 + around**2 + 1e-30) * radius / window - 1))
     in_zone = (t < rules.border_mm / unit_mm) | (t > t[:, -1:] - rules.border_mm / unit_mm)
     border = torch.relu(rate.abs() - 1) * in_zone * halves(arc)
-    return (excess * halves(beyond)).sum(dim=1).mean() / run, border.sum(dim=1).mean() / run
+    return (torch.stack(excess).mean(dim=0) * halves(beyond)).sum(dim=1).mean() / run, border.sum(dim=1).mean() / run
 
 
+@pytest.mark.parametrize("all_bends", [True, False])
 @pytest.mark.parametrize("bent_radius_mm", [1e6, 30.0])
-def test_gradients_of_turns_and_border_slopes_are_those_of_torch(bent_radius_mm):
+def test_gradients_of_turns_and_border_slopes_are_those_of_torch(bent_radius_mm, all_bends):
     """With the arc lengths that samples stand for held: their changes are left out of the gradient."""
     pad, rules = Morphology.random(2, 4, seed=5), only(min_bend_radius_mm=9.0, border_mm=12.0)
     along, across = (torch.tensor(axis, requires_grad=True) for axis in axes(pad))
-    expected = turns_and_border_slopes(along, across, rules, bent_radius_mm, pad.unit_mm)
+    expected = turns_and_border_slopes(along, across, rules, bent_radius_mm, pad.unit_mm, all_bends)
     torch.stack(expected).sum().backward()
-    values, *gradient = penalties(*axes(pad), PadSettings(grid=2, bent_radius_mm=bent_radius_mm), rules)
+    size = PadSettings(grid=2, bent_radius_mm=bent_radius_mm)
+    values, *gradient = penalties(*axes(pad), size, rules, all_bends=all_bends)
     assert values["min_bend_radius_mm"] == pytest.approx(expected[0].item(), rel=1e-9)
     assert values["border_mm"] == pytest.approx(expected[1].item(), rel=1e-9)
     assert along.grad is not None
@@ -220,6 +229,15 @@ def test_min_bend_radius_penalty_integrates_the_excess_turn(margin, bent_radius_
     rules, size = only(min_bend_radius_mm=limit_mm), PadSettings(bent_radius_mm=bent_radius_mm)
     assert expected > 0
     assert penalties(*axes(pad), size, rules, margin).values["min_bend_radius_mm"] == pytest.approx(expected, rel=0.05)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=100)
+def test_no_bend_that_breaks_the_rule_clearly_goes_without_a_penalty(seed):
+    """Also one between two samples, from which a whole window leads past it."""
+    pad, rules = Morphology.random(2, 8, seed=seed), only(min_bend_radius_mm=2.0)
+    if any(bend.measured < 0.93 * 2.0 for bend in check_rules(pad, rules)):
+        assert found(pad, rules, 1.05)["min_bend_radius_mm"] > 0
 
 
 @pytest.mark.parametrize(("cross", "travel", "fibre"), [(1.9, 0.3, 0), (3.0, 4.6, 5)])

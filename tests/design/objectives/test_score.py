@@ -39,10 +39,10 @@ def test_score_joint_entropy_saturates_before_those_of_families():
 
 
 @pytest.mark.parametrize(
-    ("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [0.75, 0.25]), ((2, 2), [3 / 6, 1 / 6, 1 / 6, 1 / 6])]
+    ("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [2 / 3, 1 / 3]), ((2, 2), [2 / 5, 1 / 5, 1 / 5, 1 / 5])]
 )
 def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fibres, weights):
-    """Half of the weight is on no failure, and 1, 2 and 3 share the rest: in these proportions also where fewer can."""
+    """No failure weighs twice as much as 1, 2 and 3 each: in these proportions also where fewer can."""
     pad = Morphology.straight(fibres)
     size = PadSettings().for_layout(pad.layout)
     scored = ScoredPad(pad, Contact(), SearchSettings(max_failures=3), RulesSettings(), size)

@@ -234,7 +234,7 @@ def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch, 
             weights.append(weight)
             return 0.0
 
-    monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: Gradient())
+    monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_, **__: Gradient())
     advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings(), start), 4)
     assert weights == pytest.approx(np.geomspace(ends[0], ends[1], 4))
 
@@ -243,14 +243,49 @@ def test_common_tracks_count_at_the_end_of_a_search(monkeypatch):
     """Before, crossings may move along; the other rules count from the first step."""
     seen = []
 
-    def noted(along, across, pad, rules, margin):
+    def noted(along, across, pad, rules, *how):
         seen.append(rules)
-        return penalties(along, across, pad, rules, margin)
+        return penalties(along, across, pad, rules, *how)
 
     monkeypatch.setattr("padforge.design.optimize.gradient.penalties", noted)
     rules = RulesSettings(max_common_track_mm=3.0)
     advance(begun(SearchSettings(knots=2, steps=11, starts=1, max_failures=0), rules), 11)
     assert seen == [rules.model_copy(update={"max_common_track_mm": None})] * 7 + [rules] * 4
+
+
+def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
+    """Fibre 1 is the one that turns too sharply; the same bits whether or not a state lies between the steps."""
+    pad, rules = Morphology.straight(2), RulesSettings(min_bend_radius_mm=4.0)
+    knots = refine(pad.knots, 5, pad.layout)
+    knots[0, 3, 1] += 0.35
+    search = SearchSettings(knots=5, steps=1, starts=1)
+    problem = SearchProblem(PAD, (PUBLISHED_CONTACT,), search, rules, Morphology(knots))
+    assert {fibre for v in problem.violations(problem.origin) for fibre in v.fibres} == {1}
+    run = GradientSearch(problem, 0)
+    run.finish()
+    advance(run, 7)
+    resumed = GradientSearch(problem, 0, run.state())
+    for each in (run, resumed):
+        advance(each, 600)
+    assert check_rules(run.morphology(), rules) == []
+    assert run.morphology() == resumed.morphology()
+    moved = np.abs(run.morphology().knots - knots).max(axis=(1, 2))
+    assert moved[0] > 0.01
+    assert moved[1:].max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("contact", "others", "steps", "expected"),
+    [
+        (Contact(), (), None, 1000),
+        (PUBLISHED_CONTACT, (), None, 1500),
+        (Contact(), (PUBLISHED_CONTACT,), None, 1500),
+        (PUBLISHED_CONTACT, (), 7, 7),
+    ],
+)
+def test_steps_are_by_the_contact_unless_they_are_stated(contact, others, steps, expected):
+    search = SearchSettings(steps=steps, contacts=others)
+    assert begun(search, FREE, contact=contact).problem.steps == expected
 
 
 def test_border_of_knots_is_that_of_the_rules_and_leaves_room_on_the_narrow_side():
