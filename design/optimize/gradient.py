@@ -53,14 +53,14 @@ HISTORY_STEPS = 10
 """Steps between entries of the history, each the geometric mean of the objectives since the last one."""
 MAX_GRADIENT = 1e150
 """Whose square is finite."""
-REPAIR_STEPS, REPAIR_CHECKS = 600, 20
-"""Most steps of repair after the last step, and steps between two exact checks."""
+REPAIR_STEPS, REPAIR_CHECKS, FINE_STEPS = 800, 20, 200
+"""Most steps of repair after the last step, steps between two exact checks, and the first ones, which are fine."""
 REPAIR_MARGIN = 0.01
 """Added to the margin at each failed check."""
-REPAIR_RATE, REPAIR_GROWTH, MAX_REPAIR_RATE = 0.003, 1.1, 0.01
-"""Longest step of the repair, short at first, and its growth at each failed check."""
-REPAIR_MEMORY = 0.5
-"""By which a step of the repair multiplies its means of directions."""
+FINE_REPAIR, FIRM_REPAIR, MAX_REPAIR_RATE = (0.003, 1.1), (0.002, 1.15), 0.01
+"""Learning rate of the repair, gentle at first, and its growth at each failed check."""
+FINE_MEMORY = 0.5
+"""By which a fine step of the repair multiplies its means of directions."""
 KNOTS_PER_TURN = 3
 """Before, at and after: a turn of given radius needs its shoulders."""
 KNOT_STD = 0.1
@@ -302,7 +302,7 @@ class GradientSearch:
     def _begin_repair(self) -> None:
         """End the search; there is nothing to repair if the exact check passes."""
         self.step = self.problem.steps
-        self._adam = Adam([self.fibres.spans, self.fibres.across])  # of which the repair needs the means alone
+        self._adam = Adam([self.fibres.spans, self.fibres.across])
         self.done = self._check()
 
     def _check(self) -> bool:
@@ -314,25 +314,36 @@ class GradientSearch:
         return not violations
 
     def _repair(self) -> None:
-        """Take one step on the rules alone of the fibres that break some; the margin grows until they hold.
+        """Take one step on the rules alone; the margin grows until they hold.
 
-        Steps are as the root of the gradient: as the gradient itself, knots of small ones would stay; all alike, as
-        nearly in Adam, knots would move that have little to do with it, which costs accuracy.
+        The first ones are fine, of fibres that break rules, and as the root of the gradient: as the gradient itself,
+        knots of small ones would stay. Where these do not suffice, all fibres take steps of Adam, which move all knots
+        nearly alike: that resolves more, but costs accuracy.
         """
         repairs = self.step - self.problem.steps
-        checks = repairs // REPAIR_CHECKS
-        rate = min(REPAIR_RATE * REPAIR_GROWTH**checks, MAX_REPAIR_RATE)
+        fine = repairs < FINE_STEPS
+        if repairs == FINE_STEPS:
+            self._adam = Adam(self._adam.variables)
+        checks = (repairs if fine else repairs - FINE_STEPS) // REPAIR_CHECKS
+        rate, growth = FINE_REPAIR if fine else FIRM_REPAIR
+        rate = min(rate * growth**checks, MAX_REPAIR_RATE)
         margin = RULE_MARGIN + REPAIR_MARGIN * checks
-        gradient = self._penalty_gradient(self._curves(), self.problem.rules, margin) * self._broken[:, None]
-        gradients = self.fibres.gradients(*gradient)
-        largest = np.maximum(*(np.abs(by_x).max(axis=1, keepdims=True) for by_x in gradients))
-        for x, (mean, _), by_x in zip(self._adam.variables, self._adam.moments, gradients, strict=True):
-            direction = np.sign(by_x) * np.sqrt(np.abs(by_x) / np.where(largest > 0, largest, 1))
-            mean += (1 - REPAIR_MEMORY) * (direction - mean)
-            x -= rate * mean
+        gradient = self._penalty_gradient(self._curves(), self.problem.rules, margin)
+        if fine:
+            self._step_finely(self.fibres.gradients(*gradient * self._broken[:, None]), rate)
+        else:
+            self._adam.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         if (repairs + 1) % REPAIR_CHECKS == 0:
             self.done = repairs + 1 >= REPAIR_STEPS or self._check()
+
+    def _step_finely(self, gradients: tuple[Array, Array], rate: float) -> None:
+        """Take a step as the root of the gradients, of length `rate` where a fibre's gradient is greatest."""
+        largest = np.maximum(*(np.abs(by_x).max(axis=1, keepdims=True) for by_x in gradients))
+        for x, (mean, _), by_x in zip(self._adam.variables, self._adam.moments, gradients, strict=True):
+            direction = np.sign(by_x) * np.sqrt(np.abs(by_x) / np.where(largest > 0, largest, 1))
+            mean += (1 - FINE_MEMORY) * (direction - mean)
+            x -= rate * mean
 
     def _curves(self) -> FibreCurves:
         return FibreCurves(*self.fibres.axes(), self.fibres.ends, self.problem.pad.layout.unit_mm)

@@ -15,7 +15,9 @@ from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import (
+    FINE_STEPS,
     GENTLE,
+    REPAIR_STEPS,
     STRICT,
     Adam,
     GradientSearch,
@@ -259,8 +261,9 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
     knots = refine(pad.knots, 5, pad.layout)
     knots[0, 3, 1] += 0.35
     search = SearchSettings(knots=5, steps=1, starts=1)
-    problem = SearchProblem(PAD, (PUBLISHED_CONTACT,), search, rules, Morphology(knots))
-    assert {fibre for v in problem.violations(problem.origin) for fibre in v.fibres} == {1}
+    origin = Morphology(knots)
+    problem = SearchProblem(PAD, (PUBLISHED_CONTACT,), search, rules, origin)
+    assert {fibre for v in problem.violations(origin) for fibre in v.fibres} == {1}
     run = GradientSearch(problem, 0)
     run.finish()
     advance(run, 7)
@@ -272,6 +275,18 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
     moved = np.abs(run.morphology().knots - knots).max(axis=(1, 2))
     assert moved[0] > 0.01
     assert moved[1:].max() < 1e-9
+
+
+def test_what_fine_steps_do_not_repair_firm_ones_do():
+    """Fibres as tangled as after three steps alone; also from a state between the two kinds of steps."""
+    run = begun(SearchSettings(knots=9, steps=3, starts=1, seed=3), RulesSettings())
+    advance(run, 3 + FINE_STEPS)
+    assert check_rules(run.morphology(), RulesSettings()) != []
+    resumed = GradientSearch(run.problem, 0, run.state())
+    for each in (run, resumed):
+        advance(each, REPAIR_STEPS)
+    assert check_rules(run.morphology(), RulesSettings()) == []
+    assert run.morphology() == resumed.morphology()
 
 
 @pytest.mark.parametrize(
