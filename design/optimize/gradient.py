@@ -133,11 +133,16 @@ class Adam:
         """Take a step of a learning rate; what is not finite of a gradient counts as 0."""
         self.steps += 1
         for x, (mean, square), gradient in zip(self.variables, self.moments, gradients, strict=True):
-            known = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).clip(-MAX_GRADIENT, MAX_GRADIENT)
+            known = _finite(gradient)
             mean += (1 - BETAS[0]) * (known - mean)
             square += (1 - BETAS[1]) * (known**2 - square)
             unbiased = mean / (1 - BETAS[0] ** self.steps), square / (1 - BETAS[1] ** self.steps)
             x -= rate * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-8)
+
+
+def _finite(gradient: Array) -> Array:
+    """Return a gradient whose squares are finite; what is not finite of it counts as 0."""
+    return np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).clip(-MAX_GRADIENT, MAX_GRADIENT)
 
 
 def _sides(layout: Layout) -> tuple[Array, Array]:
@@ -339,6 +344,7 @@ class GradientSearch:
 
     def _step_finely(self, gradients: tuple[Array, Array], rate: float) -> None:
         """Take a step as the root of the gradients, of length `rate` where a fibre's gradient is greatest."""
+        gradients = _finite(gradients[0]), _finite(gradients[1])
         largest = np.maximum(*(np.abs(by_x).max(axis=1, keepdims=True) for by_x in gradients))
         for x, (mean, _), by_x in zip(self._adam.variables, self._adam.moments, gradients, strict=True):
             direction = np.sign(by_x) * np.sqrt(np.abs(by_x) / np.where(largest > 0, largest, 1))

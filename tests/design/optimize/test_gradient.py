@@ -277,6 +277,16 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
     assert moved[1:].max() < 1e-9
 
 
+def test_fine_steps_leave_what_has_no_finite_gradient(monkeypatch):
+    """As those of the search do: one value that is none must not lose a pad."""
+    run = begun(SearchSettings(knots=5, steps=1, starts=1), RulesSettings(min_bend_radius_mm=4.0))
+    run.finish()
+    before, gradient = run.morphology().knots, np.full((2, *run.fibres.axes()[0].shape), np.nan)
+    monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: gradient)
+    advance(run, 2)
+    np.testing.assert_array_equal(run.morphology().knots, before)
+
+
 def test_what_fine_steps_do_not_repair_firm_ones_do():
     """Fibres as tangled as after three steps alone; also from a state between the two kinds of steps."""
     run = begun(SearchSettings(knots=9, steps=3, starts=1, seed=3), RulesSettings())
