@@ -456,7 +456,7 @@ class SearchSettings(Settings):
     knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
     steps: Steps = Field(
-        default=None, description="steps of a start of the gradient search, by its contact: 1000, of a shape 2000"
+        default=None, description="steps of a start of the gradient search, by its contact: 1000, of a shape 3000"
     )
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
@@ -465,7 +465,7 @@ class SearchSettings(Settings):
     levels: int = Field(default=LEVELS, ge=1, le=MAX_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")
     max_failures: MaxFailures = Field(
-        default=3, description="failed fibres designed for, each number half as likely as none, or weights of 0, 1, ..."
+        default=3, description="failed fibres designed for, each number as likely as none, or weights of 0, 1, ..."
     )
     noise: float = Field(
         default=0.02, ge=1e-9, le=10, description="standard deviation of noise, share of straight fibres' full scale"

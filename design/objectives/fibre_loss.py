@@ -31,9 +31,9 @@ def failure_masks(fibres: int, n_failed: int, max_subsets: int) -> Array:
 def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
     """Return the probabilities P(k) that k = 0, 1, ... fibres have failed, from their weights.
 
-    Or, for the most failed fibres alone: equal from 1 to it, and twice as much for none.
+    They are equal if only the largest number of failed fibres is given.
     """
-    weights = (2.0, *(1.0,) * max_failures) if isinstance(max_failures, int) else max_failures
+    weights = (1.0,) * (max_failures + 1) if isinstance(max_failures, int) else max_failures
     return tuple(weight / sum(weights) for weight in weights)
 
 

@@ -39,10 +39,10 @@ def test_score_joint_entropy_saturates_before_those_of_families():
 
 
 @pytest.mark.parametrize(
-    ("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [2 / 3, 1 / 3]), ((2, 2), [2 / 5, 1 / 5, 1 / 5, 1 / 5])]
+    ("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [1 / 2, 1 / 2]), ((2, 2), [1 / 4] * 4)]
 )
 def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fibres, weights):
-    """No failure weighs twice as much as 1, 2 and 3 each: in these proportions also where fewer can."""
+    """Each number of failures weighs the same, also where fewer can fail."""
     pad = Morphology.straight(fibres)
     size = PadSettings().for_layout(pad.layout)
     scored = ScoredPad(pad, Contact(), SearchSettings(max_failures=3), RulesSettings(), size)
