@@ -289,9 +289,9 @@ class Training:
         self._directions, self._shrinkage = self._fit_directions()
 
     def weights(self, fitted: Weights) -> Weights:
-        """Return the weights for inputs as they are, of `fitted` ones for scaled ones."""
+        """Return the weights for inputs as they are, of `fitted` parameters for scaled ones."""
         first = self.scale_down(torch.from_numpy(fitted["first.w"]).mT).mT
-        return {**fitted, "first.w": np.ascontiguousarray(first.numpy())}
+        return {**EnsembleMlp.join(fitted), "first.w": np.ascontiguousarray(first.numpy())}
 
     def measure_pace(self) -> float:
         """Return the seconds that a step takes."""
@@ -390,4 +390,5 @@ def fine_tune(
 
     parameters, steps = dict(network.named_parameters()), FINE_TUNING_STEPS
     with one_torch_thread():
-        return fit_network(parameters, loss_of_batch, steps, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)
+        fitted = fit_network(parameters, loss_of_batch, steps, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)
+    return EnsembleMlp.join(fitted)

@@ -38,9 +38,7 @@ def test_score_joint_entropy_saturates_before_those_of_families():
     assert one["published_joint_entropy"] == one["published_entropy"]
 
 
-@pytest.mark.parametrize(
-    ("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [1 / 2, 1 / 2]), ((2, 2), [1 / 4] * 4)]
-)
+@pytest.mark.parametrize(("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [1 / 2, 1 / 2]), ((2, 2), [1 / 4] * 4)])
 def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fibres, weights):
     """Each number of failures weighs the same, also where fewer can fail."""
     pad = Morphology.straight(fibres)

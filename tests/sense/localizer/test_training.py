@@ -28,7 +28,7 @@ def test_forward_agrees_with_torch(seed: int, layers: int, n_timed: int) -> None
     seen = torch.rand(7, n_timed, generator=generator) < 0.6
     x = torch_network.network_inputs(features, fibre_mask, seen)
     expected = ensemble(x[None]).detach().numpy()
-    weights = {name: weight.detach().numpy() for name, weight in ensemble.named_parameters()}
+    weights = EnsembleMlp.join({name: weight.detach().numpy() for name, weight in ensemble.named_parameters()})
     inputs = network.network_inputs(features.numpy(), fibre_mask.numpy(), seen.numpy())
     np.testing.assert_array_equal(inputs, x.numpy())
     outputs = network.forward(weights, inputs)
