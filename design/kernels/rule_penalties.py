@@ -35,19 +35,19 @@ def sum_excess_turns(
     radius: float,
     window: float,
     rolled: float,
-    ways: int,
+    all_bends: bool,
     weight: float,
     by_slope: Any,
     by_arc: Any,
 ) -> float:
     """Integrate the excess of the turn within `window` of arc length over window / radius, relative to that, (F, P).
 
-    Windows begin at samples or, half of them where `ways` is 2, end at samples: the most turn, linear between samples,
+    Windows begin at samples or, half of them for `all_bends`, end at samples: the most turn, linear between samples,
     is in one of both. Fibres go on straight from both ends, by their leads, which they may meet at a corner. They turn
     by `rolled` more, at right angles, except where a window begins on a lead.
     """
     fibres, n = arc.shape
-    size, total = n + 4, 0.0
+    size, total, ways = n + 4, 0.0, 2 if all_bends else 1
     along, heading, turned = np.empty(size), np.zeros(size), np.zeros(size)
     by_along, by_turned = np.empty(size), np.empty(size)
     for f in range(fibres):

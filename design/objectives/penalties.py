@@ -161,8 +161,8 @@ def _bends(fibres: FibreSamples, by: Gradient) -> float | None:
         return None
     radius, window = fibres.scale(radius_mm), radius_mm / fibres.layout.unit_mm / 2
     rolled = radius_mm / 2 / (fibres.pad.bent_radius_mm or math.inf)
-    ways, weight = 1 + fibres.all_bends, 1 / len(fibres.arc) / fibres.mean_run
-    return sum_excess_turns(fibres.slope, fibres.arc, radius, window, rolled, ways, weight, by.slope, by.arc)
+    weight, all_bends = 1 / len(fibres.arc) / fibres.mean_run, fibres.all_bends
+    return sum_excess_turns(fibres.slope, fibres.arc, radius, window, rolled, all_bends, weight, by.slope, by.arc)
 
 
 def _gaps(fibres: FibreSamples, by: Gradient) -> float | None:
