@@ -33,9 +33,9 @@ class _Decorator(Protocol):
     def __call__(self, **options: Any) -> Callable[[_Function], _Function]: ...
 
 
-kernel: _Decorator = partial(njit, cache=True, error_model="numpy", nogil=True)
-"""Compiles a function when it is first called, without Python's checks of divisions and its lock."""
-inner_kernel: _Decorator = partial(kernel, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+kernel: _Decorator = partial(njit, cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
+"""Compiles a function when it is first called, for Python alone, without its checks of divisions and its lock."""
+inner_kernel: _Decorator = partial(kernel, no_cpython_wrapper=True)
 """Compiles a function that only kernels call, in less time: Python, if it called it, would crash."""
 
 
