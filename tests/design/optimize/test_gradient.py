@@ -303,8 +303,8 @@ def test_what_fine_steps_do_not_repair_firm_ones_do():
     ("contact", "others", "steps", "expected"),
     [
         (Contact(), (), None, 1000),
-        (PUBLISHED_CONTACT, (), None, 2000),
-        (Contact(), (PUBLISHED_CONTACT,), None, 2000),
+        (PUBLISHED_CONTACT, (), None, 3000),
+        (Contact(), (PUBLISHED_CONTACT,), None, 3000),
         (PUBLISHED_CONTACT, (), 7, 7),
     ],
 )
