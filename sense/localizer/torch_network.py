@@ -21,7 +21,7 @@ class EnsembleMlp(nn.Module):
     """Ensemble of residual MLPs.
 
     Its parameters are those of `network.Weights`, but one for each hidden layer, `hidden.0.w`: a step would copy the
-    gradients of all layers into one array, a tenth of its time.
+    gradients of all layers into one array, a twentieth of its time.
     """
 
     def __init__(self, weights: Mapping[str, Tensor]) -> None:
