@@ -278,7 +278,7 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
     by_body = [check_triangles(mould.vertices, mould.triangles, plan.settings.printer, genus=0, has_plan=True)]
     for body in others:
         genus = lid_holes(plan) if body.name == "lid" else 0
-        by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus))
+        by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus, is_built=True))
     for body, findings in zip(bodies, by_body, strict=True):
         if broken := [f.message for f in findings if f.name in SOLID_CHECKS and f.status == "fail"]:
             raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")

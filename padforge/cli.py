@@ -166,23 +166,16 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
 
     Exit code 1 if the pad breaks a design rule or its mould fails a check; all files are written nevertheless.
     """
-    from padforge.compile_ahead import compile_beside
     from padforge.design.common.files import locked_folder
     from padforge.design.common.profiling import stage
 
     run = Run(common.load_spec(spec), out, formats=formats, **options)
-    with compile_beside() as compile_rest:
-
-        def echo(lines: str) -> None:
-            compile_rest()  # what comes first is the result of the search
-            click.echo(lines)
-
-        check_run(run)
-        with locked_folder(out):
-            code = run_stages(run, echo, search_progress, partial(common.progress_bar, "training"))
-            if code != common.INTERRUPTED:
-                with stage("report"):
-                    click.echo(f"report: {write_report(out)}")
+    check_run(run)
+    with locked_folder(out):
+        code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
+        if code != common.INTERRUPTED:
+            with stage("report"):
+                click.echo(f"report: {write_report(out)}")
     context.exit(code)
 
 

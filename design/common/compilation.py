@@ -37,6 +37,8 @@ kernel: _Decorator = partial(njit, cache=True, error_model="numpy", nogil=True, 
 """Compiles a function when it is first called, for Python alone, without its checks of divisions and its lock."""
 inner_kernel: _Decorator = partial(kernel, no_cpython_wrapper=True)
 """Compiles a function that only kernels call, in less time: Python, if it called it, would crash."""
+inline_kernel: _Decorator = partial(inner_kernel, inline="always")
+"""Makes a function that one kernel calls a part of that kernel: it is not compiled by itself."""
 
 
 def cache_folder() -> Path:

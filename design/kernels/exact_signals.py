@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.design.kernels.geometry import (
     EPS,
     INVERSE,
@@ -75,7 +75,7 @@ def _rise(span: Any, s: float) -> float:
     return span[3] + s * (2 * span[4] + 3 * s * span[5])
 
 
-@inner_kernel(inline="always")  # else counting references takes most of the time
+@inline_kernel  # else counting references takes most of the time
 def _density(span: Any, s: float, law: Any) -> float:
     """Return the weighted length per unit of s."""
     rise = _rise(span, s)
@@ -322,7 +322,7 @@ def find_one_crossing(
     return u
 
 
-@inner_kernel(inline="always")  # as `_density`
+@inline_kernel  # as `_density`
 def find_stretches_inside(
     span: Any, a: float, b: float, chains: Any, extents: Any, radius: float, tolerance: float, scratch: Any, out: Any
 ) -> Any:
@@ -463,7 +463,7 @@ def centre_cubic(
     return s0
 
 
-@inner_kernel(inline="always")  # as `_density`
+@inline_kernel  # as `_density`
 def _compute_fibre_signal(
     t: Any,
     v: Any,

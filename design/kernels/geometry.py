@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.design.kernels.pchip import piece_of
 from padforge.design.settings import profile_spline
 
@@ -63,7 +63,7 @@ def weigh(square: float, law: Any) -> float:
     return 1 / max(math.sqrt(square), radius / 100)
 
 
-@inner_kernel(inline="always")  # else counting references takes most of the time
+@inline_kernel  # else counting references takes most of the time
 def find_row(square: float, profile: Any, law: Any) -> int:
     """Return the row of a family's profile that applies at a squared distance, below that of its end."""
     row = law.bins[int(square * law.bin_rate)]
@@ -72,7 +72,7 @@ def find_row(square: float, profile: Any, law: Any) -> int:
     return row
 
 
-@inner_kernel(inline="always")  # else counting references takes most of the time
+@inline_kernel  # else counting references takes most of the time
 def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
     """Return a polynomial of a profile, PLAIN or DIRECTED, at the excess x over the squared distance of its row."""
     c, square = column, x * x
@@ -81,7 +81,7 @@ def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
     return low + square * square * high
 
 
-@inner_kernel(inline="always")  # else counting references takes most of the time
+@inline_kernel  # else counting references takes most of the time
 def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
     """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
     square = dt * dt + dv * dv
@@ -239,7 +239,7 @@ def _clip_to_slab(
     return max(low, min(first, last)), min(high, max(first, last))
 
 
-@inner_kernel
+@inline_kernel
 def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[float, float]:
     """Clip 0..1 to where (x, y) + t (dx, dy) is within `radius` of 0; low > high where nowhere."""
     square, middle = dx * dx + dy * dy, x * dx + y * dy
@@ -250,7 +250,7 @@ def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tu
     return max(0.0, (-middle - half) / square), min(1.0, (half - middle) / square)
 
 
-@inner_kernel
+@inline_kernel
 def _clip_to_capsule(
     x: float, y: float, dx: float, dy: float, ex: float, ey: float, width: float
 ) -> tuple[float, float]:

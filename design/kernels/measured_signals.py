@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.design.kernels.exact_gradient import differentiate_cubic
 from padforge.design.kernels.geometry import (
     DEGREE,
@@ -149,7 +149,7 @@ def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any
     return out
 
 
-@inner_kernel
+@inline_kernel
 def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -> int:
     """Return the number of equal pieces of a span, at most `longest` on average."""
     # the slope at which a span rises is a quadratic, which keeps within its Bezier points
@@ -297,7 +297,7 @@ def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any
     return out
 
 
-@inner_kernel
+@inline_kernel
 def _differentiate_elements(
     along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any, out: Any
 ) -> None:
@@ -365,7 +365,7 @@ def elements_gradient(
     return out
 
 
-@inner_kernel
+@inline_kernel
 def _pass_to_knots(
     along: Any, across: Any, slope: Any, elements: Any, starts: Any, element_gradient: Any, law: Any, out: Any
 ) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -64,7 +64,7 @@ def pchip_slopes(t: Any, v: Any, d: Any) -> None:
     d[n - 1] = _end_slope(h0, h1, (v[n - 1] - v[n - 2]) / h0, (v[n - 2] - v[n - 3]) / h1)
 
 
-@inner_kernel
+@inline_kernel
 def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream: float, out: Any) -> None:
     """Add the derivatives of `_end_slope` by its arguments, times `upstream`, to out (4,)."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
@@ -80,7 +80,7 @@ def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream
     out[3] -= share * h0
 
 
-@inner_kernel
+@inline_kernel
 def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: Any) -> None:
     """Add the gradient of sum(upstream * d) of `pchip_slopes`, by t and by v."""
     n = len(t)

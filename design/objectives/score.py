@@ -1,7 +1,7 @@
 """Scores of a pad: the table of terms that `score`, the searches, design.json and the report have in common.
 
 To add a term, write a function of a `ScoredPad` and add a row to TERMS; `score`, design.json and the report then have
-it. For a search to minimise it as well, name in the row the key of `[search]` that holds its weight (added to
+it (published ones only `score`, and designs for a shape). For a search to minimise it as well, name in the row the key of `[search]` that holds its weight (added to
 `SearchSettings`, 0 by default) and `loss`, its value and gradient at a step.
 
 To add a rule, see `padforge.design.objectives.rules`.
@@ -85,6 +85,7 @@ class Term:
     weight: str | None = None  # key of `[search]` by which a search weighs it; None if it does not
     # its value at a step of a search, for a contact and for what is pressed, and its gradient (3, F, n) by the curves
     loss: Callable[[FibreCurves, Contact, PadSettings], tuple[float, Array]] | None = None
+    is_published: bool = False  # whether it is of the published method, whose contact is a shape
 
 
 def sharpness(signals: Array) -> float:
@@ -130,18 +131,27 @@ TERMS = (
     ),
     Term("penalty", "penalty of {} in the gradient search", _penalties),
     Term(
-        "published_entropy", "joint entropy of the signals of each family, summed, bits", lambda s: s.published.entropy
+        "published_entropy",
+        "joint entropy of the signals of each family, summed, bits",
+        lambda s: s.published.entropy,
+        is_published=True,
     ),
-    Term("published_sharpness", "sharpness Z as published", lambda s: s.published.sharpness),
-    Term("published_disorder", "disorder C as published", lambda s: s.published.disorder),
-    Term("published_objective", "objective as published", lambda s: s.published.objective),
+    Term("published_sharpness", "sharpness Z as published", lambda s: s.published.sharpness, is_published=True),
+    Term("published_disorder", "disorder C as published", lambda s: s.published.disorder, is_published=True),
+    Term("published_objective", "objective as published", lambda s: s.published.objective, is_published=True),
     Term(
         "published_joint_entropy",
         "joint entropy of the signals of all fibres, bits; its 49 presses limit it to log2 49 = 5.61, which straight "
         "fibres and all published pads reach",
         lambda s: s.published.joint_entropy,
+        is_published=True,
     ),
 )
+
+
+def terms_of(contact: Contact) -> list[str]:
+    """Return the names of the rows of TERMS for pads designed for a contact: published ones are of a shape alone."""
+    return [term.name for term in TERMS if contact.model == "shape" or not term.is_published]
 
 
 def weighted_terms(search: SearchSettings) -> Iterator[tuple[float, Term]]:

@@ -28,7 +28,7 @@ from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
-from padforge.design.objectives.score import ScoredPad
+from padforge.design.objectives.score import ScoredPad, terms_of
 from padforge.design.optimize.gradient import HISTORY_STEPS, GradientSearch, is_strict
 from padforge.design.optimize.problem import SearchProblem, build_problem
 from padforge.design.paths.keep_outs import straight_paths
@@ -206,7 +206,8 @@ class Candidate:
 
     def to_result(self, straight: "Candidate") -> SearchResult:
         """Return the result of a search that ends with it."""
-        terms, beside = self.scored[0].terms(), straight.scored[0].terms(("expected_error_mm", "ambiguity_mm"))
+        terms = self.scored[0].terms(terms_of(self.problem.contacts[0]))
+        beside = straight.scored[0].terms(("expected_error_mm", "ambiguity_mm"))
         return SearchResult(self.pad, terms, self.violations, self.name, beside, self.problem.rules.enforce)
 
 

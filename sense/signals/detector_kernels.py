@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
 
 FIBRE = np.dtype(
     [
@@ -125,7 +125,7 @@ def initial_state(n_fibres: int) -> tuple[Any, Any]:
     return fibres, pad[0]
 
 
-@inner_kernel
+@inline_kernel
 def ingest(fibres: Any, pad: Any, row: Any, time_s: float) -> bool:
     """Add a reading (C,) to the present block; return whether that completes it with some fibre in it."""
     if pad.block_count == 0:
@@ -158,7 +158,7 @@ def ingest(fibres: Any, pad: Any, row: Any, time_s: float) -> bool:
     return complete and present
 
 
-@inner_kernel
+@inline_kernel
 def kalman_predict(fibres: Any, pad: Any, time_s: float) -> None:
     """Predict all levels for `time_s`; forget fibres that were missing for long."""
     floor = max(MIN_SHARE * pad.typical_v, MIN_V, pad.resolution_v / 2 if pad.resolution_v < np.inf else 0.0)
@@ -237,7 +237,7 @@ def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
         fibre.run_square_sum = fibre.run_sum**2
 
 
-@inner_kernel
+@inline_kernel
 def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
     """Extend the run; return its common signal (mean product of two blocks: no spike), and the distance of the last."""
     common, distance = 0.0, 0.0
@@ -255,7 +255,7 @@ def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
     return common, distance
 
 
-@inner_kernel
+@inline_kernel
 def has_changed(fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_limit: Any) -> bool:
     """Test the present block; return whether the levels have changed since reading `pad.run_first`."""
     n_present, chi_square = 0, 0.0
@@ -333,7 +333,7 @@ def _confirmed_step(fibre: Any) -> float:
     return max(now, before) if now < 0 and before < 0 else 0.0
 
 
-@inner_kernel
+@inline_kernel
 def track_peak(fibres: Any, pad: Any, time_s: float) -> None:
     """Store where a change is farthest in two blocks in a row: a single one may be a spike."""
     size = 0.0
@@ -347,7 +347,7 @@ def track_peak(fibres: Any, pad: Any, time_s: float) -> None:
         pad.after_peak = pad.block_first
 
 
-@inner_kernel
+@inline_kernel
 def _has_settled(fibres: Any, pad: Any, time_s: float, reject_limit: Any) -> bool:
     """Return whether a change has ended."""
     n_present, chi_square = 0, 0.0
@@ -367,7 +367,7 @@ def _has_settled(fibres: Any, pad: Any, time_s: float, reject_limit: Any) -> boo
     return True
 
 
-@inner_kernel
+@inline_kernel
 def _learn_touch(fibres: Any, pad: Any) -> None:
     """Learn direction and size from a touch that has settled."""
     pad.n_presses += 1
@@ -395,14 +395,14 @@ def _replace_levels(fibres: Any, levels: Any) -> float:
     return total
 
 
-@inner_kernel
+@inline_kernel
 def emit(events: Any, count: Any, down: bool, reading: int) -> int:
     """Append an event; return their number."""
     events[count, 0], events[count, 1] = down, reading
     return count + 1
 
 
-@kernel
+@inline_kernel
 def classify(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
     """Classify a change under way, as soon as it is clear what it is; return the number of events."""
     has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
@@ -426,14 +426,14 @@ def classify(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, c
     return count
 
 
-@inner_kernel
+@inline_kernel
 def _set_press_step(fibres: Any, keep: float) -> None:
     """Add the residual to a share of the step of the press."""
     for fibre in fibres:
         fibre.press_step = keep * fibre.press_step + (0.0 if np.isnan(fibre.residual) else fibre.residual)
 
 
-@kernel
+@inline_kernel
 def commit(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
     """Change the state by a change that has settled; return the number of events."""
     if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, released meanwhile
@@ -460,7 +460,7 @@ def commit(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int
     return count
 
 
-@inner_kernel
+@inline_kernel
 def _process_block(
     fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_limit: Any, events: Any, count: Any
 ) -> int:

@@ -93,11 +93,11 @@ def test_inner_kernels_are_called_by_kernels_alone() -> None:
         decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
         return " ".join(ast.unparse(decorator).split("(")[0] for decorator in decorators)
 
-    inner = {name for source in sources for name in re.findall(r"^@inner_kernel.*\ndef (\w+)", source, re.MULTILINE)}
+    inner = {name for source in sources for name in re.findall(r"^@in(?:ner|line)_kernel.*\ndef (\w+)", source, re.MULTILINE)}
     trees = [ast.parse(source) for source in sources + tests if any(name in source for name in inner)]
     assert {"piece_of", "select_frame"} <= inner
     for tree in trees:
-        kernels = [node for node in ast.walk(tree) if kind(node) in ("kernel", "inner_kernel", "njit")]
+        kernels = [node for node in ast.walk(tree) if kind(node) in ("kernel", "inner_kernel", "inline_kernel", "njit")]
         compiled = {id(child) for node in kernels for child in ast.walk(node)}
         for node in (node for node in ast.walk(tree) if id(node) not in compiled):
             assert not (isinstance(node, ast.alias) and node.name in inner and node.asname)
