@@ -43,3 +43,11 @@ def test_devcontainer_installs_as_the_readme_does_for_development() -> None:
     assert line
     container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8"))
     assert container["postCreateCommand"] == line[1].replace("'.[test]'", "-e '.[test]'")
+
+
+def test_pre_commit_runs_the_ruff_of_the_constraints() -> None:
+    pinned = re.search(r"^ruff==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    hooked = re.search(r"rev: v(\S+)", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
+    assert pinned
+    assert hooked
+    assert hooked[1] == pinned[1]
