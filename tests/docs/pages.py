@@ -6,8 +6,15 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(
-    r"(?:^<!-- run(?P<how>: [^\n]*)? -->\n+)?^```(?P<language>\w*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL
+    r"(?:^<!-- (?P<kind>run|file)(?:: (?P<how>[^\n]*))? -->\n+)?"
+    r"^```(?P<language>\w*)(?: title=\"(?P<title>[^\"\n]+)\")?\n(?P<body>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
 )
+
+
+def command_lines(body: str) -> list[str]:
+    """Return the commands of a block of shell, each as one line."""
+    return body.replace("\\\n", " ").splitlines()
 
 
 def relative(path: Path) -> str:

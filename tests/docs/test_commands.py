@@ -12,14 +12,14 @@ import click
 import pytest
 
 from padforge.cli import cli
-from tests.docs.pages import BLOCK, PAGES, relative
+from tests.docs.pages import BLOCK, PAGES, command_lines, relative
 
 
 def commands(text: str) -> Iterator[tuple[str, bool]]:
     """Every `padforge ...` of a page: the lines of its shell blocks, and, where it need not be whole, of the text."""
     for block in BLOCK.finditer(text):
-        if block["language"] == "sh":
-            lines = block["body"].replace("\\\n", " ").splitlines()
+        if block["language"] in {"sh", "powershell"}:
+            lines = command_lines(block["body"])
             yield from ((line, True) for line in lines if re.search(r"(^|[\s/])padforge ", f"{line} "))
     yield from ((found, False) for found in re.findall(r"`(padforge [^`]+)`", BLOCK.sub("", text)))
 
@@ -69,6 +69,13 @@ def test_commands_on_pages_parse(page: Path, parser: click.Command) -> None:
                 if not whole and isinstance(error, click.MissingParameter | click.exceptions.NoArgsIsHelpError):
                     continue
                 pytest.fail(f"{relative(page)}: {command}: {error.format_message()}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_commands_on_pages_quote_commas(page: Path) -> None:
+    """PowerShell takes an argument with a comma apart, unless it is in quotes."""
+    for command, whole in commands(page.read_text(encoding="utf-8")):
+        assert not whole or "," not in re.sub(r"'[^']*'|\"[^\"]*\"", "", command), f"{relative(page)}: {command}"
 
 
 @pytest.mark.parametrize(

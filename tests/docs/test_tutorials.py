@@ -1,30 +1,36 @@
 """Tutorials and how-to pages print what they show.
 
-A block of shell commands after a comment `<!-- run -->` is run here, after all such blocks above it and those of the
-page that it continues. What it prints must be what the page shows below: text and whole numbers exactly, decimals
-exactly or within the share of a comment like `<!-- run: decimals within 20 % -->`; probabilities such as 1e8 may then
-differ as well. Times always may. After `<!-- run: numbers vary -->` it prints the same kinds of lines, whatever their
-numbers and how many there are: a search on another processor rounds differently, and ends in another pad. With
-REWRITE_DOCS set in the environment the pages are rewritten by what is printed.
+A page is followed from its first block to its last, in the folder that the page has left which it continues:
+
+- A block with a title is written to the file of that name.
+- A block of commands after a comment `<!-- run -->` is run. Each line is a `padforge ...` or a `python FILE`, since all
+  shells run these alike. What they print must be what the block of text below shows. `<!-- run: exit code 1 -->` is the
+  code of the last command; all others end with 0.
+- A block of text after `<!-- file: FILE -->` shows lines of that file, or the files of a folder.
+
+Text and whole numbers must be as shown, decimals exactly or within the share of a comment like `<!-- run: decimals
+within 20 % -->`; probabilities such as 1e8 may then differ as well. Times always may. After `<!-- run: numbers vary
+-->` the same kinds of lines are printed, whatever their numbers and how many there are: a search on another processor
+rounds differently, and ends in another pad. A line `...` stands for any lines. With REWRITE_DOCS set in the environment
+the pages are rewritten by what is printed.
 """
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
-import time
-from collections.abc import Iterator
-from contextlib import chdir
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 from unittest.mock import patch
 
 import pytest
 
 from padforge.sense.health import trace_model
-from tests.docs.pages import BLOCK, ROOT, relative
-from tests.helpers.door import call
+from tests.docs.pages import BLOCK, ROOT, command_lines, relative
+from tests.helpers.door import Ended, called
 from tests.helpers.once import Once
 
 BASES = {
@@ -45,54 +51,67 @@ SHORTER = 1 if REWRITE else 10
 """What finds faults learns for this share of its time, which no page shows."""
 SECONDS = re.compile(r"(?<![\w.])\d+(\.\d+)? s\b")
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?")
-PROGRAM = """#!/bin/sh
-counter={0}
-printf '%s\\n' "$PWD" "$@" > "$counter/asking" && mv "$counter/asking" "$counter/asked"
-until [ -e "$counter/code" ]; do sleep 0.05; done
-cat "$counter/err" >&2
-cat "$counter/out"
-read -r code < "$counter/code"
-rm "$counter/code"
-exit "$code"
-"""
-"""What the shell finds as `padforge`: it asks this process, which has all libraries loaded, and says what it says."""
 OUTPUT = re.compile(r"\s*```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-class Run(NamedTuple):
-    """A block that is run: its commands, what the page shows below and where, and how that may differ."""
+class Shown(NamedTuple):
+    """Lines that a page shows: where, of what, and how what is printed may differ from them."""
 
-    commands: str
-    shown: str
-    begin: int
+    text: str
+    begin: int  # in the text of the page; -1 if it shows nothing
+    is_part: bool  # of a file, which may have more
     share: float  # by which decimals may differ
     varies: bool  # whether all numbers may
 
-
-def runs(text: str) -> Iterator[Run]:
-    """The blocks of a page that are run, in order."""
-    for block in BLOCK.finditer(text):
-        if not block[0].startswith("<!-- run"):
-            continue
-        how = block["how"] or ""
-        output = OUTPUT.match(text, block.end())
-        share = re.search(r"decimals within (\d+) %", how)
-        shown, begin = (output[1], output.start(1)) if output else ("", -1)
-        yield Run(block["body"], shown, begin, int(share[1]) / 100 if share else 0.0, "numbers vary" in how)
+    @property
+    def lines(self) -> list[str]:
+        lines = self.text.strip().splitlines()
+        return ["...", *lines, "..."] if self.is_part else lines
 
 
-def difference(block: Run, printed: str) -> str:
+def shown(text: str, begin: int, how: str, is_part: bool = False) -> Shown:
+    share = re.search(r"decimals within (\d+) %", how)
+    return Shown(text, begin, is_part, int(share[1]) / 100 if share else 0.0, "numbers vary" in how)
+
+
+def difference(page: Shown, printed: str) -> str:
     """Where what is printed differs from what a page shows; empty if it does not."""
-    pages, prints = (SECONDS.sub("# s", text).strip().splitlines() for text in (block.shown, printed))
-    if block.varies:
-        odd = ({kind(line) for line in pages} ^ {kind(line) for line in prints}) - VERDICTS
+    shows = [SECONDS.sub("# s", line) for line in page.lines]
+    prints = [SECONDS.sub("# s", line) for line in printed.strip().splitlines()]
+    if "..." in shows:
+        is_same = same_kind if page.varies else lambda one, other: same(one, other, page.share)
+        return "" if find_lines(shows, prints, is_same) else f"no lines like those of the page:\n{printed}"
+    if page.varies:
+        odd = ({kind(line) for line in shows} ^ {kind(line) for line in prints}) - VERDICTS
         return f"{sorted(odd)} are lines of the page or printed, not both" if odd else ""
-    if len(pages) != len(prints):
-        return f"{len(prints)} lines, the page has {len(pages)}"
-    for page, line in zip(pages, prints, strict=True):
-        if not (page.rstrip() == line.rstrip() or (block.share and alike(page, line, block.share))):
-            return f"{line!r}, the page has {page!r}"
+    if len(shows) != len(prints):
+        return f"{len(prints)} lines, the page has {len(shows)}"
+    for line, other in zip(shows, prints, strict=True):
+        if not same(line, other, page.share):
+            return f"{other!r}, the page has {line!r}"
     return ""
+
+
+def find_lines(shows: list[str], prints: list[str], is_same: Callable[[str, str], bool]) -> list[str] | None:
+    """Return what is printed where a page shows lines, with its `...` for the rest; None if it is not there."""
+    if not shows or shows == ["..."]:
+        return shows if shows or not prints else None
+    if shows[0] == "...":
+        ends = (find_lines(shows[1:], prints[skipped:], is_same) for skipped in range(len(prints)))
+        return next((["...", *end] for end in ends if end is not None), None)
+    if not (prints and is_same(shows[0], prints[0])):
+        return None
+    end = find_lines(shows[1:], prints[1:], is_same)
+    return None if end is None else [prints[0], *end]
+
+
+def same(page: str, line: str, share: float) -> bool:
+    """Whether two lines are equal, or alike within a share of their decimals."""
+    return page.rstrip() == line.rstrip() or bool(share and alike(page, line, share))
+
+
+def same_kind(page: str, line: str) -> bool:
+    return kind(page) == kind(line)
 
 
 VERDICTS = {
@@ -146,13 +165,7 @@ def followed(page: str, once: Once) -> tuple[Path, str]:
     return once(page, make)
 
 
-needs_unix_shell = pytest.mark.skipif(
-    not all(map(shutil.which, ("sh", "awk", "sed"))), reason="needs the tools of a Unix shell"
-)
-
-
 @pytest.mark.slow
-@needs_unix_shell
 @pytest.mark.parametrize("page", BASES)
 def test_pages_print_what_they_show(page: str, once: Once) -> None:
     _, wrong = followed(page, once)
@@ -160,54 +173,74 @@ def test_pages_print_what_they_show(page: str, once: Once) -> None:
 
 
 def follow(page: Path, folder: Path) -> str:
-    """Run the blocks of a page; where the first is not as the page says, empty if all are."""
+    """Do what the blocks of a page say; where the first is not as the page shows, empty if all are."""
     text = page.read_text(encoding="utf-8")
-    blocks = list(runs(text))
-    assert blocks, f"{relative(page)}: no block is run"
-    moved = 0
+    blocks = [block for block in BLOCK.finditer(text) if block["kind"] or block["title"]]
+    assert any(block["kind"] == "run" for block in blocks), f"{relative(page)}: no block is run"
+    wrong: list[tuple[Shown, str]] = []
     for block in blocks:
-        printed = run(block.commands, folder)
-        wrong = difference(block, printed)
-        if wrong and not REWRITE:
-            return f"{relative(page)}: {block.commands}printed {wrong}"
-        if wrong and block.begin >= 0:
-            begin, end = block.begin + moved, block.begin + moved + len(block.shown)
-            text = text[:begin] + printed.rstrip() + "\n" + text[end:]
-            moved += len(printed.rstrip()) + 1 - len(block.shown)
+        if block["title"]:
+            (folder / block["title"]).write_text(block["body"], encoding="utf-8")
+            continue
+        how = block["how"] or ""
+        if block["kind"] == "file":
+            lines = shown(block["body"], block.start("body"), how, is_part=True)
+            printed = contents(folder, how.partition(",")[0])
+        else:
+            output = OUTPUT.match(text, block.end())
+            lines = shown(output[1], output.start(1), how) if output else shown("", -1, how)
+            code = re.search(r"exit code (\d+)", how)
+            printed = run(block["body"], folder, int(code[1]) if code else 0)
+        if differs := difference(lines, printed):
+            if not REWRITE:
+                return f"{relative(page)}: {block[0]}\nprinted {differs}"
+            wrong.append((lines, printed))
+    for lines, printed in reversed(wrong):
+        text = rewritten(text, lines, printed)
     if REWRITE:
         page.write_text(text, encoding="utf-8")
     return ""
 
 
-def run(commands: str, folder: Path) -> str:
-    """What shell commands print, errors included; they must succeed."""
-    with TemporaryDirectory() as name, (Path(name) / "printed").open("w+", encoding="utf-8") as printed:
-        (program := Path(name) / "padforge").write_text(PROGRAM.format(name), encoding="utf-8")
-        program.chmod(0o755)
-        environment = os.environ | {"PATH": os.pathsep.join((name, os.environ["PATH"])), "COLUMNS": "80"}
-        with patch.dict(os.environ, environment):
-            shell = subprocess.Popen(["sh", "-c", commands], cwd=folder, stdout=printed, stderr=subprocess.STDOUT)
-            try:
-                while shell.poll() is None:
-                    answer(Path(name))
-                    time.sleep(0.01)
-            finally:
-                shell.kill()
-                shell.wait()
-        text = Path(printed.name).read_text(encoding="utf-8")
-    assert shell.returncode == 0, f"{commands}{text}"
-    return text
+def rewritten(text: str, page: Shown, printed: str) -> str:
+    """Return the text of a page with what is printed, where it shows something."""
+    if page.begin < 0:
+        return text
+    prints = printed.rstrip().splitlines()
+    if "..." in page.lines:
+        prints = find_lines(page.lines, printed.strip().splitlines(), same_kind)
+        assert prints, f"no lines of the kinds that the page shows:\n{page.text}\nin\n{printed}"
+        prints = prints[1:-1] if page.is_part else prints
+    return text[: page.begin] + "\n".join(prints) + "\n" + text[page.begin + len(page.text) :]
 
 
-def answer(counter: Path) -> None:
-    """Run what the program in the shell was asked for, if anything, in this process."""
-    if not (counter / "asked").exists():
-        return
-    here, *words = (counter / "asked").read_text(encoding="utf-8").splitlines()
-    (counter / "asked").unlink()
-    with chdir(here), patch.object(trace_model, "MAX_STEPS", trace_model.MAX_STEPS // SHORTER):
-        ended = call(*words)
-    (counter / "err").write_text(ended.err, encoding="utf-8")
-    (counter / "out").write_text(ended.out, encoding="utf-8")
-    (counter / "ending").write_text(f"{ended.code}\n", encoding="utf-8")
-    (counter / "ending").rename(counter / "code")
+def contents(folder: Path, name: str) -> str:
+    """The text of a file, or the files of a folder, by their names in order."""
+    path = folder / name
+    if path.is_dir():
+        files = (each.relative_to(folder).as_posix() for each in path.rglob("*") if each.is_file())
+        return "\n".join(sorted(files))
+    return path.read_text(encoding="utf-8")
+
+
+def run(commands: str, folder: Path, code: int) -> str:
+    """What commands print, errors first; the last one ends with `code`, and those before with 0."""
+    texts = []
+    calls = [shlex.split(line) for line in command_lines(commands)]
+    for index, (program, *words) in enumerate(calls):
+        ended = {"padforge": run_padforge, "python": run_python}[program](words, folder)
+        texts.append(ended.err + ended.out)
+        assert ended.code == (code if index == len(calls) - 1 else 0), f"{commands}{ended}"
+    return "".join(texts)
+
+
+def run_padforge(words: list[str], folder: Path) -> Ended:
+    """Run padforge in this process, which has all libraries loaded."""
+    steps = patch.object(trace_model, "MAX_STEPS", trace_model.MAX_STEPS // SHORTER)
+    with patch.dict(os.environ, COLUMNS="80"), steps:
+        return called(*words, cwd=folder)
+
+
+def run_python(words: list[str], folder: Path) -> Ended:
+    ended = subprocess.run([sys.executable, *words], cwd=folder, capture_output=True, text=True, check=False)
+    return Ended(ended.returncode, ended.stdout, ended.stderr)

@@ -1,7 +1,6 @@
 """The JSON Schema of pad.toml, which editors read: valid, and as strict as the settings as far as one key goes."""
 
 import json
-import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,16 +17,14 @@ from tests.docs.pages import BLOCK, PAGES, relative
 from tests.helpers.door import called
 
 MODELS = section_models()
-WRITTEN = re.compile(r"> \S+\.toml <<'END'\n(.*?)^END$", re.MULTILINE | re.DOTALL)  # by a shell
 
 
 def documented() -> Iterator[tuple[str, str]]:
-    """Every settings file on the pages, as a block of TOML or written by a shell, with the name of its page."""
+    """Every settings file on the pages, with the name of its page."""
     for page in PAGES:
         for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
             if block["language"] == "toml":
                 yield relative(page), block["body"]
-            yield from ((relative(page), text) for text in WRITTEN.findall(block["body"]))
 
 
 @pytest.fixture(scope="module")
