@@ -32,14 +32,15 @@ if str(ROOT) not in padforge.__path__:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True, max_examples=40)
 hypothesis.settings.load_profile("padforge")
 
-from padforge.design.common import compilation  # noqa: E402
+from padforge.design.common import compilation, plotting  # noqa: E402
 from tests.helpers import kernels  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
 compilation.PATIENCE_S = 3600.0  # what a test compiles is no output of the command that it looks at
+plotting.DPI = 40  # pixels take most of the time of a picture, and no test looks at them
 PUBLISHED = ROOT.parent / "shared" / "data" / "published"
 
 
