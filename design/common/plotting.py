@@ -13,10 +13,10 @@ HORIZONTAL, VERTICAL = "#0b6e99", "#d9730d"
 ALARM, INK, FAINT, PAPER = "#c4161c", "#37352f", "#d3d1cb", "#f7f6f3"
 CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")  # of a figure, in order
 
-DPI = 150  # of pictures
+DPI = 150  # of pictures, unless they say another
 
 
-def save_figure(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
     """Save a figure as .svg or .png, atomically and byte-reproducibly (no dates, stable ids).
 
     A PNG has a palette of 256 colours, a third of the size without visible difference.
@@ -32,7 +32,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
                 figure.savefig(temporary, metadata={"Date": None})
             return
         canvas = FigureCanvasAgg(figure)
-        figure.set_dpi(DPI)
+        figure.set_dpi(dpi or DPI)
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         reduced = picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
