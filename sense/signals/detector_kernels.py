@@ -85,7 +85,7 @@ INVERTED, MIN_INVERTED = 1.2, 0.4
 
 
 class State(IntEnum):
-    """States of the pad; `classify` and `commit` hold the transitions.
+    """States of the pad; `classify_change` and `commit_change` hold the transitions.
 
     state      change                                           events            next state
     REST       in the direction of touches                      touch             PRESSED
@@ -403,7 +403,7 @@ def emit(events: Any, count: Any, down: bool, reading: int) -> int:
 
 
 @inline_kernel
-def classify(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
+def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
     """Classify a change under way, as soon as it is clear what it is; return the number of events."""
     has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
     agreement = _agreement(fibres) if has_direction else 1.0
@@ -434,7 +434,7 @@ def _set_press_step(fibres: Any, keep: float) -> None:
 
 
 @inline_kernel
-def commit(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
+def commit_change(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
     """Change the state by a change that has settled; return the number of events."""
     if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, released meanwhile
         pad.state = State.REST
@@ -482,9 +482,9 @@ def _process_block(
         track_peak(fibres, pad, time_s)
         settled = _has_settled(fibres, pad, time_s, reject_limit)
         if pad.change == Change.UNKNOWN:
-            count = classify(fibres, pad, time_s, settled, events, count)
+            count = classify_change(fibres, pad, time_s, settled, events, count)
         if settled:
-            count = commit(fibres, pad, time_s, events, count)
+            count = commit_change(fibres, pad, time_s, events, count)
             pad.run, pad.in_change = 0, False
             for fibre in fibres:
                 _start_track(fibre, time_s, 0.0 if np.isnan(fibre.residual) else fibre.residual / fibre.scale)

@@ -174,8 +174,10 @@ def forward_pass_l1(readings: Any, lam: float, message: Any, low: Any, high: Any
     room = n_lower + n_upper + len(readings)
     lower, lower_heights = np.empty(room), np.empty(room)
     upper, upper_heights = np.empty(room), np.empty(room)
-    lower[:n_lower], lower_heights[:n_lower] = message[1]
-    upper[:n_upper], upper_heights[:n_upper] = message[2]
+    for k in range(n_lower):  # one by one: assigning slices compiles the wording of an error about their shapes
+        lower[k], lower_heights[k] = message[1][0, k], message[1][1, k]
+    for k in range(n_upper):
+        upper[k], upper_heights[k] = message[2][0, k], message[2][1, k]
     for i in range(len(readings)):
         low[i], high[i] = -np.inf, np.inf
         reading = readings[i]
@@ -212,8 +214,11 @@ def forward_pass_l1(readings: Any, lam: float, message: Any, low: Any, high: Any
                 high[i] = _halfway(position, inner)
         if len(ends):
             ends[i] = _minimum_l1(level, lower, n_lower, upper, n_upper)
-    below = np.stack((lower[:n_lower], lower_heights[:n_lower]))
-    above = np.stack((upper[:n_upper], upper_heights[:n_upper]))
+    below, above = np.empty((2, n_lower)), np.empty((2, n_upper))
+    for k in range(n_lower):
+        below[0, k], below[1, k] = lower[k], lower_heights[k]
+    for k in range(n_upper):
+        above[0, k], above[1, k] = upper[k], upper_heights[k]
     return _minimum_l1(level, lower, n_lower, upper, n_upper), (np.array([greatest, level]), below, above)
 
 
@@ -272,7 +277,9 @@ def forward_pass_l2(readings: Any, lam: float, message: Any, low: Any, high: Any
     origin, old_knots = message[0][0], message[1]
     room = len(readings)
     knots = np.empty((4, old_knots.shape[1] + 2 * room))
-    knots[:, room : room + old_knots.shape[1]] = old_knots
+    for k in range(old_knots.shape[1]):  # one by one, as in `forward_pass_l1`
+        for row in range(4):
+            knots[row, room + k] = old_knots[row, k]
     first, last = room, room + old_knots.shape[1] - 1
     for i in range(len(readings)):
         low[i], high[i] = -np.inf, np.inf

@@ -1,11 +1,12 @@
 """Compiles what numba has not kept from an earlier session, before every worker would do the same.
 
-`python -m tests.helpers.kernels` does it by hand.
+`python -m tests.helpers.kernels` does it by hand; with the name of a task, for that alone.
 """
 
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +28,17 @@ def missing() -> bool:
 
 
 def compile_all() -> None:
-    """Compile in a process of its own, so that nothing is imported before the tests say so."""
-    subprocess.run([sys.executable, __file__], check=False)
+    """Compile in processes of their own, one a task, so that nothing is imported before the tests say so."""
+    processes = [subprocess.Popen([sys.executable, __file__, name]) for name in TASKS]
+    for process in processes:
+        process.wait()
 
 
-def use_kernels() -> None:
-    """Call what has kernels: contacts, objectives, a search, a mould's check, filters, a calibration and a twin."""
-    from padforge import design, fabricate, sense
+def use_design() -> None:
+    """Call contacts, objectives, rules, and a search under a layer and under a shape."""
+    from padforge import design
     from padforge.design.objectives.ambiguity import ambiguity_map
     from padforge.design.settings import PUBLISHED_CONTACT
-    from padforge.sense.deploy.streaming import ThresholdDetector
 
     pad, presses = design.Morphology.random(2, 3, seed=1), np.array([[1.0, 1.0], [1.5, 2.0]])
     contacts = design.Contact(), PUBLISHED_CONTACT, PUBLISHED_CONTACT.model_copy(update={"sides": None})
@@ -50,21 +52,30 @@ def use_kernels() -> None:
     for contact in contacts[:2]:
         settings = design.SearchSettings(knots=1, starts=1, steps=2, max_failures=1)
         design.search(design.PadSettings(grid=1), contact, settings)
+
+
+def use_other_stages() -> None:
+    """Call filters, the check of a mesh, a calibration and a twin."""
+    from padforge import design, fabricate, sense
+
+    readings = np.random.default_rng(0).normal(size=(50, 1))
+    sense.total_variation(readings, 2.0)
+    sense.total_variation(readings, 2.0, "squares", causal=True)
+    sense.running_median(readings, 5)
     with tempfile.TemporaryDirectory() as folder:
         fabricate.build(design.Morphology.straight(1), folder, ["stl"])
         fabricate.check_mesh(Path(folder) / "mould.stl")
     straight = design.Morphology.straight(2)
     recording = sense.simulate(straight, sense.RigSettings(presses=60))
-    sense.total_variation(recording.readings, 2.0)
-    sense.total_variation(recording.readings, 2.0, "squares", causal=True)
-    sense.running_median(recording.readings, 5)
-    sense.detect_presses(recording.readings, recording.times_s)
     quick = sense.LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=1)
-    localizer, _ = sense.calibrate(recording, quick)
-    localizer.predict(recording)
-    ThresholdDetector.fit(recording, np.arange(20))
+    sense.calibrate(recording, quick)
     sense.identify(recording, straight)
 
 
+TASKS: Mapping[str, Callable[[], None]] = {"design": use_design, "other stages": use_other_stages}
+"""What calls the kernels, at once; the few that both call are compiled twice."""
+
+
 if __name__ == "__main__":
-    use_kernels()
+    for name in sys.argv[1:] or TASKS:
+        TASKS[name]()

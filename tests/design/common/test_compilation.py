@@ -93,7 +93,9 @@ def test_inner_kernels_are_called_by_kernels_alone() -> None:
         decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
         return " ".join(ast.unparse(decorator).split("(")[0] for decorator in decorators)
 
-    inner = {name for source in sources for name in re.findall(r"^@in(?:ner|line)_kernel.*\ndef (\w+)", source, re.MULTILINE)}
+    inner = {
+        name for source in sources for name in re.findall(r"^@in(?:ner|line)_kernel.*\ndef (\w+)", source, re.MULTILINE)
+    }
     trees = [ast.parse(source) for source in sources + tests if any(name in source for name in inner)]
     assert {"piece_of", "select_frame"} <= inner
     for tree in trees:

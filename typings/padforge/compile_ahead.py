@@ -1,1 +1,0 @@
-../../padforge/compile_ahead.py
