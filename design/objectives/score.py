@@ -1,8 +1,9 @@
 """Scores of a pad: the table of terms that `score`, the searches, design.json and the report have in common.
 
 To add a term, write a function of a `ScoredPad` and add a row to TERMS; `score`, design.json and the report then have
-it (published ones only `score`, and designs for a shape). For a search to minimise it as well, name in the row the key of `[search]` that holds its weight (added to
-`SearchSettings`, 0 by default) and `loss`, its value and gradient at a step.
+it (published ones only `score`, and designs for a shape). For a search to minimise it as well, name in the row the key
+of `[search]` that holds its weight (added to `SearchSettings`, 0 by default) and `loss`, its value and gradient at a
+step.
 
 To add a rule, see `padforge.design.objectives.rules`.
 """

@@ -12,7 +12,6 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from typing import Any, Literal, Protocol
 import padforge
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
+from padforge.sense.rig import clock
 
 Pose = tuple[float, float, float, float, float, float]
 """x, y, z in mm and a rotation vector in radians."""
@@ -192,7 +192,7 @@ class SerialStream:
                 data += self.serial.read(self.serial.in_waiting)
         except OSError as error:
             raise self._lost(error) from error
-        return time.monotonic(), data
+        return clock.now(), data
 
     def send(self, data: bytes) -> None:
         """Send all of `data`."""

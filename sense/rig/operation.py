@@ -5,7 +5,6 @@ An adaptive plan moves its presses, as the recording goes on, to where a localiz
 
 import logging
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
@@ -33,6 +32,7 @@ from padforge.sense.recording.press_plan import (
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import check_new_folder, check_new_recording
+from padforge.sense.rig import clock
 from padforge.sense.rig.config import RigConfig, load_or_make_plan, locate_on_bed, open_recorder, plan_notice
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
@@ -189,14 +189,14 @@ def diagnose(
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
     try:
-        diagnoses += examine_board(make_board(), time.monotonic, time.sleep)
+        diagnoses += examine_board(make_board(), clock.now, clock.sleep)
     except RigFault as fault:
         if make_arm is None:
             raise
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
     if make_arm is not None:
         try:
-            diagnoses += examine_arm(*make_arm(), time.monotonic, time.sleep)
+            diagnoses += examine_arm(*make_arm(), clock.now, clock.sleep)
         except RigFault as fault:
             diagnoses.append(Diagnosis("arm", "fail", str(fault)))
     return diagnoses

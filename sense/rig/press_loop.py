@@ -8,7 +8,6 @@ is stopped first, then lifted off, then what was recorded so far is written, the
 import contextlib
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -22,6 +21,7 @@ from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder
+from padforge.sense.rig import clock
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import Arm, Board, Pose, RigFault
 from padforge.sense.rig.safety import (
@@ -122,8 +122,8 @@ class PressLoop:
         rig: RigSettings,
         *,
         dry: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = clock.now,
+        sleep: Callable[[float], None] = clock.sleep,
     ) -> None:
         self._arm, self._board, self._recorder, self._rig = arm, board, recorder, rig
         self._clock, self._sleep, self._dry = clock, sleep, dry

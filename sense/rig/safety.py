@@ -5,12 +5,12 @@ checks every state and stops the arm before it raises. After a fault `retreat` l
 """
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
+from padforge.sense.rig import clock
 from padforge.sense.rig.devices import Arm, ArmState, Pose, RigFault
 from padforge.sense.settings import RigSettings
 
@@ -186,8 +186,8 @@ def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = 
 def wait_until_still(
     arm: Arm,
     limits: Limits,
-    clock: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
+    clock: Callable[[], float] = clock.now,
+    sleep: Callable[[float], None] = clock.sleep,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> ArmState:
     """Wait until the arm has ended its move; whatever goes wrong, it is stopped before that is raised.

@@ -1,6 +1,5 @@
 """Streams of live readings: a board's samples averaged to the rate of the readings, or a recording that is replayed."""
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.localizer.features import REST, SLOW, interpolate_gaps
 from padforge.sense.recording.recording import Recording, is_mirrored
 from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.sense.rig import clock
 from padforge.sense.rig.devices import Board, BoardSamples
 from padforge.sense.settings import RigSettings
 
@@ -106,7 +106,7 @@ def stream_board(board: Board, rate_hz: float) -> ReadingStream:
     def blocks() -> Iterator[Block]:
         while True:
             yield averager.feed(board.read())
-            time.sleep(PAUSE_S)
+            clock.sleep(PAUSE_S)
 
     return ReadingStream(identity["channels"], identity["rate_hz"] / ratio, blocks(), identity)
 
@@ -117,13 +117,13 @@ def stream_recording(recording: Recording, speed: float) -> ReadingStream:
     due_s = (recording.times_s - recording.times_s[0]) / speed
 
     def blocks() -> Iterator[Block]:
-        started_s, done = time.monotonic(), 0
+        started_s, done = clock.now(), 0
         while done < len(due_s):
-            due = int(np.searchsorted(due_s, time.monotonic() - started_s, side="right"))
+            due = int(np.searchsorted(due_s, clock.now() - started_s, side="right"))
             end = min(due, done + MAX_BLOCK)
             yield recording.times_s[done:end], recording.readings[done:end]
             if end == due:
-                time.sleep(PAUSE_S)
+                clock.sleep(PAUSE_S)
             done = end
 
     return ReadingStream(recording.fibres, recording.rate_hz, blocks())

@@ -7,7 +7,6 @@ by the host's clock, at a rate that may be off by some ppm, and fail on demand.
 import os
 import select
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,6 +15,7 @@ from typing import Self
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
+from padforge.sense.rig import clock
 from padforge.sense.rig.boards import due as framing
 from padforge.sense.rig.boards.due import SUPPLY_V, Ack, BoardSettings, DueBlock, Identity, Kind, Status
 from padforge.sense.rig.boards.line_board import HEADER_REQUEST, LineHeader, format_header, format_sample
@@ -146,7 +146,7 @@ class SerialBoard(SerialDevice):
         if self._start_s is None:
             return _POLL_S
         due_s = float(self.true_times(self._first + self._block_size() - 1))
-        return min(max(due_s - time.monotonic(), 0.0), _POLL_S)
+        return min(max(due_s - clock.now(), 0.0), _POLL_S)
 
 
 class EmulatedDue(SerialBoard):
@@ -202,7 +202,7 @@ class EmulatedDue(SerialBoard):
             self._start_s = None
         elif self._start_s is None:
             self._first = self._sequence = self._overruns = 0
-            self._start_s = time.monotonic()
+            self._start_s = clock.now()
         return Ack(message.kind, Status.OK, self._settings)
 
     def _sample(self) -> None:
@@ -213,7 +213,7 @@ class EmulatedDue(SerialBoard):
         while self._start_s is not None:
             index = self._first + np.arange(samples)
             times_s = self.true_times(index)
-            if times_s[-1] > time.monotonic():
+            if times_s[-1] > clock.now():
                 return
             self._first += samples
             if self._n_to_drop > 0 or len(self._out) > MAX_OUT_BYTES:
@@ -283,9 +283,9 @@ class EmulatedLineBoard(SerialBoard):
             return
         if self._start_s is None or self._resetting:
             self._resetting = False
-            self._start_s, self._first = time.monotonic(), 0
+            self._start_s, self._first = clock.now(), 0
             self._send(format_header(self._header))
-        end = int((time.monotonic() - self._start_s) / float(self.true_times(0) - self._start_s))
+        end = int((clock.now() - self._start_s) / float(self.true_times(0) - self._start_s))
         index = np.arange(self._first, end)
         if len(index) == 0:
             return

@@ -3,7 +3,6 @@
 import math
 import re
 import threading
-import time
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.sense.arrays import Array
+from padforge.sense.rig import clock
 from padforge.sense.rig.arms.motion import Position, StraightMove
 from padforge.sense.rig.arms.printer_link import checksum
 from padforge.sense.virtual.boards import SerialDevice
@@ -242,7 +242,7 @@ class EmulatedPrinter(SerialDevice):
 
     def _change(self, name: str, seconds: float = 0.0) -> None:
         with self._lock:
-            getattr(self.firmware, name)(time.monotonic() + seconds)
+            getattr(self.firmware, name)(clock.now() + seconds)
 
     halt = partialmethod(_change, "kill")  # the firmware finds a fault and stops for good
     restart = partialmethod(_change, "restart")  # it no longer knows where it is
@@ -258,7 +258,7 @@ class EmulatedPrinter(SerialDevice):
     def _step(self, data: bytes) -> None:
         data = self._add_noise(data)
         with self._lock:
-            now_s = time.monotonic()
+            now_s = clock.now()
             if data and self._restarts:
                 self._restarts, data = False, b""
                 self.firmware.restart(now_s)

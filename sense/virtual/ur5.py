@@ -9,7 +9,6 @@ import select
 import socket
 import struct
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -20,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from padforge.sense.rig import clock
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.devices import Array, Pose, RigFault
 from padforge.sense.virtual.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
@@ -74,7 +74,7 @@ class EmulatedUR5:
         surface_m = -np.inf if surface_mm is None else surface_mm / 1e3
         x, y, z = (value / 1e3 for value in tcp_mm)
         pose_m = np.array(pose) / TO_MM
-        self._controller = Controller(series, pose_m, surface_m, stiffness_n_mm * 1e3, time.monotonic(), (x, y, z))
+        self._controller = Controller(series, pose_m, surface_m, stiffness_n_mm * 1e3, clock.now(), (x, y, z))
         self.pose_log = PoseLog()  # true poses of the tip
         self.host = host
         self._connections: list[Connection] = []
@@ -94,7 +94,7 @@ class EmulatedUR5:
             self._close_all()
             message = f"no emulated arm at {self.host}: {error.strerror}"
             raise RigFault("refused", message, "is there another one?") from error
-        self._run_cycle(time.monotonic())  # so that there is a pose from the start on
+        self._run_cycle(clock.now())  # so that there is a pose from the start on
         self._thread.start()
         return self
 
@@ -180,19 +180,19 @@ class EmulatedUR5:
         self._close_all()
         self._delayed.clear()
         self._controller.stop_program()
-        self._restart_s = time.monotonic() + seconds
+        self._restart_s = clock.now() + seconds
 
     def _serve(self) -> None:
         period = 1 / RATES_HZ[self._controller.series]
-        cycle = time.monotonic()
+        cycle = clock.now()
         while not self._ending:
-            self._poll(max(0.0, cycle - time.monotonic()))
+            self._poll(max(0.0, cycle - clock.now()))
             while not self._commands.empty():
                 name, arguments, done = self._commands.get()
                 done.set_result(getattr(self if name.startswith("_") else self._controller, name)(*arguments))
-            while self._delayed and self._delayed[0][0] <= time.monotonic():
+            while self._delayed and self._delayed[0][0] <= clock.now():
                 self._delayed.popleft()[1]()
-            while cycle <= time.monotonic():
+            while cycle <= clock.now():
                 self._run_cycle(cycle)
                 cycle += period
 
@@ -212,7 +212,7 @@ class EmulatedUR5:
     def _poll(self, timeout: float) -> None:
         """Wait for the sockets."""
         if self._unplugged:
-            time.sleep(timeout)
+            clock.sleep(timeout)
             return
         listeners = {listener: name for name, listener in self._listeners.items()}
         links = {connection.link: connection for connection in self._connections}
@@ -255,7 +255,7 @@ class EmulatedUR5:
                 return  # a client that reconnects, as ur-rtde does, sends the recipes of its last link first
             names, layout = connection.inputs[payload[0] - 1]
             values = dict(zip(names, layout.unpack(payload[1:]), strict=True))
-            self._do(lambda: self._controller.write(values, time.monotonic()))
+            self._do(lambda: self._controller.write(values, clock.now()))
             return
         answer = b"\x01"
         if kind == rtde.CONTROLLER:
@@ -283,7 +283,7 @@ class EmulatedUR5:
     def _do(self, action: Callable[[], None]) -> None:
         """Run an action now, or later if answers are slow."""
         if self._delay_s:
-            self._delayed.append((time.monotonic() + self._delay_s, action))
+            self._delayed.append((clock.now() + self._delay_s, action))
         else:
             action()
 

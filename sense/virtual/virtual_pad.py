@@ -1,7 +1,6 @@
 """A simulated pad that a finger presses at random, in real time: a board to watch without hardware."""
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import make_plan
 from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.sense.rig import clock
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.streams import RECORDED
 from padforge.sense.settings import RigSettings
@@ -36,7 +36,7 @@ class VirtualPad:
         pad: Morphology,
         rig: RigSettings,
         contact: Contact,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock.now,
         size: PadSettings | None = None,
     ) -> None:
         """Make the pad; sampling starts with `connect`. `size` has sensed area and keep-outs, the pad's own if None."""

@@ -20,6 +20,7 @@ from padforge.sense.simulation.pad_model import SUPPLY_V, LivePad
 from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, SampleSource, SerialBoard
 from padforge.sense.virtual.printer import EmulatedPrinter
 from padforge.sense.virtual.ur5 import HOST, EmulatedUR5
+from padforge.sense.virtual.ur5_controller import Series
 
 STIFFNESS_N_MM = 2.0  # of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press
 MIN_LINE_INPUTS = 16  # inputs of the emulated line board, which has more if higher ones are named
@@ -28,16 +29,16 @@ BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any
 
 @contextmanager
 def emulate_ur5(
-    pad: Morphology, contact: Contact, rig: RigSettings, driver: Driver | None = None
+    pad: Morphology, contact: Contact, rig: RigSettings, driver: Driver | None = None, series: Series = "e"
 ) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, SerialBoard]]:
     """Open drivers of arm and board, not yet connected, and the emulators behind them; `rig` is of `ur5_settings`.
 
-    The driver of the arm is one of `UR5`'s, or its default.
+    The driver of the arm is one of `UR5`'s, or its default. An arm of the series "cb3" measures no force.
     """
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
     with (
-        EmulatedUR5("e", tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot,
+        EmulatedUR5(series, tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot,
         _emulate_board(pad, contact, rig, robot.true_poses) as (board_driver, board),
         closing(UR5.from_settings(rig.model_copy(update={"host": HOST}), driver)) as arm,
     ):

@@ -112,6 +112,8 @@ ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux
 """Of this machine: on Linux all that begin with 127, elsewhere the first alone."""
 
 HAS_UR_RTDE = importlib.util.find_spec("rtde_control") is not None
+NEEDS_UR_RTDE = pytest.mark.skipif(not HAS_UR_RTDE, reason="ur-rtde is not here")
+BY_URSCRIPT = pytest.mark.skip(reason="the URScript driver is to leave, and its tests go by the clock")
 
 FORBIDDEN = ("play", "unlock", "power", "brake", "safety")
 """Words of orders to the dashboard that are for a person alone."""
@@ -217,8 +219,8 @@ def robot(robots: Robots, series: Series) -> EmulatedUR5:
 
 @pytest.fixture(
     params=[
-        pytest.param("ur-rtde", marks=pytest.mark.skipif(not HAS_UR_RTDE, reason="ur-rtde is not here")),
-        "urscript",
+        pytest.param("ur-rtde", marks=NEEDS_UR_RTDE),
+        pytest.param("urscript", marks=BY_URSCRIPT),
     ],
     scope="module",
 )

@@ -13,10 +13,9 @@ import math
 import queue
 import re
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -24,6 +23,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
+from padforge.sense.rig import clock
 from padforge.sense.rig.arms.motion import Position, StraightMove
 from padforge.sense.rig.arms.printer_link import (
     FIRMWARE,
@@ -77,7 +77,7 @@ class NozzleThread(threading.Thread):
         self._states: deque[NozzleState] = deque(maxlen=_MAX_STATES)
         self._ending = threading.Event()
         self.fault: RigFault | None = None  # why the position is unknown; None while all is well
-        self.latest = NozzleState(time.monotonic(), position, 0.0, False)  # the last state
+        self.latest = NozzleState(clock.now(), position, 0.0, False)  # the last state
 
     def run(self) -> None:
         """Poll, and execute commands, until the end or a fault."""
@@ -125,11 +125,13 @@ class NozzleThread(threading.Thread):
             raise self.fault
         result: Future[None] = Future()
         self._commands.put((command, result))
-        try:
-            result.result(timeout_s)
-        except TimeoutError:
+        deadline_s = clock.now() + timeout_s
+        while not result.done() and clock.now() < deadline_s:
+            wait([result], _POLL_S)
+        if not result.done():
             result.cancel()  # or it would be executed later, when nobody waits for its end
-            raise self.fault or RigFault("deadline", f"the printer did not answer within {timeout_s} s") from None
+            raise self.fault or RigFault("deadline", f"the printer did not answer within {timeout_s} s")
+        result.result()
 
     def _execute(self, command: Callable[[], None], result: "Future[None]") -> None:
         if not result.set_running_or_notify_cancel():
@@ -155,21 +157,21 @@ class NozzleThread(threading.Thread):
             self._link.execute(f"M204 P{move.acceleration:.1f} T{move.acceleration:.1f}")
             self._acceleration = move.acceleration
         self._link.execute(format_move(end, move.speed))
-        self._start_s = time.monotonic()
+        self._start_s = clock.now()
         # Without R the firmware reports the end of its moves: software endstops may have clipped this one.
         if math.dist(planned := self._ask_position("M114", end), end) > _TOLERANCE_MM:
             self._quick_stop()
             self._raise_displaced(f"is about to go to {_format(planned)}", end)
-        self._add_state(time.monotonic(), move.start)
+        self._add_state(clock.now(), move.start)
 
     def _poll(self) -> None:
         move = self._move
         if move is None:
             self._check_at_rest(self._position)
-            self._add_state(time.monotonic(), self._position)
+            self._add_state(clock.now(), self._position)
             return
         position = self._ask_position("M114 R", None)
-        now_s = time.monotonic()
+        now_s = clock.now()
         elapsed_s = now_s - self._start_s
         if math.dist(position, move.end) <= _TOLERANCE_MM:
             if elapsed_s >= move.duration_s:
@@ -194,7 +196,7 @@ class NozzleThread(threading.Thread):
 
     def _rest(self, position: Position) -> None:
         self._move, self._position, self._n_implausible = None, position, 0
-        self._add_state(time.monotonic(), position)
+        self._add_state(clock.now(), position)
 
     def _check_at_rest(self, expected: Position) -> None:
         if math.dist(position := self._ask_position("M114 R", expected), expected) > _TOLERANCE_MM:
@@ -285,7 +287,7 @@ class Printer:
     def state(self) -> ArmState:
         """Return the latest state; see `Arm.state`."""
         state = self._connected().latest
-        if (age_s := time.monotonic() - state.time_s) > STALE_S:
+        if (age_s := clock.now() - state.time_s) > STALE_S:
             message = f"the printer's last answer is {age_s:.2f} s old; allowed {STALE_S} s"
             raise RigFault("stale", message, "it may be busy: look at its display")
         return self._to_arm_state(state)

@@ -1,7 +1,6 @@
 """Marlin's G-code over a serial port: lines are numbered, checked, and executed once, whatever noise there is."""
 
 import re
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -9,6 +8,7 @@ from functools import reduce
 from operator import xor
 from typing import Any
 
+from padforge.sense.rig import clock
 from padforge.sense.rig.arms.motion import Position
 from padforge.sense.rig.devices import Cause, RigFault, SerialStream
 
@@ -95,8 +95,8 @@ class MarlinLink:
 
     def handshake(self, timeout_s: float) -> None:
         """Wait until the printer answers, and count its lines from 0; RigFault("refused") without one."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+        deadline = clock.now() + timeout_s
+        while clock.now() < deadline:
             self._stream.send(b"\n" + number_line(0, "M110 N0"))
             if any(map(_is_confirmation, list(self._read_until_silent()))):
                 self._connected = True
@@ -112,14 +112,14 @@ class MarlinLink:
         self._number += 1
         self._history.append(number_line(self._number, command))
         answer: list[str] = []
-        resend_s, deadline = 0.0, time.monotonic() + timeout_s
+        resend_s, deadline = 0.0, clock.now() + timeout_s
         n_sent = n_bad_resends = requested = 0
-        while (now := time.monotonic()) < deadline:
+        while (now := clock.now()) < deadline:
             if now >= resend_s:
                 self._stream.send(self._history[-1])
                 answer, resend_s, n_sent = [], now + _RESEND_S, n_sent + 1
             for line in self._receive():
-                resend_s = time.monotonic() + _RESEND_S
+                resend_s = clock.now() + _RESEND_S
                 if (number := parse_resend(line)) is not None:
                     requested = number
                     list(self._read_until_silent())
@@ -163,11 +163,11 @@ class MarlinLink:
 
     def _read_until_silent(self) -> Iterator[str]:
         """Yield lines until none come, for `ANSWER_S` at most: what never falls silent is no printer."""
-        latest = time.monotonic() + ANSWER_S
-        end = time.monotonic() + _SILENCE_S
-        while time.monotonic() < min(end, latest):
+        latest = clock.now() + ANSWER_S
+        end = clock.now() + _SILENCE_S
+        while clock.now() < min(end, latest):
             for line in self._receive():
-                end = time.monotonic() + _SILENCE_S
+                end = clock.now() + _SILENCE_S
                 yield line
 
     def _receive(self) -> list[str]:

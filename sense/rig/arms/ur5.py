@@ -9,7 +9,6 @@ import json
 import os
 import subprocess
 import threading
-import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -19,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
+from padforge.sense.rig import clock
 from padforge.sense.rig.arms.rtde import stop_program
 from padforge.sense.rig.arms.urscript import Retreat
 from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, start
@@ -50,7 +50,7 @@ class RtdeWorker:
         self._ids = itertools.count(1)
         self._states: deque[ArmState] = deque(maxlen=MAX_STATES)
         self._received = threading.Condition()
-        self._supervised_s = time.monotonic()
+        self._supervised_s = clock.now()
         self._killed = threading.Event()
         self.process = start(
             "padforge.sense.rig.arms.rtde_worker",
@@ -78,7 +78,7 @@ class RtdeWorker:
 
     def supervise(self) -> None:
         """Note that the program looks at the arm, so that a move may go on."""
-        self._supervised_s = time.monotonic()
+        self._supervised_s = clock.now()
 
     def drain(self) -> list[ArmState]:
         """Return the states since the last call."""
@@ -115,7 +115,7 @@ class RtdeWorker:
 
     def _send_heartbeats(self) -> None:
         while not self._killed.wait(HEARTBEAT_S) and not self.fault:
-            if time.monotonic() < self._supervised_s + SUPERVISION_S:
+            if clock.now() < self._supervised_s + SUPERVISION_S:
                 with suppress(RigFault):
                     self._write(b"")
 
@@ -202,7 +202,7 @@ class UR5:
         worker = self._connected()
         worker.supervise()
         state = worker.latest
-        age_s = np.inf if state is None else time.monotonic() - state.time_s
+        age_s = np.inf if state is None else clock.now() - state.time_s
         if state is None or age_s > STALE_S:
             raise RigFault("stale", f"the last state of the arm is {age_s:.2f} s old; allowed {STALE_S} s")
         return replace(state, moving=state.moving or state.time_s < self._move_s)
@@ -228,7 +228,7 @@ class UR5:
             if fault.cause != "refused":
                 self._abandon()
             raise
-        self._move_s = time.monotonic()
+        self._move_s = clock.now()
 
     def stop(self) -> None:
         """Stop the arm by its driver, or else by dashboard and watchdog; RigFault("lost") if unconfirmed."""

@@ -1,7 +1,6 @@
 """What all boards need: a driver without its protocol, a thread that drains the port, and host times of the samples."""
 
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
+from padforge.sense.rig import clock
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
 
 POLL_S = 0.1  # longest wait for bytes
@@ -101,14 +101,14 @@ class BlockReader(threading.Thread):
     def start_settled(self, request_start: Callable[[], object]) -> None:
         """Start, call `request_start` until blocks come, return after `SETTLE_S`; RigFault("stale") without."""
         self.start()
-        deadline = time.monotonic() + _START_S
+        deadline = clock.now() + _START_S
         while self._buffered_s() < SETTLE_S:
             if self._buffered_s() == 0:
                 request_start()
             self._raise_fault()
-            if time.monotonic() > deadline:
+            if clock.now() > deadline:
                 raise RigFault("stale", f"{self._port}: the board does not send", "reset it and connect again")
-            time.sleep(POLL_S)
+            clock.sleep(POLL_S)
 
     def run(self) -> None:
         """Fill the buffer."""
@@ -144,7 +144,7 @@ class BlockReader(threading.Thread):
             return self._arrivals[-1][0] - self._arrivals[0][0] if self._arrivals else 0.0
 
     def _fill(self) -> None:
-        silent_s, last_s = 0.0, time.monotonic()
+        silent_s, last_s = 0.0, clock.now()
         while not self._stopped.is_set():
             now_s, blocks = self._receive()
             silent_s += min(now_s - last_s, 2 * POLL_S)  # time in which the host slept is no silence of the board

@@ -5,7 +5,6 @@ the payload, because one flipped bit among the COBS counts would alter several b
 """
 
 import struct
-import time
 from binascii import crc_hqx
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.design.common.validation import check_float
+from padforge.sense.rig import clock
 from padforge.sense.rig.boards.board_reader import BoardDriver, SampleClock, select_inputs
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
@@ -332,9 +332,9 @@ class DueBoard(BoardDriver):
         matches: Callable[[M], bool] = lambda message: True,
     ) -> M:
         """Send a command until a message of this kind that matches comes; RigFault("stale") after a second without."""
-        deadline = time.monotonic() + _ANSWER_S
+        deadline = clock.now() + _ANSWER_S
         resend_s = 0.0
-        while (now := time.monotonic()) < deadline:
+        while (now := clock.now()) < deadline:
             if now >= resend_s:
                 stream.send(encode(command))
                 resend_s = now + _RESEND_S

@@ -1,6 +1,5 @@
 """A board that sends lines of text, so plain that any board can be programmed to; see docs/howto-boards.md."""
 
-import time
 from binascii import crc32
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from padforge.sense.arrays import MAX_FIBRES
+from padforge.sense.rig import clock
 from padforge.sense.rig.boards.board_reader import BoardDriver, SampleClock, select_inputs
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
@@ -201,7 +201,7 @@ class LineBoard(BoardDriver):
         header = self._identify(stream)
         inputs = select_inputs(self._inputs, header.channels, "the board")
         assembler = LineAssembler(header, inputs)
-        self._last_sample_s = time.monotonic()
+        self._last_sample_s = clock.now()
         self._read_blocks(lambda: self._receive_blocks(stream, header), header.rate_hz, assembler.assemble)
         self._settled = True
         return {
@@ -216,9 +216,9 @@ class LineBoard(BoardDriver):
         }
 
     def _identify(self, stream: SerialStream) -> LineHeader:
-        deadline, resend_s = time.monotonic() + _ANSWER_S, 0.0
+        deadline, resend_s = clock.now() + _ANSWER_S, 0.0
         while self._decoder.header is None:
-            if (now := time.monotonic()) > deadline:
+            if (now := clock.now()) > deadline:
                 reason = self._decoder.error or "no board that speaks the line protocol answers"
                 raise RigFault("refused", f"{self._port}: {reason}", "is [rig] baud that of the board?")
             if now >= resend_s:

@@ -1,6 +1,5 @@
 """An arm and a board in virtual time, on one simulated pad: minutes of pressing take moments."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from padforge.design import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.run_directory import STATE_COLUMNS
+from padforge.sense.rig import clock
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import ArmState, BoardSamples, Pose, RigFault
 from padforge.sense.settings import RigSettings
@@ -143,12 +143,12 @@ def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> floa
     """Call `action` until it raises the fault; returns how long that took by the wall's clock."""
 
     def repeat() -> None:
-        while time.monotonic() < start_s + 10:
+        while clock.now() < start_s + 10:
             action()
-            time.sleep(0.005)
+            clock.sleep(0.005)
 
-    start_s = time.monotonic()
+    start_s = clock.now()
     with pytest.raises(RigFault, match=match) as caught:
         repeat()
     assert caught.value.cause == cause
-    return time.monotonic() - start_s
+    return clock.now() - start_s

@@ -1,6 +1,7 @@
 """Streams of a board and of a recording."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.sense.rig import clock
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.streams import RECORDED, is_pad_mirrored, stream_board, stream_recording
 from padforge.sense.settings import RigSettings
@@ -16,12 +18,11 @@ from tests.sense.rig.fakes import Time
 
 
 @pytest.fixture
-def still(monkeypatch: pytest.MonkeyPatch) -> Time:
+def still() -> Iterator[Time]:
     """A clock that goes on only in `sleep`."""
     time = Time(least_s=0)
-    monkeypatch.setattr("padforge.sense.rig.streams.time.monotonic", time)
-    monkeypatch.setattr("padforge.sense.rig.streams.time.sleep", time.sleep)
-    return time
+    with clock.replaced(time, time.sleep):
+        yield time
 
 
 def test_stream_recording_gives_every_reading_when_it_is_due(brief: Recording, still: Time) -> None:

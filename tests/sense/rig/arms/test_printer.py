@@ -1,7 +1,6 @@
 """The printer as an arm, and its numbered lines, through a real pseudo-terminal against the emulated firmware."""
 
 import os
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from padforge.sense.rig import clock
 from padforge.sense.rig.arms import printer_link
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.printer_link import MarlinLink
@@ -21,7 +21,10 @@ from padforge.sense.virtual.printer import EmulatedPrinter
 from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")
-pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
+    pytest.mark.usefixtures("steady"),
+]
 
 AT, BAUD = (80.0, 110.0, 60.0), 115_200
 TCP = (30.0, 0.0, -20.0)
@@ -46,7 +49,7 @@ def pose(x: float, y: float, z: float) -> tuple[float, ...]:
 
 def to_rest(arm: Printer) -> ArmState:
     while (state := arm.state()).moving:
-        time.sleep(0.004)
+        clock.sleep(0.004)
     return state
 
 
@@ -69,10 +72,10 @@ def test_connect_reports_identity_and_axis_limits():
 def test_move_is_straight_and_states_follow_it(realtime):
     with connected(realtime=realtime) as (arm, printer):
         arm.drain()
-        start_s = time.monotonic()
+        start_s = clock.now()
         arm.move(pose(115, 100, 32), 20.0, 500.0)
         assert to_rest(arm).pose == pytest.approx(pose(115, 100, 32), abs=1e-9)
-        assert time.monotonic() - start_s == pytest.approx(0.1 + 13.75 / 20 + 20 / 500, abs=0.2)
+        assert clock.now() - start_s == pytest.approx(0.1 + 13.75 / 20 + 20 / 500, abs=0.2)
         rows = arm.drain()
         truth = printer.true_positions(rows[:, 0]) + TCP
         assert truth[-1] == pytest.approx((115, 100, 32), abs=1e-3)
@@ -86,11 +89,11 @@ def test_move_is_straight_and_states_follow_it(realtime):
 def test_stop_halts_at_once_and_position_stays_known(emergency_parser):
     with connected(emergency_parser=emergency_parser) as (arm, printer):
         arm.move(pose(110, 110, 20), 20.0, 3000.0)
-        time.sleep(0.3)
-        start_s = time.monotonic()
+        clock.sleep(0.3)
+        start_s = clock.now()
         arm.stop()
-        assert time.monotonic() - start_s < 0.5
-        stood = printer.true_positions(time.monotonic())[0] + TCP
+        assert clock.now() - start_s < 0.5
+        stood = printer.true_positions(clock.now())[0] + TCP
         assert 27 < stood[2] < 39
         assert arm.state().pose[:3] == pytest.approx(stood, abs=0.01)
         assert not arm.state().moving
@@ -120,21 +123,21 @@ def test_state_raises_within_two_seconds_of_fault(disturb, cause, match, under_w
 def test_unconfirmed_stop_halts_printer_and_clipped_move_raises():
     with connected() as (arm, printer):
         arm.move(pose(110, 110, 10), 10.0, 3000.0)
-        time.sleep(0.3)
+        clock.sleep(0.3)
         printer.busy(10)
-        start_s = time.monotonic()
+        start_s = clock.now()
         with pytest.raises(RigFault, match="did not confirm the stop, and was told to halt"):
             arm.stop()
         with pytest.raises(RigFault, match="told to halt; see that it stands"):  # also for the next caller
             arm.state()
-        time.sleep(0.05)
+        clock.sleep(0.05)
         assert printer.firmware.halted
         assert printer.true_positions(start_s + 0.6)[0] == pytest.approx(printer.true_positions(start_s + 5)[0])
     with connected() as (arm, printer):
         with pytest.raises(RigFault, match=r"is about to go to 220\.00, .* but was sent to 230\.00") as fault:
             arm.move(pose(260, 110, 40), 50.0, 3000.0)
         assert fault.value.cause == "lost"
-        assert printer.true_positions(time.monotonic() + 9)[0] == pytest.approx(AT, abs=0.5)
+        assert printer.true_positions(clock.now() + 9)[0] == pytest.approx(AT, abs=0.5)
         fault_of(arm.state, "lost")
 
 
@@ -143,12 +146,12 @@ def test_move_that_was_given_up_is_never_made(asked_s: float):
     """The thread waits for a position as it is told to move, or for the new acceleration."""
     with connected() as (arm, printer):
         printer.busy(0.95)
-        time.sleep(asked_s)
+        clock.sleep(asked_s)
         fault_of(lambda: arm.move(pose(110, 110, 38), 50.0, 3000.0), "deadline", "did not answer within")
         with suppress(RigFault):  # halted, as the stop is not confirmed in time
             arm.stop()
-        time.sleep(0.3)
-        assert printer.true_positions(time.monotonic() + 9)[0] == pytest.approx(AT)
+        clock.sleep(0.3)
+        assert printer.true_positions(clock.now() + 9)[0] == pytest.approx(AT)
 
 
 @pytest.mark.parametrize(

@@ -24,10 +24,9 @@ from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
 from padforge.sense.virtual.ur5 import HOME, EmulatedUR5
+from tests.sense.conftest import BY_URSCRIPT
 
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
-ONE_DRIVER = pytest.mark.parametrize("driver", ["urscript"], scope="module")
-"""For what does not depend on the driver."""
 LIMITS = Limits(
     box_mm=((-300, 0), (-600, -200), (0, 400)), contact_mm=100, max_depth_mm=80, max_force_n=None, deadline_s=10
 )
@@ -140,7 +139,6 @@ def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure:
     cure()
 
 
-@ONE_DRIVER
 def test_connect_refuses_unavailable_arm(robots: Any, host: str, driver: Driver) -> None:
     robots.free()
     with closing(UR5(host, driver)) as arm:
@@ -154,7 +152,7 @@ def test_connect_refuses_unavailable_arm(robots: Any, host: str, driver: Driver)
         arm.connect()
 
 
-@pytest.mark.parametrize("installed", [True, False])
+@pytest.mark.parametrize("installed", [True, pytest.param(False, marks=BY_URSCRIPT)])
 def test_driver_is_ur_rtde_where_it_is_installed(
     robots: Any, host: str, monkeypatch: pytest.MonkeyPatch, installed: bool
 ) -> None:
@@ -168,7 +166,6 @@ def test_driver_is_ur_rtde_where_it_is_installed(
         assert arm.connect()["driver"].startswith("ur-rtde 1" if installed else "URScript")
 
 
-@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, driver: Driver, monkeypatch) -> None:
     with closing(UR5(host, driver)) as arm:
@@ -179,7 +176,6 @@ def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, drive
         arm.connect()
 
 
-@ONE_DRIVER
 def test_connect_refuses_arm_in_use_on_this_computer(
     robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
 ) -> None:
@@ -193,7 +189,6 @@ def test_connect_refuses_arm_in_use_on_this_computer(
     arm.stop()
 
 
-@ONE_DRIVER
 @pytest.mark.slow
 def test_connect_refuses_arm_in_use_by_another_computer(
     robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
@@ -210,7 +205,6 @@ def test_connect_refuses_arm_in_use_by_another_computer(
     go(arm, HOME)
 
 
-@ONE_DRIVER
 def test_force_is_limited_in_all_directions(robots: Any, host: str, driver: Driver) -> None:
     robot = robots.get("e", surface_mm=100, stiffness_n_mm=2.0, tcp_mm=(0.0, 1.5, 150.0))
     with closing(UR5(host, driver)) as arm:
@@ -349,6 +343,7 @@ def test_arm_rests_after_program_dies_or_is_suspended(
     assert start_s < last_motion_s(robot) < start_s + REST_S
 
 
+@BY_URSCRIPT
 @pytest.mark.parametrize("name", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
 def test_arm_retreats_by_itself_after_program_dies_or_is_suspended(robots: Any, host: str, name: str) -> None:
     """Nobody is left to lift the tool but the program on the arm."""
@@ -367,7 +362,6 @@ def test_arm_retreats_by_itself_after_program_dies_or_is_suspended(robots: Any, 
     robots.free()
 
 
-@ONE_DRIVER
 @pytest.mark.slow
 def test_arm_rests_when_program_stops_asking(robot: EmulatedUR5, arm: UR5, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ur5, "SUPERVISION_S", 0.4)
@@ -387,6 +381,7 @@ def test_stop_works_without_script_connection(robot: EmulatedUR5, arm: UR5) -> N
     assert go(arm, LOW).pose == pytest.approx(LOW)
 
 
+@BY_URSCRIPT
 def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: Any, host: str) -> None:
     """The program on the arm does; a parent that lives on leaves it to do so."""
     robot = robots.get("e", pose=(*HOME[:2], 120.0, *HOME[3:]), surface_mm=100)
@@ -402,7 +397,8 @@ def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: An
         robots.free()
 
 
-@ONE_DRIVER
+@BY_URSCRIPT
+@pytest.mark.parametrize("driver", ["urscript"], scope="module")
 def test_connect_refuses_registers_that_another_client_writes(robots: Any, host: str, driver: Driver) -> None:
     robots.free()
     robot = robots.get("cb3")

@@ -3,7 +3,6 @@
 import os
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from padforge.sense.rig import clock
 from padforge.sense.rig.boards import board_reader, due, line_board
 from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
@@ -20,7 +20,10 @@ from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")
-pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
+    pytest.mark.usefixtures("steady"),
+]
 
 STEP_V = 3.3 / 4095
 HEADER = LineHeader(1000, 12, 3.3, 16, extra=(("name", "emulated"), ("serial", "7")))
@@ -62,9 +65,9 @@ def concatenate(*parts: BoardSamples) -> BoardSamples:
 
 
 def read_for(driver: Driver, seconds: float) -> BoardSamples:
-    parts, end = [driver.read()], time.monotonic() + seconds
-    while time.monotonic() < end:
-        time.sleep(0.02)
+    parts, end = [driver.read()], clock.now() + seconds
+    while clock.now() < end:
+        clock.sleep(0.02)
         parts.append(driver.read())
     return concatenate(*parts)
 
@@ -197,7 +200,7 @@ def test_read_raises_after_buffer_overflow(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(board_reader, "BUFFER_S", 0.3)
     board = EmulatedDue(waves)
     with connected(board) as driver:
-        time.sleep(0.35)
+        clock.sleep(0.35)
         check(driver.read(), board)
         fault_of(driver.read, "data", "nobody has read")
 
@@ -231,8 +234,8 @@ def test_line_board_survives_resets_at_any_moment() -> None:
     """Also within one of its steps; a board whose thread has died would not answer again."""
     board = EmulatedLineBoard(waves, replace(HEADER, rate_hz=10_000))
     with board, closing(make_driver(board, 10_000)) as driver:
-        end = time.monotonic() + 0.3
-        while time.monotonic() < end:
+        end = clock.now() + 0.3
+        while clock.now() < end:
             board.reset()
         assert driver.connect()["rate_hz"] == 10_000  # lines from before the last reset may still be in the port
 
