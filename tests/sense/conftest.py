@@ -13,7 +13,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from padforge.design import Morphology
+from padforge.design import Morphology, contact
 from padforge.sense import Evaluation, Recording, calibrate
 from padforge.sense import settings as sense_settings
 from padforge.sense.localizer.model import LocalizerModel
@@ -28,7 +28,7 @@ from padforge.sense.virtual.ur5_controller import Series
 from tests.helpers.once import Once
 from tests.helpers.rigs import ideal_rig
 
-QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=50, batch=64)
+QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=20, batch=64)
 
 
 @pytest.fixture(scope="session")
@@ -72,16 +72,24 @@ def localizer(calibrated: tuple[LocalizerModel, Evaluation]) -> LocalizerModel:
 
 @pytest.fixture(scope="session")
 def deep_recording(once: Once) -> Recording:
-    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter."""
+    """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter.
+
+    They are interpolated between few depths, as wide in all their parts: each depth and width is solved of its own.
+    """
     depths = tuple(np.random.default_rng(4).uniform(0.5, 5, 400).tolist())
-    rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths, scatter=0)
-    recording = once("deep-recording", lambda folder: simulate(Morphology.random(2, knots=3, seed=5), rig))
-    return replace(recording, forces_n=3.0 * recording.depths_mm)
+    widths = {"onset_width": 1.0, "after_width": 1.0}
+    rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths, scatter=0, **widths)
+
+    def make(folder: Path) -> Recording:
+        with patch.object(contact, "DEPTH_STEPS", 4):
+            return simulate(Morphology.random(2, knots=3, seed=5), rig)
+
+    return replace(recording := once("deep-recording", make), forces_n=3.0 * recording.depths_mm)
 
 
 @pytest.fixture(scope="session")
 def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[LocalizerModel, Evaluation]:
-    options = QUICK.model_copy(update={"members": 1, "epochs": 24})
+    options = QUICK.model_copy(update={"members": 1, "epochs": 12})
     return once("deeply-calibrated", lambda folder: calibrate(deep_recording, options))
 
 

@@ -48,6 +48,12 @@ def make_model(folder: Path, presses: int) -> Path:
     return folder
 
 
+@pytest.fixture
+def loose_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are not laid out, for which they would be measured twice before they are drawn."""
+    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda engine, figure: None)
+
+
 @pytest.fixture(scope="session")
 def few_presses(once: Once) -> Path:
     return once("few presses and their model", lambda folder: make_model(folder, 60))

@@ -7,6 +7,7 @@ import pytest
 
 from padforge.sense.localizer import training
 from padforge.sense.localizer.moments import MOMENTS
+from tests.sense.cli.conftest import SPEC
 
 
 def files_in(folder: str) -> dict[str, bytes]:
@@ -28,8 +29,10 @@ def test_calibrate_writes_a_document_that_evaluate_agrees_with(few) -> None:
         assert json.loads(out)["errors"] == document["errors"][:levels]
 
 
+@pytest.mark.usefixtures("loose_pictures")
 def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
     before = files_in("model")
+    Path("pad.toml").write_text(SPEC.replace("[rig]", "max_failures = 0\n[rig]"))
     assert few("calibrate", "rec", "--seed", "5")[0] == 0
     assert json.loads(Path("calibration.json").read_text())["provenance"]["seed"] == 5
     assert files_in("model") == before
@@ -77,6 +80,7 @@ def test_evaluate_lists_errors_of_depth_and_force(padforge_sense, deep_localizer
     assert lines.index("error of force in N") == depth + 4 == len(lines) - 5 - 2 - len(MOMENTS)
 
 
+@pytest.mark.usefixtures("loose_pictures")
 def test_a_drifted_pad_is_followed_into_a_new_model(few, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "FINE_TUNING_STEPS", 15)
     before = files_in("model")

@@ -6,10 +6,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from padforge import sense
+from padforge.sense.localizer.model import LocalizerModel
 
 COMMANDS = {
     "record": "record --out out/rec",
@@ -31,6 +33,19 @@ def full_disk(limit: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.fixture
+def calibrate_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the same command learns again is what it has learnt at first."""
+    learnt: list[tuple[LocalizerModel, sense.Evaluation]] = []
+
+    def calibrate(*arguments: Any, **options: Any) -> tuple[LocalizerModel, sense.Evaluation]:
+        learnt[:] = learnt or [sense.calibrate(*arguments, **options)]
+        return learnt[0]
+
+    monkeypatch.setattr("padforge.sense.localizer.localizer.calibrate", calibrate)
+
+
+@pytest.mark.usefixtures("loose_pictures", "calibrate_once")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_command_on_a_full_disk_leaves_all_or_nothing(few, name: str) -> None:
     """Where a model was it stays; whatever the limit, nothing is left of what did not fit."""

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from padforge.design import Morphology
+from padforge.sense import Recording
 from padforge.sense.cli.options import typed_keys
+from tests.sense.live.conftest import first_presses
 
 
 def test_import_loads_neither_torch_nor_matplotlib() -> None:
@@ -67,10 +69,11 @@ print(json.dumps(ends))
 
 
 def test_locate_works_without_optional_libraries(few) -> None:
+    first_presses(Recording.open("rec"), 3).save("short", {})
     lines = (
         "sense locate --model model rec",
         "sense evaluate --model model rec --max-failures 1",
-        "sense live --model model --replay rec --speed 1e6 --port 0",
+        "sense live --model model --replay short --speed 1e6 --port 0",
         "sense calibrate rec --out again",
         "run --out pad",
     )

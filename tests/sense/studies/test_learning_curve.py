@@ -25,7 +25,7 @@ from padforge.sense.studies.learning_curve import (
 )
 from tests.helpers.door import called
 
-QUICK = Options(hidden=8, layers=1, epochs=1, batch=64)
+QUICK = Options(hidden=8, layers=1, epochs=1, batch=64, max_failures=0)
 
 
 @settings(max_examples=20)
@@ -76,7 +76,9 @@ def test_learning_curve_command_writes_document_and_figure(
     curve: LearningCurve, recording: Recording, tmp_path: Path
 ) -> None:
     recording.save(tmp_path / "rec", {})
-    (tmp_path / "pad.toml").write_text("[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\n")
+    (tmp_path / "pad.toml").write_text(
+        "[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\nmax_failures = 0\n"
+    )
     ended = called("sense", "learning-curve", "rec", "--out", "out", "--json", cwd=tmp_path)
     written = json.loads(ended.out)
     assert (ended.code, written) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))

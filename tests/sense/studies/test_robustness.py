@@ -16,7 +16,7 @@ import pytest
 from padforge.design import Contact, Morphology
 from padforge.design.networks import SimulatedPresses
 from padforge.sense.studies import robustness
-from padforge.sense.studies.robustness import robustness_study
+from padforge.sense.studies.robustness import MIN_NETWORKS, robustness_study
 from padforge.sense.studies.study import load_pads, run
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
@@ -27,6 +27,7 @@ def small() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(robustness, "HIDDEN", 10)
         patched.setattr(robustness, "TEST", 300)
+        patched.setattr(robustness, "MIN_NETWORKS", 4)
         yield
 
 
@@ -139,6 +140,7 @@ def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(SimulatedPresses, "fit", counted)
     monkeypatch.setattr(robustness, "HIDDEN", 1)
+    monkeypatch.setattr(robustness, "MIN_NETWORKS", MIN_NETWORKS)
     document = run(robustness_study({"a": PADS["square"]}, max_failures=2, presses=16), tmp_path)
     by_size = {size: {count for failed, count in trained.items() if len(failed) == size} for size in range(3)}
     assert by_size == {0: {16}, 1: {4}, 2: {3}}

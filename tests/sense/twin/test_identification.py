@@ -1,9 +1,7 @@
 """Identification of pads whose truth is known, and recordings that do not suffice."""
 
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -20,23 +18,15 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.report.identification import identification_lines
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.twin import identification, wiring
 from padforge.sense.twin.identification import Identification, identify_pad
 from tests.helpers.rigs import ideal_rig
 
-from .conftest import PLAN
+from .conftest import PLAN, few_candidates
 
 
 @pytest.fixture(scope="module")
 def recording(printed: Twin) -> Recording:
     return simulate(printed, ideal_rig(presses=300, seed=3))
-
-
-@contextmanager
-def few_candidates():
-    """One wiring is fitted beside the stated one and images, of six that are refined, in place of 4 of 24."""
-    with patch.object(identification, "N_CANDIDATES", 1), patch.object(wiring, "N_REFINED", 6):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +83,8 @@ def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
 
 
 @pytest.mark.slow
-def test_identify_recovers_the_printed_pad_among_all_candidates(printed: Twin) -> None:
-    assert_recovered(identify_pad(simulate(printed, ideal_rig(presses=500, seed=3)), PLAN, seed=1), printed)
+def test_identify_recovers_the_printed_pad_among_all_candidates(recording: Recording, printed: Twin) -> None:
+    assert_recovered(identify_pad(recording, PLAN, seed=1), printed)
 
 
 @pytest.mark.slow

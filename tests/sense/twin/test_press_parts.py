@@ -10,7 +10,7 @@ from padforge.sense.simulation.pad_model import SUPPLY_V, Cycle, resistance_chan
 from padforge.sense.twin.press_parts import SplitPresses, part_kernels, split_presses
 
 PAD = Morphology.random(2, knots=3, seed=5)
-RIG = RigSettings(presses=800, seed=1, scatter=0.0, floor_mv=0.0, gain_wander=0.0, drift_mv=0.0, hysteresis_s=12.0)
+RIG = RigSettings(presses=500, seed=1, scatter=0.0, floor_mv=0.0, gain_wander=0.0, drift_mv=0.0, hysteresis_s=12.0)
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +20,11 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def split(recording: Recording) -> SplitPresses:
-    return split_presses(recording, np.arange(800) % 7 != 0, hysteresis_s=20.0)
+    return split_presses(recording, np.arange(500) % 7 != 0, hysteresis_s=20.0)
 
 
 def test_parts_are_those_that_were_simulated(recording: Recording, split: SplitPresses) -> None:
-    depths_mm = np.full(800, RIG.depth_mm)
+    depths_mm = np.full(500, RIG.depth_mm)
     changes = resistance_changes(build_pad(PAD, RIG), recording.presses_mm, depths_mm, Contact(), RIG)
     rest_v = np.median(recording.readings[:10], axis=0)
     slope_v = rest_v * (1 - rest_v / SUPPLY_V)  # by which a divider falls for a small change of resistance
