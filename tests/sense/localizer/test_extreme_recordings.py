@@ -15,7 +15,7 @@ from padforge.sense.localizer.response_model import ResponseModel
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
 
-TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=2, test_share=0.3)
+TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=1, test_share=0.3)
 
 
 def worst(seed: int, recording: Recording) -> Recording:
