@@ -84,7 +84,8 @@ def deep_recording(once: Once) -> Recording:
         with patch.object(contact, "DEPTH_STEPS", 4):
             return simulate(Morphology.random(2, knots=3, seed=5), rig)
 
-    return replace(recording := once("deep-recording", make), forces_n=3.0 * recording.depths_mm)
+    recording = once("deep-recording", make)
+    return replace(recording, forces_n=3.0 * recording.depths_mm)
 
 
 @pytest.fixture(scope="session")

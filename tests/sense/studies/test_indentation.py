@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology, press_forces_n
+from padforge.design import Contact, InputError, Morphology, contact, press_forces_n
 from padforge.sense.studies import indentation
 from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study, tool_contacts
 from padforge.sense.studies.study import Sizes, Study, run
@@ -23,6 +23,7 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(indentation, "FORCE_NOISES", (1.0, 100.0))
+    monkeypatch.setattr(contact, "DEPTH_STEPS", 6)
     force = run(force_study(PADS, sizes=Sizes(300, 120, hidden=12, epochs=25)), tmp_path)
     expected = [(label, noise) for label in PADS for noise in (1.0, 100.0)]
     assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == expected
@@ -60,7 +61,8 @@ def test_circumradius_gives_polygons_of_one_area(sides: int | None) -> None:
 
 
 @pytest.mark.slow
-def test_shape_study_classifies_better_than_chance(tmp_path: Path) -> None:
+def test_shape_study_classifies_better_than_chance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contact, "DEPTH_STEPS", 6)
     shapes = run(shape_study(PADS, sizes=Sizes(500, 200, hidden=12, epochs=25)), tmp_path)
     assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, kind) for label in PADS for kind in SETS]
     for row, matrix in zip(shapes["rows"], shapes["confusions"], strict=True):

@@ -82,8 +82,9 @@ def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monk
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path) -> None:
+def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(robustness, "MIN_NETWORKS", MIN_NETWORKS)  # as workers have it, which are other processes
     study = robustness_study({"a": Morphology.straight(1), "b": Morphology.random(1, 1)}, max_failures=1, presses=16)
     expected = run(study, tmp_path / "local")
     with (

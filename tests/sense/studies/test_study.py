@@ -37,7 +37,7 @@ from padforge.sense.studies.study import (
 from tests.helpers.door import refused
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
-TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=16, max_failures=1)
+TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=16, max_failures=0)
 SMALLEST: dict[str, Callable[[], Study]] = {
     "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
     "drift": lambda: drift.drift_study(

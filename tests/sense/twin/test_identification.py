@@ -175,7 +175,7 @@ def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:
 
 @pytest.mark.slow
 def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {"PRESSES": (250,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
+    small = {"PRESSES": (150,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
     for name, value in small.items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(harness, "BUDGET_S", 0)

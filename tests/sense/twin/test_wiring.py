@@ -11,10 +11,11 @@ from padforge.sense.twin.as_built import PadPlan
 from padforge.sense.twin.responses import Responses
 from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, planned_paths_mm
 
-from .conftest import PLAN
+from .conftest import PLAN, few_candidates
 
 
 @pytest.mark.slow  # the quick tests of `identify` find wirings, too
+@few_candidates()
 def test_find_wirings_puts_the_true_one_first(printed, responses) -> None:
     """Though readings are missing, and what stands in their place is nonsense."""
     volts, valid = responses.volts.copy(), responses.valid.copy()
