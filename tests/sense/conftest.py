@@ -77,8 +77,8 @@ def deep_recording(once: Once) -> Recording:
     They are interpolated between few depths, as wide in all their parts: each depth and width is solved of its own.
     """
     depths = tuple(np.random.default_rng(4).uniform(0.5, 5, 400).tolist())
-    widths = {"onset_width": 1.0, "after_width": 1.0}
-    rig = sense_settings.RigSettings(presses=400, seed=2, depths_mm=depths, scatter=0, **widths)
+    settings = {"presses": 400, "seed": 2, "depths_mm": depths, "scatter": 0, "onset_width": 1.0, "after_width": 1.0}
+    rig = sense_settings.RigSettings.model_validate(settings)
 
     def make(folder: Path) -> Recording:
         with patch.object(contact, "DEPTH_STEPS", 4):
