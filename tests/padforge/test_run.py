@@ -90,9 +90,9 @@ def test_run_is_deterministic(folder: Path) -> None:
 
 
 def test_resume_reuses_finished_run(folder: Path) -> None:
-    before = digests(folder)
+    before = digests(folder, "report.html")
     assert resumed(folder) == ALL
-    assert digests(folder) == before
+    assert digests(folder, "report.html") == before
 
 
 def test_resume_reuses_files_in_whatever_order_they_are_noted(folder: Path) -> None:
@@ -115,7 +115,7 @@ def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.Mon
     ("old", "new", "more", "kept", "others"),
     [
         ("epochs = 4", "epochs = 5", (), "design, mould, recording, contacts", set()),
-        ("presses = 80", "presses = 90", (), "design, mould, contacts", {"recording"}),
+        ("presses = 60", "presses = 70", (), "design, mould, contacts", {"recording"}),
         ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "design, recording, contacts, calibration", {"mould.stl"}),
         pytest.param("", "", ("--seed", "1"), "", {"recording"}, marks=pytest.mark.slow),
     ],
@@ -138,12 +138,16 @@ def test_resume_with_another_seed_searches_again(folder: Path, monkeypatch: pyte
 
 
 def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
-    before = digests(folder)
+    def kept() -> dict[str, str]:
+        files = digests(folder, "fabrication.json", *VOLATILE)  # the former has digests of pictures, which are blank
+        return {name: digest for name, digest in files.items() if not name.endswith(".png")}
+
+    before = kept()
     (folder / "out" / "pad" / "mould.stl").unlink()
     (folder / "out" / "pad" / "localizer.safetensors").write_bytes(b"torn")
     (folder / "out" / "pad" / "recording" / "readings.bin").write_bytes(b"")
     assert resumed(folder) == "design, contacts"
-    assert digests(folder) == before
+    assert kept() == before
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from padforge.sense.report.sections import (
     loss_chart,
     recording_sections,
 )
+from tests.helpers.pictures import blank_pictures
 from tests.padforge.report.conftest import (
     HOSTILE,
     PAD,
@@ -242,7 +243,10 @@ def test_report_refuses_damaged_file_in_one_line(pad: Path, name: str, content: 
 
 
 @pytest.mark.parametrize("name", ["mould.stl", "mould.png", "tracks.png", "orientation.svg"])
-def test_report_omits_mould_of_other_checks(pad: Path, tmp_path: Path, name: str) -> None:
+def test_report_omits_mould_of_other_checks(
+    pad: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blank_pictures(monkeypatch)
     build(Morphology.straight(2), tmp_path / "other", [name.partition(".")[2]])
     shutil.copy(tmp_path / "other" / name, pad / name)
     with pytest.raises(
@@ -373,7 +377,8 @@ def test_drawn_fibres_sink_by_the_strain_below_them() -> None:
     np.testing.assert_allclose(drawn, height_mm - sunk, atol=0.01 * sunk.max())
 
 
-def test_press_stretches_fibres_by_the_greater_of_both_strains_in_the_plane() -> None:
+def test_press_stretches_fibres_by_the_greater_of_both_strains_in_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    blank_pictures(monkeypatch)
     contact = Contact(tool="flat", tool_radius_mm=5.0, depth_mm=1.0, fibre_depths_mm=(0.8, 0.8))
     press = contact_press(contact)
     r = np.linspace(0, 2 * press.contact_radius_mm, 100)
@@ -468,7 +473,8 @@ def test_contact_section_and_line_compare_pads_by_contact() -> None:
     )
 
 
-def test_press_section_states_what_the_press_does_to_each_family() -> None:
+def test_press_section_states_what_the_press_does_to_each_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    blank_pictures(monkeypatch)
     document = design_document()
     contact = Contact(depth_mm=2.0, thickness_mm=8.0, tool_radius_mm=10.0, fibre_depths_mm=(1.5, 0.5))
     document["provenance"]["settings"]["contact"] = contact.model_dump(mode="json")
