@@ -24,7 +24,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from functools import partial
+from functools import cache, partial
 from importlib import metadata
 from itertools import count
 from pathlib import Path
@@ -501,9 +501,15 @@ def provenance(
         "command": command,
         "seed": seed,
         "versions": {"python": platform.python_version()}
-        | {name: metadata.version(name) for name in (*_PACKAGES, *packages)},
+        | {name: installed_version(name) for name in (*_PACKAGES, *packages)},
         "inputs": {path.name: sha256(path) for path in inputs},
     }
+
+
+@cache
+def installed_version(package: str) -> str:
+    """Return the version of an installed package, which does not change while a process runs: it is read once."""
+    return metadata.version(package)
 
 
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:

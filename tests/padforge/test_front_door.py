@@ -114,14 +114,13 @@ def test_mistakes_are_refused_in_one_line(tmp_path: Path, settings: str, words: 
 
 def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is refused before anything is written, and the line names the extra."""
-    version = metadata.version
 
     def version_without_pymoo(name: str) -> str:
         if name == "pymoo":
             raise metadata.PackageNotFoundError(name)
-        return version(name)
+        return metadata.version(name)
 
-    monkeypatch.setattr(metadata, "version", version_without_pymoo)
+    monkeypatch.setattr("padforge.design.common.files.installed_version", version_without_pymoo)
     smallest = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
     (tmp_path / "pad.toml").write_text(smallest)
     said = refused("design", "--method", "genetic", cwd=tmp_path)

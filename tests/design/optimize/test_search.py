@@ -17,7 +17,7 @@ from padforge.design.paths.curves import refine
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)
-SMALL = SearchSettings(knots=3, starts=2, steps=25, population=10, generations=3, max_failures=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=10, population=10, generations=3, max_failures=1)
 QUICK = SMALL.model_copy(update={"starts": 1, "steps": 1, "generations": 1})
 REPAIR = "padforge.design.optimize.gradient.REPAIR_STEPS"
 
@@ -30,7 +30,7 @@ def test_search_depends_on_its_seed_and_not_on_its_executor(method, monkeypatch)
     with ThreadPoolExecutor(1) as executor:
         run = SearchOptions(lambda *progress: reported.append(progress), executor=executor)
         sliced = search(pad, None, settings, FREE, run=run)
-    assert len(reported) == (2 * 25 if method == "descent" else 3)
+    assert len(reported) == (2 * 10 if method == "descent" else 3)
     assert method == "genetic" or first.candidate.startswith("start")  # better than straight fibres
     assert (first.morphology, first.history, first.terms) == (sliced.morphology, sliced.history, sliced.terms)
     assert first.morphology != search(pad, None, settings.model_copy(update={"seed": 1}), FREE).morphology

@@ -50,7 +50,7 @@ def judged(plan: Plan, **wells) -> CadModel:
     return model
 
 
-@pytest.mark.parametrize(("draft_deg", "deep"), [(0.0, "horizontal"), (0.0, "vertical"), (20.0, "horizontal")])
+@pytest.mark.parametrize(("draft_deg", "deep"), [(0.0, "vertical"), (20.0, "horizontal")])
 def test_mould_model_of_a_straight_pad_has_closed_form_volumes(draft_deg, deep):
     settings = with_settings(PLAIN | {"wall_draft_deg": draft_deg}, pad={"deep_family": deep})
     plan = Plan(Morphology.straight(2), settings)
