@@ -24,6 +24,7 @@ from padforge.design.optimize.search import SearchResult, settings_for_twin, sta
 from padforge.design.paths.curves import crossings
 from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
+from tests.helpers.less import compare_little
 
 QUICK_SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\nmax_failures = 1\n"
 QUICK = "[pad]\ngrid = 2\n" + QUICK_SEARCH.replace("steps = 3", "steps = 1")
@@ -125,14 +126,17 @@ def evaluate(pad, contact, noise):
 
 
 @pytest.mark.slow
-def test_design_for_twin_uses_its_contact(here, twin):
+def test_design_for_twin_uses_its_contact(here, twin, monkeypatch):
+    compare_little(monkeypatch)
     _, document = designed("--twin", twin, spec=QUICK_SEARCH)
     used, contact = document["provenance"]["settings"], Twin.load(twin).contact()
     assert Contact.model_validate_json(json.dumps(used["contact"])) == contact
     assert document["candidate"] in ("twin", "from default", "default", "straight fibres")
     assert document["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad = Morphology.load("out/pad/morphology.json")
-    assert document["terms"] == pytest.approx(evaluate(pad, contact, used["search"]["noise"]), rel=1e-9)
+    terms = evaluate(pad, contact, used["search"]["noise"])
+    terms = {name: term for name, term in terms.items() if not name.startswith("published_")}  # those are of a shape
+    assert document["terms"] == pytest.approx(terms, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -149,8 +153,9 @@ def test_design_for_twin_refuses_contradicting_settings_and_invalid_files(here, 
 
 
 @pytest.mark.slow
-def test_search_for_twin_resumes(here, twin):
-    long = QUICK_SEARCH.replace("steps = 3", "steps = 20")
+def test_search_for_twin_resumes(here, twin, monkeypatch):
+    compare_little(monkeypatch)
+    long = QUICK_SEARCH.replace("steps = 3", "steps = 8")
     _, unbroken = designed("--twin", twin, spec=long)
 
     def stop(*step):

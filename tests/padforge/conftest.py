@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.door import called
+from tests.helpers.less import blank_pictures, compare_little
 from tests.helpers.once import Once
-from tests.helpers.pictures import blank_pictures
 
 SMALL = """
 [pad]
@@ -25,12 +25,6 @@ hidden = 16
 epochs = 4
 max_failures = 1
 """
-
-
-def compare_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare contacts by few presses and small networks."""
-    for name, value in (("SIDE", 10), ("N_TEST", 50), ("HIDDEN", 5)):
-        monkeypatch.setattr(f"padforge.design.contact_comparison.{name}", value)
 
 
 @pytest.fixture(scope="session")

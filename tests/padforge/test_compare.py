@@ -13,8 +13,7 @@ from padforge.design.contact import half_width_mm
 from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called
-from tests.helpers.pictures import blank_pictures
-from tests.padforge.conftest import compare_little
+from tests.helpers.less import blank_pictures, compare_little
 
 
 def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):

@@ -20,8 +20,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="l
 
 COMMANDS = {
     "design": ("design", "--out", "pad"),
-    "genetic": ("design", "--method", "genetic", "--out", "pad"),
-    "show": ("design", "show", "made/morphology.json", "--out", "pad/plan.png"),
     "fabricate": ("fabricate", "made/morphology.json", "--formats", "stl,3mf,svg,png", "--out", "pad"),
     "picture": ("fabricate", "check", "made/morphology.json", "--picture", "pad/found.png"),
     "init": ("init", "pad/new.toml"),
@@ -88,11 +86,9 @@ def litter(folder: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "limit"),
     [
-        ("design", 0),
         ("design", 2000),
         ("fabricate", 2000),
         ("picture", 0),
-        ("show", 2000),
         ("report", 0),
         ("record", 0),
     ],
@@ -143,7 +139,7 @@ def test_kill_while_writing_leaves_one_mould(room: Path, ending: signal.Signals)
         assert litter(room) == [], err
 
 
-@pytest.mark.parametrize("name", ["fabricate", "design", "genetic"])
+@pytest.mark.parametrize("name", ["fabricate", "design"])
 def test_concurrent_runs_leave_one_result(room: Path, name: str):
     children = [start(room, *COMMANDS[name]) for _ in range(2)]
     for child in children:

@@ -10,7 +10,7 @@ from padforge.design.common.files import sha256, write_json
 from padforge.design.morphology import Morphology
 from padforge.sense.recording.run_directory import Recorder
 from tests.helpers.door import called, refused
-from tests.helpers.pictures import blank_pictures
+from tests.helpers.less import blank_pictures
 
 SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nmax_failures = 1\n[rules]\nenforce = false\n"
 DESIGN = "design --out pad"

@@ -30,7 +30,7 @@ from padforge.sense.report.sections import (
     loss_chart,
     recording_sections,
 )
-from tests.helpers.pictures import blank_pictures
+from tests.helpers.less import blank_pictures
 from tests.padforge.report.conftest import (
     HOSTILE,
     PAD,
