@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
+from scipy.spatial import KDTree
 
 from padforge.design import InputError, Morphology, Spec, crossings
 from padforge.design.contact import fibre_axes
@@ -36,7 +37,7 @@ def test_rules_settings_write_no_limit_as_any(key, refused):
         Spec({"rules": {key: refused}}).section(RulesSettings)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_min_gap_fold_matches_scipy_curve(seed):
     """Against points of SciPy's curve, 0.02 mm apart: none lies nearer, and some almost as near."""
     pad = Morphology.random(1, 6, seed)
@@ -143,7 +144,7 @@ def test_min_gap_of_bent_fibres_matches_scipy_curves():
     knots[0, 1:3, 1], knots[1, 1:3, 1] = (1.75, 0.6), (2.3, 0.9)
     at = np.linspace(0, 3, 6001)
     first, second = (np.column_stack([at, PchipInterpolator(*knots[f].T)(at)]) * 11.25 for f in (0, 1))
-    least = min(np.linalg.norm(second - place, axis=1).min() for place in first)
+    least = KDTree(second).query(first)[0].min()
     (found,) = check_rules(Morphology(knots), only(min_gap_mm=6.0))
     assert found.measured == pytest.approx(least, abs=3e-3)
 
