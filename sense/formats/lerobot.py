@@ -195,7 +195,8 @@ def _statistics(values: _Column) -> dict[str, Any]:
     """Return the statistics of each of k values over the frames; missing ones are left out, zeros if all are."""
     rows = values.reshape(len(values), -1).astype(np.float64)
     rows = np.where(np.isnan(rows).all(axis=0), 0.0, rows)
-    quantiles = np.nanquantile(rows, _QUANTILES, axis=0)
+    quantile = np.nanquantile if np.isnan(rows).any() else np.quantile  # the same in a tenth of the time
+    quantiles = quantile(rows, _QUANTILES, axis=0)
     statistics = {
         "min": np.nanmin(rows, axis=0),
         "max": np.nanmax(rows, axis=0),
