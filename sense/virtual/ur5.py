@@ -192,7 +192,8 @@ class EmulatedUR5:
                 done.set_result(getattr(self if name.startswith("_") else self._controller, name)(*arguments))
             while self._delayed and self._delayed[0][0] <= clock.now():
                 self._delayed.popleft()[1]()
-            while cycle <= clock.now():
+            due_s = clock.now()  # and no later: where cycles take longer than they last, it must still read its sockets
+            while cycle <= due_s:
                 self._run_cycle(cycle)
                 cycle += period
 
