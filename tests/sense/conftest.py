@@ -27,6 +27,7 @@ from padforge.sense.virtual.ur5 import EmulatedUR5
 from padforge.sense.virtual.ur5_controller import Series
 from tests.helpers.once import Once
 from tests.helpers.rigs import ideal_rig
+from tests.helpers.steady_clock import SteadyClock, steady_clock
 
 QUICK = sense_settings.LocalizerSettings(members=2, hidden=48, layers=2, epochs=20, batch=64)
 
@@ -114,6 +115,13 @@ def folder(recording: Recording, tmp_path: Path) -> Path:
     """The run directory of a recording."""
     recording.save(tmp_path / "run", {"command": "test"})
     return tmp_path / "run"
+
+
+@pytest.fixture
+def steady() -> Iterator[SteadyClock]:
+    """The clock of rigs stands still for all while one of their threads gets no processor."""
+    with steady_clock() as clock:
+        yield clock
 
 
 WAIT_S = 180.0
