@@ -6,16 +6,13 @@ profile of the distance to the press centre, or of the published weight inside a
 
 import math
 from collections.abc import Iterator
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design import layer
 from padforge.design.common import profiling
-from padforge.design.common.kept import Arrays, kept
 from padforge.design.common.parallel import map_chunks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import MAX_VALUES, InputError, check_array, check_float, check_int, check_type
@@ -403,7 +400,7 @@ def contact_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
     families = tuple((distance / unit_mm, *weights) for distance, *weights in profile_weights(contact))
     near, edge = math.inf, 0.0
     if contact.model == "layer":
-        edge = contact.scale * float(_layer_weights(contact)["contact_radius_mm"]) / unit_mm
+        edge = contact.scale * contact_press(contact).contact_radius_mm / unit_mm
         near = edge + contact.scale * contact.thickness_mm / 2 / unit_mm
     return geometry.profile_law(_LENGTHS[contact.length], families, near, edge)
 
@@ -433,18 +430,6 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
         return ((distance, weight, np.zeros_like(weight)),)
-    return tuple((distance, plain, directed) for distance, plain, directed in _layer_weights(contact)["families"])
-
-
-@lru_cache(maxsize=128)
-def _layer_weights(contact: Contact) -> Arrays:
-    """Return "families", `profile_weights` of a layer, shape (families, 3, n), and "contact_radius_mm"."""
-    code = [Path(file).read_bytes() for file in (__file__, str(layer.__file__), str(geometry.__file__))]
-    return kept(b"".join([contact.model_dump_json().encode(), *code]), partial(_solve_layer, contact))
-
-
-def _solve_layer(contact: Contact) -> Arrays:
-    """Compute `_layer_weights`."""
     press = contact_press(contact)
     thickness_mm = min(contact.thickness_mm, THICK * press.contact_radius_mm)
     distance = _layer_distances(contact, press.contact_radius_mm, thickness_mm)
@@ -457,7 +442,7 @@ def _solve_layer(contact: Contact) -> Arrays:
         directed = contact.stretch * (strains.radial - strains.hoop)
         directed[0] = 0.0  # to rounding, by symmetry
         families.append((contact.scale * distance, fade * plain, fade * directed))
-    return {"families": np.array(families), "contact_radius_mm": np.array(press.contact_radius_mm)}
+    return tuple(families)
 
 
 def half_width_mm(contact: Contact) -> float:

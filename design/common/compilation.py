@@ -41,11 +41,6 @@ inline_kernel: _Decorator = partial(inner_kernel, inline="always")
 """Makes a function that one kernel calls a part of that kernel: it is not compiled by itself."""
 
 
-def cache_folder() -> Path:
-    """Return the folder in or below which Numba keeps the compiled kernels of `design`."""
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "kernels" / "__pycache__")
-
-
 def clear_stale_kernels(package: Path) -> None:
     """Delete the compiled kernels of a package if any of its sources has changed since the last call.
 
