@@ -46,8 +46,8 @@ PUBLISHED = ROOT.parent / "shared" / "data" / "published"
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """One worker more than cores: rigs wait for clocks most of their time."""
-    return 1 + (len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1)
+    """One worker for each core that may be used, of two threads too: each imports all, which takes ten seconds."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def pytest_cmdline_main(config: pytest.Config) -> None:
