@@ -177,71 +177,37 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     context.exit(int(bool(findings)))
 
 
-def _parse_bytes(context: click.Context, param: click.Parameter, value: str) -> int:
-    match = re.fullmatch(r"(\d{1,9})([kM]?)", value)
-    if match is None:
-        raise click.BadParameter(f"got {value!r}, expected bytes, as 65536, 64k or 1M")
-    return int(match[1]) * {"": 1, "k": 2**10, "M": 2**20}[match[2]]
-
-
-def _bytes_option(name: str, default: str, text: str) -> Callable[..., Any]:
-    return click.option(name, metavar="BYTES", callback=_parse_bytes, default=default, show_default=True, help=text)
-
-
 @click.command()
 @model_option
 @click.argument("files", nargs=-1, required=True, metavar="[RECORDING] OUT", type=click.Path(path_type=Path))
-@_bytes_option("--flash", "256k", "For code and tables of a .h.")
-@_bytes_option("--ram", "64k", "For the state of a .h.")
-@click.option("--quantize", type=click.Choice(["int8"]), help="Weights of a .h as int8, not float32.")
-@common.spec_option
 @common.profile_option
-def deploy(model: Path, files: tuple[Path, ...], flash: int, ram: int, quantize: str | None, spec: Path | None) -> None:
-    """Write the localizer for other machines. OUT is an .onnx, or a .h for microcontrollers.
+def deploy(model: Path, files: tuple[Path, ...]) -> None:
+    """Write the localizer for other programs, as OUT, an .onnx.
 
     \b
     padforge sense deploy --model out/pad localizer.onnx
-    padforge sense deploy --model out/pad out/pad/recording localizer.h --flash 256k --ram 64k
 
-    An .onnx takes all readings so far, the rows at which presses start and end, and a mask of the fibres, and returns
+    It takes all readings so far, the rows at which presses start and end, and a mask of the fibres, and returns
     positions, standard deviations and radii. It is compared with the localizer in ONNX Runtime, on the presses of
     RECORDING or on synthetic ones, and not written if they differ.
-
-    A .h is one C99 file that takes reading after reading. Its student network, as large as --flash and --ram allow, is
-    trained on RECORDING to predict positions at the end of a press. Its error on held-out presses is printed beside
-    those of the model and, if it uses the release, of one trained without it. [localizer] sets the training.
     """
     from padforge.design.common.files import check_writable, sha256
+    from padforge.sense.deploy.onnx_export import export_onnx
     from padforge.sense.localizer.model import LocalizerModel
 
     path, recording = files[-1], files[0] if len(files) == 2 else None
     if len(files) > 2:
         raise InputError(f"{files[1]}: one argument too many, expected [RECORDING] OUT")
-    if path.suffix not in (".onnx", ".h"):
-        raise InputError(f"{path}: cannot be written, expected a name that ends in .onnx or .h")
+    if path.suffix != ".onnx":
+        raise InputError(f"{path}: cannot be written, expected a name that ends in .onnx")
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written, there is no folder {path.parent}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: cannot be written, it is there and no file")
     check_writable(path.parent)
     localizer, digest = LocalizerModel.load(model), sha256(model / "localizer.json")
-    if path.suffix == ".onnx":
-        from padforge.sense.deploy.onnx_export import export_onnx
-
-        opened = None if recording is None else read_recording(recording)
-        click.echo(f"{export_onnx(localizer, digest, path, opened).text} -> {path}")
-        return
-    from padforge.sense.deploy.c_header import export_header
-    from padforge.sense.deploy.streaming import MemoryBudget
-    from padforge.sense.settings import LocalizerSettings
-
-    if recording is None:
-        raise InputError(f"{path}: a .h learns from a recording, which is not given: expected RECORDING {path}")
-    budget, options = MemoryBudget(flash, ram, quantize == "int8"), common.load_spec(spec).section(LocalizerSettings)
-    opened = read_recording(recording)
-    with common.progress_bar("training") as report:
-        header = export_header(localizer, digest, path, opened, budget, options, report)
-    click.echo("\n".join([*header.lines(budget), f"localizer -> {path}"]))
+    opened = None if recording is None else read_recording(recording)
+    click.echo(f"{export_onnx(localizer, digest, path, opened).text} -> {path}")
 
 
 @click.command()

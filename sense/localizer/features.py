@@ -17,7 +17,6 @@ Window = tuple[int, int]
 REST: Window = (-10, 0)  # readings before the probe is sent down; the other windows are measured from their mean
 DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
-ONSET = 6  # windows of `DOWN` that end within six readings of the touch, which comes two after the command
 UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 NOW: tuple[Window, ...] = ((-1, 0), (-2, -1))

@@ -34,7 +34,6 @@ N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
 """Parameters that all channels share (transform and two profiles), and those of each channel."""
 OFFSET, SENSITIVITY = slice(2, 2 + 2 * N_OFFSET), slice(2 + 2 * N_OFFSET, N_CHANNEL)
 """Among the parameters of a channel, those of its lateral offset, x before y, and of its log-sensitivity."""
-SLOPE_STEP_MM = 0.5  # half of the step of the central differences by which slopes over the position are taken
 
 
 @inner_kernel
@@ -266,12 +265,6 @@ class AsBuiltPad:
     def residuals(self, responses: Responses) -> Responses:
         """Return the residuals of responses."""
         return replace(responses, volts=responses.volts - self.predict(responses.positions_mm))
-
-    def mean_squared_slope(self, positions_mm: Array) -> Array:
-        """Return the squared slope of each channel over the position, mean over positions (Q, 2); V^2/mm^2; (C,)."""
-        steps = SLOPE_STEP_MM * np.eye(2)
-        differences = [self.predict(positions_mm + step) - self.predict(positions_mm - step) for step in steps]
-        return np.sum(np.square(np.divide(differences, 2 * SLOPE_STEP_MM)), axis=0).mean(axis=0)
 
     def with_values(self, values: Array) -> "AsBuiltPad":
         """Return the pad of other parameters, with w scaled to 1 at its largest and gains to match."""

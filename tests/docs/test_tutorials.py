@@ -43,7 +43,7 @@ BASES = {
     "example": None,
     "howto-ros": "example",
     "howto-lerobot": "example",
-    "howto-microcontroller": "example",
+    "howto-deploy": "example",
 }
 """Pages that are run, and the page that each continues."""
 REWRITE = "REWRITE_DOCS" in os.environ

@@ -55,7 +55,7 @@ RIGHT: dict[str, tuple[str, ...]] = {
     "plan": ("plan.svg", "plan.dxf"),
     "mesh_or_morphology": (*PADS, "pad/mould.stl", "pad/mould.3mf"),
     "file": ("presses.csv", "presses.h5", "lab.csv", "bag_mcap", "new.csv", "new.h5", "new.mcap"),
-    "files": ("new.onnx", "new.h", "pad/recording"),
+    "files": ("new.onnx", "pad/recording"),
     "sources": ("pad/morphology.json", "other.toml"),
     "names": ("no-such-pad", "square@999", "random-100"),
     "path": ("new.toml",),

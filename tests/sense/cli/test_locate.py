@@ -6,12 +6,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 
 from padforge.sense import Recording
-from padforge.sense.cli.localizer import deploy
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import Moment
 from padforge.sense.signals.press_detection import first_readings
@@ -92,20 +90,6 @@ def test_deploy_writes_a_graph(few) -> None:
     assert Path("again.onnx").read_bytes() == Path("localizer.onnx").read_bytes()
 
 
-def test_deploy_writes_a_header(few) -> None:
-    code, out, err = few("deploy", "--model", "model", "rec", "localizer.h", "--flash", "40k", "--ram", "8192")
-    assert (code, err) == (0, "")
-    lines = out.splitlines()
-    assert " KiB of 40, 8 of them for code; RAM " in lines[0]
-    assert lines[1] == "mean error in mm on 9 presses never trained on"
-    assert lines[2].split() == ["failed", "sets", "header", "at", "the", "end", "whole", "press"]
-    assert [line.split()[:2] for line in lines[3:7]] == [["0", "1"], ["1", "4"], ["2", "6"], ["3", "4"]]
-    assert lines[-1] == "localizer -> localizer.h"
-    assert "int8_t localizer" not in Path("localizer.h").read_text()
-    assert few("deploy", "--model", "model", "rec", "localizer.h", "--flash", "40k", "--quantize", "int8")[0] == 0
-    assert "static const int8_t localizer_first_w_" in Path("localizer.h").read_text()
-
-
 @pytest.mark.parametrize("library", ["onnx", "onnxruntime"])
 def test_deploy_names_a_missing_library(few, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("padforge.sense.deploy.onnx")]:
@@ -127,12 +111,3 @@ def test_locate_looks_at_the_readings_nearest_to_a_moment(few, moment: str, sinc
     until = Moment(since, readings).until(touched, recording.up_command)  # type: ignore[arg-type]
     expected_mm = LocalizerModel.load("model").predict(recording, until=until).positions_mm
     np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), expected_mm, atol=1e-4)
-
-
-def test_deploy_takes_bytes_kibibytes_and_mebibytes() -> None:
-    flash = next(option for option in deploy.params if option.name == "flash")
-    context = click.Context(deploy)
-    sizes = [flash.process_value(context, text) for text in ("65536", "64k", "1M")]
-    assert sizes == [65_536, 65_536, 1_048_576]
-    with pytest.raises(click.BadParameter, match="expected bytes, as 65536, 64k or 1M"):
-        flash.process_value(context, "64K")

@@ -39,9 +39,7 @@ recalibrate --model model rec --out studied     | localizer.json: fibre_loss.jso
 identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
 recalibrate --model empty/../model model/recording | padforge: model: holds the old model; name a folder
 deploy --model model localizer.tflite           | localizer.tflite: cannot be written, expected a name that ends in
-deploy --model model l.h                        | l.h: a .h learns from a recording, which is not given
-deploy --model model other l.h                  | readings are of 6 fibres, the localizer was learnt from 4
-deploy --model model rec l.h --flash 4k         | --flash is 4096 bytes: the smallest localizer of 4 fibres takes
+deploy --model model other l.onnx               | readings are of 6 fibres, the localizer was learnt from 4
 record --seed 9 --out rec                       | never written over
 record --presses -3 --out rec                   | Invalid value for '--presses': got -3, input should be greater
 record --plan rows --out rec                    | Invalid value for '--plan': got 'rows', expected uniform, grid,

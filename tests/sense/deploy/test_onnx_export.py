@@ -17,12 +17,10 @@ from padforge.design.common.validation import Fault, InputError
 from padforge.sense import Recording, export_csv
 from padforge.sense.deploy import onnx_export
 from padforge.sense.deploy.onnx_export import FORMAT, MAX_DIFFERENCE_MM, OnnxReport, export_onnx
-from padforge.sense.deploy.streaming import commanded_presses
 from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.network import predict
 from padforge.sense.localizer.scaler import MAX_INPUT
-from tests.sense.deploy.conftest import tutorial_code
 from tests.sense.live.conftest import first_presses
 
 DIGEST = "a" * 64
@@ -101,8 +99,9 @@ def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer,
 
 
 def test_graph_clips_what_is_far_beyond_the_training(graph, localizer, recording) -> None:
-    readings = np.array(recording.readings)
-    readings[:] = np.where(commanded_presses(recording), 1000.0, -1000.0)[:, None]
+    readings = np.full_like(recording.readings, -1000.0)
+    for first, end in zip(recording.down_command, recording.up_command, strict=True):
+        readings[first:end] = 1000.0
     strong = replace(recording, readings=readings)
     presses = localizer.scaled_features(strong)
     assert (np.abs(presses.inputs) == MAX_INPUT).any()
@@ -190,7 +189,8 @@ def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, t
     Path("localizer.onnx").write_bytes(exported[0].read_bytes())
     export_csv(brief, "presses.csv")
     names: dict[str, np.ndarray] = {}
-    exec(tutorial_code("graph", "python"), names)
+    page = (Path(__file__).parents[3] / "docs" / "howto-deploy.md").read_text(encoding="utf-8")
+    exec(page.partition("```python\n")[2].partition("```")[0], names)
     assert np.array_equal(names["down_command"], brief.down_command)
     presses = localizer.scaled_features(brief)
     without_last = localizer.predict_features(presses[np.arange(len(brief.down_command) - 1)])
