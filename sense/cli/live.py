@@ -35,8 +35,6 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
     "--port", type=click.IntRange(0, 65_535), default=PORT, show_default=True, help="Port of the page; 0: any."
 )
 @click.option("--tcp", type=click.IntRange(0, 65_535), help="Send lines of JSON on this port; 0: any.")
-@click.option("--osc", metavar="HOST:PORT", help="Send Open Sound Control to this address.")
-@click.option("--lsl", metavar="NAME", help="Send streams of the Lab Streaming Layer by this name.")
 @click.option("--foxglove", type=click.IntRange(0, 65_535), help="Serve Foxglove on this port; 0: any.")
 @click.option(
     "--rerun",
@@ -76,7 +74,6 @@ def live(
 
     \b
     padforge sense live --tcp 9000                                for programs here: docs/live-protocol.md
-    padforge sense live --osc 127.0.0.1:9001 --lsl pad            for music, for labs
     padforge sense live --foxglove 8765 --rerun                   for viewers of robotics
     padforge sense live --tcp 9000 --host 0.0.0.0 --token WORD    for other machines
 
@@ -154,15 +151,13 @@ def _open_outputs(
     stream: "ReadingStream",
     area: dict[str, Any],
     tcp: int | None,
-    osc: str | None,
-    lsl: str | None,
     foxglove: int | None,
     rerun: str | None,
     host: str,
     token: str,
 ) -> "tuple[list[OutputStream], list[str]]":
     """Return the outputs that were asked for, which `stack` closes, and lines with the addresses of servers."""
-    from padforge.sense.live.outputs import JsonLines, LslOutput, OscOutput
+    from padforge.sense.live.outputs import JsonLines
     from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
 
     outputs: list[OutputStream] = []
@@ -171,10 +166,6 @@ def _open_outputs(
         lines = stack.enter_context(JsonLines(host, tcp, token))
         addresses.append(f"lines: {lines.address[0]}:{lines.address[1]}")
         outputs.append(lines)
-    if osc is not None:
-        outputs.append(stack.enter_context(OscOutput(osc)))
-    if lsl is not None:
-        outputs.append(LslOutput(lsl, stream.fibres, stream.rate_hz))
     if foxglove is not None:
         viewer = stack.enter_context(FoxgloveOutput(foxglove, **area))
         addresses.append(f"foxglove: {viewer.url}")

@@ -9,10 +9,9 @@ import hmac
 import json
 import math
 import queue
-import socket
 import socketserver
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -28,8 +27,6 @@ MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behin
 MAX_SUBSCRIBERS = 32
 SEND_TIMEOUT_S = 10.0  # a subscriber that receives nothing for this time is disconnected
 MAX_COMMANDS = 16  # of a page that wait to be read: a button may be hit again and again
-TOUCH_UNITS = {"press": "", "x_mm": "mm", "y_mm": "mm", "r50_mm": "mm", "r90_mm": "mm", "final": ""}
-"""Values of a touch that OSC and LSL send, with their units."""
 _OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
 
 
@@ -199,73 +196,6 @@ class _Subscriber(socketserver.StreamRequestHandler):
                 self.wfile.write(line)
         finally:
             self.server.unsubscribe(self)
-
-
-class OscOutput(contextlib.AbstractContextManager["OscOutput"]):
-    """Open Sound Control over UDP, to HOST:PORT: /pad/touches, /pad/readings, /pad/pressed and /pad/health."""
-
-    def __init__(self, address: str) -> None:
-        from pythonosc.udp_client import SimpleUDPClient
-
-        host, _, port = address.rpartition(":")
-        if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
-            raise InputError(f"--osc is {address!r}, expected HOST:PORT")
-        try:
-            family, *_, target = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
-        except (OSError, UnicodeError) as error:
-            raise InputError(f"--osc is {address!r}: no such host ({error})") from error
-        try:
-            with socket.socket(family, socket.SOCK_DGRAM) as probe:
-                probe.connect(target)
-        except OSError as error:
-            raise InputError(f"--osc is {address!r}: nothing can be sent there ({error})") from error
-        # The numeric address: a name would be resolved for every message, and all outputs wait for that.
-        self._client = SimpleUDPClient(str(target[0]), int(port), family=family)
-
-    def __exit__(self, *error: object) -> None:
-        self._client.close()
-
-    def send(self, message: Message) -> None:
-        with contextlib.suppress(OSError):  # UDP: what nobody receives, or a cable that is out, is lost
-            self._client.send_message(message.topic, _values(message))
-
-
-def _values(message: Message) -> list[Any]:
-    """Return the values of a message that OSC and LSL send."""
-    pad = message.pad
-    if message.topic == READINGS:
-        return [math.nan if value is None else value for value in pad["volts"]]
-    if message.topic == TOUCHES:
-        return [int(pad[name]) if name == "final" else pad[name] for name in TOUCH_UNITS]
-    return [pad["pressed"]] if message.topic == PRESSED else list(pad["states"])
-
-
-class LslOutput:
-    """Streams of the Lab Streaming Layer, for all the network: "NAME readings" in V at their rate, "NAME touches"."""
-
-    def __init__(self, name: str, fibres: int, rate_hz: float) -> None:
-        if any("\ud800" <= letter <= "\udfff" for letter in name):  # bytes of a command line that are no text
-            raise InputError(f"the name of a stream is {short_repr(name)}, expected text")
-        volts = {f"fibre {fibre}": "V" for fibre in range(1, fibres + 1)}
-        self._readings = _open_outlet(f"{name} readings", volts, rate_hz)
-        self._touches = _open_outlet(f"{name} touches", TOUCH_UNITS, 0.0)
-
-    def send(self, message: Message) -> None:
-        if message.topic == READINGS:
-            self._readings.push_sample(_values(message))
-        elif message.topic == TOUCHES:
-            self._touches.push_sample(list(map(float, _values(message))))
-
-
-def _open_outlet(name: str, units: Mapping[str, str], rate_hz: float) -> Any:
-    """Open a stream whose channels have names and units; rate 0 for an irregular one."""
-    from pylsl import IRREGULAR_RATE, StreamInfo, StreamOutlet, cf_double64
-
-    info = StreamInfo(name, "Tactile", len(units), rate_hz or IRREGULAR_RATE, cf_double64, f"padforge {name}")
-    channels = info.desc().append_child("channels")
-    for label, unit in units.items():
-        channels.append_child("channel").append_child_value("label", label).append_child_value("unit", unit)
-    return StreamOutlet(info)
 
 
 class LivePage(LocalPage):

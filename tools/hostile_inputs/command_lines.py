@@ -39,8 +39,6 @@ RIGHT: dict[str, tuple[str, ...]] = {
     "--plan": ("plan.csv", "grid", "uniform", "adaptive"),
     "--port": ("0",),
     "--tcp": ("0",),
-    "--osc": ("127.0.0.1:9001",),
-    "--lsl": ("pad",),
     "--foxglove": ("0",),
     "--rerun": ("new.rrd",),
     "--host": ("127.0.0.1", "localhost"),

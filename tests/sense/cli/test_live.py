@@ -63,9 +63,9 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     assert set(last) == {f"press {press}" for press in final}
 
 
-def test_live_sends_to_tcp_and_osc(replay) -> None:
+def test_live_sends_to_tcp(replay) -> None:
     token = "a word of sixteen"
-    code, _, err = replay("--tcp", "0", "--osc", "127.0.0.1:9", "--host", "127.0.0.1", "--token", token)
+    code, _, err = replay("--tcp", "0", "--host", "127.0.0.1", "--token", token)
     assert code == 0, err
     assert re.search(r"^page: http://127\.0\.0\.1:\d+/\?token=a\+word\+of\+sixteen ", err, re.MULTILINE)
     assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)

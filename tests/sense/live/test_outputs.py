@@ -1,9 +1,7 @@
 """Messages agree with the estimates of the pipeline, reach every subscriber, and wait for nobody."""
 
-import errno
 import json
 import operator
-import pickle
 import re
 import socket
 import subprocess
@@ -20,8 +18,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from pythonosc.osc_message import OscMessage
-from pythonosc.udp_client import UDPClient
 
 from padforge.design.common import server
 from padforge.design.common.validation import InputError
@@ -29,7 +25,7 @@ from padforge.sense import Live, Recording
 from padforge.sense.formats.ros_messages import HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, depths_to_z
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live import outputs
-from padforge.sense.live.outputs import FORMAT, JsonLines, LslOutput, Message, MessageBuilder, OscOutput
+from padforge.sense.live.outputs import FORMAT, JsonLines, Message, MessageBuilder
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
 from tests.sense.live.conftest import first_presses
@@ -215,56 +211,3 @@ def test_client_has_a_time_limit_for_its_token_however_slowly_it_sends(monkeypat
         lines.send(TOUCH)
         received = admitted.makefile()
         assert [json.loads(received.readline())["topic"] for _ in range(2)] == [HEALTH, TOUCHES]
-
-
-def test_osc_sends_numbers() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(20)
-        with OscOutput(f"127.0.0.1:{receiver.getsockname()[1]}") as osc:
-            for message in (TOUCH, DOWN, STATES, READING):
-                osc.send(message)
-        received = [OscMessage(receiver.recv(4096)) for _ in range(4)]
-    assert [each.address for each in received] == [TOUCHES, PRESSED, HEALTH, READINGS]
-    assert [each.params for each in received[:3]] == [[4, 1.5, -2.25, 0.5, 1.0, 1], [True], ["sound", "stuck"]]
-    np.testing.assert_array_equal(received[3].params, [1.0, np.nan])
-
-
-def test_osc_survives_a_lost_network_and_resolves_its_host_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(client: UDPClient, content: object) -> None:
-        addresses.append(client._address)  # noqa: SLF001
-        raise OSError(errno.ENETUNREACH, "Network is unreachable")
-
-    addresses: list[str] = []
-    monkeypatch.setattr(UDPClient, "send", fail)
-    with OscOutput("localhost:9") as osc:
-        osc.send(TOUCH)
-    assert addresses[0] in ("127.0.0.1", "::1")
-
-
-def test_lsl_streams_readings_and_touches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In its own process, which looks for streams on this machine only."""
-    with pytest.raises(InputError, match="the name of a stream is"):
-        LslOutput("\udc80", 2, 13.0)
-    (tmp_path / "lsl.cfg").write_text("[multicast]\nResolveScope = machine\n[log]\nlevel = -3\n")
-    code = """
-import pickle, sys
-import pylsl
-from padforge.sense.live.outputs import LslOutput
-reading, touch = pickle.load(sys.stdin.buffer)
-lsl = LslOutput("a pad", 2, 13.0)
-found = [pylsl.resolve_byprop("name", f"a pad {what}", timeout=20)[0] for what in ("readings", "touches")]
-readings, touches = (pylsl.StreamInlet(info) for info in found)
-for inlet in (readings, touches):
-    inlet.open_stream(timeout=20)
-channel = readings.info().desc().child("channels").child("channel")
-print(channel.child_value("label"), channel.child_value("unit"), found[0].nominal_srate(), found[0].channel_count())
-lsl.send(reading)
-lsl.send(touch)
-print(readings.pull_sample(timeout=20)[0], touches.pull_sample(timeout=20)[0])
-"""
-    monkeypatch.setenv("LSLAPICFG", str(tmp_path / "lsl.cfg"))
-    sent = pickle.dumps((READING, TOUCH))
-    done = subprocess.run([sys.executable, "-c", code], input=sent, capture_output=True, timeout=120, check=False)
-    lines = done.stdout.decode().splitlines()
-    assert lines == ["fibre 1 V 13.0 2", "[1.0, nan] [4.0, 1.5, -2.25, 0.5, 1.0, 1.0]"], done.stderr
