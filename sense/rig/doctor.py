@@ -1,12 +1,13 @@
 """Diagnoses of a rig before a long run: whether it responds, how fast, and which channels have a working fibre."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from padforge.sense.arrays import Array
+from padforge.sense.rig import clock
 from padforge.sense.rig.devices import Arm, Board, RigFault
 from padforge.sense.rig.safety import check_tcp
 from padforge.sense.settings import RigSettings
@@ -29,12 +30,12 @@ class Diagnosis:
     message: str
 
 
-def examine_board(board: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> list[Diagnosis]:
+def examine_board(board: Board) -> list[Diagnosis]:
     """Connect and close a board: whether it responds, its rate, gaps and latency, and each of its channels."""
     try:
         identity = board.connect()
-        times_s, volts, n_missing = _read_samples(board, clock, sleep)
-        delay_s = clock() - times_s[-1] if len(times_s) else np.inf
+        times_s, volts, n_missing = _read_samples(board)
+        delay_s = clock.now() - times_s[-1] if len(times_s) else np.inf
     except RigFault as fault:
         return [Diagnosis("board", "fail", str(fault))]
     finally:
@@ -52,15 +53,13 @@ def examine_board(board: Board, clock: Callable[[], float], sleep: Callable[[flo
     ]
 
 
-def examine_arm(
-    arm: Arm, rig: RigSettings, clock: Callable[[], float], sleep: Callable[[float], None]
-) -> list[Diagnosis]:
+def examine_arm(arm: Arm, rig: RigSettings) -> list[Diagnosis]:
     """Connect and close an arm, without moving it; what would keep `record` from moving it fails here, too."""
     try:
         identity = arm.connect()
         arm.drain()
-        sleep(OBSERVE_S)
-        states, state, now_s = arm.drain(), arm.state(), clock()
+        clock.sleep(OBSERVE_S)
+        states, state, now_s = arm.drain(), arm.state(), clock.now()
     except RigFault as fault:
         return [Diagnosis("arm", "fail", str(fault))]
     finally:
@@ -104,11 +103,11 @@ def _examine_force(force_n: float | None, max_force_n: float | None) -> Diagnosi
     return Diagnosis("force", "ok", f"{measured}, stopped beyond {max_force_n:g} N")
 
 
-def _read_samples(board: Board, clock: Callable[[], float], sleep: Callable[[float], None]) -> tuple[Array, Array, int]:
-    end_s, blocks = clock() + OBSERVE_S, []
-    while clock() < end_s:
+def _read_samples(board: Board) -> tuple[Array, Array, int]:
+    end_s, blocks = clock.now() + OBSERVE_S, []
+    while clock.now() < end_s:
         blocks.append(board.read())
-        sleep(0.01)
+        clock.sleep(0.01)
     times_s = np.concatenate([block.times_s for block in blocks])
     volts = np.vstack([block.volts for block in blocks if len(block.times_s)] or [np.empty((0, 0))])
     return times_s, volts, int(sum(block.missing.sum() for block in blocks))

@@ -32,7 +32,6 @@ from padforge.sense.recording.press_plan import (
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import check_new_folder, check_new_recording
-from padforge.sense.rig import clock
 from padforge.sense.rig.config import RigConfig, load_or_make_plan, locate_on_bed, open_recorder, plan_notice
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
@@ -189,14 +188,14 @@ def diagnose(
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
     try:
-        diagnoses += examine_board(make_board(), clock.now, clock.sleep)
+        diagnoses += examine_board(make_board())
     except RigFault as fault:
         if make_arm is None:
             raise
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
     if make_arm is not None:
         try:
-            diagnoses += examine_arm(*make_arm(), clock.now, clock.sleep)
+            diagnoses += examine_arm(*make_arm())
         except RigFault as fault:
             diagnoses.append(Diagnosis("arm", "fail", str(fault)))
     return diagnoses

@@ -122,11 +122,8 @@ class PressLoop:
         rig: RigSettings,
         *,
         dry: bool = False,
-        clock: Callable[[], float] = clock.now,
-        sleep: Callable[[float], None] = clock.sleep,
     ) -> None:
-        self._arm, self._board, self._recorder, self._rig = arm, board, recorder, rig
-        self._clock, self._sleep, self._dry = clock, sleep, dry
+        self._arm, self._board, self._recorder, self._rig, self._dry = arm, board, recorder, rig, dry
         self._frame, self._limits = RobotFrame.from_settings(rig), Limits.from_settings(rig)
         ratio = max(1, round(rig.board_rate_hz / rig.rate_hz))
         self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz  # half the cycle of a press
@@ -161,7 +158,7 @@ class PressLoop:
                         plan = changed
                     self._await_disk(self._press(press, plan.positions_mm[press], float(plan.depths_mm[press])))
                     on_progress(len(self._recorder.done), len(plan), "")
-            self._record_until(self._clock() + self._half_s)  # the release after the last press
+            self._record_until(clock.now() + self._half_s)  # the release after the last press
             self._await_disk(self._disk.submit(self._recorder.sync))
 
     def _start_clock(self) -> None:
@@ -169,18 +166,18 @@ class PressLoop:
         self._board.read()
         self._arm.drain()
         last_s = self._recorder.last_s
-        self._zero_s = self._clock() - (last_s + 1 if np.isfinite(last_s) else 0.0)
+        self._zero_s = clock.now() - (last_s + 1 if np.isfinite(last_s) else 0.0)
 
     def _press(self, press: int, position_mm: Array, depth_mm: float) -> Future[Any]:
         """Make a press; return the call that puts it on the disk."""
         above = self._frame.pose(position_mm, -self._rig.clearance_mm)
         # 1. Travel, and let the pad recover for half a cycle.
-        start_s = self._clock()
+        start_s = clock.now()
         self._move(above, self._rig.travel_mm_s)
         self._await_still()
         self._record_until(start_s + self._half_s)
         # 2. Down; the press is in the journal on the disk while it is held for half a cycle.
-        down_s = self._clock()
+        down_s = clock.now()
         target = self._frame.pose(position_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
         self._move(target, self._rig.press_mm_s)
         self._await_reading(down_s)
@@ -195,7 +192,7 @@ class PressLoop:
         tip_mm, depths_mm = self._frame.tip(np.array([self._arm.state().pose]))
         reached["at_mm"] = [*tip_mm[0].round(4).tolist(), round(float(depths_mm[0]), 4)]
         # 3. Up; the press is done once the journal says so on the disk.
-        up_s = self._clock()
+        up_s = clock.now()
         self._move(above, self._rig.press_mm_s)
         self._await_reading(up_s)
         reached["lost"] = self._averager.n_missing
@@ -205,38 +202,38 @@ class PressLoop:
         return synced
 
     def _move(self, pose: Pose, speed_mm_s: float) -> None:
-        check_state(self._arm.state(), self._limits, self._clock())
+        check_state(self._arm.state(), self._limits, clock.now())
         try:
             self._arm.move(pose, speed_mm_s, self._rig.acceleration_mm_s2)
         except RigFault:
-            self._sleep(_SETTLE_S)  # the next state tells why, if the arm was stopped a moment ago
-            check_state(self._arm.state(), self._limits, self._clock())
+            clock.sleep(_SETTLE_S)  # the next state tells why, if the arm was stopped a moment ago
+            check_state(self._arm.state(), self._limits, clock.now())
             raise
 
     def _await_still(self) -> None:
-        wait_until_still(self._arm, self._limits, self._clock, self._sleep, self._poll)
+        wait_until_still(self._arm, self._limits, self._poll)
 
     def _record_until(self, time_s: float) -> None:
         self._poll()
-        while self._clock() < time_s:
-            self._sleep(POLL_S)
+        while clock.now() < time_s:
+            clock.sleep(POLL_S)
             self._poll()
 
     def _await_reading(self, time_s: float) -> None:
         """Record until there is a reading taken after a time."""
-        deadline_s = self._clock() + _READING_DEADLINE_S
+        deadline_s = clock.now() + _READING_DEADLINE_S
         self._poll()
         while not self._count_after(time_s):
-            if self._clock() >= deadline_s:
+            if clock.now() >= deadline_s:
                 raise RigFault("deadline", f"no reading came within {_READING_DEADLINE_S:.1f} s", "look at the board")
-            self._sleep(POLL_S)
+            clock.sleep(POLL_S)
             self._poll()
 
     def _await_disk(self, synced: Future[Any]) -> None:
         """Record until a call of the disk thread is done; what is recorded meanwhile may wait."""
-        deadline_s = self._clock() + _DISK_DEADLINE_S
+        deadline_s = clock.now() + _DISK_DEADLINE_S
         while not wait([synced], POLL_S).done:
-            if self._clock() >= deadline_s:
+            if clock.now() >= deadline_s:
                 message = f"the disk took more than {_DISK_DEADLINE_S:.0f} s for a press"
                 raise RigFault("disk", message, "look at the disk")
             self._poll()
@@ -245,7 +242,7 @@ class PressLoop:
     def _poll(self) -> None:
         """Check that all is well, before anything else; then read the devices, and have that recorded."""
         self._interrupts.check()
-        check_state(self._arm.state(), self._limits, self._clock())
+        check_state(self._arm.state(), self._limits, clock.now())
         self._disk.check()
         times_s, volts = self._averager.feed(self._board.read())
         if len(times_s):
@@ -290,7 +287,7 @@ class PressLoop:
         except Exception as error:
             stop_error = str(error)
         try:
-            retreat(self._arm, self._limits, self._rig.acceleration_mm_s2, self._clock, self._sleep)
+            retreat(self._arm, self._limits, self._rig.acceleration_mm_s2)
         except Exception as error:
             return stop_error or str(error)
         return None
@@ -298,7 +295,7 @@ class PressLoop:
     def _lift(self) -> None:
         """Lift the tool straight up to its travelling height; raises RigFault if it is outside the box, or stopped."""
         state = self._arm.state()
-        check_state(state, self._limits, self._clock())
+        check_state(state, self._limits, clock.now())
         if any(not low <= x <= high for x, (low, high) in zip(state.pose, self._limits.box_mm, strict=False)):
             at = ", ".join(f"{x:.1f}" for x in state.pose[:3])
             raise RigFault("refused", f"the tool stands at {at} mm, outside the box", "move it there by hand")
@@ -307,7 +304,7 @@ class PressLoop:
         check_target(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2, self._limits)
         if up != state.pose:
             self._arm.move(up, self._rig.press_mm_s, self._rig.acceleration_mm_s2)
-            wait_until_still(self._arm, self._limits, self._clock, self._sleep)
+            wait_until_still(self._arm, self._limits)
 
 
 def check_plan(plan: PressPlan, rig: RigSettings) -> None:

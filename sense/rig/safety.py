@@ -186,38 +186,34 @@ def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = 
 def wait_until_still(
     arm: Arm,
     limits: Limits,
-    clock: Callable[[], float] = clock.now,
-    sleep: Callable[[float], None] = clock.sleep,
     meanwhile: Callable[[], None] = lambda: None,
 ) -> ArmState:
     """Wait until the arm has ended its move; whatever goes wrong, it is stopped before that is raised.
 
     Checks the limits at every state, and calls `meanwhile` between two of them. Raises RigFault, see `check_state`.
     """
-    until_s = clock() + limits.deadline_s
+    until_s = clock.now() + limits.deadline_s
     try:
         while True:
             state = arm.state()
-            check_state(state, limits, clock(), until_s)
+            check_state(state, limits, clock.now(), until_s)
             if not state.moving and state.speed_mm_s <= STILL_MM_S:
                 return state
             meanwhile()
-            sleep(POLL_S)
+            clock.sleep(POLL_S)
     except BaseException:
         with suppress(RigFault):
             arm.stop()
         raise
 
 
-def retreat(
-    arm: Arm, limits: Limits, acceleration_mm_s2: float, clock: Callable[[], float], sleep: Callable[[float], None]
-) -> None:
+def retreat(arm: Arm, limits: Limits, acceleration_mm_s2: float) -> None:
     """Lift the tool straight up, unless it is above the pad already and no force is too great.
 
     Everything is checked as in any move, except that a force or depth beyond its limit has to decrease, and that the
     tool may stand at the edge of the box. The arm is stopped, and RigFault("force") raised, if it does not decrease.
     """
-    state = _await_state(arm, clock, sleep)
+    state = _await_state(arm)
     if state.force_n is None:  # the sensor may have failed in a press, and the tool has to come off all the same
         limits = replace(limits, max_force_n=None)
     if limits.contact_mm is None:
@@ -231,7 +227,7 @@ def retreat(
         max_force_n=None if overloaded else max_n,
         max_depth_mm=max(limits.max_depth_mm, limits.contact_mm - z),
     )
-    check_state(state, relaxed, clock())
+    check_state(state, relaxed, clock.now())
     clear_mm = max(limits.contact_mm, z if overloaded else z - RETREAT_MM) + RETREAT_MM
     up: Pose = (*state.pose[:2], min(clear_mm, limits.box_mm[2][1]), *state.pose[3:])
     if up[2] <= z:
@@ -239,37 +235,35 @@ def retreat(
     speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
     check_target(up, speed_mm_s, acceleration_mm_s2, relaxed)
     arm.move(up, speed_mm_s, acceleration_mm_s2)
-    meanwhile = (
-        _falling_force_check(arm, state.total_force_n or 0.0, max_n, clock) if overloaded and max_n else lambda: None
-    )
-    check_state(wait_until_still(arm, relaxed, clock, sleep, meanwhile), limits, clock())
+    meanwhile = _falling_force_check(arm, state.total_force_n or 0.0, max_n) if overloaded and max_n else lambda: None
+    check_state(wait_until_still(arm, relaxed, meanwhile), limits, clock.now())
 
 
-def _await_state(arm: Arm, clock: Callable[[], float], sleep: Callable[[float], None]) -> ArmState:
+def _await_state(arm: Arm) -> ArmState:
     """Return the first state that is not stale; raises the RigFault of `arm.state` if none comes in time."""
-    deadline_s = clock() + FRESH_S
+    deadline_s = clock.now() + FRESH_S
     while True:
         try:
             state = arm.state()
         except RigFault as fault:
-            if fault.cause != "stale" or clock() >= deadline_s:
+            if fault.cause != "stale" or clock.now() >= deadline_s:
                 raise
         else:
-            if clock() - state.time_s <= MAX_STATE_AGE_S or clock() >= deadline_s:
+            if clock.now() - state.time_s <= MAX_STATE_AGE_S or clock.now() >= deadline_s:
                 return state
-        sleep(POLL_S)
+        clock.sleep(POLL_S)
 
 
-def _falling_force_check(arm: Arm, first_n: float, max_n: float, clock: Callable[[], float]) -> Callable[[], None]:
+def _falling_force_check(arm: Arm, first_n: float, max_n: float) -> Callable[[], None]:
     """Return a check that raises RigFault("force") unless the force falls from now on."""
-    start_s, min_n = clock(), first_n
+    start_s, min_n = clock.now(), first_n
 
     def check() -> None:
         nonlocal min_n
         force_n = arm.state().total_force_n or 0.0
         min_n = min(min_n, force_n)
         # The allowed force falls along a line, from the first one to the limit, and stays near its minimum so far.
-        remaining = min((start_s + FALL_END_S - clock()) / (FALL_END_S - FALL_START_S), 1.0)
+        remaining = min((start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
         if not force_n <= max(max_n, min(min_n + MAX_RISE_N, max_n + (first_n + MAX_RISE_N - max_n) * remaining)):
             raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
 

@@ -1,7 +1,7 @@
 """A simulated pad that a finger presses at random, in real time: a board to watch without hardware."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,6 @@ class VirtualPad:
         pad: Morphology,
         rig: RigSettings,
         contact: Contact,
-        clock: Callable[[], float] = clock.now,
         size: PadSettings | None = None,
     ) -> None:
         """Make the pad; sampling starts with `connect`. `size` has sensed area and keep-outs, the pad's own if None."""
@@ -44,7 +43,7 @@ class VirtualPad:
         if rig.plan_file is None:
             make_plan(pad, rig, rng, size)  # the presses of the recording are drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
-        self._pad, self._contact, self._rig, self._clock = pad, contact, rig, clock
+        self._pad, self._contact, self._rig = pad, contact, rig
         self._depths_mm = rig.depths_mm or (rig.depth_mm,)
         self._size = size
         self._position_rng = rng.spawn(1)[0]
@@ -55,7 +54,7 @@ class VirtualPad:
     def connect(self) -> Mapping[str, Any]:
         """Start sampling; see `Board`."""
         self._model.prepare()  # before it has to keep up
-        self._start_s, self._n_samples = self._clock(), 0
+        self._start_s, self._n_samples = clock.now(), 0
         fibres = len(self._pad.knots)
         identity = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
         return {**identity, "rate_hz": self._rig.rate_hz, "supply_v": SUPPLY_V}
@@ -64,7 +63,7 @@ class VirtualPad:
         """Return all samples since the last call; see `Board`. Raises RigFault("refused") before `connect`."""
         if self._start_s is None:
             raise RigFault("refused", "the simulated rig is not connected")
-        count = math.floor((self._clock() - self._start_s) * self._rig.rate_hz)
+        count = math.floor((clock.now() - self._start_s) * self._rig.rate_hz)
         elapsed_s = np.arange(self._n_samples + 1, count + 1) / self._rig.rate_hz
         self._n_samples = count
         touches = [self._touch(time_s) for time_s in elapsed_s.tolist()]

@@ -1,6 +1,7 @@
 """An arm and a board in virtual time, on one simulated pad: minutes of pressing take moments."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,6 +39,10 @@ class Time:
 
     def sleep(self, seconds: float) -> None:
         self.now += max(seconds, self.least_s)
+
+    def of_all(self) -> AbstractContextManager[None]:
+        """In its body all of a rig goes by this clock."""
+        return clock.replaced(self, self.sleep)
 
 
 @dataclass

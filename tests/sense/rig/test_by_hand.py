@@ -18,7 +18,7 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
-from padforge.sense.rig import by_hand, clock
+from padforge.sense.rig import by_hand
 from padforge.sense.rig.by_hand import (
     MAP_COLUMNS,
     MAP_ROWS,
@@ -191,7 +191,7 @@ class Hands:
             self.finger.look(view)
             watch(view)
 
-        with clock.replaced(self.clock, self.clock.sleep):
+        with self.clock.of_all():
             board = FingerBoard(self.finger, self.clock)
             return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.commands()], resume)
 

@@ -26,11 +26,13 @@ class Rig:
         self.board.model.volts = replaced
 
     def examine_board(self):
-        return {row.name: row for row in examine_board(self.board, self.time, self.time.sleep)}
+        with self.time.of_all():
+            return {row.name: row for row in examine_board(self.board)}
 
     def examine_arm(self, **settings):
         rig = RIG.model_copy(update=settings)
-        return {row.name: row for row in examine_arm(self.arm, rig, self.time, self.time.sleep)}
+        with self.time.of_all():
+            return {row.name: row for row in examine_arm(self.arm, rig)}
 
 
 def test_examine_moves_nothing():

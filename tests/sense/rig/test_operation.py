@@ -37,8 +37,8 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
     board = FakeBoard(arm)
 
     def record(name, plan, **more):
-        with Recorder(tmp_path / name, FIBRES, {}, {}) as recorder:
-            PressLoop(arm, board, recorder, options, clock=time, sleep=time.sleep).run(plan, **more)
+        with time.of_all(), Recorder(tmp_path / name, FIBRES, {}, {}) as recorder:
+            PressLoop(arm, board, recorder, options).run(plan, **more)
         return Recording.open(tmp_path / name)
 
     training_recording = record("training", PressPlan(left_mm, training.depths_mm))

@@ -40,13 +40,14 @@ def open_run(path):
     return Recorder.resume(path) if path.exists() else Recorder(path, 4, {"kind": "fake"}, {})
 
 
-def loop(arm, board, recorder, options, **more):
-    return PressLoop(arm, board, recorder, options, clock=arm.time, sleep=arm.time.sleep, **more)
+def press(arm, board, recorder, options, plan=PLAN, dry=False, **more):
+    with arm.time.of_all():
+        PressLoop(arm, board, recorder, options, dry=dry).run(plan, **more)
 
 
 def run(path, arm, board, options, plan=PLAN, **more):
     with open_run(path) as recorder:
-        loop(arm, board, recorder, options, **more).run(plan)
+        press(arm, board, recorder, options, plan, **more)
 
 
 def fault_of(path, arm, board, options, match, plan=PLAN):
@@ -134,7 +135,7 @@ def test_run_checks_a_changed_plan_before_its_next_press(tmp_path):
     arm, board, options = rig()
     outside = PressPlan(PLAN.positions_mm + 150.0, PLAN.depths_mm)
     with open_run(tmp_path / "run") as recorder, pytest.raises(RigFault, match="x 150 mm"):
-        loop(arm, board, recorder, options).run(PLAN, planner=lambda plan, press: outside if press == 1 else plan)
+        press(arm, board, recorder, options, planner=lambda plan, press: outside if press == 1 else plan)
     assert len(arm.moves) == 3  # of the press before
 
 
@@ -253,7 +254,7 @@ def test_run_loses_nothing_on_a_full_disk(tmp_path):
 
         recorder.sync = full
         with pytest.raises(RigFault, match="No space left") as fault:
-            loop(arm, board, recorder, options).run(PLAN)
+            press(arm, board, recorder, options)
         recorder.sync = sync
     assert fault.value.cause == "disk"
     assert arm.stops >= 1
@@ -271,8 +272,13 @@ def test_run_begins_no_press_before_the_last_one_is_on_the_disk(tmp_path):
             sync()
 
         recorder.sync = slow
-        loop(arm, board, recorder, options).run(
-            FOUR, lambda done, total, what: progress.append((done, n_done(tmp_path / "run"), len(arm.moves)))
+        press(
+            arm,
+            board,
+            recorder,
+            options,
+            FOUR,
+            on_progress=lambda done, total, what: progress.append((done, n_done(tmp_path / "run"), len(arm.moves))),
         )
     assert progress == [(done, done, 3 * done) for done in range(1, 5)]
 
@@ -296,7 +302,7 @@ def test_run_raises_a_disk_that_hangs(tmp_path):
 
         recorder.sync, arm.hook = hangs, hook
         with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
-            loop(arm, board, recorder, options).run(PLAN)
+            press(arm, board, recorder, options)
     assert fault.value.cause == "disk"
     assert len(arm.moves) == 3
 
@@ -323,8 +329,13 @@ def test_run_waits_for_a_press_alone_on_a_disk_that_never_rests(tmp_path):
             append_states(rows)
 
         arm.drain, recorder.append_states = counted_drain, slow
-        loop(arm, board, recorder, options).run(
-            PressPlan(PLAN.positions_mm[:1], PLAN.depths_mm[:1]), lambda *progress: more.release(1000)
+        press(
+            arm,
+            board,
+            recorder,
+            options,
+            PressPlan(PLAN.positions_mm[:1], PLAN.depths_mm[:1]),
+            on_progress=lambda *progress: more.release(1000),
         )
     assert n_done(tmp_path / "run") == 1
 

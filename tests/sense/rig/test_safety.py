@@ -229,7 +229,8 @@ def test_wait_until_still_waits_for_the_tip_to_rest() -> None:
     arm, clock = scripted_arm(
         replace(STILL, moving=True), replace(STILL, speed_mm_s=1.1), replace(STILL, speed_mm_s=1.0)
     )
-    assert wait_until_still(arm, LIMITS, clock, clock.sleep).speed_mm_s == 1
+    with clock.of_all():
+        assert wait_until_still(arm, LIMITS).speed_mm_s == 1
     assert not arm.stop.called
     assert clock() > 10
 
@@ -246,8 +247,8 @@ def test_wait_until_still_waits_for_the_tip_to_rest() -> None:
 )
 def test_wait_until_still_stops_the_arm_before_it_raises(step: ArmState | BaseException, cause: str | None) -> None:
     arm, clock = scripted_arm(replace(STILL, moving=True), step)
-    with pytest.raises(RigFault if cause else KeyboardInterrupt) as caught:
-        wait_until_still(arm, LIMITS, clock, clock.sleep)
+    with clock.of_all(), pytest.raises(RigFault if cause else KeyboardInterrupt) as caught:
+        wait_until_still(arm, LIMITS)
     assert getattr(caught.value, "cause", None) == cause
     arm.stop.assert_called_once()
     assert clock() < 10 + LIMITS.deadline_s + 1
@@ -266,7 +267,8 @@ def arm_at(height_mm: float, force: Callable[[FakeArm], float]) -> FakeArm:
 
 
 def retreated(arm: FakeArm) -> FakeArm:
-    retreat(arm, RETREAT_LIMITS, 500, arm.time, arm.time.sleep)
+    with arm.time.of_all():
+        retreat(arm, RETREAT_LIMITS, 500)
     return arm
 
 

@@ -10,7 +10,6 @@ import pytest
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START
-from padforge.sense.rig import clock
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.streams import RECORDED, is_pad_mirrored, stream_board, stream_recording
 from padforge.sense.settings import RigSettings
@@ -21,7 +20,7 @@ from tests.sense.rig.fakes import Time
 def still() -> Iterator[Time]:
     """A clock that goes on only in `sleep`."""
     time = Time(least_s=0)
-    with clock.replaced(time, time.sleep):
+    with time.of_all():
         yield time
 
 

@@ -24,15 +24,16 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
     rig = quiet_rig(presses=20, seed=4)
     recorded, time = simulate(pad, rig), Time(least_s=0)
-    board = VirtualPad(pad, rig, PUBLISHED_CONTACT, time)
-    with pytest.raises(RigFault, match="not connected"):
-        board.read()
-    started_s = time()
-    assert board.connect().items() >= {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}.items()
-    samples = []
-    for pause_s in [0.0, 0.3, 0.01, 5.0] + 30 * [1.0]:
-        time.sleep(pause_s)
-        samples.append(board.read())
+    board = VirtualPad(pad, rig, PUBLISHED_CONTACT)
+    with time.of_all():
+        with pytest.raises(RigFault, match="not connected"):
+            board.read()
+        started_s = time()
+        assert board.connect().items() >= {"name": "simulated", "channels": 4, "rate_hz": rig.rate_hz}.items()
+        samples = []
+        for pause_s in [0.0, 0.3, 0.01, 5.0] + 30 * [1.0]:
+            time.sleep(pause_s)
+            samples.append(board.read())
     volts = np.concatenate([each.volts for each in samples])
     times_s = np.concatenate([each.times_s for each in samples])
     np.testing.assert_allclose(np.diff(times_s), 1 / rig.rate_hz)
@@ -47,10 +48,11 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
 def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
     rig = quiet_rig(presses=4, seed=4, depths_mm=(0.5, 5.0), readings_per_press=20)
     time = Time(least_s=0)
-    board = VirtualPad(Morphology.straight(2), rig, Contact(), time)
-    board.connect()
-    time.sleep(4.01 * 20 / rig.rate_hz)
-    volts = board.read().volts
+    board = VirtualPad(Morphology.straight(2), rig, Contact())
+    with time.of_all():
+        board.connect()
+        time.sleep(4.01 * 20 / rig.rate_hz)
+        volts = board.read().volts
     swings = [np.ptp(volts[20 * press : 20 * press + 20], axis=0).sum() for press in range(4)]
     assert max(swings[0::2]) < 0.5 * min(swings[1::2])
 

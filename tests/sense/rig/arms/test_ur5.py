@@ -182,7 +182,7 @@ def test_connect_refuses_arm_in_use_on_this_computer(
     """Nor looked over by `doctor`; the move that is under way goes on."""
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    (diagnosis,) = examine_arm(UR5(address, driver), RigSettings(), time.monotonic, time.sleep)
+    (diagnosis,) = examine_arm(UR5(address, driver), RigSettings())
     assert diagnosis.status == "fail"
     assert "another program on this computer uses the arm" in diagnosis.message
     assert arm.state().moving
