@@ -160,6 +160,7 @@ def solve_press(
 
     compliance = FINGER_COMPLIANCE if tool == "finger" else 0.0
 
+    @cache  # the root is sought between radii that are solved already, and ends on one
     def solve(a: float) -> tuple[Array, Array]:
         return _solve_phi(tool, radius_mm, a, thickness_mm, base, compliance)
 
