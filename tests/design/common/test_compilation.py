@@ -28,6 +28,8 @@ def outer(x):
     return inner(x) * 2
 """
 
+COMPILED = ("kernel", "inner_kernel", "inline_kernel", "njit")
+
 
 def loaded(path: Path) -> ModuleType:
     """Load the module anew, as a new process does."""
@@ -89,18 +91,21 @@ def test_inner_kernels_are_called_by_kernels_alone() -> None:
         for where in (folders, [Path(__file__).parents[2]])
     )
 
-    def kind(node: ast.AST) -> str:
-        decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
-        return " ".join(ast.unparse(decorator).split("(")[0] for decorator in decorators)
-
     inner = {
         name for source in sources for name in re.findall(r"^@in(?:ner|line)_kernel.*\ndef (\w+)", source, re.MULTILINE)
     }
-    trees = [ast.parse(source) for source in sources + tests if any(name in source for name in inner)]
     assert {"piece_of", "select_frame"} <= inner
-    for tree in trees:
-        kernels = [node for node in ast.walk(tree) if kind(node) in ("kernel", "inner_kernel", "inline_kernel", "njit")]
-        compiled = {id(child) for node in kernels for child in ast.walk(node)}
-        for node in (node for node in ast.walk(tree) if id(node) not in compiled):
-            assert not (isinstance(node, ast.alias) and node.name in inner and node.asname)
-            assert getattr(node, "attr", getattr(node, "id", "")) not in inner
+    named = re.compile(rf"\b({'|'.join(inner)})\b")
+
+    def look_at(node: ast.AST) -> None:
+        """Assert of a node and all below it, but for what is compiled."""
+        decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
+        if any(ast.unparse(decorator).split("(")[0] in COMPILED for decorator in decorators):
+            return
+        assert not (isinstance(node, ast.alias) and node.name in inner and node.asname)
+        assert getattr(node, "attr", getattr(node, "id", "")) not in inner
+        for child in ast.iter_child_nodes(node):
+            look_at(child)
+
+    for source in filter(named.search, sources + tests):
+        look_at(ast.parse(source))
