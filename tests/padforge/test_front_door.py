@@ -15,31 +15,32 @@ from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings,
 from tests.helpers.door import called, refused, started
 
 
-def loaded_by(code: str) -> set[str]:
-    """Names of the modules that `code` loads."""
-    script = f"import sys\ntry:\n  {code}\nexcept SystemExit: pass\nprint('\\n@', *sys.modules)"
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return set(result.stdout.rsplit("@", 1)[1].split())
+def loaded_by(*codes: str) -> list[set[str]]:
+    """Names of the modules that are loaded after each of `codes`, one after the other in a process that begins anew."""
+    steps = (f"try:\n  {code}\nexcept SystemExit: pass\nprint('\\n@', *sys.modules)" for code in codes)
+    command = [sys.executable, "-c", "\n".join(("import sys", *steps))]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    return [set(line[1:].split()) for line in result.stdout.splitlines() if line.startswith("@")]
 
 
-def test_import_of_the_package_loads_no_stage() -> None:
-    modules = loaded_by("import padforge")
-    assert not {name for name in modules if name.startswith("padforge.")}
-    assert not modules & {"numpy", "click", "pydantic"}
-
-
-def test_help_imports_no_heavy_library() -> None:
-    modules = loaded_by("sys.argv = ['padforge', '--help']; from padforge.cli import main; main()")
-    assert not modules & {"torch", "build123d", "OCP", "numpy", "numba", "pydantic", "matplotlib", "shapely"}
-
-
-def test_stages_import_only_what_they_need(tmp_path: Path) -> None:
-    modules = loaded_by("import padforge.fabricate.cli")
-    assert not modules & {"torch", "build123d", "OCP", "matplotlib", "trimesh", "manifold3d", "numpy", "pydantic"}
+def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> None:
+    """What one may load, none before it has loaded."""
     pad, build = "p = design.Morphology.straight(1)", f"build(p, {str(tmp_path)!r}, ['stl', 'svg'])"
-    modules = loaded_by(f"from padforge import build, design; {pad}; design.signals(p, [[1, 1]]); {build}")
-    assert modules >= {"numba", "manifold3d"}
-    assert not modules & {"torch", "build123d", "OCP", "matplotlib"}
+    package, helped, stage, built = loaded_by(
+        "import padforge",
+        "sys.argv = ['padforge', '--help']; from padforge.cli import main; main()",
+        "import padforge.fabricate.cli",
+        f"from padforge import build, design; {pad}; design.signals(p, [[1, 1]]); {build}",
+    )
+    assert not {name for name in package if name.startswith("padforge.")}
+    assert not package & {"numpy", "click", "pydantic"}
+    cad = {"torch", "build123d", "OCP", "matplotlib"}
+    assert "padforge.cli" in helped
+    assert not helped & (cad | {"numpy", "numba", "pydantic", "shapely"})
+    assert "padforge.fabricate.cli" in stage
+    assert not stage & (cad | {"trimesh", "manifold3d", "numpy", "pydantic"})
+    assert built >= {"numba", "manifold3d"}
+    assert not built & cad
 
 
 def test_bench_of_a_wheel_is_refused_in_one_line() -> None:
