@@ -107,11 +107,12 @@ def test_face_follows_the_tool_inside_and_stays_clear_of_it_outside(tool, base):
 def test_silicone_keeps_its_volume(base):
     solved = solve_press("dome", 8.4, 4.0, 6.0, base)
     heights, weights = np.polynomial.legendre.leggauss(20)
-    for radius in (3.0, 8.0, 14.0):
-        outward = [float(solved.strains([radius], 3 + 3 * height).hoop[0]) * radius for height in heights]
+    radii = np.array([3.0, 8.0, 14.0])
+    outward = weights @ np.array([solved.strains(radii, 3 + 3 * height).hoop for height in heights]) * radii
+    for radius, through in zip(radii, outward, strict=True):
         r = radius * (1 + heights) / 2
         displaced = radius / 2 * weights @ (solved.deflection(r) * r)
-        assert radius * 3 * weights @ outward == pytest.approx(displaced, abs=0.01 * 4.0 * 8.0)
+        assert radius * 3 * through == pytest.approx(displaced, abs=0.01 * 4.0 * 8.0)
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
@@ -122,7 +123,7 @@ def test_strains_are_differences_of_displacements(base):
     strains = solved.strains(r, 4.5)
     np.testing.assert_allclose((right - left) / (2 * step), strains.radial, atol=1e-6)
     np.testing.assert_allclose(strains.compressive, strains.radial + strains.hoop, atol=1e-12)
-    heights, weights = np.polynomial.legendre.leggauss(40)
+    heights, weights = np.polynomial.legendre.leggauss(20)
     squeezed = sum(w * solved.strains(r, 3 + 3 * h).compressive for h, w in zip(heights, weights, strict=True))
     np.testing.assert_allclose(3 * squeezed, solved.deflection(r), atol=0.01 * 3.0)
 
