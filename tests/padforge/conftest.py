@@ -1,10 +1,13 @@
 """A small pad that has been made from end to end."""
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
+from padforge.design.common.page import PageSection
+from padforge.design.report import press_sections
 from tests.helpers.door import called
 from tests.helpers.less import blank_pictures, compare_little
 from tests.helpers.once import Once
@@ -25,6 +28,26 @@ hidden = 16
 epochs = 4
 max_failures = 1
 """
+
+
+@pytest.fixture(scope="session")
+def pressed() -> dict[str, list[PageSection]]:
+    """Sections on presses that reports have had so far, by what they are made of."""
+    return {}
+
+
+@pytest.fixture(autouse=True)
+def press_drawn_once(monkeypatch: pytest.MonkeyPatch, pressed: dict[str, list[PageSection]]) -> None:
+    """A report draws a press only if no other has drawn the same: that is most of what it takes."""
+
+    def remembered(document: Mapping, max_strain: float | None) -> list[PageSection]:
+        settings = document["provenance"]["settings"]
+        key = repr((settings["contact"], settings["pad"], max_strain))
+        if key not in pressed:
+            pressed[key] = press_sections(document, max_strain)
+        return list(pressed[key])
+
+    monkeypatch.setattr("padforge.design.report.press_sections", remembered)
 
 
 @pytest.fixture(scope="session")

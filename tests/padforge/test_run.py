@@ -17,6 +17,7 @@ from safetensors.numpy import load_file
 from padforge.design.common.files import sha256
 from padforge.design.common.parallel import Checkpoints
 from padforge.design.common.settings import Spec
+from padforge.design.report import press_sections
 from padforge.run import Run
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused, started
@@ -288,7 +289,8 @@ def test_damaged_note_is_refused(folder: Path, stages: str) -> None:
     assert "run.json: " in refused("run", "--resume", cwd=folder)
 
 
-def test_report_is_deterministic(folder: Path) -> None:
+def test_report_is_deterministic(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("padforge.design.report.press_sections", press_sections)  # every report draws its own
     page = folder / "out" / "pad" / "report.html"
     pages = []
     for _ in range(2):

@@ -2,17 +2,15 @@
 
 import json
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from padforge.design.common.files import provenance
-from padforge.design.common.page import PageSection
 from padforge.design.common.plotting import save_figure
 from padforge.design.morphology import Morphology
-from padforge.design.report import draw_plan, press_sections
+from padforge.design.report import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
 from padforge.report import write_report
@@ -120,23 +118,3 @@ def pad(made: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def page(made: Path) -> Path:
     return write_report(made)
-
-
-@pytest.fixture(scope="session")
-def pressed() -> dict[str, list[PageSection]]:
-    """Sections on presses that reports have had so far, by what they are made of."""
-    return {}
-
-
-@pytest.fixture(autouse=True)
-def press_drawn_once(monkeypatch: pytest.MonkeyPatch, pressed: dict[str, list[PageSection]]) -> None:
-    """A report draws a press only if no other has drawn the same: that is most of what it takes."""
-
-    def remembered(document: Mapping, max_strain: float | None) -> list[PageSection]:
-        settings = document["provenance"]["settings"]
-        key = repr((settings["contact"], settings["pad"], max_strain))
-        if key not in pressed:
-            pressed[key] = press_sections(document, max_strain)
-        return list(pressed[key])
-
-    monkeypatch.setattr("padforge.design.report.press_sections", remembered)
