@@ -176,7 +176,7 @@ _NUMBER, _EDGE, _GREY = "#8a867d", "#a7a49c", "#77746c"
 _RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
 """Colours of a mesh from its lowest visible height to its highest."""
 _DPI = 100
-_PIXELS = 900
+PIXELS = 900
 """Longer side of the axes: 14 pixels a mm for the published pad, about six for a ridge."""
 _MIN_WIDTH = 600
 """Pixels, with room for a title and a legend."""
@@ -245,7 +245,7 @@ def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[
     from matplotlib.colors import LinearSegmentedColormap
 
     corners = np.asarray(vertices, dtype=float)
-    heights, bounds = mesh_relief(corners, np.asarray(triangles, dtype=np.intp), _PIXELS)
+    heights, bounds = mesh_relief(corners, np.asarray(triangles, dtype=np.intp), PIXELS)
     mask = np.isfinite(heights)
     low, high = (float(heights[mask].min()), float(heights[mask].max())) if mask.any() else (0.0, 0.0)
     heights[~mask] = low
@@ -375,5 +375,5 @@ class _Picture:
 def _count_pixels(bounds: Bounds) -> tuple[int, int]:
     """Return the width and the height in pixels of x_min, y_min, x_max, y_max."""
     x_min, y_min, x_max, y_max = bounds
-    scale = _PIXELS / max(x_max - x_min, y_max - y_min)
+    scale = PIXELS / max(x_max - x_min, y_max - y_min)
     return max(1, round(scale * (x_max - x_min))), max(1, round(scale * (y_max - y_min)))

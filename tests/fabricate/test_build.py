@@ -26,6 +26,7 @@ from padforge.fabricate.mesh import BODY_COLOURS
 from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
+from tests.helpers.less import small_pictures
 
 PAD = Morphology.random(1, 2, seed=7)
 FILES = {
@@ -40,7 +41,9 @@ SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Path, Build]:
     out = tmp_path_factory.mktemp("mould")
-    return out, build(PAD, out, tuple(FORMATS), SETTINGS)
+    with pytest.MonkeyPatch.context() as patch:
+        small_pictures(patch)
+        return out, build(PAD, out, tuple(FORMATS), SETTINGS)
 
 
 def test_build_writes_all_files_with_their_digests_and_no_others(built):
@@ -52,8 +55,9 @@ def test_build_writes_all_files_with_their_digests_and_no_others(built):
 
 
 @pytest.mark.slow
-def test_build_is_reproducible_to_the_byte(built, tmp_path):
+def test_build_is_reproducible_to_the_byte(built, tmp_path, monkeypatch):
     out, _ = built
+    small_pictures(monkeypatch)
     build(PAD, tmp_path / "again", tuple(FORMATS), SETTINGS)
     for name in FILES:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name

@@ -9,7 +9,7 @@ import pytest
 from padforge.design.common.page import PageSection
 from padforge.design.report import press_sections
 from tests.helpers.door import called
-from tests.helpers.less import blank_pictures, compare_little
+from tests.helpers.less import blank_pictures, compare_little, small_pictures
 from tests.helpers.once import Once
 
 SMALL = """
@@ -58,6 +58,7 @@ def finished(once: Once) -> tuple[Path, str]:
         (folder / "pad.toml").write_text(SMALL)
         with pytest.MonkeyPatch.context() as patch:
             compare_little(patch)
+            small_pictures(patch)
             ended = called("run", cwd=folder)
         assert ended.code == 0, ended
         return folder, ended.out

@@ -13,11 +13,12 @@ from padforge.design.contact import half_width_mm
 from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called
-from tests.helpers.less import blank_pictures, compare_little
+from tests.helpers.less import blank_pictures, compare_little, small_pictures
 
 
 def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
     compare_little(monkeypatch)
+    small_pictures(monkeypatch)
     drawn = []
     monkeypatch.setattr(
         comparison, "save_figure", lambda figure, path: drawn.append(figure) or save_figure(figure, path)

@@ -21,7 +21,7 @@ from padforge.design.report import press_sections
 from padforge.run import Run
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused, started
-from tests.helpers.less import blank_pictures, compare_little
+from tests.helpers.less import blank_pictures, compare_little, small_pictures
 from tests.padforge.conftest import SMALL
 
 ALL = "design, mould, recording, contacts, calibration"
@@ -158,6 +158,7 @@ def test_resume_repeats_interrupted_calibration_only(
     """And two runs give the same files."""
     (tmp_path / "pad.toml").write_text(SMALL)
     compare_little(monkeypatch)
+    small_pictures(monkeypatch)
     with monkeypatch.context() as patch:
         patch.setattr("padforge.sense.report.calibration.calibrate_into", breaks)
         assert called("run", cwd=tmp_path).code == 130

@@ -30,8 +30,11 @@ from padforge.fabricate.outputs.pictures import (
 )
 from padforge.fabricate.plan import Plan, fibre_layers
 from tests.fabricate.planted import level_pad, with_settings
+from tests.helpers.less import small_pictures
 
 PLAN = Plan(level_pad(1.8, 1.2))
+PIXELS = 450
+"""Longer side of the axes of pictures whose pixels are looked at, half of the usual one."""
 SMALL = 150_000
 """Bytes that a picture may have: it goes into git."""
 
@@ -64,7 +67,9 @@ def mould_picture(tmp_path_factory) -> Callable[..., np.ndarray]:
 
     @cache
     def picture(*findings: Finding) -> np.ndarray:
-        draw_mould(PLAN, findings, path)
+        with pytest.MonkeyPatch.context() as patch:
+            small_pictures(patch, PIXELS)
+            draw_mould(PLAN, findings, path)
         return pixels(path)
 
     return picture
@@ -122,15 +127,19 @@ def test_mesh_relief_of_slivers_upright_faces_and_gaps():
 
 def test_layers_have_different_colours(mould_picture):
     picture = mould_picture(*UNMARKED)
+
+    def share(colour: str) -> float:
+        return has_colour(picture, colour).sum() / PIXELS**2
+
     for layer in fibre_layers(PLAN):
-        assert has_colour(picture, layer.colour).mean() > 1e-3
+        assert share(layer.colour) > 1.3e-3
     assert {HORIZONTAL, VERTICAL} < {layer.colour for layer in fibre_layers(PLAN)}
-    assert has_colour(picture, PAPER).mean() > 0.3
-    assert has_colour(picture, FAINT).mean() > 0.03
+    assert share(PAPER) > 0.39
+    assert share(FAINT) > 0.04
 
 
 def test_marks_are_at_positions_of_findings(mould_picture):
-    scale = 900 / (2 * PLAN.tray.bounds[2])  # pixels a mm
+    scale = PIXELS / (2 * PLAN.tray.bounds[2])  # pixels a mm
     for colour, order in ((ALARM, 1), (CARE, -1)):  # the swapped picture warns where this one fails
         first, second = (has_colour(mould_picture(*marks), colour) for marks in (MARKED, SWAPPED)[::order])
         middles = [np.argwhere(one & ~other).mean(axis=0) for one, other in ((first, second), (second, first))]
@@ -149,18 +158,20 @@ def test_only_failures_and_warnings_are_marked(mould_picture):
     assert cared > 0
 
 
-def test_tracks_have_fibres_and_crossings_of_one_family(tmp_path):
+def test_tracks_have_fibres_and_crossings_of_one_family(tmp_path, monkeypatch):
+    small_pictures(monkeypatch, PIXELS)
     for name, plan in (("crossed", PLAN), ("level", Plan(level_pad(1.0, 2.0)))):
         draw_tracks(plan, tmp_path / name)
         picture = pixels(tmp_path / name)
         for layer in fibre_layers(plan):
             assert has_colour(picture, layer.colour).mean() > 1e-3
-    drawn = slice(80, 920), slice(100, 940)  # without title, axes and legend, whose ink it is as well
+    drawn = slice(60, 470), slice(80, 500)  # without title, axes and legend, whose ink it is as well
     assert has_colour(pixels(tmp_path / "crossed")[drawn], INK).sum() > 8
     assert not has_colour(pixels(tmp_path / "level")[drawn], INK).any()
 
 
-def test_draw_findings_marks_any_mesh(tmp_path):
+def test_draw_findings_marks_any_mesh(tmp_path, monkeypatch):
+    small_pictures(monkeypatch, PIXELS)
     vertices = np.array([[100, 50, 3], [130, 50, 3], [130, 60, 3], [100, 60, 5.0]])
     path = tmp_path / "mesh.tmp"
     counts = []
@@ -168,7 +179,7 @@ def test_draw_findings_marks_any_mesh(tmp_path):
         draw_findings(vertices, [[0, 1, 2], [0, 2, 3]], [finding("fail", place)], path)
         counts.append(has_colour(pixels(path), ALARM))
     middles = [np.argwhere(counts[i] & ~counts[1 - i]).mean(axis=0) for i in (0, 1)]
-    assert middles[1] - middles[0] == pytest.approx([0, 300], abs=0.7)
+    assert middles[1] - middles[0] == pytest.approx([0, PIXELS / 3], abs=0.7)
     draw_findings(vertices[:3] * (1, 0, 1), [[0, 1, 2]], [], path)  # invisible from above
     assert not has_colour(pixels(path), ALARM).any()
 

@@ -14,6 +14,7 @@ from padforge.design.report import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
 from padforge.report import write_report
+from tests.helpers.less import small_pictures
 
 HOSTILE = '</script><img src="x" onerror="document.title=1"> & <b>'
 PAD = Morphology.random(2, 2, seed=1)
@@ -95,7 +96,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what every stage leaves, and a study."""
     folder = tmp_path_factory.mktemp("made")
     PAD.save(folder / "morphology.json")
-    build(PAD, folder, ["stl", "png"], inputs=[folder / "morphology.json"])
+    with pytest.MonkeyPatch.context() as patch:
+        small_pictures(patch)
+        build(PAD, folder, ["stl", "png"], inputs=[folder / "morphology.json"])
     save_figure(draw_plan(PAD, Contact()), folder / "design.svg")
     written(folder / "design.json", design_document())
     written(folder / "calibration.json", calibration_document())
