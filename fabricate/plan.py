@@ -49,6 +49,8 @@ _NUMBER_DISTANCE = 5
 """Maximum distance of a number from its fibre's start, in heights: beyond it no longer seems to belong there."""
 _NUMBER_STEP_MM = 0.5
 """Grid of candidate positions for a number."""
+_NUMBER_TRIES = 50
+"""Candidates that are looked at together: most numbers have room among the first."""
 _AT_WALL_MM = 1e-3
 """Distance up to which a pillar touches a wall."""
 _MAX_WHITE = 0.7
@@ -106,8 +108,8 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
     mould, lines = plan.settings.mould, plan.lines
     clearance = mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope + mould.min_silicone_mm
     reach = min(plan.min_pitch_mm, _NUMBER_DISTANCE * mould.number_mm)
-    shapely.prepare(lines)
     floor, occupied = plan.cavity.difference(plan.pillars).buffer(-clearance, join_style="mitre"), []
+    shapely.prepare([*lines, floor])
     positioned: list[BaseGeometry | None] = []
     ahead, aside = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
     depth, shift = (grid.ravel() for grid in np.meshgrid(ahead, aside))
@@ -117,15 +119,18 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
         inward = np.sign(second - start)  # along an axis: lines leave the walls at right angles
         start = np.where(inward > 0, plan.cavity.bounds[:2], start)
         middles = (start + depth[:, None] * inward + shift[:, None] * inward[::-1])[nearest_first]
-        half = np.array(number.bounds[2:])
-        boxes = shapely.box(*(middles - half).T, *(middles + half).T)
-        free = shapely.within(boxes, floor)
-        for other in (*lines, *occupied):
-            free[free] = ~shapely.dwithin(other, boxes[free], clearance)
-        first = int(np.argmax(free))
-        if free[first]:
-            occupied.append(boxes[first])
-        positioned.append(affinity.translate(number, *middles[first]) if free[first] else None)
+        half, position = np.array(number.bounds[2:]), None
+        for middle in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
+            boxes = shapely.box(*(middle - half).T, *(middle + half).T)
+            free = shapely.contains(floor, boxes)
+            for other in (*lines, *occupied):
+                free[free] = ~shapely.dwithin(other, boxes[free], clearance)
+            if free.any():
+                first = int(np.argmax(free))
+                occupied.append(boxes[first])
+                position = affinity.translate(number, *middle[first])
+                break
+        positioned.append(position)
     return positioned
 
 
