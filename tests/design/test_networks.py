@@ -18,6 +18,7 @@ from padforge.design.networks import (
     training_presses,
 )
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
+from tests.helpers.less import compare_little
 
 
 def means(pad, **settings):
@@ -118,7 +119,8 @@ def test_alternative_contacts_begin_with_the_assumed_one():
         assert (list(contacts), contacts["as assumed"]) == (["as assumed", *others], assumed)
 
 
-def test_errors_by_contact_of_both_pads():
+def test_errors_by_contact_of_both_pads(monkeypatch):
+    compare_little(monkeypatch)
     contacts = {"wide": Contact(), "narrow": Contact(radius=0.2)}
     found = errors_by_contact(beside_straight(PAD), contacts, *ASKED, seed=4)
     assert [(each.contact, each.pad) for each in found] == [
@@ -133,7 +135,8 @@ def test_errors_by_contact_of_both_pads():
     assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
 
 
-def test_errors_by_contact_grow_with_scatter_and_heed_keep_outs():
+def test_errors_by_contact_grow_with_scatter_and_heed_keep_outs(monkeypatch):
+    compare_little(monkeypatch)
     hole = PadSettings(grid=2, keep_out_mm=(((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0)),))
     means = [
         errors_by_contact({"pad": PAD}, {"contact": Contact()}, size, scatter, subsets=1)[0].errors_mm[0]

@@ -216,7 +216,8 @@ def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
 
 
 @pytest.mark.parametrize("counts", [(4, 4), (3, 12), pytest.param((8, 8), marks=pytest.mark.slow)])
-def test_expected_errors_grow_with_failures_and_scatter(counts):
+def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
+    monkeypatch.setattr(module, "GRIDS", 1)
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
     pad = Morphology.straight(size.layout)
     quiet, loud = (expected_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))

@@ -8,6 +8,7 @@ from padforge.design.objectives.published import information
 
 
 @pytest.fixture(autouse=True)
-def few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bound the information by the cells of a coarse grid: pairs of cells of the usual one take most of a score."""
+def little_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Expected errors are those of one grid of presses, and information is bounded by the cells of a coarse grid."""
+    monkeypatch.setattr("padforge.design.objectives.expected_error.GRIDS", 1)
     monkeypatch.setattr("padforge.design.objectives.published.information", partial(information, side=5))
