@@ -1,6 +1,6 @@
 """Draw the plan of a pad, and write the sections of a report on its design and its contact."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from padforge.design.common.plotting import (
 from padforge.design.common.validation import InputError, check_array, check_type
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_width_mm, half_widths_mm, profile_weights
 from padforge.design.layer import LayerPress
-from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings, sensed_rectangle
+from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -134,16 +134,19 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     """
     terms, violations, settings = document["terms"], document["violations"], document["provenance"]["settings"]
     enforced, search = settings["rules"]["enforce"], settings["search"]
-    layout = PadSettings(**settings["pad"]).layout
-    low, high = sensed_rectangle(layout)
-    size = " x ".join(f"{round((b - a) * layout.unit_mm, 6):g}" for a, b in zip(low, high, strict=True)) + " mm"
+    pad = PadSettings(**settings["pad"])
+    layout, (low, high) = pad.layout, pad.sensed
+    size, sensed = _size_text(layout.size_mm), _size_text(layout.unit_mm * np.subtract(high, low))
     errors = [
         [name[-1], *(f"{float(errors_mm[name]):#.3g}" for errors_mm in (terms, document["straight"]))]
         for name in sorted(terms)
         if name.startswith("expected_error")
     ]
     check = f"{len(violations)} broken" if violations else "all hold" if enforced else "not enforced"
-    plan = f"Plan of the pad, {size}: horizontal and vertical fibres, their crossings, and the contact at the centre."
+    plan = (
+        f"Plan of the pad, {size}, of which {sensed} are sensed: horizontal and vertical fibres, their crossings, and"
+        " the contact at the centre."
+    )
     error_text = (
         "Expected error of a localizer in mm, averaged over all sets of failed fibres of a size. It is computed before"
         " anything is built, by a formula that agrees with the errors of trained networks within about 5 %. Responses"
@@ -174,6 +177,10 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         (f"{errors[0][1]} mm", "expected error of the design"),
     ]
     return [PageSection("Fibres", body, key_figures)]
+
+
+def _size_text(sides_mm: Iterable[float]) -> str:
+    return " x ".join(f"{round(float(side), 6):g}" for side in sides_mm) + " mm"
 
 
 def _rule_rows(rules: Mapping[str, Any], violations: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:

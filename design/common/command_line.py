@@ -241,6 +241,9 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         message = str(error if isinstance(error, KeyboardInterrupt) else error.__cause__ or "")
         return _fail(name, f"interrupted; {message or 'what was finished is kept'}", INTERRUPTED)
+    except click.MissingParameter as error:
+        text = getattr(error.param, "help", None)
+        return _fail(name, error.format_message() + (f" {text}" if text else ""))
     except click.ClickException as error:
         return _fail(name, error.format_message())
     except (InputError, Fault) as error:

@@ -69,12 +69,12 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     """
     from padforge.design.common.files import provenance
     from padforge.sense.formats.columns import PRESSES_DETECTED
-    from padforge.sense.formats.import_export import import_file
+    from padforge.sense.formats.import_export import find_reader
     from padforge.sense.recording.run_directory import check_new_folder
 
-    folder = out or pad_folder(file) / "recording"
+    read, folder = find_reader(file), out or pad_folder(file) / "recording"
     check_new_folder(folder)
-    recording = import_file(file, columns)
+    recording = read(file, columns)
     echo_note(recording, file)
     if PRESSES_DETECTED.items() <= recording.source.items():
         click.echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)

@@ -17,7 +17,8 @@ from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import START, STATE_COLUMNS, STATES
 
-_READERS: dict[str, Callable[[Path, str], Recording]] = {
+Reader = Callable[[Path, str], Recording]
+_READERS: dict[str, Reader] = {
     ".mat": import_mat,
     **dict.fromkeys((".csv", ".tsv", ".txt"), import_csv),
     **dict.fromkeys((".h5", ".hdf5"), import_hdf5),
@@ -60,11 +61,16 @@ def import_file(path: Path, columns: str = "") -> Recording:
         path: of the file or folder.
         columns: what the columns, datasets or topics of a foreign file hold.
     """
+    return find_reader(path)(path, columns)
+
+
+def find_reader(path: Path) -> Reader:
+    """Return what imports a file of a name that ends so, or a rosbag2 folder; raises InputError for another path."""
     if _is_bag_folder(path):
-        return import_bag(path, columns)
+        return import_bag
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_READERS)}, or a rosbag2 folder")
-    return _READERS[path.suffix.lower()](path, columns)
+    return _READERS[path.suffix.lower()]
 
 
 def arm_states(path: Path) -> Array | None:

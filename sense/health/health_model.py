@@ -206,7 +206,7 @@ def fit_health_model(
     traces = extract_traces(readings[:, living], down_command, up_command)
     traces = traces[np.isfinite(traces).all(axis=(1, 2))]
     if len(traces) < MIN_PRESSES:
-        raise InputError(f"recording has {len(traces)} complete presses, health is learnt from {MIN_PRESSES} or more")
+        raise InputError(f"{len(traces)} complete presses to learn from, expected {MIN_PRESSES} or more")
 
     pca, inputs, targets = TracePCA.fit_transform(traces)
     # Each member is trained without its fold, since a network predicts the presses that it was trained on too well.

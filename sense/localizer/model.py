@@ -300,6 +300,10 @@ class LocalizerModel(LocalizerDocument):
             InputError: a file is missing or torn, the two do not belong together, or a value is out of range.
         """
         files = files_of(folder, NAME)
+        if not files.document.exists():
+            raise InputError(
+                f"{folder}: no {files.document.name}, expected a folder that `padforge sense calibrate` wrote"
+            )
         document, digest = _read_document(read_json(files.document, FORMAT), str(files.document))
         scaler, method = document.scaler, document.method
         n_timed = len(document.interval_factors) - 1

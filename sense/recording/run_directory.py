@@ -376,7 +376,9 @@ class Recorder:
 def read_fibres(path: Path) -> int:
     """Return the number of fibres of a run directory."""
     if not (path / START).is_file():
-        raise InputError(f"{path}: no recording, expected a folder with {START}, {JOURNAL} and {READINGS}")
+        inner = path / "recording"  # what every command calls the one that it writes into the folder of a pad
+        expected = inner if (inner / START).is_file() else f"a folder with {START}, {JOURNAL} and {READINGS}"
+        raise InputError(f"{path}: no recording, expected {expected}")
     fibres = read_json(path / START, FORMAT).get("fibres")
     if type(fibres) is not int or not 1 <= fibres <= MAX_FIBRES:
         raise InputError(f"{path / START}: fibres is {fibres!r}, allowed is 1 to {MAX_FIBRES}")

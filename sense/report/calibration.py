@@ -74,7 +74,8 @@ def calibrate_into(
             detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)
         except InputError as error:
             detector = None
-            _log.warning("the health of the fibres is not monitored: %s", error)
+            held_out = f"{len(model.test)} presses are held out"
+            _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
     # Those of an earlier calibration must not stay.
     with atomic_files(out, without={*HEALTH_FILES, BY_MOMENT}) as folder:
         localizer.save(folder)

@@ -438,9 +438,9 @@ def test_design_section_has_errors_rules_and_terms() -> None:
     }
     [section] = design_sections(Path("none"), document)
     text = words(section.body)
-    # half a pitch beyond the outermost of 3 verticals, 8 mm apart, and of 2 horizontals, 15 mm apart
+    # of 3 verticals, 8 mm apart, and 2 horizontals, 15 mm apart, a pitch beyond the outermost, and sensed half as far
     assert list(section.figures) == [
-        ("2 + 3", "fibres on 24 x 30 mm"),
+        ("2 + 3", "fibres on 32 x 45 mm"),
         ("2 broken", "design rules"),
         ("1.00 mm", "expected error of the design"),
     ]

@@ -27,6 +27,10 @@ export rec set --model model                    | allowed are .csv, .h5, .mcap, 
 export rec pad.toml/r.csv                       | pad.toml
 export rec model --format lerobot               | model: exists and is not empty
 calibrate pad.toml --out m                      | pad.toml: no recording, expected a folder
+calibrate model --out m                         | model: no recording, expected {recording}
+import model/localizer.json                     | model/localizer.json: ends in '.json', allowed are .mat, .csv
+evaluate rec                                    | Missing option '--model'. Folder that calibrate wrote.
+evaluate --model empty rec                      | empty: no localizer.json, expected a folder that `padforge sense
 fibre-loss rec --out m                          | neither --model nor --retrain is given
 fibre-loss rec --model model --failed 5         | fibre 5: no such fibre, allowed are 1 to 4
 calibrate rec --out pad.toml/model              | pad.toml is a file, expected a folder
@@ -107,7 +111,7 @@ def test_invalid_command_fails_in_one_line(
     monkeypatch.chdir(workshop)
     before = {path: path.stat().st_mtime_ns for path in workshop.rglob("*") if path.is_file()}
     with LivePage(0) as page:
-        meant = SHORT | {"taken": page.url.rstrip("/").rsplit(":", 1)[1]}
+        meant = SHORT | {"taken": page.url.rstrip("/").rsplit(":", 1)[1], "recording": str(Path("model/recording"))}
         code, out, err = padforge_sense(*shlex.split(words.format(**meant)))
     *notes, last = err.splitlines()
     assert (code, out) == (2, "")

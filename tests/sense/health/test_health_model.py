@@ -96,7 +96,7 @@ def test_find_dead_fibres() -> None:
 
 
 def test_fit_refuses_few_presses_and_dead_pads(pad: Recording) -> None:
-    with pytest.raises(InputError, match=f"299 complete presses, health is learnt from {MIN_PRESSES}"):
+    with pytest.raises(InputError, match=f"299 complete presses to learn from, expected {MIN_PRESSES}"):
         fit(pad.readings, pad, MIN_PRESSES - 1)
     with pytest.raises(InputError, match="all 6 fibres are dead"):
         fit(0 * pad.readings, pad)
