@@ -108,8 +108,7 @@ def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Sca
     scatter = scatter_of_full_scale(scatter, contact, scale)
 
     def respond(positions: Array) -> Array:
-        stretch = relative_stretch(pad, positions, contact) / scale
-        return stretch * scatter.sample_gains(stretch.shape, rng) + scatter.floor * rng.standard_normal(stretch.shape)
+        return scatter.sample(relative_stretch(pad, positions, contact) / scale, rng)
 
     return SimulatedPresses.simulate(pad, SIDE, N_TEST, seed, respond, size)
 

@@ -430,10 +430,15 @@ class Scatter(NamedTuple):
     share: float = 0.0  # standard deviation of the part proportional to the response, as a share of it
     common: float = 0.0  # share of the proportional part's variance that all fibres have in common
 
-    def sample_gains(self, shape: tuple[int, int], rng: "np.random.Generator") -> "NDArray[np.float64]":
+    def sample_gains(self, shape: tuple[int, ...], rng: "np.random.Generator") -> "NDArray[np.float64]":
         """Sample the factor, about 1, on each response; the shape is (presses, fibres)."""
         individual, common = rng.standard_normal(shape), rng.standard_normal((shape[0], 1))
         return 1 + self.share * (math.sqrt(1 - self.common) * individual + math.sqrt(self.common) * common)
+
+    def sample(self, responses: "NDArray[np.float64]", rng: "np.random.Generator") -> "NDArray[np.float64]":
+        """Sample responses (presses, fibres), in units of full scale, as they scatter from press to press."""
+        gains = self.sample_gains(responses.shape, rng)
+        return responses * gains + self.floor * rng.standard_normal(responses.shape)
 
     def scaled(self, factor: float) -> "Scatter":
         """Return the scatter with its standard deviations multiplied by a factor."""

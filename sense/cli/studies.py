@@ -15,7 +15,9 @@ from padforge.design.common.validation import InputError
 from padforge.sense.cli.options import max_failures_option
 
 if TYPE_CHECKING:
+    from padforge.design.common.settings import Spec
     from padforge.design.morphology import Morphology
+    from padforge.sense.studies.press_model import PressModel
     from padforge.sense.studies.study import Study
 
 
@@ -33,7 +35,8 @@ def study() -> None:
     padforge study scaling --jobs 2 --out out/study
 
     A PAD is a morphology.json, a published .mat, `square`, `random-N` (N knots a fibre), `optimised` or `optimised-N`
-    (result of a short search) or `genetic-N` (of the published search); `square@8` has a grid of 8.
+    (result of a short search) or `genetic-N` (of the published search), as large as [pad] says; `square@8` has a grid
+    of 8.
     Each study writes NAME.json, NAME.csv, NAME.png and NAME.md. After an interruption, --resume continues it.
     """
 
@@ -86,10 +89,23 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
     return decorate
 
 
-def _pads(names: tuple[str, ...], seed: int, default: tuple[str, ...] = DEFAULT_PADS) -> "dict[str, Morphology]":
+def _pads(
+    names: tuple[str, ...], seed: int, settings: "Spec", default: tuple[str, ...] = DEFAULT_PADS
+) -> "dict[str, Morphology]":
+    from padforge.design.settings import PadSettings
     from padforge.sense.studies.study import load_pads
 
-    return load_pads(names or default, seed)
+    return load_pads(names or default, seed, settings.section(PadSettings).layout)
+
+
+def _press_model(settings: "Spec") -> "PressModel":
+    """Return the contact and the scatter that settings state, those of the paper if they state no contact."""
+    from padforge.design.settings import Contact, SearchSettings, read_contact
+    from padforge.sense.studies.press_model import PressModel
+
+    if not settings.stated(Contact):
+        return PressModel()
+    return PressModel(read_contact(settings), settings.section(SearchSettings).response_scatter)
 
 
 def _check_square(context: click.Context, param: click.Parameter, value: int) -> int:
@@ -134,26 +150,47 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     settings = common.load_spec(spec)
     contact = read_contact(settings) if settings.stated(Contact) else None
-    return robustness_study(_pads(names, seed), seed=seed, contact=contact, **options)
+    return robustness_study(_pads(names, seed, settings), seed=seed, contact=contact, **options)
 
 
 @_command("scaling")
-@click.option("--grids", default="4,8,16,32,64,128", show_default=True, help="Sizes of the surfaces.")
-def scaling(names: tuple[str, ...], *, seed: int, grids: str) -> "Study":
+@click.option("--grids", metavar="N,N,...", help="Sizes of the surfaces (default: 1, 2, 4, ... 32 tiles a side).")
+@common.spec_option
+def scaling(names: tuple[str, ...], *, seed: int, grids: str | None, spec: Path | None) -> "Study":
     """Larger surfaces, tiled with the pads (figures 7 and 8).
+
+    The contact is the paper's, or what [contact] states; under a layer responses scatter by [search].
 
     \b
     padforge study scaling optimised --grids 4,16,64
     """
-    from padforge.sense.studies.scaling import scaling_study
+    from padforge.sense.studies.scaling import MAX_GRID, scaling_study
 
     try:
-        sizes = tuple(sorted({int(part) for part in grids.split(",")}))
+        sizes = tuple(sorted({int(part) for part in grids.split(",")})) if grids is not None else ()
     except ValueError:
-        sizes = ()
-    if not sizes or not 2 <= sizes[0] <= sizes[-1] <= 256:
-        raise InputError(f"--grids is {grids!r}, expected numbers from 2 to 256 with commas between them")
-    return scaling_study(_pads(names, seed, ("square", "optimised")), grids=sizes, seed=seed)
+        sizes = (0,)
+    if sizes and not 2 <= sizes[0] <= sizes[-1] <= MAX_GRID:
+        raise InputError(f"--grids is {grids!r}, expected numbers from 2 to {MAX_GRID} with commas between them")
+    settings = common.load_spec(spec)
+    pads = _pads(names, seed, settings, ("square", "optimised"))
+    return scaling_study(pads, grids=sizes, press_model=_press_model(settings), seed=seed)
+
+
+@_command("multicontact")
+@common.spec_option
+def multicontact(names: tuple[str, ...], *, seed: int, spec: Path | None) -> "Study":
+    """Number and positions of contacts at once (figure 9). Of two contacts, either comes first.
+
+    The contact is the paper's, or what [contact] states; under a layer responses scatter by [search].
+
+    \b
+    padforge study multicontact square
+    """
+    from padforge.sense.studies.multicontact import multicontact_study
+
+    settings = common.load_spec(spec)
+    return multicontact_study(_pads(names, seed, settings), press_model=_press_model(settings), seed=seed)
 
 
 @_command("drift", "PAD_OR_RECORDING")
@@ -173,18 +210,18 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
     return drift_study(load_pads(pads, seed), load_recordings(recordings), seed=seed)
 
 
-def _add_study(name: str, module: str, text: str, example: str, *, has_contact: bool = True) -> None:
+def _add_study(name: str, module: str, text: str, example: str) -> None:
     """Add the command of a study without options of its own; `example` are its pads in the help."""
 
     def make(names: tuple[str, ...], *, seed: int, spec: Path | None = None) -> "Study":
         from padforge.design.settings import Contact
 
         make_study = getattr(import_module(f"padforge.sense.studies.{module}"), f"{name}_study")
-        contact = {"contact": common.load_spec(spec).section(Contact)} if has_contact else {}
-        return make_study(_pads(names, seed), seed=seed, **contact)
+        settings = common.load_spec(spec)
+        return make_study(_pads(names, seed, settings), seed=seed, contact=settings.section(Contact))
 
     make.__doc__ = f"{text}\n\n\b\npadforge study {name} {example}"
-    _command(name)(common.spec_option(make) if has_contact else make)
+    _command(name)(common.spec_option(make))
 
 
 _sensitivity = """Other tools and depths, trained with or not (figure 6).
@@ -193,10 +230,8 @@ They have half to one and a half times the radius and the depth that [contact] s
 the preset `published`, the objects are those of the paper, of sizes K and shapes D in grid units."""
 _force = "Depth and force of a press, from the signals. A tool presses the layer of [contact]."
 _shape = "Which object was pressed, from the signals. Objects are a dome, a ball, a finger and a flat end."
-_multicontact = "Number and positions of contacts at once (figure 9). Of two contacts, either comes first."
 _strokes = "Follow a finger that slides over simulated pads. The localizers are trained on single presses of them."
 _add_study("strokes", "strokes", _strokes, "optimised")
 _add_study("sensitivity", "sensitivity", _sensitivity, "square")
 _add_study("force", "indentation", _force, "square random-5")
 _add_study("shape", "indentation", _shape, "random-5")
-_add_study("multicontact", "multicontact", _multicontact, "square", has_contact=False)

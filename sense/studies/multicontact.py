@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, INK, add_title
-from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses
-from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
+from padforge.design.settings import between_fibres
 from padforge.sense.arrays import Array
+from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel
 from padforge.sense.studies.study import (
     ADC_COUNTS,
     Sizes,
@@ -39,7 +39,7 @@ SIZES = Sizes(8192, 2000, hidden=60, epochs=100)
 LABELLED = "fixed labels"
 MAX_CONTACTS = 3  # at once, where they are counted
 NOISE_COUNTS = 1.0
-"""Noise of the readings by which contacts are counted, in counts of a 12-bit converter; positions are without."""
+"""Noise of the readings by which contacts are counted, in counts of a 12-bit converter; positions are without it."""
 BINS = 16  # groups of equally many pairs, by the distance of the two contacts
 COUNTING = "number of contacts"  # stands for the method in rows that are not of pairs
 
@@ -107,44 +107,47 @@ def fit_pairs(
     return lambda features: method.decode(np.stack([network(features) for network in networks]))
 
 
-def multicontact_study(pads: Mapping[str, Morphology], *, sizes: Sizes = SIZES, seed: int = 0) -> Study:
+def multicontact_study(
+    pads: Mapping[str, Morphology], *, press_model: PressModel = PUBLISHED_PRESSES, sizes: Sizes = SIZES, seed: int = 0
+) -> Study:
     """Localize two contacts at once by each of METHODS, and count up to MAX_CONTACTS contacts.
 
-    Signals of contacts add, and contacts are drawn uniformly and independently.
+    Responses to contacts add, and contacts are drawn uniformly and independently.
     """
     work = {name: partial(_localize_pairs, method) for name, method in METHODS.items()} | {COUNTING: _count_contacts}
     tasks = [
-        Task(f"{label}, {name}", partial(compute, pad=pad, sizes=sizes, seed=seed))
+        Task(f"{label}, {name}", partial(compute, pad=pad, press_model=press_model, sizes=sizes, seed=seed))
         for label, pad in pads.items()
         for name, compute in work.items()
     ]
     settings = {
         "pads": describe_pads(pads),
+        **press_model.to_dict(),
         "max_contacts": MAX_CONTACTS,
         "noise_counts": NOISE_COUNTS,
         "seed": seed,
         **asdict(sizes),
     }
-    conclude = partial(_conclude, dict(pads), settings)
+    conclude = partial(_conclude, dict(pads), settings, press_model.describe())
     return Study("multicontact", "Several contacts at once", settings, tasks, conclude, _draw)
 
 
-def _localize_pairs(method: PairTargets, pad: Morphology, sizes: Sizes, seed: int) -> State:
+def _localize_pairs(method: PairTargets, pad: Morphology, press_model: PressModel, sizes: Sizes, seed: int) -> State:
     """Return the test pairs "pressed" and "predicted"; shape (T, 2, 2), grid units."""
     rng, n = np.random.default_rng([5, seed]), sizes.presses
     pairs = _draw_contacts(pad, n + sizes.test, 2, rng)
-    inputs = signals(pad, pairs, PUBLISHED_CONTACT)
+    inputs = press_model.respond(pad, pairs, np.random.default_rng([5, seed, 0]))
     predict = fit_pairs(method, inputs[:n], pairs[:n], rng, sizes)
     return {"pressed": pairs[n:], "predicted": predict(inputs[n:])}
 
 
-def _count_contacts(pad: Morphology, sizes: Sizes, seed: int) -> State:
+def _count_contacts(pad: Morphology, press_model: PressModel, sizes: Sizes, seed: int) -> State:
     """Return the confusions (MAX_CONTACTS + 1, MAX_CONTACTS + 1) of the number of contacts on the test presses."""
     rng, count = np.random.default_rng([6, seed]), sizes.presses + sizes.test
     positions = _draw_contacts(pad, count, MAX_CONTACTS, rng)
     number = rng.integers(MAX_CONTACTS + 1, size=count)
-    each = signals(pad, positions.reshape(-1, 2), PUBLISHED_CONTACT).reshape(*positions.shape[:2], -1)
-    summed = (each * (np.arange(MAX_CONTACTS) < number[:, None])[:, :, None]).sum(axis=1)
+    present = np.arange(MAX_CONTACTS) < number[:, None]
+    summed = press_model.respond(pad, positions, np.random.default_rng([6, seed, 0]), present)
     return classify(quantize(summed, sizes.presses, NOISE_COUNTS, rng), number, MAX_CONTACTS + 1, rng, sizes)
 
 
@@ -154,7 +157,9 @@ def _draw_contacts(pad: Morphology, count: int, contacts: int, rng: np.random.Ge
     return positions.reshape(count, contacts, 2)
 
 
-def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
+def _conclude(
+    pads: Mapping[str, Morphology], settings: Mapping[str, Any], responses: str, states: list[State]
+) -> StudyResult:
     rows, curves, confusions = [], [], []
     results = iter(states)
     for label, pad in pads.items():
@@ -182,7 +187,7 @@ def _conclude(pads: Mapping[str, Morphology], settings: Mapping[str, Any], state
         counts = next(results)["confusions"]
         rows.append(dict.fromkeys(rows[-1]) | {"pad": label, "method": COUNTING} | classification_scores(counts))
         confusions.append({"pad": label, "counts": counts.tolist()})
-    return StudyResult(rows, _describe(settings, rows), {"curves": curves, "confusions": confusions})
+    return StudyResult(rows, _describe(settings, responses, rows), {"curves": curves, "confusions": confusions})
 
 
 def _errors_by_distance(errors_mm: Array, distances_mm: Array) -> dict[str, list[float]]:
@@ -201,9 +206,9 @@ def _resolution_mm(curve: Mapping[str, list[float]]) -> float | None:
     return resolved[-1][0] if resolved else None
 
 
-def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe(settings: Mapping[str, Any], responses: str, rows: list[dict[str, Any]]) -> list[str]:
     text = [
-        "Two contacts press at once, each anywhere between the outermost fibres, and their signals add, without noise. "
+        f"Two contacts press at once, each anywhere between the outermost fibres, and their strains add. {responses} "
         f"Networks of {settings['hidden']} neurons, of which the mean of {settings['members']} is taken, were trained "
         f"on {settings['presses']} pairs in at most {settings['epochs']} steps and tested on {settings['test']} "
         "others. An error is the mean distance of both contacts, in the order of the two that makes it less. Fixed "

@@ -7,6 +7,7 @@ the largest signals tell the tile, and one network for all tiles, given the fibr
 position in it: neither its size nor its error need grow with the surface.
 """
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -19,11 +20,11 @@ from matplotlib.figure import Figure
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
-from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.networks import fit_batch, fresh_presses, training_presses
-from padforge.design.settings import PUBLISHED_CONTACT, Rectangle, between_fibres
+from padforge.design.settings import Rectangle, between_fibres
 from padforge.sense.arrays import Array
+from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel
 from padforge.sense.studies.study import (
     Study,
     StudyResult,
@@ -33,7 +34,8 @@ from padforge.sense.studies.study import (
     label_axes,
 )
 
-GRIDS = (4, 8, 16, 32, 64, 128)
+TILES, MAX_GRID = (1, 2, 4, 8, 16, 32), 256
+"""Tiles along a side, which are 4 to 128 fibres of the published pads, and most fibres of a family."""
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"
 METHODS = (PUBLISHED, SPREAD, SHARED)
 HIDDEN = 70
@@ -43,22 +45,48 @@ CELLS = 16  # along a side of an error map
 
 
 def scaling_study(
-    pads: Mapping[str, Morphology], *, grids: Sequence[int] = GRIDS, side: int = 64, seed: int = 0
+    pads: Mapping[str, Morphology],
+    *,
+    grids: Sequence[int] = (),
+    press_model: PressModel = PUBLISHED_PRESSES,
+    side: int = 64,
+    seed: int = 0,
 ) -> Study:
-    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile, by side^2 training presses."""
+    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile.
+
+    Args:
+        pads: square pads, by label.
+        grids: fibres of a family of the surfaces, multiples of every pad's; if empty, TILES of the smallest surface
+            that all pads tile, up to MAX_GRID.
+        press_model: contact and scatter.
+        side: root of the number of training presses.
+        seed: of every random choice.
+
+    Raises:
+        InputError: a pad that is no tile of a surface.
+    """
     for label, pad in pads.items():
         if not pad.layout.is_square:
             raise InputError(f"{label} has {pad.layout}, expected tiles of M + M fibres of one pitch")
+    smallest = math.lcm(*(pad.grid for pad in pads.values()))
+    grids = grids or [grid for tiles in TILES if (grid := tiles * smallest) <= MAX_GRID]
+    if not grids:
+        raise InputError(f"pads tile surfaces from {smallest} fibres on alone, allowed are {MAX_GRID}")
+    for label, pad in pads.items():
         for grid in grids:
             if grid % pad.grid:
                 raise InputError(f"grids has {grid}, expected multiples of {pad.grid}, the grid of {label}")
     cases = list(product(grids[::-1], pads, METHODS))
     tasks = [
-        Task(f"{label}, {grid} x {grid}, {method}", partial(_evaluate, pads[label], grid, method, side, seed))
+        Task(
+            f"{label}, {grid} x {grid}, {method}",
+            partial(_evaluate, pads[label], grid, method, press_model, side, seed),
+        )
         for grid, label, method in cases
     ]
     settings = {
         "pads": describe_pads(pads),
+        **press_model.to_dict(),
         "grids": list(grids),
         "presses": side**2,
         "hidden": HIDDEN,
@@ -66,7 +94,8 @@ def scaling_study(
         "test": TEST,
         "seed": seed,
     }
-    return Study("scaling", "Larger surfaces", settings, tasks, partial(_conclude, cases, settings), _draw)
+    conclude = partial(_conclude, cases, settings, press_model.describe())
+    return Study("scaling", "Larger surfaces", settings, tasks, conclude, _draw)
 
 
 def spread_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
@@ -101,10 +130,11 @@ def tile_inputs(responses: Array, tile: int) -> tuple[Array, Array]:
     return np.hstack(windows), np.column_stack(origins).astype(float)
 
 
-def _evaluate(tile: Morphology, grid: int, method: str, side: int, seed: int) -> State:
+def _evaluate(tile: Morphology, grid: int, method: str, press_model: PressModel, side: int, seed: int) -> State:
     """Compute errors (Q,) at "positions" (Q, 2), grid units, and the seconds and epochs of the training."""
     pad = tile.tiled(grid // tile.grid) if grid > tile.grid else tile
     rectangle, begin = between_fibres(pad.layout), time.perf_counter()
+    scatter_rng = np.random.default_rng([8, seed, 0])
     if method == PUBLISHED:
         training = test = training_presses(rectangle, side, seed)
     else:
@@ -112,7 +142,7 @@ def _evaluate(tile: Morphology, grid: int, method: str, side: int, seed: int) ->
 
     def network_inputs(positions: Array) -> tuple[Array, Array]:
         """Return inputs, and the origins (Q, 2) that the outputs count from."""
-        responses = signals(pad, positions, PUBLISHED_CONTACT)
+        responses = press_model.respond(pad, positions, scatter_rng)
         if method == SHARED:
             return tile_inputs(responses, tile.grid)
         return responses if method == PUBLISHED else family_shares(responses), np.zeros((len(positions), 2))
@@ -130,7 +160,9 @@ def _evaluate(tile: Morphology, grid: int, method: str, side: int, seed: int) ->
     return {"errors": errors, "positions": test, "seconds": np.array(seconds), "epochs": np.array(network.epochs)}
 
 
-def _conclude(cases: Sequence[tuple[int, str, str]], settings: Mapping[str, Any], states: list[State]) -> StudyResult:
+def _conclude(
+    cases: Sequence[tuple[int, str, str]], settings: Mapping[str, Any], responses: str, states: list[State]
+) -> StudyResult:
     rows, maps = [], []
     by_case = dict(zip(cases, states, strict=True))
     for label, method, grid in product(settings["pads"], METHODS, settings["grids"]):
@@ -150,7 +182,7 @@ def _conclude(cases: Sequence[tuple[int, str, str]], settings: Mapping[str, Any]
         rows.append(row)
         if method == SPREAD:
             maps.append({"pad": label, "grid": grid, "errors": _error_map(grid, state).tolist()})
-    return StudyResult(rows, _describe(settings, rows), {"maps": maps})
+    return StudyResult(rows, _describe(settings, responses, rows), {"maps": maps})
 
 
 def _error_map(grid: int, state: State) -> Array:
@@ -161,14 +193,14 @@ def _error_map(grid: int, state: State) -> Array:
     return np.round(total / np.maximum(count, 1), 4).reshape(CELLS, CELLS)
 
 
-def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe(settings: Mapping[str, Any], responses: str, rows: list[dict[str, Any]]) -> list[str]:
     text = [
         f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses, for every size of "
         f"the surface alike, in at most {settings['epochs']} steps. The published method learns the signals of a "
         "serpentine and is evaluated on it, most of which was trained on; the spread method learns each fibre's share "
         f"of its family's signal from presses spread evenly, and is evaluated on {settings['test']} fresh ones. The "
         "shared method learns from the same presses the position in the tile, by one network for all tiles. Errors are "
-        "in grid units."
+        f"in grid units. {responses}"
     ]
     for label, method in product(settings["pads"], METHODS):
         cases = [row for row in rows if (row["pad"], row["method"]) == (label, method)]

@@ -22,6 +22,7 @@ from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
+from padforge.design.settings import PUBLISHED_PAD, Layout
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.recording.recording import Recording
 
@@ -32,7 +33,6 @@ ADC_COUNTS = 2**12 - 1
 """Full scale of the converter that studies read signals with."""
 NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
 """Pads without a file: straight fibres, random ones of N knots, and those of a search; their grid after an @."""
-GRID = 4
 
 
 @dataclass(frozen=True)
@@ -203,14 +203,15 @@ def _markdown(document: Mapping[str, Any], figure: str) -> str:
     return "\n\n".join([*parts, "\n".join([head, rule, *body])]) + "\n"
 
 
-def load_pads(names: Sequence[str], seed: int) -> dict[str, Morphology]:
+def load_pads(names: Sequence[str], seed: int, layout: Layout = PUBLISHED_PAD.layout) -> dict[str, Morphology]:
     """Load or make pads, by the labels of tables and figures; raises InputError for unknown names and a label twice.
 
     Args:
         names: files, `square`, `random-N`, `optimised`, `optimised-N` or `genetic-N` (`square@8`: with a grid of 8).
         seed: of random pads and searches.
+        layout: of pads without a file; one with another grid has its pitch.
     """
-    return _label([(name, *_load_pad(name, seed)) for name in names])
+    return _label([(name, *_load_pad(name, seed, layout)) for name in names])
 
 
 def load_recordings(names: Sequence[str]) -> dict[str, Recording]:
@@ -236,7 +237,7 @@ def _label(parts: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     return labelled
 
 
-def _load_pad(name: str, seed: int) -> tuple[str, Morphology]:
+def _load_pad(name: str, seed: int, layout: Layout) -> tuple[str, Morphology]:
     path = Path(name)
     if path.exists():
         is_default_name = path.name == "morphology.json" and path.parent.name
@@ -247,16 +248,18 @@ def _load_pad(name: str, seed: int) -> tuple[str, Morphology]:
             f"{name}: no such file, and none of square, optimised, random-N, optimised-N, genetic-N (N from 1 to 99 "
             "knots; 64 where they are searched for)"
         )
-    grid, kind = int(named[5] or GRID), named[2] or named[3]
+    kind = named[2] or named[3]
+    if named[5]:
+        layout = Layout.create(int(named[5]), layout.pitch_mm)
     if kind is None:
-        return name, Morphology.straight(grid)
+        return name, Morphology.straight(layout)
     if kind == "random":
-        return name, Morphology.random(grid, int(named[4]), seed)
+        return name, Morphology.random(layout, int(named[4]), seed)
     from padforge.design.optimize.search import search
-    from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, SearchSettings
+    from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_SEARCH, SearchSettings
 
     # under the published contact: by descent from a single start, or genetic as published
-    pad = PUBLISHED_PAD.model_copy(update={"grid": grid})
+    pad = PUBLISHED_PAD.model_copy(update=layout.settings)
     method = "genetic" if kind == "genetic" else "descent"
     overrides = {"starts": 1, "seed": seed, "method": method} | ({"knots": int(named[4])} if named[4] else {})
     settings = validate(SearchSettings, PUBLISHED_SEARCH.model_dump() | overrides, f"{method} search")

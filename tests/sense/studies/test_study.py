@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from padforge.cli import main
 from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
+from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
@@ -173,6 +175,31 @@ def test_study_presses_with_the_contact_of_the_settings(name: str, tmp_path: Pat
     assert "[contact] model is shape, allowed is layer" in message
 
 
+@pytest.mark.parametrize("name", ["multicontact", "scaling"])
+def test_study_takes_contact_scatter_and_pads_from_the_settings(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And is the paper's where they state no contact."""
+    studies: list[Study] = []
+    monkeypatch.setattr("padforge.sense.studies.study.run", lambda study, *_, **__: studies.append(study) or {})
+    monkeypatch.setattr("padforge.sense.studies.study.study_lines", lambda document: [])
+    layer = "[contact]\ndepth_mm = 3\n[search]\nscatter = 0.1\n[pad]\ngrid = 3\npitch_mm = 8\n"
+    for path, text in (("layer.toml", layer), ("paper.toml", "")):
+        (tmp_path / path).write_text(text)
+        command = ["study", name, "square", "--spec", str(tmp_path / path), "--out", str(tmp_path)]
+        monkeypatch.setattr(sys, "argv", ["padforge", *command])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        assert not caught.value.code
+    layer_settings, paper_settings = (study.settings for study in studies)
+    assert (layer_settings["contact"]["model"], layer_settings["contact"]["depth_mm"]) == ("layer", 3)
+    assert layer_settings["scatter"] == {"floor": 0.02, "share": 0.1, "common": 0.36}
+    assert [layer_settings["pads"]["square"][key] for key in ("grid", "pitch_mm")] == [3, 8]
+    assert layer_settings.get("grids", [3, 6, 12, 24, 48, 96]) == [3, 6, 12, 24, 48, 96]
+    assert paper_settings["contact"] == PUBLISHED_CONTACT.model_dump(mode="json")
+    assert (paper_settings["scatter"], paper_settings["pads"]["square"]["grid"]) == (None, 4)
+
+
 @pytest.mark.slow
 def test_interrupt_ends_a_study_at_once_and_keeps_finished_tasks(tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -207,6 +234,12 @@ def test_load_pads_by_file_or_name(tmp_path: Path) -> None:
         "square@3": Morphology.straight(3),
         "random-2@2": Morphology.random(2, 2, 4),
         "mine": winding,
+    }
+    layout = Layout.create((1, 2), 8.0)
+    assert load_pads(("square", "random-2", "square@3"), 4, layout) == {
+        "square": Morphology.straight(layout),
+        "random-2": Morphology.random(layout, 2, 4),
+        "square@3": Morphology.straight(3, 8.0),
     }
     paths = [tmp_path / f"{name}.json" for name in ("-_+x", "=1+1", "@mine")]
     for path in paths:
