@@ -270,6 +270,10 @@ def fibre_loss(
     \b
     padforge sense fibre-loss out/pad/recording --model out/pad
 
+    \b
+    Figure 14, S6, S7 and S8 of the paper, whose S1 and S2 broke:
+    padforge sense fibre-loss para5_long.mat --retrain --failed 4,5,6
+
     Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
     worst set of each size, and without the fibres of --failed. Finished networks are kept after an interruption, and
     the same command continues with them.

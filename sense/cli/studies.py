@@ -12,7 +12,7 @@ import click
 
 from padforge.design.common import command_line as common
 from padforge.design.common.validation import InputError
-from padforge.sense.cli.options import max_failures_option
+from padforge.sense.cli.options import fibre_indices, fibres_option, max_failures_option
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
@@ -132,9 +132,13 @@ def _check_square(context: click.Context, param: click.Parameter, value: int) ->
     callback=_check_square,
     help="Training presses, a square number.",
 )
+@fibres_option("--failed", "Also map errors without these fibres, numbered from 1, such as 6,7,8.")
 @common.spec_option
-def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **options: Any) -> "Study":
-    """Errors by number of failed fibres (figures 3 to 5). Means are over all sets of them; error maps are drawn.
+def robustness(
+    names: tuple[str, ...], *, seed: int, spec: Path | None, failed: tuple[int, ...], **options: Any
+) -> "Study":
+    """Errors by number of failed fibres (figures 3 to 5). Means are over all sets of them. Error maps without the worst
+    set of each size, and without the fibres of --failed, are drawn, and their change from the map with all fibres.
 
     \b
     padforge study robustness square random-5 --max-failures 2
@@ -150,7 +154,9 @@ def robustness(names: tuple[str, ...], *, seed: int, spec: Path | None, **option
 
     settings = common.load_spec(spec)
     contact = read_contact(settings) if settings.stated(Contact) else None
-    return robustness_study(_pads(names, seed, settings), seed=seed, contact=contact, **options)
+    pads = _pads(names, seed, settings)
+    options["failed"] = fibre_indices(failed, min(pad.layout.fibres for pad in pads.values()))
+    return robustness_study(pads, seed=seed, contact=contact, **options)
 
 
 @_command("scaling")

@@ -1,7 +1,7 @@
 """Robustness: accuracy of a pad as fibres are lost, by networks retrained for every set (paper, figures 3, 4 and 5)."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -45,11 +45,22 @@ def robustness_study(
     rule: str = "published",
     max_failures: int = 3,
     presses: int = 1024,
+    failed: Sequence[int] = (),
     seed: int = 0,
 ) -> Study:
     """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
 
-    Signals are by one of RULES, under PUBLISHED_CONTACT unless there is another; training presses are a square number.
+    Args:
+        pads: the pads, by label.
+        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
+        rule: one of RULES, by which signals are computed.
+        max_failures: most fibres that fail at once; at least one is left.
+        presses: to train on, a square number.
+        failed: indices of fibres without which errors are mapped too, however many; none if empty.
+        seed: of every random choice.
+
+    Raises:
+        InputError: `presses` is no square number, or a pad has none of the `failed` fibres, or no others.
     """
     side = math.isqrt(presses)
     if side**2 != presses or side < 2:
@@ -61,6 +72,12 @@ def robustness_study(
         for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
         for part in split_batches(failure_subsets(pad.layout.fibres, level, MAX_SETS))
     ]
+    chosen = tuple(sorted(set(failed)))
+    for label, pad in pads.items():
+        if chosen and not (chosen[-1] < pad.layout.fibres and len(chosen) < pad.layout.fibres):
+            numbers = "+".join(str(fibre + 1) for fibre in chosen)
+            raise InputError(f"failed are {numbers}, allowed are some of the {pad.layout.fibres} fibres of {label}")
+    parts += [(label, [chosen]) for label in pads if chosen]
     sizes = {"hidden": HIDDEN, "test": TEST, "seed": seed}
     evaluate = partial(_evaluate, respond=partial(RULES[rule], contact=contact), side=side, **sizes)
     tasks = [Task(f"{label}, {len(part[0])} failed", partial(evaluate, pads[label], part)) for label, part in parts]
@@ -69,6 +86,7 @@ def robustness_study(
         "contact": contact.model_dump(mode="json"),
         "signals": rule,
         "max_failures": max_failures,
+        "failed": list(chosen),
         "presses": presses,
         **sizes,
     }
@@ -108,12 +126,13 @@ def _conclude(
     rows, maps, by_subset = [], [], []
     for label, pad in pads.items():
         results = [(part, state) for (name, part), state in zip(parts, states, strict=True) if name == label]
+        chosen = [results.pop()] if settings["failed"] else []  # the last part of a pad
         failures = [failed for part, _ in results for failed in part]
         fresh, training, errors = (
             np.concatenate([state[name] for _, state in results]) for name in ("fresh", "training", "maps")
         )
         sizes = np.array([len(failed) for failed in failures])
-        (left, low), (right, high) = between_fibres(pad.layout)
+        mapped = []
         for level in range(sizes.max() + 1):
             means = fresh[sizes == level]
             row = {
@@ -130,17 +149,27 @@ def _conclude(
             }
             rows.append(row)
             worst = int(np.flatnonzero(sizes == level)[means.argmax()])
-            cells = np.round(errors[worst].reshape(SIDE, SIDE), 3).tolist()
-            panel = {"failed": list(failures[worst]), "extent": [left, right, low, high], "errors": cells}
-            maps.append({"pad": label} | panel)
+            mapped.append((failures[worst], float(fresh[worst]), errors[worst]))
+        mapped += [(part[0], float(state["fresh"][0]), state["maps"][0]) for part, state in chosen]
+        (left, low), (right, high) = between_fibres(pad.layout)
+        maps += [
+            {
+                "pad": label,
+                "failed": list(failed),
+                "mean": mean,
+                "extent": [left, right, low, high],
+                "errors": np.round(cells.reshape(SIDE, SIDE), 3).tolist(),
+            }
+            for failed, mean, cells in mapped
+        ]
         by_subset += [
             {"pad": label, "failed": list(failed), "mean": float(mean)}
             for failed, mean in zip(failures, fresh, strict=True)
         ]
-    return StudyResult(rows, _describe(settings, rows), {"maps": maps, "by_subset": by_subset})
+    return StudyResult(rows, _describe(settings, rows, maps), {"maps": maps, "by_subset": by_subset})
 
 
-def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]], maps: list[dict[str, Any]]) -> list[str]:
     is_sample = any(row["subsets"] < row["of"] for row in rows)
     sample = f" ({MAX_SETS} of them, drawn at random, where there are more)" if is_sample else ""
     most = max(row["n_failed"] for row in rows)
@@ -160,6 +189,9 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
                 f", {failed['mean']:.3f} with {most} failed ({failed['mean'] / row['mean']:.1f} times as much), "
                 f"{failed['max']:.3f} with the worst {most}"
             )
+        if chosen := settings["failed"]:
+            mapped = [panel for panel in maps if panel["pad"] == label][-1]
+            line += f", {mapped['mean']:.3f} {failed_label(chosen)}"
         text.append(f"{line}.")
     if len(worst) > 1:
         best, *_, last = sorted(worst, key=lambda label: worst[label]["mean"])
@@ -171,11 +203,15 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:
-    """Draw errors by number of failed fibres, and error maps without the worst sets."""
+    """Draw errors by number of failed fibres, error maps without the worst sets, and how these change the map."""
     labels = list(document["settings"]["pads"])
     levels = 1 + max(row["n_failed"] for row in document["rows"])
-    figure = Figure(figsize=(max(7.2, 1.9 * levels), 3.6 + 1.75 * len(labels)), layout="constrained")
-    grid = figure.add_gridspec(1 + len(labels), levels, height_ratios=[1.9] + [1.0] * len(labels))
+    panels = {label: [panel for panel in document["maps"] if panel["pad"] == label] for label in labels}
+    columns = max(map(len, panels.values()))
+    maps_each = 1 if columns == 1 else 2  # rows of maps of a pad: errors, and their change
+    figure = Figure(figsize=(max(7.2, 1.9 * columns), 3.6 + 1.75 * maps_each * len(labels)), layout="constrained")
+    height_ratios = [1.9] + [1.0] * maps_each * len(labels)
+    grid = figure.add_gridspec(len(height_ratios), columns, height_ratios=height_ratios)
     axes = figure.add_subplot(grid[0, :])
     width = 0.8 / len(labels)
     for number, label in enumerate(labels):
@@ -191,9 +227,15 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     caption = "bar: mean over the sets; line: their standard deviation; dash: the worst set"
     axes.set_title(caption, loc="left", fontsize=8.5)
     highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.99))
-    for number, label in enumerate(labels):
-        for column, panel in enumerate(panel for panel in document["maps"] if panel["pad"] == label):
-            axes = figure.add_subplot(grid[1 + number, column], aspect="equal")
+    for number, (label, (intact, *others)) in enumerate(panels.items()):
+        row = 1 + maps_each * number
+        for column, panel in enumerate([intact, *others]):
+            axes = figure.add_subplot(grid[row, column], aspect="equal")
             title, row_label = failed_label(panel["failed"]), "" if column else label
             draw_error_map(axes, panel["errors"], title, highest, panel["extent"], row_label)
+        for column, panel in enumerate(others, 1):
+            axes = figure.add_subplot(grid[row + 1, column], aspect="equal")
+            change, row_label = np.subtract(panel["errors"], intact["errors"]), "change" if column == 1 else ""
+            image = draw_error_map(axes, change, "", highest, panel["extent"], row_label)
+            image.set(cmap="RdBu_r", clim=(-highest, highest))
     return figure

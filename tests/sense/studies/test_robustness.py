@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from padforge.design import Contact, Morphology
+from padforge.design import Contact, InputError, Morphology
 from padforge.design.networks import SimulatedPresses
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import MIN_NETWORKS, robustness_study
@@ -159,7 +159,7 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
     settings = {"pads": {"plain": {}, "bent": {}}, "hidden": 7, "presses": 16, "test": 9, "signals": "exact"}
     cells = np.arange(robustness.SIDE**2).reshape(robustness.SIDE, -1) / 1000
     maps = [
-        {"pad": pad, "failed": failed, "extent": [0, 1, 0, 1], "errors": cells.tolist()}
+        {"pad": pad, "failed": failed, "extent": [0, 1, 0, 1], "errors": (cells * (1 + len(failed))).tolist()}
         for pad in ("plain", "bent")
         for failed in ([], [2])
     ]
@@ -178,4 +178,28 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
     assert [label.get_text() for label in bars.get_xticklabels()] == ["all fibres", "1 failed"]
     assert bars.get_ylabel() == "mean error (grid units)"
     assert bars.get_title("left") == "bar: mean over the sets; line: their standard deviation; dash: the worst set"
-    assert len([panel for panel in panels if panel.images]) == 4
+    images = [panel.images[0].get_array() for panel in panels if panel.images]
+    for errors, changed, change in (images[:3], images[3:]):  # of a pad: both maps, and the change of the second
+        np.testing.assert_allclose(errors, cells)
+        np.testing.assert_allclose(changed, 2 * cells)
+        np.testing.assert_allclose(change, cells)
+
+
+def test_study_maps_errors_without_chosen_fibres(tmp_path: Path) -> None:
+    """However many fail otherwise, and as for the set that is evaluated anyway."""
+    document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(3, 0, 2)), tmp_path)
+    assert [row["n_failed"] for row in document["rows"]] == [0, 1] * 2
+    for pad, paragraph in zip(PADS, document["text"][1:], strict=False):
+        *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
+        assert chosen["failed"] == [0, 2, 3]
+        intact = select_rows(document, pad=pad, n_failed=0)[0]["mean"]
+        assert intact < chosen["mean"] == pytest.approx(np.mean(chosen["errors"]), rel=0.25)
+        assert f"{chosen['mean']:.3f} without 1+3+4" in paragraph
+    document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(2,)), tmp_path)
+    for pad in PADS:
+        *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
+        [row] = [row for row in document["by_subset"] if (row["pad"], row["failed"]) == (pad, [2])]
+        assert chosen["mean"] == row["mean"]
+    for failed in ((4,), (0, 1, 2, 3)):
+        with pytest.raises(InputError, match="allowed are some of the 4 fibres of square"):
+            robustness_study(PADS, failed=failed)

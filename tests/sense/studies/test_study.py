@@ -160,6 +160,7 @@ def test_run_rejects_a_lock_that_is_no_file(tmp_path: Path) -> None:
             ["robustness", "square", "--presses", "1000"],
             "Invalid value for '--presses': got 1000, allowed is a square number",
         ),
+        (["robustness", "square", "--failed", "6,9"], "fibre 9: no such fibre, allowed are 1 to 8"),
         (["scaling", "square", "--grids", "4,x"], "--grids is '4,x', expected numbers from 2 to 256"),
         *(([name, "no"], "no: no such file") for name in ("sensitivity", "force", "shape", "multicontact")),
     ],
