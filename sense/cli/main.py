@@ -68,7 +68,7 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     A value holds until the next message. An .mcap whose end is missing is imported as far as it goes.
     """
     from padforge.design.common.files import provenance
-    from padforge.sense.formats.columns import PRESSES_DETECTED
+    from padforge.sense.formats.columns import PRESSES_DETECTED, join_names
     from padforge.sense.formats.import_export import find_reader
     from padforge.sense.recording.run_directory import check_new_folder
 
@@ -79,6 +79,8 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     if PRESSES_DETECTED.items() <= recording.source.items():
         click.echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))
+    if recording.fibre_names:
+        click.echo(f"fibres from 1 on: {join_names(recording.fibre_names)}")
     click.echo(recording_line(recording, folder))
 
 

@@ -30,7 +30,6 @@ from padforge.sense.localizer import features
 from padforge.sense.localizer.bayes import PREFIX, STAGES, BayesianLocalizer
 from padforge.sense.localizer.features import Window, compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, complete_at
 from padforge.sense.localizer.network import LEAST_SLIDE, MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
@@ -328,7 +327,7 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
     if model.features != "windows":
         raise InputError(f"the localizer is of features {model.features}, expected windows: calibrate on a recording")
     if recording is not None:
-        check_same_pad(model, "the localizer", recording.fibres, recording.rate_hz)
+        model.check_recording(recording)
         trial = recording.readings, recording.down_command, recording.up_command
     else:
         trial = _made_up_presses(model)

@@ -5,6 +5,7 @@ stands for any characters and `?` for any one, also for a comma or a colon. A un
 as 0.001; without any, times are s, readings V, positions and depths mm, and forces N.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import Array, Indices, Mask, check_numbers
 from padforge.sense.recording.csv_table import UNKNOWN
-from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.recording import FIBRE_NAMES, Recording
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 MILLIMETRES = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1000.0}
@@ -41,6 +42,7 @@ PRESSES_DETECTED = {"presses": "detected"}
 """Entry of the source of a recording whose presses were detected in its readings."""
 MAX_CHARACTERS = 10_000
 _MAX_LISTED = 12
+_NUMBER = re.compile(r"\d{1,9}")
 
 
 class ColumnEntry(NamedTuple):
@@ -120,12 +122,13 @@ def matches(name: str, pattern: str) -> bool:
     return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))  # brackets hold units, no characters
 
 
-def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[tuple[ColumnEntry, list[int]]]:
-    """Return the entries with the indices of their columns, ascending: one each, but for fibres, which come last.
+def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[tuple[ColumnEntry, int]]:
+    """Return the columns that entries name, each with its own name and its index: fibres last, others once each.
 
-    A pattern leaves out the columns of entries before it.
+    A pattern leaves out the columns of entries before it. Columns of one pattern whose names differ by a number alone
+    come in the order of that number, others in the order of the file.
     """
-    matched: list[tuple[ColumnEntry, list[int]]] = []
+    matched: list[tuple[ColumnEntry, int]] = []
     used: set[int] = set()
     for entry in sorted(entries, key=lambda entry: entry.quantity == "fibres"):
         what = f"{entry.quantity} is {short_repr(entry.name)}"
@@ -138,8 +141,23 @@ def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[
         if not used.isdisjoint(columns):
             raise InputError(f"{what}, which is named before; expected each once")
         used.update(columns)
-        matched.append((entry, columns))
+        matched += [(entry._replace(name=names[i]), i) for i in _by_number(columns, names)]
     return matched
+
+
+def _by_number(columns: Sequence[int], names: Sequence[str]) -> list[int]:
+    """Sort columns by the numbers in their names, among those whose names are alike otherwise.
+
+    pandas, R and HDF5 sort names as text, in which c10 comes before c2.
+    """
+    alike: dict[str, list[int]] = {}
+    for column in columns:
+        alike.setdefault(_NUMBER.sub("#", names[column]), []).append(column)
+    ranked = {
+        text: iter(sorted(group, key=lambda i: [int(number) for number in _NUMBER.findall(names[i])]))
+        for text, group in alike.items()
+    }
+    return [next(ranked[_NUMBER.sub("#", names[column])]) for column in columns]
 
 
 def join_names(names: Sequence[str]) -> str:
@@ -159,9 +177,10 @@ def assemble_recording(
 
     Args:
         path: of the file, for messages.
-        arrays: each with its entry. `time` and `press` have R values; `fibres` is (R, C), (C, R) or (R,), in one
-            array or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
-        source: of the recording.
+        arrays: each with its entry and its own name. `time` and `press` have R values; `fibres` is (R, C), (C, R) or
+            (R,), in one array or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or
+            presses.
+        source: of the recording; the names of the fibres are added.
     """
     with naming_file(path):
         return _assemble(arrays, source)
@@ -169,18 +188,19 @@ def assemble_recording(
 
 def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mapping[str, Any]) -> Recording:
     columns: dict[str, Array] = {}
-    fibres: list[Array] = []
+    fibres: list[tuple[str, Array]] = []
     for entry, array in arrays:
         values = _scaled(entry, array)
         if entry.quantity == "fibres":
-            fibres.append(values)
+            fibres.append((entry.name, values))
         elif entry.quantity == "positions" or values.size in values.shape:
             columns[entry.quantity] = values if entry.quantity == "positions" else values.ravel()
         else:
             raise InputError(f"{entry.quantity} has shape {values.shape}, expected one row or column")
     times = columns["time"]
-    fibres = [_by_readings(values, len(times)) for values in fibres]
-    readings = fibres[0] if len(fibres) == 1 else np.column_stack(fibres)
+    fibres = [(name, _by_readings(values, len(times))) for name, values in fibres]
+    readings = fibres[0][1] if len(fibres) == 1 else np.column_stack([values for _, values in fibres])
+    source = {**source, FIBRE_NAMES: [name for each in fibres for name in _fibre_names(*each)]}
     timed = {entry.quantity for entry, _ in arrays if entry.factor is not None}
     for name in timed & {"down_command", "up_command"}:
         # A thousandth of an interval is allowed for: times that were converted to another unit and back are rounded.
@@ -224,6 +244,11 @@ def _by_readings(values: Array, n_readings: int) -> Array:
     if values.ndim == 1:
         return values[:, None]
     return values if len(values) == n_readings else values.T
+
+
+def _fibre_names(name: str, values: Array) -> list[str]:
+    """Return the names of (R, c) readings from an array: its own, with an index where it holds several fibres."""
+    return [name] if values.shape[1] == 1 else [f"{name}[{i}]" for i in range(values.shape[1])]
 
 
 def _join_positions(columns: Mapping[str, Array]) -> Array | None:

@@ -46,16 +46,15 @@ def import_csv(path: str | Path, columns: str = "") -> Recording:
     table = CsvTable(path)
     with naming_file(path):
         matched = match_columns(entries or _own_entries(table.names), table.names)
-    indices = [i for _, entry_columns in matched for i in entry_columns]
-    x_y = [entry_columns[0] for entry, entry_columns in matched if entry.quantity in "xy"]
+    indices = [i for _, i in matched]
+    x_y = [i for entry, i in matched if entry.quantity in "xy"]
     values = table.read_columns(indices, x_y)
     missing = np.isnan(values[:, [indices.index(i) for i in x_y]])
     if (incomplete := missing.any(axis=1) & ~missing.all(axis=1)).any():
         x, y = (table.names[i] for i in x_y)
         line = table.line_number(int(np.argmax(incomplete)))
         raise InputError(f"{path}: line {line} has one of {x} and {y}, expected both or neither")
-    ends = np.cumsum([len(entry_columns) for _, entry_columns in matched])
-    arrays = [(entry, part) for (entry, _), part in zip(matched, np.split(values, ends[:-1], axis=1), strict=True)]
+    arrays = [(entry, column) for (entry, _), column in zip(matched, values.T, strict=True)]
     return assemble_recording(
         path, arrays, {"kind": "csv", "file": path.name} | ({"columns": columns} if columns else {})
     )

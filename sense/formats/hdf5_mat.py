@@ -76,7 +76,7 @@ def import_hdf5(path: str | Path, columns: str = "") -> Recording:
         entries = [entry._replace(name=entry.name.removeprefix("/")) for entry in parse_columns(columns)]
         with open_hdf5(path) as file:
             matched = match_columns(entries, file.names)
-            arrays = [(entry, file.read(file.names[i])) for entry, indices in matched for i in indices]
+            arrays = [(entry, file.read(entry.name)) for entry, _ in matched]
         return assemble_recording(path, arrays, {"kind": "hdf5", "file": path.name, "columns": columns})
     with open_hdf5(path) as file:
         if (file_format := file.read_text("format")) != FORMAT:
@@ -111,7 +111,7 @@ def import_mat(path: str | Path, columns: str = "") -> Recording:
             return _import_published(path, content)
         names = [name for name in content if not name.startswith("__")]
         matched = match_columns(parse_columns(columns), names)
-        arrays = [(entry, _matrix(content, names[i])) for entry, indices in matched for i in indices]
+        arrays = [(entry, _matrix(content, entry.name)) for entry, _ in matched]
     return assemble_recording(path, arrays, {"kind": "mat", "file": path.name, "columns": columns})
 
 

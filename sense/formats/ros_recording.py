@@ -401,7 +401,7 @@ def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
 def _to_arrays(topics: Mapping[str, TopicSeries], is_cut: bool) -> _Arrays:
     """Return what the messages of an exported bag say by themselves."""
     stamps, readings = topics[READINGS]
-    arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", ""), readings)]
+    arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", READINGS), readings)]
     if PRESSED not in topics:
         return arrays
     down, up = _find_commands(topics[PRESSED], stamps, is_cut)
@@ -451,13 +451,9 @@ def _find_commands(pressed: TopicSeries, readings: Indices, is_cut: bool) -> tup
 def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
     raw, types, note = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
-    names = list(types)
+    names = sorted(types)  # bags list topics as they were discovered, each bag in another order
     with naming_file(path):
-        series = [
-            (entry, _decode_entry(store, entry, names[i], raw))
-            for entry, indices in match_columns(entries, names)
-            for i in indices
-        ]
+        series = [(entry, _decode_entry(store, entry, raw)) for entry, _ in match_columns(entries, names)]
         clock = next(topic.stamps for entry, topic in series if entry.quantity == "fibres")
         arrays: _Arrays = [(ColumnEntry("time", ""), clock / 1e9)]
         for entry, topic in series:
@@ -474,9 +470,10 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
     return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns, **note})
 
 
-def _decode_entry(store: "Typestore", entry: ColumnEntry, name: str, raw: Mapping[str, RawMessages]) -> TopicSeries:
+def _decode_entry(store: "Typestore", entry: ColumnEntry, raw: Mapping[str, RawMessages]) -> TopicSeries:
     """Return the numbers of a topic, of a type that may hold the quantity."""
-    what, types = f"{entry.quantity} is {short_repr(name)}", _TYPES[entry.quantity]
+    name, types = entry.name, _TYPES[entry.quantity]
+    what = f"{entry.quantity} is {short_repr(name)}"
     if name not in raw:
         raise InputError(f"{what}, which has no messages")
     if raw[name].msgtype not in types:

@@ -102,7 +102,8 @@ def calibrate(
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"), one_torch_thread():
         model = fit_recording(recording, training, options, rng, on_progress, time_budget)
-    model = replace(model, split=options.split, test=tuple(test.tolist()), provenance=made_by)
+    origin = {"fibre_names": recording.fibre_names, "provenance": made_by}
+    model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
     with stage("evaluate"):
         evaluation = evaluate(model, recording, range(_n_levels(options, recording.fibres)), on_progress=on_progress)
     evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())

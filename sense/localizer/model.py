@@ -18,6 +18,7 @@ from pydantic import ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 from padforge.design.common.files import read_json, reraise_write_error, write_text
 from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
+from padforge.sense.formats.columns import join_names
 from padforge.sense.localizer.bayes import N_SUMMARY, STAGES, BayesianLocalizer
 from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.features import (
@@ -116,6 +117,7 @@ class LocalizerDocument:
     split: Split = "random"  # how the test presses of the training were held back
     test: tuple[Annotated[int, Field(ge=0)], ...] = ()
     recalibrated_by: tuple[Digest, ...] = ()  # recordings all of whose presses it has seen
+    fibre_names: tuple[str, ...] = ()  # of the recording of the training, if that was imported
     errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
 
@@ -159,6 +161,20 @@ class LocalizerModel(LocalizerDocument):
         """How a finger that slides is followed; None where none is."""
         return Sliding(*self.scaler.to_now(N_TIMED)) if FOLLOWING in self.networks else None
 
+    def check_recording(self, recording: Recording) -> None:
+        """Raise InputError unless a recording is of a pad with the fibres, their names and the rate of the training.
+
+        Args:
+            recording: to be localized. Names that the training did not know tell nothing.
+        """
+        check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
+        for fibre, (name, learnt) in enumerate(zip(recording.fibre_names, self.fibre_names, strict=False), 1):
+            if name != learnt and (name in self.fibre_names or learnt in recording.fibre_names):
+                raise InputError(
+                    f"fibre {fibre} is {short_repr(name)}, the localizer learnt it as {short_repr(learnt)}; "
+                    f"import the fibres in the order {join_names(self.fibre_names)}"
+                )
+
     def raw_features(self, recording: Recording, until: ArrayLike | None = None) -> PressFeatures:
         """Return the features of every press, V.
 
@@ -172,7 +188,7 @@ class LocalizerModel(LocalizerDocument):
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
         check_type("recording", recording, Recording)
-        check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
+        self.check_recording(recording)
         commands = recording.down_command, recording.up_command
         end = None if until is None else np.asarray(until)
         if end is not None and (end.dtype.kind not in "iu" or end.shape != commands[0].shape):

@@ -46,6 +46,8 @@ from padforge.sense.recording.run_directory import (
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64)
 _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
 _CHUNK_BYTES, _CHUNK_PRESSES = 2**18, 2**12  # of readings and presses that are written at once
+FIBRE_NAMES = "fibre_names"
+"""Key in the source of a recording for what its fibres are called in the file that it was imported from."""
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
@@ -128,6 +130,12 @@ class Recording:
     def mirrored(self) -> bool:
         """Whether the pad lay with its tracks up, by `[rig]`: seen from above, x ran to the left of y."""
         return is_mirrored(self.source)
+
+    @property
+    def fibre_names(self) -> tuple[str, ...]:
+        """What the C fibres are called in the file that they were imported from; () where they have no names."""
+        names = self.source.get(FIBRE_NAMES)
+        return tuple(map(str, names)) if isinstance(names, list) and len(names) == self.fibres else ()
 
     @property
     def rate_hz(self) -> float:

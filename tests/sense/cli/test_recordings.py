@@ -25,6 +25,21 @@ def test_import_reads_csv(padforge_sense, brief: Recording) -> None:
     assert set(start["provenance"]["inputs"]) == {"r.csv"}
 
 
+def test_import_puts_columns_to_the_fibres_they_name(padforge_sense, brief: Recording) -> None:
+    """As pandas, R and spreadsheets sort columns of their names."""
+    wide = replace(brief, readings=brief.readings[:, [0, 1, 2, 3] * 3] + np.arange(12) / 100)
+    export_csv(wide, "r.csv")
+    table = [line.split(",") for line in Path("r.csv").read_text().splitlines()]
+    order = [0, *sorted(range(1, 13), key=lambda i: table[0][i]), 13, 14]
+    assert [table[0][i] for i in order][2:4] == ["fibre_10_v", "fibre_11_v"]
+    Path("sorted.csv").write_text("".join(",".join(row[i] for i in order) + "\n" for row in table))
+    code, out, _ = padforge_sense("import", "sorted.csv")
+    assert code == 0
+    assert out.startswith("fibres from 1 on: 'fibre_0_v', 'fibre_1_v', 'fibre_2_v'")
+    assert Recording.open("out/sorted/recording") == wide
+    assert Recording.open("out/sorted/recording").fibre_names[2] == "fibre_2_v"
+
+
 def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:
     content = {"voltage": recording.readings[:391], "tim": recording.times_s[None, :391]}
     scipy.io.savemat("cut.mat", content | {"pos": recording.presses_mm[:10].T})

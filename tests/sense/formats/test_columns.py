@@ -21,8 +21,9 @@ NAMES = ["t_ms", "Time [s]", "ch1", "ch2", "a,b", "a:b", "px", "py", "contact"]
 
 def matched(mapping: str, names: list[str] = NAMES) -> dict[str, list[str]]:
     columns: dict[str, list[str]] = {}
-    for entry, indices in match_columns(parse_columns(mapping), names):
-        columns.setdefault(entry.quantity, []).extend(names[i] for i in indices)
+    for entry, i in match_columns(parse_columns(mapping), names):
+        assert entry.name == names[i]
+        columns.setdefault(entry.quantity, []).append(entry.name)
     return columns
 
 
@@ -45,6 +46,17 @@ def test_match_columns_by_name_and_pattern() -> None:
     assert matched("time=a?b,fibres=ch?", ["a,b", "ch1", "ch22"]) == {"time": ["a,b"], "fibres": ["ch1"]}
     assert matched("time=T*,fibres=*,x=px,y=py", ["px", "c", "Time", "py"])["fibres"] == ["c"]
     assert matched("time=*,fibres=c*", ["*", "c", "d"]) == {"time": ["*"], "fibres": ["c"]}
+
+
+def test_match_columns_orders_fibres_by_their_numbers() -> None:
+    def order(*names: str, mapping: str = "time=t,fibres=*") -> list[str]:
+        return matched(mapping, ["t", *names])["fibres"]
+
+    assert order("fibre_0_v", "fibre_10_v", "fibre_1_v") == ["fibre_0_v", "fibre_1_v", "fibre_10_v"]
+    assert order("c02", "c10", "c1") == ["c1", "c02", "c10"]
+    assert order("ref", "l10", "r2", "l2", "r1") == ["ref", "l2", "r1", "l10", "r2"]  # places of like names
+    assert order("left", "back", "2nd") == ["left", "back", "2nd"]  # a table has an order of its own
+    assert order("c2", "c1", mapping="time=t,fibres=c2,fibres=c1") == ["c2", "c1"]  # as stated
 
 
 @pytest.mark.parametrize(
@@ -107,13 +119,14 @@ def test_assemble_recording_accepts_fibres_as_rows_or_columns() -> None:
     assert np.array_equal(assembled(COMMANDS | {"fibres": VOLTS.T}).readings, VOLTS)
     one = assembled(COMMANDS | {"fibres": VOLTS[:, 0], "time": TIMES[None]})
     assert np.array_equal(one.readings, VOLTS[:, :1])
-    arrays = [(ColumnEntry("time", ""), TIMES), (ColumnEntry("fibres", ""), VOLTS[:, 1])]
+    arrays = [(ColumnEntry("time", ""), TIMES), (ColumnEntry("fibres", "one"), VOLTS[:, 1])]
     arrays += [
-        (ColumnEntry("fibres", "", 2.0), VOLTS.T),
+        (ColumnEntry("fibres", "two", 2.0), VOLTS.T),
         *((ColumnEntry(name, ""), COMMANDS[name]) for name in COMMANDS),
     ]
     several = assemble_recording(Path("f"), arrays, {})
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
+    assert several.fibre_names == ("one", "two[0]", "two[1]")
 
 
 def test_assemble_recording_converts_units_and_allows_for_rounded_times() -> None:

@@ -81,7 +81,8 @@ def test_import_csv_by_columns(tmp_path: Path) -> None:
     assert recording.forces_n.tolist() == [0.25, 0.5]
     assert np.isnan(recording.depths_mm).all()
     assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([1, 4], [3, 5])
-    assert recording.source == {"kind": "csv", "file": "lab.csv", "columns": mapping}
+    names = {"fibre_names": ["ch1", "ch2"]}
+    assert recording.source == {"kind": "csv", "file": "lab.csv", "columns": mapping, **names}
 
 
 def test_import_csv_by_names_with_separators(tmp_path: Path) -> None:

@@ -98,11 +98,17 @@ def test_import_hdf5_by_columns(tmp_path: Path) -> None:
     assert np.array_equal(recording.readings, content["data/volts"].T * 1e-3)
     assert recording.presses_mm.tolist() == [[10, 20], [-30, 40]]
     assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([10, 25], [20, 35])
-    assert recording.source == {"kind": "hdf5", "file": "lab.h5", "columns": mapping}
+    names = {"fibre_names": [f"data/volts[{i}]" for i in range(len(content["data/volts"]))]}
+    assert recording.source == {"kind": "hdf5", "file": "lab.h5", "columns": mapping, **names}
     lab(tmp_path, on=content["t"][content["on"]], off=content["t"][content["off"]])
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
     lab(tmp_path, **{"data/volts": None, "data/ch0": content["data/volts"][0], "data/ch1": content["data/volts"][1]})
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("volts", "ch*")).fibres == 2
+    channels = {f"data/ch{i}": np.full_like(content["t"], i, dtype=float) for i in range(1, 13)}
+    lab(tmp_path, **{"data/volts": None}, **channels)
+    wide = import_hdf5(tmp_path / "lab.h5", mapping.replace("volts:mV", "ch*"))
+    assert wide.readings[0].tolist() == list(range(1, 13))  # HDF5 lists ch10 before ch2
+    assert wide.fibre_names[1] == "data/ch2"
     lab(tmp_path)
     present = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     assert f"(--columns) say what other datasets hold, {present}" in refusal_of(tmp_path / "lab.h5")

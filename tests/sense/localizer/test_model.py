@@ -106,6 +106,20 @@ def test_predict_refuses_unknown_fibres_and_other_pads(localizer: LocalizerModel
         localizer.scaled_features(replace(recording, readings=recording.readings[:, :3]))
 
 
+def test_predict_compares_the_names_of_fibres(localizer: LocalizerModel, recording: Recording) -> None:
+    learnt = replace(localizer, fibre_names=("c1", "c2", "c3", "c4"))
+
+    def named(*names: str) -> Recording:
+        return replace(recording, source={"fibre_names": list(names)})
+
+    for names in ((), ("c1", "c2", "c3", "c5"), ("fibre_0_v", "fibre_1_v", "fibre_2_v", "fibre_3_v")):
+        learnt.check_recording(named(*names))
+    message = "fibre 2 is 'c3', the localizer learnt it as 'c2'; import the fibres in the order 'c1', 'c2', 'c3', 'c4'"
+    with pytest.raises(InputError, match=message):
+        learnt.predict(named("c1", "c3", "c2", "c4"))
+    localizer.check_recording(named("c1", "c3", "c2", "c4"))  # it knows no names
+
+
 def test_predict_takes_rates_within_a_quarter(localizer: LocalizerModel, recording: Recording) -> None:
     for ratio in (0.76, 1.24):
         presses = localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
