@@ -20,6 +20,7 @@ from padforge.sense.cli.options import (
     max_failures_option,
     model_option,
     predict_despite_faults,
+    pressed_line,
     read_recording,
     recording_argument,
 )
@@ -40,7 +41,10 @@ from padforge.sense.cli.options import (
 @common.force_option
 @common.json_option
 @common.profile_option
-def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: bool, **options: Any) -> None:
+@click.pass_context
+def calibrate(
+    context: click.Context, recording: Path, spec: Path | None, out: Path | None, as_json: bool, **options: Any
+) -> None:
     """Train a localizer on RECORDING. It is tested on held-out presses.
 
     \b
@@ -48,7 +52,8 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
     padforge sense calibrate out/pad/recording --time-budget 600
 
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
-    error_map.png, error_by_loss.png and error_by_moment.png.
+    error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
+    right, or presses that cannot lie where it says.
     """
     from padforge.design.common.files import locked_folder
     from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
@@ -61,7 +66,9 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
         settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
         with common.progress_bar("training") as show:
             document = calibrate_into(presses, folder, settings, on_progress=show, **run)
-    common.show_result(document, [*calibration_lines(document), *moment_lines(document["by_moment"])], as_json)
+    lines = [pressed_line(presses), *calibration_lines(document), *moment_lines(document["by_moment"])]
+    common.show_result(document, lines, as_json)
+    context.exit(int(bool(document["doubts"])))
 
 
 @click.command()
@@ -70,13 +77,14 @@ def calibrate(recording: Path, spec: Path | None, out: Path | None, as_json: boo
 @max_failures_option
 @common.json_option
 @common.profile_option
-def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
+@click.pass_context
+def evaluate(context: click.Context, model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
     """Evaluate a model on RECORDING, by set of failed fibres.
 
     \b
     padforge sense evaluate --model out/pad out/later/recording --max-failures 1
 
-    On the recording that the model was trained on, only the held-out presses count.
+    On the recording that the model was trained on, only the held-out presses count. Exit 1 if something is doubtful.
     """
     from padforge.sense.localizer import evaluation
     from padforge.sense.localizer.model import LocalizerModel
@@ -88,6 +96,7 @@ def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> 
         document = evaluation.evaluate(localizer, opened, levels, on_progress=show).to_dict()
     lines = [*evaluation.calibration_lines(document), *evaluation.moment_lines(document["by_moment"])]
     common.show_result(document, lines, as_json)
+    context.exit(int(bool(document["doubts"])))
 
 
 def _parse_moment(context: click.Context, param: click.Parameter, value: str | None) -> tuple[str, float] | None:

@@ -70,6 +70,7 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     from padforge.design.common.files import provenance
     from padforge.sense.formats.columns import PRESSES_DETECTED, join_names
     from padforge.sense.formats.import_export import find_reader
+    from padforge.sense.recording.doubts import find_doubts
     from padforge.sense.recording.run_directory import check_new_folder
 
     read, folder = find_reader(file), out or pad_folder(file) / "recording"
@@ -78,6 +79,8 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     echo_note(recording, file)
     if PRESSES_DETECTED.items() <= recording.source.items():
         click.echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
+    for doubt in find_doubts(recording):
+        click.echo(f"doubtful: {doubt}", err=True)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))
     if recording.fibre_names:
         click.echo(f"fibres from 1 on: {join_names(recording.fibre_names)}")

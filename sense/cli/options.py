@@ -71,18 +71,26 @@ def echo_note(recording: "Recording", file: Path) -> None:
         click.echo(f"{file}: {note}", err=True)
 
 
-def recording_line(recording: "Recording", out: Path) -> str:
-    """Describe a recording in one line, with what it misses."""
+def pressed_line(recording: "Recording") -> str:
+    """Describe in one line what was pressed and read, with what is missing."""
     import numpy as np
 
-    unknown = int((~recording.has_position).sum())
+    from padforge.sense.recording.doubts import area_mm
+
+    unknown, area = int((~recording.has_position).sum()), area_mm(recording)
+    over = "" if area is None else f" over {area[0]:.4g} x {area[1]:.4g} mm"
     missing = int(np.isnan(recording.readings).sum())
     rate = f"{recording.rate_hz:.1f}" if recording.rate_hz >= 1 else f"{recording.rate_hz:.2g}"  # a wrong unit of time
     return (
-        f"{len(recording.presses_mm)} presses{f' ({unknown} of unknown position)' * (unknown > 0)}, "
+        f"{len(recording.presses_mm)} presses{over}{f' ({unknown} of unknown position)' * (unknown > 0)}, "
         f"{len(recording.readings)} readings of {recording.fibres} fibres"
-        f"{f', {missing} values missing,' * (missing > 0)} at {rate} Hz -> {out}"
+        f"{f', {missing} values missing,' * (missing > 0)} at {rate} Hz"
     )
+
+
+def recording_line(recording: "Recording", out: Path) -> str:
+    """Describe a recording in a folder in one line."""
+    return f"{pressed_line(recording)} -> {out}"
 
 
 class Prediction(NamedTuple):

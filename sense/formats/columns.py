@@ -38,6 +38,9 @@ is 1 while the pad is pressed. `down_command` and `up_command` are indices of re
 """
 MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 """Quantities with one value a press, and their attributes of a `Recording`."""
+NOTE = "note"
+"""Key in the source of a recording that says what was left out of it, or filled in."""
+MAX_GAP = 3  # readings without a position that are bridged within a press
 PRESSES_DETECTED = {"presses": "detected"}
 """Entry of the source of a recording whose presses were detected in its readings."""
 MAX_CHARACTERS = 10_000
@@ -206,7 +209,13 @@ def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mappin
         # A thousandth of an interval is allowed for: times that were converted to another unit and back are rounded.
         tolerance = 1e-3 * np.median(np.diff(times)) if len(times) > 1 else 0.0
         columns[name] = np.searchsorted(times, columns[name] - tolerance).astype(np.float64)
-    positions = _join_positions(columns)
+    positions, rows = _join_positions(columns), np.arange(len(times))
+    if positions is not None and len(positions) == len(times) and not {"press", "down_command"} & columns.keys():
+        rows = _bridge_gaps(positions)
+        positions, n_bridged = positions[rows], int((rows != np.arange(len(rows))).sum())
+        if n_bridged:
+            filled = f"{n_bridged} readings within presses lack a position; gaps of up to {MAX_GAP} are bridged"
+            source = {**source, NOTE: "; ".join([*filter(None, [source.get(NOTE)]), filled])}
     presses = _find_presses(columns, positions, len(times))
     if presses is None:
         presses, source = _detect(readings, times, source), {**source, **PRESSES_DETECTED}
@@ -218,7 +227,7 @@ def _assemble(arrays: Sequence[tuple[ColumnEntry, NDArray[Any]]], source: Mappin
         if len(values) != len(times):
             expected = f"one for each of {len(down)} presses or {len(times)} readings"
             raise InputError(f"{name} are {len(values)}, expected {expected}")
-        return values[np.clip((down + up) // 2, 0, len(times) - 1)]
+        return values[rows[np.clip((down + up) // 2, 0, len(times) - 1)]]
 
     measures: dict[str, Any] = {MEASURES[name]: at_presses(name, columns[name]) for name in MEASURES if name in columns}
     presses_mm = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
@@ -286,6 +295,24 @@ def _find_presses(
         raise InputError(f"positions have one of x and y in row {int(np.argmax(incomplete))}, expected both or neither")
     pressed = ~missing[:, 0]
     return _find_runs(positions, pressed) if pressed.any() and not pressed.all() else None
+
+
+def _bridge_gaps(positions: Array) -> Indices:
+    """Return which of (R, 2) positions each reading takes, (R,): its own, or in a short gap the last before it.
+
+    A gap is short if it has MAX_GAP readings at most, fewer than half a rest between presses, and the same position
+    before and after.
+    """
+    known = np.flatnonzero(~np.isnan(positions[:, 0]))
+    before, after = known[:-1], known[1:]
+    n_missing = after - before - 1
+    is_same = (positions[before] == positions[after]).all(axis=1) & (positions[before, 0] != UNKNOWN)
+    rests = n_missing[~is_same & (n_missing > 0)]
+    max_gap = min(MAX_GAP, (np.median(rests) - 1) // 2) if len(rests) else 0
+    rows = np.arange(len(positions))
+    for gap in np.flatnonzero(is_same & (n_missing > 0) & (n_missing <= max_gap)):
+        rows[before[gap] : after[gap]] = before[gap]
+    return rows
 
 
 def _is_pressed(press: Array) -> Mask:

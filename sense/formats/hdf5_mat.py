@@ -18,6 +18,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.columns import (
     MEASURES,
+    NOTE,
     assemble_recording,
     check_import,
     join_names,
@@ -28,8 +29,6 @@ from padforge.sense.formats.columns import (
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-hdf5/2"
-NOTE = "note"
-"""Key in the source of a recording that says what was left out of it."""
 _DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")}
 _DATASETS["readings_v"] = "readings"
 """Datasets, and their attributes of a `Recording`."""

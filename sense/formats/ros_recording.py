@@ -32,6 +32,7 @@ from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.columns import (
     MILLIMETRES,
+    NOTE,
     UNITS,
     ColumnEntry,
     assemble_recording,
@@ -42,7 +43,6 @@ from padforge.sense.formats.columns import (
     naming_file,
     parse_columns,
 )
-from padforge.sense.formats.hdf5_mat import NOTE
 from padforge.sense.formats.ros_messages import (
     ARM,
     FORCE,

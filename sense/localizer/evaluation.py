@@ -11,6 +11,7 @@ from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
+from padforge.sense.localizer.doubts import find_doubts
 from padforge.sense.localizer.features import DOWN, compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
@@ -42,6 +43,7 @@ class Evaluation:
         provenance: of the localizer, and the kind of the recording.
         training_presses: their number, after a calibration.
         settings: of the training, after a calibration.
+        doubts: what makes the evaluation doubtful, each in a line.
     """
 
     errors: list[dict[str, Any]]
@@ -56,6 +58,7 @@ class Evaluation:
     provenance: dict[str, Any]
     training_presses: int | None = None
     settings: dict[str, Any] | None = None
+    doubts: Sequence[str] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `calibration.json`."""
@@ -94,7 +97,8 @@ def evaluate(
             f"recording has no press of known position to test on among {len(recording.presses_mm)}, "
             "expected at least one"
         )
-    features, positions_mm = model.scaled_features(recording)[test], recording.presses_mm[test]
+    presses = model.scaled_features(recording)
+    features, positions_mm = presses[test], recording.presses_mm[test]
     measures = {name: values[test] for name, values in recording.measures.items()}
     rows, by_subset = errors_by_loss(
         model.fibres,
@@ -105,6 +109,8 @@ def evaluate(
         on_progress,
     )
     prediction = model.predict_features(features)
+    within_r90 = float((distances(prediction.positions_mm, positions_mm) <= prediction.r90_mm).mean())
+    doubts = find_doubts(recording, model.predict_features(presses), within_r90, len(test))
     return Evaluation(
         errors=rows,
         split="none" if held_back is None else model.split,
@@ -128,6 +134,7 @@ def evaluate(
             },
         },
         provenance={**model.provenance, "recording_kind": recording.source.get("kind")},
+        doubts=doubts,
     )
 
 
@@ -328,7 +335,7 @@ def idle_share(recording: Recording) -> Array:
 
 
 def calibration_lines(document: Mapping[str, Any]) -> list[str]:
-    """Format the errors of a calibration document as tables: of positions, and of depth and force if predicted."""
+    """Format a calibration document: errors of positions, those of depth and force if predicted, and doubts."""
     rows = document["errors"]
 
     def table(title: str, header: str, errors: Sequence[str], shares: Sequence[str]) -> list[str]:
@@ -349,7 +356,8 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
         if names[0] in rows[0]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
-    return [*lines, BUILT_PAD] if is_simulated else lines
+    doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
+    return [*lines, *([BUILT_PAD] if is_simulated else []), *doubts]
 
 
 def moment_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:

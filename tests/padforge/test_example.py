@@ -14,7 +14,7 @@ def test_example_is_a_buildable_pad_and_its_presses_again_at_every_call(tmp_path
     (tmp_path / "pad.toml").write_text("[rig]\npresses = 3\n")  # which changes nothing
     first = called("example", cwd=tmp_path)
     assert first.code == 0, first
-    assert "1500 presses, 60000 readings of 6 fibres" in first.out
+    assert "1500 presses over 44.96 x 44.97 mm, 60000 readings of 6 fibres" in first.out
     assert "padforge sense calibrate para5_long.mat" in first.out
     example = tmp_path / "out" / "example"
     pad, recording = Morphology.load(example / "morphology.json"), Recording.open(example / "recording")

@@ -1,10 +1,13 @@
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from padforge.sense import Recording
 from padforge.sense.localizer import training
 from padforge.sense.localizer.moments import MOMENTS
 from tests.sense.cli.conftest import SPEC
@@ -27,6 +30,28 @@ def test_calibrate_writes_a_document_that_evaluate_agrees_with(few) -> None:
         code, out, _ = few("evaluate", "--model", "new", "rec", "--max-failures", max_failures, "--json")
         assert code == 0
         assert json.loads(out)["errors"] == document["errors"][:levels]
+
+
+@pytest.mark.usefixtures("loose_pictures")
+def test_calibrate_doubts_units_and_misplaced_presses(few) -> None:
+    good = Recording.open("rec")
+    area = r"60 presses over \d+\.\d+ x \d+\.\d+ mm, 2400 readings of 4 fibres at 13\.3 Hz"
+    code, out, _ = few("calibrate", "rec", "--out", "good")
+    assert (code, "doubtful" in out) == (0, False)
+    assert re.fullmatch(area, out.splitlines()[0])
+    replace(good, presses_mm=good.presses_mm / 1000).save("metres", {})
+    code, out, _ = few("calibrate", "metres", "--out", "m", "--json")
+    assert code == 1
+    (doubt,) = json.loads(out)["doubts"]
+    assert doubt.endswith("are positions in m (x=NAME:m,y=NAME:m)?")
+    presses_mm = good.presses_mm.copy()
+    presses_mm[7] = 250, 3
+    replace(good, presses_mm=presses_mm).save("typo", {})
+    code, out, _ = few("evaluate", "--model", "model", "typo", "--max-failures", "0")
+    assert code == 1
+    far, misplaced = (line for line in out.splitlines() if line.startswith("doubtful: "))
+    assert far.endswith(": press 7 at (250, 3) mm")
+    assert misplaced == "doubtful: more than 4 r90 from where the fibres say: press 7 at (250, 3) mm"
 
 
 @pytest.mark.usefixtures("loose_pictures")

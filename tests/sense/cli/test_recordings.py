@@ -46,7 +46,7 @@ def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:
     note = "cut.mat: the last of 10 presses is left out, with 31 of 40 readings\n"
     code, out, err = padforge_sense("import", "cut.mat")
     assert (code, err) == (0, note)
-    assert out.startswith("9 presses, 391 readings")
+    assert out.startswith("9 presses over ")
     assert Recording.open("out/cut/recording").source["note"] in note
     assert padforge_sense("export", "cut.mat", "cut.csv")[2] == note
     assert padforge_sense("export", "out/cut/recording", "again.csv")[2] == ""
@@ -69,7 +69,7 @@ def test_export_writes_a_bag_with_predictions_that_import_reads(few) -> None:
     assert topics("r.mcap") == {"/pad/recording": 1, "/pad/readings": len(recording.readings)} | presses
     code, out, err = few("import", "r.mcap")
     assert (code, err) == (0, "")
-    assert out.startswith("60 presses, 2400 readings")
+    assert out.startswith("60 presses over ")
     assert Recording.open("out/r/recording").digest == recording.digest
     assert few("locate", "--model", "model", "r.mcap", "--out", "places.csv")[0] == 0
 
@@ -95,7 +95,8 @@ def test_recording_line_counts_what_is_unknown_and_missing() -> None:
     line = "2 presses (1 of unknown position), 40 readings of 3 fibres, 2 values missing, at 8.0 Hz -> out"
     assert options.recording_line(recording, Path("out")) == line
     slow = replace(recording, times_s=100 * times_s, readings=np.full((40, 3), 1.5), presses_mm=np.zeros((2, 2)))
-    assert options.recording_line(slow, Path("out")) == "2 presses, 40 readings of 3 fibres at 0.08 Hz -> out"
+    line = "2 presses over 0 x 0 mm, 40 readings of 3 fibres at 0.08 Hz -> out"
+    assert options.recording_line(slow, Path("out")) == line
     assert options.fibre_indices((3, 1), 3) == (2, 0)
     for number in (0, 4):
         with pytest.raises(InputError, match=f"fibre {number}: no such fibre, allowed are 1 to 3"):

@@ -172,3 +172,32 @@ def test_assemble_recording_detects_presses_in_the_readings(recording: Recording
 def test_assemble_recording_refuses_arrays_that_do_not_fit(arrays: dict[str, np.ndarray], message: str) -> None:
     with pytest.raises(InputError, match=f"f: {message}"):
         assembled(arrays)
+
+
+def test_assemble_recording_bridges_gaps_of_positions(recording: Recording) -> None:
+    """A motion capture loses 5 % of the positions for one reading."""
+    positions = np.full((len(recording.times_s), 2), np.nan)
+    depths = np.full(len(positions), np.nan)
+    for position, down, up in zip(recording.presses_mm, recording.down_command, recording.up_command, strict=True):
+        positions[down:up], depths[down:up] = position, 3.0
+    lost = np.random.default_rng(0).random(len(positions)) < 0.05
+    lost[[*recording.down_command, *(recording.up_command - 1)]] = False
+    content = {"time": recording.times_s, "fibres": recording.readings}
+    gappy = {"positions": np.where(lost[:, None], np.nan, positions), "depth": np.where(lost, np.nan, depths)}
+    bridged = assembled(content | gappy)
+    assert np.array_equal(bridged.down_command, recording.down_command)
+    assert np.array_equal(bridged.up_command, recording.up_command)
+    assert np.array_equal(bridged.presses_mm, recording.presses_mm)
+    assert (bridged.depths_mm == 3).all()
+    n_lost = int((lost & ~np.isnan(positions[:, 0])).sum())
+    assert bridged.source["note"].startswith(f"{n_lost} readings within presses lack a position; gaps of up to 3")
+
+
+@pytest.mark.parametrize(
+    ("gap", "rest", "presses"), [(1, 6, 2), (2, 6, 2), (3, 6, 3), (3, 8, 2), (4, 12, 3), (1, 1, 3)]
+)
+def test_assemble_recording_keeps_rests_between_presses(gap: int, rest: int, presses: int) -> None:
+    """Two presses on one spot are two if the pad rests as long between others."""
+    x = np.array([*[np.nan] * 5, *[1.0] * 5, *[np.nan] * gap, *[1.0] * 5, *[np.nan] * rest, *[2.0] * 5, np.nan])
+    content = {"time": np.arange(len(x)) / 10, "fibres": np.ones((len(x), 1)), "x": x, "y": x}
+    assert len(assembled(content).down_command) == presses

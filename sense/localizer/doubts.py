@@ -1,0 +1,38 @@
+"""Doubts about an evaluation: presses that cannot lie where the recording says, and a recording of another pad."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from padforge.sense.localizer.model import Localization
+from padforge.sense.recording import doubts
+from padforge.sense.recording.recording import Recording
+
+MAX_RADII = 4.0
+"""Radii of 90 % between the predicted and the stated position of a press, at most: on the published recording they are
+up to 2.5, and 5 or more where the sign of one coordinate was lost."""
+MIN_WITHIN_R90 = 0.5  # share of presses within their radii; of a pad that has drifted for hours it is above
+MIN_PRESSES = 20  # from which that share means something
+
+
+def find_doubts(recording: Recording, localization: Localization, within_r90: float, n_presses: int) -> list[str]:
+    """Return what makes an evaluation doubtful, each in a line.
+
+    Args:
+        recording: that was evaluated.
+        localization: of all its presses.
+        within_r90: share of the test presses within their radii of 90 %.
+        n_presses: number of the test presses.
+    """
+    if within_r90 < MIN_WITHIN_R90 and n_presses >= MIN_PRESSES:
+        misfit = f"{within_r90:.0%} of {n_presses} presses lie within r90: is it the recording of this pad?"
+        return [*doubts.find_doubts(recording), misfit]
+    return [*doubts.find_doubts(recording), *_misplaced_presses(recording, localization)]
+
+
+def _misplaced_presses(recording: Recording, localization: Localization) -> Iterator[str]:
+    distance = np.hypot(*(localization.positions_mm - recording.presses_mm).T)
+    is_misplaced = distance > MAX_RADII * localization.r90_mm  # false where the position is unknown
+    if is_misplaced.any():
+        named = doubts.name_presses(recording, is_misplaced)
+        yield f"more than {MAX_RADII:g} r90 from where the fibres say: {named}"

@@ -1,0 +1,64 @@
+"""Doubts about a recording: units that cannot be right, and presses far outside of the others."""
+
+import numpy as np
+
+from padforge.sense.arrays import Array, Mask
+from padforge.sense.recording.recording import Recording
+
+MIN_SPAN_MM, MAX_SPAN_MM = 2.0, 2000.0
+"""How far apart presses lie at most, on pads of a few mm to a metre or two: in m they are 0.01 to 2 apart."""
+MIN_RATE_HZ, MAX_RATE_HZ = 1.5, 10_000.0
+"""Readings a second of multimeters to fast boards: what reads 200 times a second seems to do so at 0.2 Hz in ms."""
+MAX_REST_V = 50.0
+MARGIN = 0.5  # of the span of most presses, by which one may lie beside them
+MIN_PRESSES = 20  # from which it is known where most lie
+MAX_NAMED = 5
+
+
+def area_mm(recording: Recording) -> Array | None:
+    """Return the extent (2,) of the known positions along x and y, mm; None of fewer than two presses."""
+    positions_mm = recording.presses_mm[recording.has_position]
+    return np.ptp(positions_mm, axis=0) if len(positions_mm) > 1 else None
+
+
+def find_doubts(recording: Recording) -> list[str]:
+    """Return what makes a recording doubtful, each in a line; presses count from 0."""
+    return [*_unit_doubts(recording), *_far_presses(recording)]
+
+
+def name_presses(recording: Recording, mask: Mask) -> str:
+    """Name the presses of a (Q,) mask, with positions in mm: the first of them, and how many more there are."""
+    presses = np.flatnonzero(mask)
+    named = ["press {} at ({:.4g}, {:.4g}) mm".format(press, *recording.presses_mm[press]) for press in presses]
+    more = [f"{len(presses) - MAX_NAMED} more"] if len(presses) > MAX_NAMED else []
+    return ", ".join([*named[:MAX_NAMED], *more])
+
+
+def _unit_doubts(recording: Recording) -> list[str]:
+    doubts = []
+    area, rate_hz = area_mm(recording), recording.rate_hz
+    rest_v = float(np.nanmedian(np.abs(recording.readings)))
+    if area is not None and 0 < area.max() < MIN_SPAN_MM:
+        doubts.append(f"presses span {area[0]:.4g} x {area[1]:.4g} mm: are positions in m (x=NAME:m,y=NAME:m)?")
+    if area is not None and area.max() > MAX_SPAN_MM:
+        doubts.append(f"presses span {area[0]:.4g} x {area[1]:.4g} mm: are positions in another unit (x=NAME:UNIT)?")
+    if rate_hz < MIN_RATE_HZ:
+        doubts.append(f"there are {rate_hz:.2g} readings a second: are times in ms (time=NAME:ms)?")
+    if rate_hz > MAX_RATE_HZ:
+        doubts.append(f"there are {rate_hz:.4g} readings a second: are times in s (time=NAME:s)?")
+    if rest_v > MAX_REST_V:
+        doubts.append(f"fibres read {rest_v:.4g} V: are they counts (fibres=NAME:FACTOR), or mV (fibres=NAME:mV)?")
+    return doubts
+
+
+def _far_presses(recording: Recording) -> list[str]:
+    positions_mm = recording.presses_mm[recording.has_position]
+    if len(positions_mm) < MIN_PRESSES:
+        return []
+    low, high = np.percentile(positions_mm, [5, 95], axis=0)
+    margin = MARGIN * (high - low).max()
+    is_far = ((recording.presses_mm < low - margin) | (recording.presses_mm > high + margin)).any(axis=1)
+    if not is_far.any():
+        return []
+    usual = "x = {:.4g} to {:.4g}, y = {:.4g} to {:.4g} mm".format(*np.stack([low, high], axis=1).ravel())
+    return [f"far outside of where most presses lie, {usual}: {name_presses(recording, is_far)}"]

@@ -1,0 +1,28 @@
+"""Presses that cannot lie where the recording says, and recordings that a localizer does not fit."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from padforge.sense import Recording
+from padforge.sense.localizer.doubts import find_doubts
+from padforge.sense.localizer.model import LocalizerModel
+
+
+def test_presses_many_radii_from_their_positions_are_named(localizer: LocalizerModel, recording: Recording) -> None:
+    localization = localizer.predict(recording)
+    assert find_doubts(recording, localization, 0.9, 45) == []
+    presses_mm = recording.presses_mm.copy()
+    corner = int(np.argmin(presses_mm.sum(axis=1)))
+    presses_mm[corner] *= -1  # a sign was lost
+    presses_mm[3] = np.nan
+    (line,) = find_doubts(replace(recording, presses_mm=presses_mm), localization, 0.9, 45)
+    assert line.startswith(f"more than 4 r90 from where the fibres say: press {corner} at (")
+
+
+def test_recording_that_does_not_fit_is_doubted(localizer: LocalizerModel, recording: Recording) -> None:
+    other = replace(recording, presses_mm=np.roll(recording.presses_mm, 1, axis=0))
+    localization = localizer.predict(other)
+    expected = ["2% of 300 presses lie within r90: is it the recording of this pad?"]
+    assert find_doubts(other, localization, 0.02, 300) == expected
+    assert find_doubts(recording, localizer.predict(recording), 0.02, 10) == []  # of so few it may be chance
