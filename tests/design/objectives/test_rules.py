@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial import KDTree
-from scipy.spatial import KDTree
 
 from padforge.design import InputError, Morphology, Spec, crossings
 from padforge.design.contact import fibre_axes
