@@ -423,6 +423,10 @@ LEVELS = 4096  # levels of the published 12-bit converter
 MAX_LEVELS = 2**24
 
 
+Entropy = Literal["families", "joint"]
+"""Entropy in the published objective: of either family, summed, as the published code has it, or of all fibres."""
+
+
 class Scatter(NamedTuple):
     """Scatter of a fibre's response from press to press at one position."""
 
@@ -466,6 +470,9 @@ class SearchSettings(Settings):
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")
     weights: Weights = Field(default=WEIGHTS, description="weights of entropy, sharpness and disorder, genetic search")
+    entropy: Entropy = Field(
+        default="families", description='summed over "families" as published, or "joint" as in (5), genetic search'
+    )
     presses: int = Field(default=SIDE, ge=2, le=64, description="side of the square of presses of the genetic search")
     levels: int = Field(default=LEVELS, ge=1, le=MAX_LEVELS, description="levels of a signal in the genetic search")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of every random choice")

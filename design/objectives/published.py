@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,9 +29,13 @@ from padforge.design.settings import (
     WEIGHTS,
     Contact,
     Counts,
+    Entropy,
     Layout,
     between_fibres,
 )
+
+MIN_ENTROPY = 1e-9
+"""Joint entropy that formula (5) divides by, bits, of a pad that no press touches: it has none."""
 
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:
@@ -116,8 +121,8 @@ class PublishedTerms:
     entropy: float  # joint entropy of the horizontals' signals plus that of the verticals', bits
     sharpness: float  # Z, sum of |second difference| of the converter levels along the press order
     disorder: float  # C, sum over samples and over pairs i < j of a family of the negative parts of curve_j - curve_i
-    objective: float  # alpha / (1 + entropy) + beta Z + gamma C, to be minimised
-    joint_entropy: float  # of the signals of all fibres, bits, which is not in it
+    objective: float  # alpha / (1 + entropy) + beta Z + gamma C, or alpha / joint_entropy + ..., to be minimised
+    joint_entropy: float  # of the signals of all fibres, bits
 
 
 @lru_cache(maxsize=16)
@@ -136,8 +141,12 @@ def published_terms(
     weights: tuple[float, float, float] = WEIGHTS,
     layout: Layout | None = None,
     levels: int = LEVELS,
+    entropy: Entropy = "families",
 ) -> list[PublishedTerms]:
-    """Compute the terms of formula (5), as the published code does, for every pad of a population.
+    """Compute the terms of formula (5) for every pad of a population.
+
+    The objective has the `entropy` of "families", as the published code does, or the "joint" one of all fibres, as the
+    paper's formula.
 
     The pads are a morphology, or knots (P, F, N + 2, 2) of a `layout`, by default as many horizontals as verticals, the
     default pitch apart. `presses` (Q, 2) are in an order of neighbours, by default the 49 published ones. Signals have
@@ -145,6 +154,8 @@ def published_terms(
     """
     if weights is not WEIGHTS and check_array("weights", weights, 1e12).shape != (3,):
         raise InputError(f"weights are {short_repr(weights)}, expected three numbers: alpha, beta, gamma")
+    if entropy not in get_args(Entropy):
+        raise InputError(f"entropy is {short_repr(entropy)}, allowed are {', '.join(get_args(Entropy))}")
     alpha, beta, gamma = weights
     along, across, ends, _ = fibre_axes(pads, layout)
     samples, levels = check_samples(samples, along.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)
@@ -160,7 +171,12 @@ def published_terms(
         kernels.published_terms(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
 
     map_chunks(work, len(along), min_chunk=8)
-    return [PublishedTerms(h, z, c, alpha / (1 + h) + beta * z + gamma * c, j) for h, z, c, j in terms.tolist()]
+
+    def objective(families: float, z: float, c: float, joint: float) -> float:
+        information = 1 + families if entropy == "families" else max(joint, MIN_ENTROPY)
+        return alpha / information + beta * z + gamma * c
+
+    return [PublishedTerms(h, z, c, objective(h, z, c, j), j) for h, z, c, j in terms.tolist()]
 
 
 def published_objective(

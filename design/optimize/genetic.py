@@ -107,8 +107,9 @@ class _PublishedProblem(PymooProblem):
         return assemble_knots(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
-        how = {"weights": self.search.weights, "layout": self.layout, "levels": self.search.levels}
-        terms = published_terms(self.knots(x), self.contact, self.presses, **how)
+        search = self.search
+        how = {"weights": search.weights, "levels": search.levels, "entropy": search.entropy}
+        terms = published_terms(self.knots(x), self.contact, self.presses, layout=self.layout, **how)
         out["F"] = np.array([[pad.objective] for pad in terms])
 
 

@@ -1,12 +1,14 @@
 """Information measures against closed forms, and the published objective against its stated values."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.benchmarks import contact as objective
-from padforge.design import Contact, Morphology, published_objective, signals
+from padforge.design import Contact, InputError, Morphology, published_objective, signals
 from padforge.design.contact import serpentine_presses
 from padforge.design.objectives.published import (
     idle_share,
@@ -54,6 +56,19 @@ def test_disorder_counts_samples_in_the_wrong_order():
 def test_published_objective_of_the_published_optima(published, name, value):
     """Values stated for numpy's RandomState(214) jitter of the 49 presses."""
     assert published_objective(Morphology.load(published / f"{name}.mat")) == pytest.approx(value, abs=1e-9)
+
+
+def test_objective_of_the_joint_entropy_is_formula_5():
+    """Of a pad that no press touches, without joint entropy, it is large and finite."""
+    pad = Morphology.random(4, 3, 0)
+    [joint], [families] = (published_terms(pad, entropy=entropy) for entropy in ("joint", "families"))
+    assert replace(joint, objective=families.objective) == families
+    expected = 2 / joint.joint_entropy + 1e-6 * joint.sharpness + 1e-5 * joint.disorder
+    assert published_terms(pad, weights=(2, 1e-6, 1e-5), entropy="joint")[0].objective == pytest.approx(expected)
+    [untouched] = published_terms(pad, presses=[[1e3, 1e3]] * 9, entropy="joint")
+    assert (untouched.joint_entropy, untouched.objective > 1e8) == (0, True)
+    with pytest.raises(InputError, match="entropy is 'all', allowed are families, joint"):
+        published_terms(pad, entropy="all")  # type: ignore[arg-type]
 
 
 def test_published_terms_add_up_for_each_pad_of_a_population():

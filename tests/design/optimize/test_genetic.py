@@ -31,7 +31,10 @@ def test_genetic_search_objective_never_rises_and_is_that_of_its_best_pad():
 
 @pytest.mark.parametrize(
     "asked",
-    [{"weights": (2.0, 1e-6, 0.0)}, {"presses": 12}, {"levels": 16}, {"weights": (0.5, 0.0, 1e-5), "presses": 3}],
+    [
+        *({"weights": (2.0, 1e-6, 0.0)}, {"presses": 12}, {"levels": 16}, {"weights": (0.5, 0.0, 1e-5), "presses": 3}),
+        {"entropy": "joint"},
+    ],
 )
 def test_genetic_search_minimises_the_objective_of_its_settings(asked):
     breeding, objectives = bred(2, SMALL.model_copy(update=asked))
