@@ -316,11 +316,14 @@ class LocalizerModel(LocalizerDocument):
             InputError: a file is missing or torn, the two do not belong together, or a value is out of range.
         """
         files = files_of(folder, NAME)
-        if not files.document.exists():
-            raise InputError(
-                f"{folder}: no {files.document.name}, expected a folder that `padforge sense calibrate` wrote"
-            )
-        document, digest = _read_document(read_json(files.document, FORMAT), str(files.document))
+        try:
+            content = read_json(files.document, FORMAT)
+        except InputError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
+            name = files.document.name
+            raise InputError(f"{folder}: no {name}, expected a folder that `padforge sense calibrate` wrote") from error
+        document, digest = _read_document(content, str(files.document))
         scaler, method = document.scaler, document.method
         n_timed = len(document.interval_factors) - 1
         n_inputs, n_measures = scaler.n_inputs(method, n_timed), len(scaler.measures)
