@@ -47,10 +47,10 @@ def network_parts(networks, inputs, hidden, outputs, samples=40, alternatives=1)
 def jacobians(x, fit):
     """J and R J of one network, every column by automatic differentiation, and the output weights held."""
 
-    def outputs(hidden):
-        return activations(hidden[None], x[None])[0] @ fit.output[0]
-
-    jacobian = torch.autograd.functional.jacobian(outputs, fit.hidden[0]).flatten(2)
+    hidden = fit.hidden[0].clone().requires_grad_()
+    outputs = activations(hidden[None], x[None])[0] @ fit.output[0]
+    rows = [torch.autograd.grad(each, hidden, retain_graph=True)[0].ravel() for each in outputs.ravel()]
+    jacobian = torch.stack(rows).unflatten(0, outputs.shape)
     gram = fit.neurons[0].mT @ fit.neurons[0]
     gram.diagonal().add_(RIDGE * len(x))
     projection = torch.eye(len(x)) - fit.neurons[0] @ torch.linalg.solve(gram, fit.neurons[0].mT)

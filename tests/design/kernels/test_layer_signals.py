@@ -63,7 +63,12 @@ def panel_polynomials(squares, values):
         Polynomial.fit(squares[i : i + DEGREE + 1], values[i : i + DEGREE + 1], DEGREE)
         for i in range(0, len(squares) - 1, DEGREE)
     ]
-    return lambda square: np.piecewise(square, [square >= begin for begin in begins], panels)
+
+    def evaluate(square):
+        panel = np.searchsorted(begins, square, side="right") - 1
+        return np.piecewise(square, [panel == index for index in range(len(panels))], panels)
+
+    return evaluate
 
 
 def curves(pad, move: np.ndarray | float = 0.0):
