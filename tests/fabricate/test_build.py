@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-from build123d import Solid, import_step
 
 from padforge.design.common.files import sha256
 from padforge.design.common.validation import InputError
@@ -126,6 +125,8 @@ def listed(iterator, current: str) -> list:
 
 
 def test_step_reads_back_as_a_valid_solid_of_the_meshes_volume(built):
+    from build123d import import_step  # takes seconds, also in workers that run other tests
+
     out, result = built
     whole = import_step(out / "mould.step")
     assert whole.is_valid
@@ -205,6 +206,8 @@ def test_toolpath_findings_only_with_a_program(tmp_path):
 
 def other_solid(monkeypatch, body: str) -> None:
     """Plant a box in place of a body's CAD model."""
+    from build123d import Solid
+
     for makes in ("build_mould_model", "build_body_model"):
         right = getattr(model, makes)
 

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import shapely
-from build123d import Solid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipe
@@ -23,6 +23,9 @@ from padforge.fabricate.mould import Prism, cylinder, lid_body, sizes
 from padforge.fabricate.plan import Plan, polygon_rings
 from tests.fabricate.planted import with_settings
 
+if TYPE_CHECKING:
+    from build123d import Solid
+
 
 def disc(x: float, y: float, radius: float) -> BaseGeometry:
     return shapely.Point(x, y).buffer(radius, quad_segs=512)
@@ -36,7 +39,7 @@ def drawn(*areas: BaseGeometry) -> Subdivision:
     return Subdivision([area.boundary for area in areas], pieces)
 
 
-def built(areas: Sequence[BaseGeometry], top: Callable[[set[int]], float | None]) -> list[Solid]:
+def built(areas: Sequence[BaseGeometry], top: Callable[[set[int]], float | None]) -> "list[Solid]":
     """The solids over z = 0 up to a height that is given for the set of areas which cover a cell."""
     drawing = drawn(*areas)
     spans: list[ZRange | None] = []
@@ -46,11 +49,13 @@ def built(areas: Sequence[BaseGeometry], top: Callable[[set[int]], float | None]
     return wrapped(drawing, spans)
 
 
-def wrapped(drawing: Subdivision, spans: Sequence[ZRange | None]) -> list[Solid]:
+def wrapped(drawing: Subdivision, spans: Sequence[ZRange | None]) -> "list[Solid]":
+    from build123d import Solid  # takes seconds, also in workers that run other tests
+
     return [Solid(solid) for solid in build_solids(drawing, spans)]
 
 
-def kinds(solid: Solid) -> dict[str, int]:
+def kinds(solid: "Solid") -> dict[str, int]:
     names = [face.geom_type.name for face in solid.faces()]
     return {name: names.count(name) for name in sorted(set(names))}
 

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-from build123d import Color, Cylinder, Location, Solid, Vector, import_step
 
 from padforge.fabricate.cad.step_file import CadPart, deduplicate, export_xcaf, write_step
 
@@ -16,6 +15,8 @@ def entities(text: str) -> dict[str, str]:
 
 def assembly() -> CadPart:
     """An assembly within an assembly: a block with a drum on it, and a part of two solids."""
+    from build123d import Cylinder, Location, Solid  # takes seconds, also in workers that run other tests
+
     block = CadPart("a block", "#8FA3B8", (Solid.make_box(20, 10, 2).wrapped,))
     drum = CadPart("drum", "#0B6E99", (Cylinder(2, 5).solid().wrapped,), position_mm=(4, 4, 4.5))
     boxes = Solid.make_box(1, 1, 1), Solid.make_box(1, 1, 3).moved(Location((5, 0, 0)))
@@ -35,6 +36,8 @@ def file(tmp_path_factory) -> Path:
 
 
 def test_write_step_keeps_shapes_names_colours_and_positions(file):
+    from build123d import Color, Vector, import_step
+
     read = import_step(file)
     assert read.is_valid
     assert (len(read.faces()), len(read.edges())) == (3 * 6 + 3, 3 * 12 + 3)
