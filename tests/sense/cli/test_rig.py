@@ -73,7 +73,7 @@ def test_record_with_a_virtual_printer(padforge_sense) -> None:
     Morphology.straight(2).save("morphology.json")
     pad = ("--morphology", "morphology.json", "--spec", "pad.toml")
     code, out, _ = padforge_sense("record", "--rig", "printer", "--virtual-hardware", "--presses", "2", *pad)
-    assert (code, out[:10]) == (0, "2 presses,")
+    assert (code, out[:14]) == (0, "2 presses over")
     assert Recording.open("recording").source["rig"]["tcp_mm"] == [30.0, 0.0, -20.0]
 
 
