@@ -147,7 +147,8 @@ def locate(
     opened = read_recording(recording)
     localization, faults, shifts, _ = predict_despite_faults(model, opened, exclude_fibres, moment)
     for fault in faults:
-        click.echo(f"{fault.text}; masked from press {fault.since} on", err=True)
+        masked = f"; masked from press {fault.since} on" if fault.is_masked else ""
+        click.echo(f"{fault.text}{masked}", err=True)
     for shift in shifts:
         click.echo(shift.text, err=True)
     write_localization(localization, file)

@@ -1,7 +1,7 @@
 """Detection of faulty fibres: press by press (`FaultMonitor`), and in a recording (`FaultDetector`, an estimator)."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -50,14 +50,19 @@ TEXTS = {
     "open": "has an open circuit: its readings are at an impossible level, or noise alone",
     "no_response": "does not respond to presses",
     "reduced_gain": "responds with about half its gain",
+    "inverted": "responds with the opposite sign, as if wired the other way round",
     "inconsistent": "responds as if another position were pressed",
     "swapped": "are swapped",
     "noisy": "is noisy",
     "offset": "has another baseline",
     "drifting": "has a drifting baseline",
     "missing": "gives no readings",
+    "misfit": "respond otherwise than in the calibration, which does not fit this recording: is it of this pad, with "
+    "its channels in this order? They are not masked",
 }
 """Kinds of faults, in words."""
+RESPONSE_FAULTS = ("no_response", "reduced_gain", "inverted", "inconsistent", "swapped")
+"""Kinds that the calibration alone tells: if most fibres have them, it is at fault, not they (misfit)."""
 
 
 @dataclass(frozen=True)
@@ -66,14 +71,20 @@ class FibreFault:
 
     press: int  # index of the press at which the fault was detected
     since: int  # estimated index of the first bad press
-    fibres: tuple[int, ...]  # indices of the fibres; two if they are swapped
+    fibres: tuple[int, ...]  # indices of the fibres; two if they are swapped, most of a misfit
     kind: str  # a key of `TEXTS`
     score: float  # a healthy pad looks like this once in 10 ** score presses; at most 99, which is certain
 
     @property
+    def is_masked(self) -> bool:
+        """Whether its fibres are masked."""
+        return self.kind != "misfit"
+
+    @property
     def text(self) -> str:
         """One line; fibres are numbered from 1."""
-        numbers = " and ".join(str(fibre + 1) for fibre in self.fibres)
+        *others, last = (str(fibre + 1) for fibre in self.fibres)
+        numbers = f"{', '.join(others)} and {last}" if others else last
         return (
             f"fibre{'s' * (len(self.fibres) > 1)} {numbers} {TEXTS[self.kind]} ({self.kind}) since press {self.since}, "
             f"detected at press {self.press}; false alarm probability 1e-{self.score:.0f} per press"
@@ -88,8 +99,16 @@ class _PressRecord(NamedTuple):
     is_warm: Mask  # (L,) whether that level is reliable
 
 
+class _Wiring(NamedTuple):
+    kind: str  # a key of `TEXTS`
+    fibres: tuple[int, ...]  # among the living
+    llr: float  # log-likelihood ratio of this wiring against that of the calibration
+
+
 class FaultMonitor:
     """Detects faulty fibres press by press; they are masked from then on.
+
+    If responses of most fibres seem to be at fault, it is the model that does not fit: these are masked no more.
 
     Args:
         model: of the healthy pad.
@@ -102,6 +121,7 @@ class FaultMonitor:
         self._failed = np.zeros(fibres, dtype=bool)
         self._n_missing = np.zeros(fibres, dtype=np.int64)
         self._history = TraceHistory.initial(fibres)
+        self._response_faults: list[FibreFault] = []
         self._recent: deque[_PressRecord] = deque(maxlen=WINDOW)
         self._height = np.zeros((fibres, len(HYPOTHESES)))
         self._onset = np.zeros((fibres, len(HYPOTHESES)), dtype=np.int64)
@@ -109,7 +129,18 @@ class FaultMonitor:
     @property
     def failed(self) -> tuple[int, ...]:
         """Indices of the fibres that are dead, or were found faulty."""
-        return tuple(sorted((*self.model.dead, *self.model.living[self._failed].tolist())))
+        failed = {*self.model.dead, *self.model.living[self._failed].tolist()}
+        return tuple(sorted(failed - self._suspected if self._is_misfit else failed))
+
+    @property
+    def _suspected(self) -> set[int]:
+        """Indices of the fibres whose responses seem to be at fault."""
+        return {fibre for fault in self._response_faults for fibre in fault.fibres}
+
+    @property
+    def _is_misfit(self) -> bool:
+        """Whether these are most, by more than a single swap."""
+        return len(self._response_faults) > 1 and 2 * len(self._suspected) > self.model.fibres
 
     def update(self, readings: Array, down_command: int, up_command: int) -> list[FibreFault]:
         """Process the next press.
@@ -137,9 +168,20 @@ class FaultMonitor:
         self._update_sums(llr_continuing[-1], llr_onset[-1], self.n_presses)
         faults = self._find_missing(trace)
         while (self._neg_log_p(self._failed) > self.model.threshold).any():
-            faults.append(self._identify())
+            faults += self._report(self._identify())
         self.n_presses += 1
         return faults
+
+    def _report(self, fault: FibreFault) -> list[FibreFault]:
+        """Return a fault, with a misfit when it makes one; nothing for a response once the model does not fit."""
+        if fault.kind not in RESPONSE_FAULTS:
+            return [fault]
+        was_misfit = self._is_misfit
+        self._response_faults.append(fault)
+        if was_misfit or not self._is_misfit:
+            return [] if was_misfit else [fault]
+        since, score = (min(getattr(each, name) for each in self._response_faults) for name in ("since", "score"))
+        return [fault, FibreFault(self.n_presses, since, tuple(sorted(self._suspected)), "misfit", score)]
 
     def _find_missing(self, trace: Array) -> list[FibreFault]:
         self._n_missing = np.where(np.isfinite(trace).all(axis=1), 0, self._n_missing + 1)
@@ -195,7 +237,7 @@ class FaultMonitor:
         )
         is_alarm = worst > self.model.threshold
         pairs = [pair for pair in combinations(sorted(order.tolist()), 2) if is_alarm[list(pair)].any()]
-        pair = self._find_swapped(pairs, first)
+        wiring = self._find_wiring(pairs, first)
         scores = []
         for fibre in suspects:
             failed = self._failed.copy()
@@ -203,21 +245,35 @@ class FaultMonitor:
             failed[fibre] = False
             self._replay(first, failed)
             scores.append(self._neg_log_p(failed)[fibre].max())
-        fibres = pair or (int(suspects[np.argmax(scores)]),)
+        fibres = wiring.fibres if wiring else (int(suspects[np.argmax(scores)]),)
         fibre = max(fibres, key=lambda c: worst[c])
         hypothesis = int(neg_log_p[fibre].argmax())
         since = int(onset[fibre, hypothesis])
-        kind = "swapped" if pair else self._classify(fibre, hypothesis, since)
+        kind = wiring.kind if wiring else self._classify(fibre, hypothesis, since)
         score = min(float(worst[fibre] / np.log(10)), MAX_SCORE)
         self._failed[list(fibres)] = True
         self._replay(first, self._failed)
         return FibreFault(self.n_presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
 
-    def _find_swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> tuple[int, int] | None:
-        """Find the pair whose readings since press `first` are far more likely if they are swapped."""
+    def _find_wiring(self, pairs: Sequence[tuple[int, int]], first: int) -> _Wiring | None:
+        """Find the pair or fibre whose readings since press `first` are far more likely if swapped or inverted."""
+        wirings = [*self._swapped(pairs, first), *self._inverted(first)]
+        best = max(wirings, key=lambda wiring: wiring.llr, default=None)
+        return best if best and best.llr > self.model.threshold else None
+
+    def _inverted(self, first: int) -> Iterator[_Wiring]:
+        """Yield each fibre as if inverted; an inverted one disturbs predictions for all others, but not its own."""
+        _, targets, mean, std = self._predict(self._records_since(first), self._failed)
+        log_likelihood = self.model.likelihoods.log_likelihood_healthy
+        difference = log_likelihood(-targets, mean, std) - log_likelihood(targets, mean, std)
+        llrs = np.nan_to_num(np.clip(difference, -MAX_LLR, MAX_LLR)).sum(axis=0)
+        for fibre in np.flatnonzero(~self._failed).tolist():
+            yield _Wiring("inverted", (fibre,), float(llrs[fibre]))
+
+    def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> Iterator[_Wiring]:
+        """Yield pairs as if swapped."""
         records = self._records_since(first)
         pca, likelihoods = self.model.pca, self.model.likelihoods
-        best, best_llr = None, self.model.threshold
         for pair in pairs:
             this, other = list(pair), list(reversed(pair))
             failed = self._failed.copy()
@@ -235,9 +291,7 @@ class FaultMonitor:
             scale_v, level = pca.target_scale_v[this, -1], records[0].level[this]
             as_is, if_swapped = ((rests[:, source].mean(axis=0) - level) / scale_v for source in (this, other))
             llr += np.nan_to_num(np.clip(as_is**2 - if_swapped**2, -2 * MAX_LLR, 2 * MAX_LLR)).sum() / 2
-            if llr > best_llr:
-                best, best_llr = pair, llr
-        return best
+            yield _Wiring("swapped", pair, float(llr))
 
     def _classify(self, fibre: int, hypothesis: int, since: int) -> str:
         """Return the kind of fault, by the last presses of the fibre."""
@@ -318,6 +372,8 @@ class FaultDetector:
     def predict(self, recording: Recording) -> list[FibreFault]:
         """Detect faults in a recording of the same pad; return them in the order of their detection.
 
+        A misfit takes the place of the faults that made it.
+
         Args:
             recording: of a pad with the fibres and the rate of the training.
 
@@ -334,7 +390,8 @@ class FaultDetector:
         for down, up, low, high in zip(recording.down_command, recording.up_command, firsts, ends, strict=True):
             first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
             faults += monitor.update(readings[first:last], int(down - first), int(up - first))
-        return faults
+        is_fit = all(fault.is_masked for fault in faults)
+        return [fault for fault in faults if is_fit or fault.kind not in RESPONSE_FAULTS]
 
     def include_rests(self, recording: Recording) -> None:
         """Make the rests of a recording usual ones, as after a recalibration.
@@ -402,7 +459,8 @@ def mask_faults(faults: Sequence[FibreFault], presses: int, fibres: int) -> Mask
     for fault in faults:
         if max(fault.fibres, default=0) >= fibres:
             raise InputError(f"faults name fibre {max(fault.fibres) + 1}, allowed are 1 to {fibres}")
-        mask[fault.since :, list(fault.fibres)] = False
+        if fault.is_masked:
+            mask[fault.since :, list(fault.fibres)] = False
     return mask
 
 

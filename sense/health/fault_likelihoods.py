@@ -15,10 +15,10 @@ from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 from padforge.sense.health.trace_model import COMPONENTS, HELD, RELEASED, REST, T_DEGREES, TRACE
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)  # of the rest, in standard deviations of its residual
-HYPOTHESES = ("stuck", "no_response", "reduced_gain", "inconsistent", "noisy", *(f"offset {o:+g}" for o in OFFSETS))
-"""Constant readings; a gain of 0; a gain of one half; the response to another press; five times the noise; and a rest
-that has shifted by one of `OFFSETS`."""
-GAINS = (0.0, 0.5)
+GAINS = {"no_response": 0.0, "reduced_gain": 0.5, "inverted": -1.0}
+HYPOTHESES = ("stuck", *GAINS, "inconsistent", "noisy", *(f"offset {o:+g}" for o in OFFSETS))
+"""Constant readings; a gain of `GAINS`; the response to another press; five times the noise; and a rest that has
+shifted by one of `OFFSETS`."""
 NOISE_FACTOR = 5.0
 STD_FACTOR = 4.0  # an inconsistent response is that to another press, or wrong by this many predicted deviations
 MAX_LLR = 6.0  # largest contribution of one press: no mishap in a single press is a fault
@@ -122,12 +122,15 @@ class FaultLikelihoods:
         return llr_continuing, llr_onset
 
     def _response_llrs(self, targets: Array, mean: Array, std: Array) -> list[Array]:
-        """Ratios (Q, C) of no_response, reduced_gain and inconsistent."""
+        """Ratios (Q, C) of `GAINS` and inconsistent."""
         targets = np.nan_to_num(targets)
         healthy = self.log_likelihood_healthy(targets, mean, std)
         response, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
         std = self._calibrated(std)[..., :COMPONENTS]
-        gains = [_log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1) for gain in GAINS]
+        gains = [
+            _log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1)
+            for gain in GAINS.values()
+        ]
         # In parts: with all of the library a press takes kilobytes a fibre.
         parts = (response[first : first + _CHUNK, None] for first in range(0, len(response), _CHUNK))
         others = (_log_t(part, self.library_mean, self.library_std).sum(axis=-1) for part in parts)

@@ -102,7 +102,7 @@ def calibrate(
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"), one_torch_thread():
         model = fit_recording(recording, training, options, rng, on_progress, time_budget)
-    origin = {"fibre_names": recording.fibre_names, "provenance": made_by}
+    origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
     model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
     with stage("evaluate"):
         evaluation = evaluate(model, recording, range(_n_levels(options, recording.fibres)), on_progress=on_progress)

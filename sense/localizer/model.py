@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,6 +118,7 @@ class LocalizerDocument:
     test: tuple[Annotated[int, Field(ge=0)], ...] = ()
     recalibrated_by: tuple[Digest, ...] = ()  # recordings all of whose presses it has seen
     fibre_names: tuple[str, ...] = ()  # of the recording of the training, if that was imported
+    pad_sha256: Digest | Literal[""] = ""  # of its `pad_digest`
     errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
 
@@ -162,12 +163,17 @@ class LocalizerModel(LocalizerDocument):
         return Sliding(*self.scaler.to_now(N_TIMED)) if FOLLOWING in self.networks else None
 
     def check_recording(self, recording: Recording) -> None:
-        """Raise InputError unless a recording is of a pad with the fibres, their names and the rate of the training.
+        """Raise InputError unless a recording is of the pad of the training, with its fibres, their names and its rate.
 
         Args:
-            recording: to be localized. Names that the training did not know tell nothing.
+            recording: to be localized. Names and plans that one of both does not know tell nothing.
         """
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
+        if self.pad_sha256 and recording.pad_digest not in ("", self.pad_sha256):
+            raise InputError(
+                f"recording is of a pad with the plan {recording.pad_digest[:12]}, "
+                f"the localizer was learnt from {self.pad_sha256[:12]}"
+            )
         for fibre, (name, learnt) in enumerate(zip(recording.fibre_names, self.fibre_names, strict=False), 1):
             if name != learnt and (name in self.fibre_names or learnt in recording.fibre_names):
                 raise InputError(

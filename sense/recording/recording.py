@@ -138,6 +138,14 @@ class Recording:
         return tuple(map(str, names)) if isinstance(names, list) and len(names) == self.fibres else ()
 
     @property
+    def pad_digest(self) -> str:
+        """Hex SHA-256 of the plan of the pad, to a millionth of its units; "" where the source does not hold it."""
+        if (plan := self.source.get("morphology")) is None:
+            return ""
+        rounded = json.loads(json.dumps(plan), parse_float=lambda number: round(float(number), 6))
+        return hashlib.sha256(json.dumps(rounded, sort_keys=True).encode()).hexdigest()
+
+    @property
     def rate_hz(self) -> float:
         """Readings per second, by the median interval."""
         return median_rate_hz(self.times_s)

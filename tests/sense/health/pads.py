@@ -56,6 +56,7 @@ FAULTS: dict[str, Fault] = {
     "offset": lambda values, before, rng: values + 0.1,
     "drifting": lambda values, before, rng: values - 5e-5 * np.arange(len(values)),
     "reduced_gain": lambda values, before, rng: (values + np.median(before)) / 2,
+    "inverted": lambda values, before, rng: 2 * np.median(before) - values,
 }
 """Readings of a faulty fibre 1, from its own and those before; "swapped" is with fibre 4."""
 

@@ -20,7 +20,7 @@ from padforge.sense import (
     simulate,
 )
 from padforge.sense.health import fault_detector
-from padforge.sense.health.fault_detector import TEXTS, fault_lines
+from padforge.sense.health.fault_detector import TEXTS, fault_lines, mask_faults
 from padforge.sense.health.fault_likelihoods import HYPOTHESES
 from tests.sense.health.pads import BAD_FROM, PRESSES, TRAINED, detect, detect_later, faulty, fit, part_of, plant
 
@@ -30,7 +30,7 @@ from tests.sense.health.pads import BAD_FROM, PRESSES, TRAINED, detect, detect_l
     [
         *(("stuck", {"stuck"}, 20), ("open", {"open"}, 20), ("noisy", {"noisy"}, 20), ("offset", {"offset"}, 20)),
         *(("swapped", {"swapped", "offset"}, 20), ("floating", {"open", "offset"}, 20)),
-        *(("drifting", {"drifting"}, 60), ("reduced_gain", {"reduced_gain"}, 60)),
+        *(("drifting", {"drifting"}, 60), ("reduced_gain", {"reduced_gain"}, 60), ("inverted", {"inverted"}, 10)),
     ],
 )
 def test_planted_faults_are_detected(
@@ -46,6 +46,46 @@ def test_planted_faults_are_detected(
     assert first.score >= 5
     # No fibre is reported twice, and no sound one with it.
     assert sorted(fibre for each in faults for fibre in each.fibres) == bad
+
+
+@pytest.mark.parametrize("fibre", range(6))
+def test_inverted_fibre_is_told_from_the_start(pad: Recording, model: HealthModel, fibre: int) -> None:
+    """A divider wired the other way round: the others, which it misleads, are sound."""
+    readings = pad.readings.copy()
+    readings[:, fibre] = 3.3 - readings[:, fibre]
+    (fault,) = detect_later(model, readings, pad)
+    assert (fault.fibres, fault.kind) == ((fibre,), "inverted")
+    assert fault.press < 20
+
+
+def test_most_fibres_at_fault_are_a_misfit_and_not_masked(pad: Recording, model: HealthModel) -> None:
+    bad = [0, 1, 2, 4]
+    readings = pad.readings.copy()
+    readings[:, bad] = 3.3 - readings[:, bad]
+    (misfit,) = faults = detect_later(model, readings, pad)
+    assert misfit.fibres == tuple(bad)
+    assert misfit.text.startswith("fibres 1, 2, 3 and 5 respond otherwise than in the calibration, which does not fit")
+    assert mask_faults(faults, PRESSES - TRAINED, 6).all()
+    assert fault_lines(faults, 6)[1] == "sound fibres: 4, 6"
+    readings[:, 3] = readings[0, 3]  # what its own readings show is masked nevertheless
+    faults = detect_later(model, readings, pad)
+    assert {fault.kind for fault in faults} - {"stuck", "open"} == {"misfit"}
+    assert not mask_faults(faults, PRESSES - TRAINED, 6)[-1, 3]
+    assert mask_faults(faults, PRESSES - TRAINED, 6)[:, bad].all()
+
+
+def test_monitor_masks_none_of_a_misfit(pad: Recording, model: HealthModel) -> None:
+    monitor, kinds, most = FaultMonitor(model), list[str](), 0
+    readings = pad.readings.copy()
+    readings[:, [0, 1, 2, 4]] = 3.3 - readings[:, [0, 1, 2, 4]]
+    for press in range(TRAINED, TRAINED + 60):
+        first = pad.down_command[press] - 10
+        part = readings[first : pad.down_command[press + 1]]
+        kinds += [fault.kind for fault in monitor.update(part, 10, int(pad.up_command[press] - first))]
+        most = max(most, len(monitor.failed))
+    assert kinds[-1] == "misfit"
+    assert kinds.count("misfit") == 1
+    assert (monitor.failed, most) == ((), 3)
 
 
 @pytest.mark.parametrize(("distance", "kind"), [(-1.01, "open"), (-0.99, "stuck"), (0.99, "stuck"), (1.01, "open")])

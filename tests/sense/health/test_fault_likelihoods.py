@@ -84,6 +84,7 @@ def test_log_likelihood_ratios_are_those_of_densities(seed: int) -> None:
             -math.log(model.constant_share[c]) if np.ptp(traces[q, c]) == 0 else -6.0,
             log_density(y, 0 * m, floor) - healthy,
             log_density(y, 0.5 * m, np.hypot(0.5 * s, floor)) - healthy,
+            log_density(y, -m, np.hypot(s, floor)) - healthy,
             math.log(inconsistent) - healthy,
             shift_llr(
                 float((log_noise - model.log_noise_mean[c]) / model.log_noise_std[c]),

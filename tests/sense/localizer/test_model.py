@@ -120,6 +120,19 @@ def test_predict_compares_the_names_of_fibres(localizer: LocalizerModel, recordi
     localizer.check_recording(named("c1", "c3", "c2", "c4"))  # it knows no names
 
 
+def test_predict_compares_the_plans_of_pads(localizer: LocalizerModel, recording: Recording) -> None:
+    assert localizer.pad_sha256 == recording.pad_digest != ""
+    plan = recording.source["morphology"]
+    knots = [[[value + 1e-9 for value in row] for row in fibre] for fibre in plan["knots"]]
+    localizer.check_recording(replace(recording, source={"morphology": plan | {"knots": knots}}))
+    localizer.check_recording(replace(recording, source={}))  # an imported one does not know
+    other = replace(recording, source={"morphology": plan | {"pitch_mm": 9.0}})
+    message = f"recording is of a pad with the plan {other.pad_digest[:12]}, the localizer was learnt from {'.' * 12}$"
+    for use in (localizer.predict, localizer.check_recording):
+        with pytest.raises(InputError, match=message):
+            use(other)
+
+
 def test_predict_takes_rates_within_a_quarter(localizer: LocalizerModel, recording: Recording) -> None:
     for ratio in (0.76, 1.24):
         presses = localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
