@@ -7,6 +7,7 @@ of a built pad does.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -54,6 +55,10 @@ class BuiltPad:
     paths: Morphology
     sensitivities: PressParts[Array] | None = None
 
+    @cached_property
+    def _lengths(self) -> Array:
+        return lengths(self.paths)
+
     @classmethod
     def sample(cls, plan: Morphology, rig: RigSettings, rng: np.random.Generator) -> "BuiltPad":
         """Sample the pad that is built by a plan, as far from it as `[rig]` says."""
@@ -69,7 +74,7 @@ class BuiltPad:
         presses, parts = self.paths.to_grid(positions_mm), []
         for contact, sensitivity in zip(contacts, self.sensitivities or [None] * len(contacts), strict=True):
             signals = quick_signals(self.paths, presses, contact, FINE_PRECISION, sensitivity)
-            parts.append(signals / lengths(self.paths))
+            parts.append(signals / self._lengths)
         return PressParts(*parts)
 
 
