@@ -13,6 +13,7 @@ from padforge.sense import Recording
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import Moment
 from padforge.sense.signals.press_detection import first_readings
+from tests.sense.live.conftest import first_presses
 
 
 def test_locate_excludes_fibres_by_number(few) -> None:
@@ -81,10 +82,12 @@ def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model
     assert not list(Path("model").glob("health.*"))
 
 
-def test_deploy_writes_a_graph(few) -> None:
-    code, out, _ = few("deploy", "--model", "model", "rec", "localizer.onnx")
+def test_deploy_writes_a_graph(few, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("padforge.sense.deploy.onnx_export.N_TRIALS", 5)
+    first_presses(Recording.open("rec"), 4).save("short", {})
+    code, out, _ = few("deploy", "--model", "model", "short", "localizer.onnx")
     assert code == 0
-    assert "tested on 60 presses and at every moment of one, with up to 3 failed fibres: positions within " in out
+    assert "tested on 4 presses and at every moment of one, with up to 3 failed fibres: positions within " in out
     assert out.endswith(" -> localizer.onnx\n")
     assert few("deploy", "--model", "model", "again.onnx")[0] == 0
     assert Path("again.onnx").read_bytes() == Path("localizer.onnx").read_bytes()

@@ -36,6 +36,15 @@ def exported(
 
 
 @pytest.fixture(scope="module")
+def deeply_exported(
+    deep_localizer: LocalizerModel, deep_recording: Recording, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, OnnxReport]:
+    """The same of one member, which has no Bayesian localizers, but depth and force."""
+    path = tmp_path_factory.mktemp("deep-onnx") / "localizer.onnx"
+    return path, export_onnx(deep_localizer, DIGEST, path, first_presses(deep_recording, 5))
+
+
+@pytest.fixture(scope="module")
 def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(exported[0])
 
@@ -63,8 +72,8 @@ def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, record
 
 def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recording) -> None:
     """It is called with the readings so far, from the touch to after the release; first, nothing is known."""
-    readings, down, up = recording.readings, recording.down_command[:6], recording.up_command[:6]
-    so_far = Recording(readings, recording.times_s, recording.presses_mm[:6], down, up)
+    so_far = first_presses(recording, 6)
+    readings, down, up = so_far.readings, so_far.down_command, so_far.up_command
     n_complete = []
     for end in range(down[-1] + 1, up[-1] + 24):
         expected = localizer.predict(so_far, until=np.full(6, end))
@@ -143,12 +152,11 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None
     np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
 
-def test_graph_gives_depth_and_force(deep_localizer, deep_recording, tmp_path) -> None:
-    """Of one member, which has no Bayesian localizers."""
-    report = export_onnx(deep_localizer, DIGEST, tmp_path / "l.onnx", first_presses(deep_recording, 20))
+def test_graph_gives_depth_and_force(deep_localizer, deep_recording, deeply_exported) -> None:
+    path, report = deeply_exported
     assert report.position_difference_mm < MAX_DIFFERENCE_MM
-    assert report.n_presses == 20
-    presses, graph = deep_localizer.scaled_features(deep_recording), onnxruntime.InferenceSession(tmp_path / "l.onnx")
+    assert report.n_presses == 5
+    presses, graph = deep_localizer.scaled_features(deep_recording), onnxruntime.InferenceSession(path)
     names = [each.name for each in graph.get_outputs()][4:]
     assert names == ["depth_mm", "depth_r90_mm", "force_n", "force_r90_n"]
     for failed in ((), (0, 1, 2, 3)):
@@ -172,15 +180,19 @@ def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
     assert "with up to 1 failed fibre: positions" in replace(exported[1], max_failures=1).text
 
 
-def test_export_refuses_other_localizers_and_a_graph_that_differs(deep_localizer, tmp_path, monkeypatch) -> None:
-    path, localizer = tmp_path / "l.onnx", deep_localizer
+def test_export_refuses_other_localizers_and_a_graph_that_differs(
+    deep_localizer, deep_recording, deeply_exported, tmp_path, monkeypatch
+) -> None:
+    """The graph is the one that torch has exported of the same localizer before, in a second."""
+    path, localizer, exported = tmp_path / "l.onnx", deep_localizer, deeply_exported[0].read_bytes()
+    monkeypatch.setattr("torch.onnx.export", lambda module, inputs, file, **options: file.write(exported))
     with pytest.raises(InputError, match="method published, expected ensemble"):
         export_onnx(replace(localizer, method="published"), DIGEST, path)
     with pytest.raises(InputError, match="of features array, expected windows"):
         export_onnx(replace(localizer, features="array"), DIGEST, path)
     monkeypatch.setattr(onnx_export, "MAX_DIFFERENCE_MM", 1e-9)
     with pytest.raises(Fault, match="not written, positions by onnxruntime differ"):
-        export_onnx(localizer, DIGEST, path)
+        export_onnx(localizer, DIGEST, path, first_presses(deep_recording, 5))
     assert not list(tmp_path.iterdir())
 
 
