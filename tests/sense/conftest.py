@@ -5,6 +5,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -21,6 +22,7 @@ from padforge.sense.rig.arms.ur5 import UR5, Driver
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.twin import identification as twin_identification
+from padforge.sense.twin import wiring
 from padforge.sense.twin.identification import Identification, identify_pad
 from padforge.sense.virtual import virtual_rig
 from padforge.sense.virtual.ur5 import EmulatedUR5
@@ -39,6 +41,13 @@ def recording(once: Once) -> Recording:
     return once("recording", lambda folder: simulate(Morphology.random(2, knots=3, seed=5), rig))
 
 
+@contextmanager
+def few_candidates() -> Iterator[None]:
+    """One wiring is fitted beside the stated one and images, of six that are refined, in place of 4 of 24."""
+    with patch.object(twin_identification, "N_CANDIDATES", 1), patch.object(wiring, "N_REFINED", 6):
+        yield
+
+
 def identified(built: Morphology, told: Morphology, rig: sense_settings.RigSettings) -> Identification:
     """Identify a simulated pad by a plan; its contact and the parts of presses, which take longest, do not count."""
     contact = patch.object(twin_identification, "_measure_contact", lambda *_: None)
@@ -50,7 +59,12 @@ def identified(built: Morphology, told: Morphology, rig: sense_settings.RigSetti
 def identification(once: Once) -> Identification:
     """A pad of 2 + 2 fibres that lies as planned, without its contact and its parts."""
     plan = Morphology.random(2, knots=3, seed=5)
-    return once("identification", lambda folder: identified(plan, plan, ideal_rig(presses=120, seed=1)))
+
+    @few_candidates()
+    def make(folder: Path) -> Identification:
+        return identified(plan, plan, ideal_rig(presses=120, seed=1))
+
+    return once("identification", make)
 
 
 @pytest.fixture(scope="session")
@@ -122,6 +136,19 @@ def steady() -> Iterator[SteadyClock]:
     """The clock of rigs stands still for all while one of their threads gets no processor."""
     with steady_clock() as clock:
         yield clock
+
+
+@contextmanager
+def blank_pictures() -> Iterator[None]:
+    """Pictures are made and saved, but with nothing drawn, which takes longest."""
+    with patch("matplotlib.figure.Figure.draw", lambda figure, renderer: None):
+        yield
+
+
+@pytest.fixture
+def blank() -> Iterator[None]:
+    with blank_pictures():
+        yield
 
 
 WAIT_S = 180.0

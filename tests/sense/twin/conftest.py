@@ -1,26 +1,14 @@
 """Printed pads of known truth, and their responses."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from unittest.mock import patch
-
 import numpy as np
 import pytest
 
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
 from padforge.design.twin import Twin
-from padforge.sense.twin import identification, wiring
 from padforge.sense.twin.responses import Responses
 
 PLAN = Morphology.random(2, knots=3, seed=5)
-
-
-@contextmanager
-def few_candidates() -> Iterator[None]:
-    """One wiring is fitted beside the stated one and images, of six that are refined, in place of 4 of 24."""
-    with patch.object(identification, "N_CANDIDATES", 1), patch.object(wiring, "N_REFINED", 6):
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,7 @@ from padforge.sense.twin.as_built import OFFSET, PadPlan, channel_indices
 from padforge.sense.twin.doubts import find_doubts
 from padforge.sense.twin.identification import Identification
 from padforge.sense.twin.wiring import Wiring, images
-from tests.sense.conftest import identified
-
-from .conftest import few_candidates
+from tests.sense.conftest import few_candidates, identified
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.report.identification import identification_lines
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.twin import identification
 from padforge.sense.twin.identification import Identification, identify_pad
 from tests.helpers.rigs import ideal_rig
+from tests.sense.conftest import few_candidates
 
-from .conftest import PLAN, few_candidates
+from .conftest import PLAN
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,9 @@ def recording(printed: Twin) -> Recording:
 @pytest.fixture(scope="module")
 @few_candidates()
 def result(recording: Recording) -> Identification:
-    return identify_pad(recording, PLAN, seed=1)
+    """Candidates are compared by half of its presses, and the contact, which is measured elsewhere, fitted to few."""
+    with patch.object(identification, "N_COMPARED", 120), patch.object(identification, "N_CONTACT", 60):
+        return identify_pad(recording, PLAN, seed=1)
 
 
 def assert_recovered(result: Identification, printed: Twin) -> None:

@@ -10,8 +10,9 @@ from padforge.design.twin import PlanTransform
 from padforge.sense.twin.as_built import PadPlan
 from padforge.sense.twin.responses import Responses
 from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, planned_paths_mm
+from tests.sense.conftest import few_candidates
 
-from .conftest import PLAN, few_candidates
+from .conftest import PLAN
 
 
 @pytest.mark.slow  # the quick tests of `identify` find wirings, too
