@@ -32,7 +32,7 @@ def test_calibrate_writes_a_document_that_evaluate_agrees_with(few) -> None:
         assert json.loads(out)["errors"] == document["errors"][:levels]
 
 
-@pytest.mark.usefixtures("loose_pictures")
+@pytest.mark.usefixtures("blank")
 def test_calibrate_doubts_units_and_misplaced_presses(few) -> None:
     good = Recording.open("rec")
     area = r"60 presses over \d+\.\d+ x \d+\.\d+ mm, 2400 readings of 4 fibres at 13\.3 Hz"
@@ -54,7 +54,7 @@ def test_calibrate_doubts_units_and_misplaced_presses(few) -> None:
     assert misplaced == "doubtful: more than 4 r90 from where the fibres say: press 7 at (250, 3) mm"
 
 
-@pytest.mark.usefixtures("loose_pictures")
+@pytest.mark.usefixtures("blank")
 def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
     before = files_in("model")
     Path("pad.toml").write_text(SPEC.replace("[rig]", "max_failures = 0\n[rig]"))
@@ -105,7 +105,7 @@ def test_evaluate_lists_errors_of_depth_and_force(padforge_sense, deep_localizer
     assert lines.index("error of force in N") == depth + 4 == len(lines) - 5 - 2 - len(MOMENTS)
 
 
-@pytest.mark.usefixtures("loose_pictures")
+@pytest.mark.usefixtures("blank")
 def test_a_drifted_pad_is_followed_into_a_new_model(few, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "FINE_TUNING_STEPS", 15)
     before = files_in("model")

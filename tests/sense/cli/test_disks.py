@@ -45,7 +45,7 @@ def calibrate_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("padforge.sense.localizer.localizer.calibrate", calibrate)
 
 
-@pytest.mark.usefixtures("loose_pictures", "calibrate_once")
+@pytest.mark.usefixtures("blank", "calibrate_once")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_command_on_a_full_disk_leaves_all_or_nothing(few, name: str) -> None:
     """Where a model was it stays; whatever the limit, nothing is left of what did not fit."""

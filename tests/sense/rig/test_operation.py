@@ -42,7 +42,7 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
         return Recording.open(tmp_path / name)
 
     training_recording = record("training", PressPlan(left_mm, training.depths_mm))
-    small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=30, max_failures=0)
+    small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=10, max_failures=0)
     localizer, _ = calibrate(training_recording, small)
     planner = AdaptivePlanner(
         localizer, tmp_path / "run", np.random.default_rng(5), lambda positions_mm: np.ones(len(positions_mm), bool)

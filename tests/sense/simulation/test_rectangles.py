@@ -19,7 +19,7 @@ from tests.helpers.rigs import ideal_rig
 KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
 PAD = Morphology.random(SIZE.layout, knots=3, seed=2)
-QUICK = LocalizerSettings(members=1, hidden=32, layers=2, epochs=20, batch=64, max_failures=1)
+QUICK = LocalizerSettings(members=1, hidden=32, layers=2, epochs=10, batch=64, max_failures=1)
 
 
 @pytest.fixture(scope="module")

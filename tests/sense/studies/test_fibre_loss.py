@@ -132,7 +132,7 @@ def test_fibre_loss_command_writes_document_and_figure() -> None:
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("here", "blank")
 def test_fibre_loss_command_keeps_networks_until_the_result_is_written(
     trained: list, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,6 +131,7 @@ def test_maps_cover_the_pressed_rectangle(tmp_path: Path) -> None:
     assert document["rows"][0]["mean_mm"] == pytest.approx(document["rows"][0]["mean"] * np.sqrt(8 * 15))
 
 
+@pytest.mark.usefixtures("blank")
 def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One set of failed fibres takes 16, four take 4 each, and six 3."""
     fit, trained = SimulatedPresses.fit, Counter[tuple[int, ...]]()
