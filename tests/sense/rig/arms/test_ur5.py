@@ -210,18 +210,18 @@ def test_force_is_limited_in_all_directions(robots: Any, host: str, driver: Driv
     with closing(UR5(host, driver)) as arm:
         assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
         assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
-        arm.move(LOW, 50, 500)
+        arm.move(LOW, 10, 500)  # slowly: this arm's time does not wait for a driver that gets no processor
         assert fault_of(wait_until_still, arm, FORCE_LIMITS) == "force"
         state = arm.state()
         assert not state.moving
         assert 50 < (state.force_n or 0) < 60
         arm.move(HOME, 1000, 20_000)
         wait_until_still(arm, LIMITS)
-        arm.move((HOME[0] + 80, *HOME[1:]), 40, 500)
+        arm.move((HOME[0] + 80, *HOME[1:]), 10, 500)
         robot.push(60.0)
         assert fault_of(wait_until_still, arm, FORCE_LIMITS) == "force"
         state = arm.state()
-        assert state.pose[0] < HOME[0] + 40
+        assert state.pose[0] < HOME[0] + 10
         assert (state.force_n, state.sideways_n) == (0, 60)
     robots.free()
 
