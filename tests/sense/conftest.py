@@ -17,7 +17,9 @@ import pytest
 from padforge.design import Morphology, contact
 from padforge.sense import Evaluation, Recording, calibrate
 from padforge.sense import settings as sense_settings
+from padforge.sense.localizer import calibration, evaluation
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.rig.arms.ur5 import UR5, Driver
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
@@ -73,6 +75,17 @@ def brief(recording: Recording) -> Recording:
     end = int(recording.down_command[40])
     presses = {name: getattr(recording, name)[:40] for name in ("presses_mm", "down_command", "up_command")}
     return Recording(recording.readings[:end], recording.times_s[:end], **presses)
+
+
+@contextmanager
+def few_moments() -> Iterator[None]:
+    """Radii are learnt from one set of failed fibres of each size, and errors evaluated at two moments of a press.
+
+    Both take longer than a short training.
+    """
+    sets = patch.multiple(calibration, MOMENT_SUBSETS=1, SCALE_SUBSETS=1)
+    with sets, patch.object(evaluation, "MOMENTS", (MOMENTS[0], MOMENTS[-1])):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
 from padforge.sense.settings import LocalizerSettings
 from tests.helpers.once import Once
-from tests.sense.conftest import blank_pictures
+from tests.sense.conftest import blank_pictures, few_moments
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
 
@@ -44,7 +44,7 @@ def make_model(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures():
+    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments():
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from padforge.sense import Recording
+from padforge.sense.health.fault_detector import HEALTH_FILES
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import Moment
 from padforge.sense.signals.press_detection import first_readings
@@ -73,10 +74,12 @@ def test_locate_and_health_name_what_differs_from_the_calibration(enough) -> Non
     assert shift["value"] > shift["usual"][1]
 
 
-def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model(enough) -> None:
+@pytest.mark.usefixtures("blank")
+def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model(few) -> None:
+    for name in HEALTH_FILES:
+        Path("model", name).touch()
     assert Path("model/health.json").exists()
-    enough("record", "--presses", "50", "--out", "short")
-    code, _, err = enough("calibrate", "short", "--out", "model")
+    code, _, err = few("calibrate", "rec", "--out", "model")
     assert (code, err.count("\n")) == (0, 1)
     assert "health of the fibres is not monitored: 42 complete presses to learn from, expected 300 or more; 8 pr" in err
     assert not list(Path("model").glob("health.*"))

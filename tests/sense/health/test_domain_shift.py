@@ -11,6 +11,7 @@ from padforge.sense.health.domain_shift import MIN_PRESSES, DomainShift, detect_
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings
 from tests.helpers.once import Once
+from tests.sense.conftest import few_moments
 from tests.sense.health.pads import PRESSES, TRAINED, part_of
 
 COARSE = LocalizerSettings(members=2, hidden=24, layers=1, epochs=2, batch=64, max_failures=1)
@@ -19,8 +20,11 @@ COARSE = LocalizerSettings(members=2, hidden=24, layers=1, epochs=2, batch=64, m
 
 @pytest.fixture(scope="session")
 def localizer(once: Once, pad: Recording) -> LocalizerModel:
-    start = part_of(pad, 0, TRAINED, int(pad.down_command[TRAINED]))
-    return once("health-localizer", lambda folder: calibrate(start, COARSE))[0]
+    @few_moments()
+    def make(folder: Path) -> LocalizerModel:
+        return calibrate(part_of(pad, 0, TRAINED, int(pad.down_command[TRAINED])), COARSE)[0]
+
+    return once("health-localizer", make)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import MAX_TRACK, RELEASE, Estimate, Live
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.signals.press_detection import PressEvent
-from tests.sense.conftest import QUICK
+from tests.sense.conftest import QUICK, few_moments
 from tests.sense.live.conftest import first_presses
 
 
@@ -68,6 +68,7 @@ def trained(brief: Recording) -> Callable[[str], LocalizerModel]:
     """Hardly trained localizers by their method, whose positions depend on every reading that they look at."""
 
     @cache
+    @few_moments()
     def train(method: str) -> LocalizerModel:
         options = {"method": method, "members": 1, "hidden": 16, "epochs": 1}
         return calibrate(brief, QUICK.model_copy(update=options))[0]
@@ -121,10 +122,10 @@ def assert_as_a_whole(recording: Recording, model: LocalizerModel, estimates: Se
 
 @pytest.mark.parametrize("delays", [(0, 0), (2, 1), (6, 3)])
 def test_live_estimates_are_those_of_the_whole_recording(recording, hasty, delays: tuple[int, int]) -> None:
-    part = first_presses(recording, 12)
+    part = first_presses(recording, 6)
     _, events = replay(part, hasty, delays)
     until = moments(part, events)
-    for press in range(11):
+    for press in range(5):
         estimates = [each for each in events if each.press == press]
         down, up = int(part.down_command[press]), int(part.up_command[press])
         end = min(up + RELEASE, int(part.down_command[press + 1]))
@@ -203,7 +204,7 @@ def test_a_tap_that_its_release_shows_is_estimated_from_then_on(recording, hasty
 
 
 def test_radii_shrink_as_a_press_goes_on(recording, localizer) -> None:
-    _, events = replay(first_presses(recording, 15), localizer)
+    _, events = replay(first_presses(recording, 10), localizer)
     by_moment = {
         (since, readings): np.mean([e.r90_mm for e in events if (e.since, e.readings) == (since, readings)])
         for since, readings in (("touch", 3), ("touch", 20), ("lift", RELEASE))
@@ -219,7 +220,7 @@ def test_radii_shrink_as_a_press_goes_on(recording, localizer) -> None:
 
 def test_live_handles_a_press_that_is_held_for_hours(recording, hasty, monkeypatch) -> None:
     """So long that old readings are dropped for the second time within the press."""
-    history, slack, held = 150, 60, 2
+    history, slack, held = 120, 40, 2
     for module in ("rig.streams", "live.pipeline"):
         monkeypatch.setattr(f"padforge.sense.{module}.HISTORY", history)
         monkeypatch.setattr(f"padforge.sense.{module}.SLACK", slack)

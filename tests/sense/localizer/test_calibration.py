@@ -23,8 +23,14 @@ from padforge.sense.localizer.moments import N_DOWN, complete_at
 from padforge.sense.localizer.network import predict_members
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.settings import LocalizerSettings as Options
+from tests.sense.conftest import few_moments
 
 SHORT = Options(members=1, hidden=48, layers=2, epochs=3, batch=64, max_failures=1)
+
+
+@few_moments()
+def calibrate_shortly(recording: Recording, **changes: Any) -> tuple[LocalizerModel, Evaluation]:
+    return calibrate(recording, SHORT.model_copy(update=changes))
 
 
 def same_networks(one: LocalizerModel, other: LocalizerModel) -> bool:
@@ -35,7 +41,7 @@ def same_networks(one: LocalizerModel, other: LocalizerModel) -> bool:
 @pytest.fixture(scope="module")
 def short(recording: Recording) -> LocalizerModel:
     """What a short training learns of the recording as it is, with the seed and the split of the defaults."""
-    return calibrate(recording, SHORT)[0]
+    return calibrate_shortly(recording)[0]
 
 
 @settings(max_examples=40)
@@ -58,15 +64,13 @@ def test_split_presses_partitions(presses: int, share: float, split: str, seed: 
 
 @pytest.mark.parametrize("split", ["random", "chronological"])
 def test_calibrate_is_blind_to_test_presses(recording: Recording, short: LocalizerModel, split: str) -> None:
-    plain = short if split == SHORT.split else calibrate(recording, SHORT.model_copy(update={"split": split}))[0]
+    plain = short if split == SHORT.split else calibrate_shortly(recording, split=split)[0]
     test = np.array(plain.test)
     readings, places = np.array(recording.readings), np.array(recording.presses_mm)
     places[test] = 5e4 + np.arange(len(test))[:, None]
     if split == "chronological":  # of random ones, the readings are what came before the presses learnt from
         readings[recording.down_command[test[0]] + 20 :] = 77.0
-    spoilt, _ = calibrate(
-        replace(recording, readings=readings, presses_mm=places), SHORT.model_copy(update={"split": split})
-    )
+    spoilt, _ = calibrate_shortly(replace(recording, readings=readings, presses_mm=places), split=split)
     assert spoilt.test == plain.test
     assert np.array_equal(spoilt.interval_factors, plain.interval_factors)
     assert same_networks(spoilt, plain)
@@ -77,10 +81,10 @@ def test_calibrate_repeats_by_seed(recording: Recording, short: LocalizerModel) 
     """All but the places of test presses counts; that the rest is repeated is seen where these are changed."""
     places = np.array(recording.presses_mm)
     places[sorted(set(range(len(places))) - set(short.test))[:50]] *= 0.5
-    changed, _ = calibrate(replace(recording, presses_mm=places), SHORT)
+    changed, _ = calibrate_shortly(replace(recording, presses_mm=places))
     assert changed.test == short.test
     assert not same_networks(changed, short)
-    other, _ = calibrate(recording, SHORT.model_copy(update={"seed": 7}))
+    other, _ = calibrate_shortly(recording, seed=7)
     assert short.test != other.test
     assert replace(recording, depths_mm=np.empty(0)).digest == recording.digest
     assert short.scaler.measures == ()
@@ -149,7 +153,7 @@ def test_calibrate_leaves_out_unknown_positions(recording: Recording) -> None:
     places = np.array(recording.presses_mm)
     places[::3] = np.nan
     part = replace(recording, presses_mm=places)
-    localizer, evaluation = calibrate(part, SHORT)
+    localizer, evaluation = calibrate_shortly(part)
     assert all(press % 3 for press in localizer.test)
     assert evaluation.training_presses == 200 - evaluation.test_presses
     assert np.isfinite(localizer.predict(part).positions_mm).all()
@@ -175,7 +179,7 @@ def test_calibrate_reports_divergence(recording: Recording, monkeypatch: pytest.
 
     monkeypatch.setattr(training, "train_members", diverged)
     with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate 0.005, try a lower one"):
-        calibrate(recording, SHORT)
+        calibrate_shortly(recording)
 
 
 def test_predict_masks_a_fault_from_its_first_press(localizer: LocalizerModel, recording: Recording) -> None:
@@ -326,7 +330,7 @@ def arrays(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
     x, y = arrays
     localizer = Localizer(max_failures=1, random_state=3, **TINY)
-    scores = cross_val_score(localizer, x, y, cv=3)
+    scores = cross_val_score(localizer, x, y, cv=2)
     trivial = np.hypot(*(y - np.median(y, axis=0)).T).mean()
     assert ((-0.8 * trivial < scores) & (scores < 0)).all()
     fitted = localizer.fit(x[:200], y[:200])
@@ -341,6 +345,7 @@ def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarr
         assert np.array_equal(again.predict(x).positions_mm, fitted.predict(x).positions_mm)
 
 
+@few_moments()
 def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_path: Path) -> None:
     localizer = Localizer(2, split="chronological", **TINY).fit(brief)
     rows = localizer.evaluate(brief)

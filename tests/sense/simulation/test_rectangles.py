@@ -15,6 +15,7 @@ from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.virtual.virtual_pad import virtual_pad_of
 from tests.helpers.rigs import ideal_rig
+from tests.sense.conftest import few_moments
 
 KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
@@ -31,6 +32,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="module")
+@few_moments()
 def calibrated(recording: Recording) -> tuple[LocalizerModel, Evaluation]:
     return calibrate(recording, QUICK)
 
@@ -59,6 +61,7 @@ def test_localization_of_a_rectangular_pad_is_in_mm(
     assert within == pytest.approx([0.5, 0.9], abs=0.2)
 
 
+@few_moments()
 @pytest.mark.parametrize("counts", [(0, 3), *(pytest.param(one, marks=pytest.mark.slow) for one in ((3, 0), (1, 0)))])
 def test_localization_on_strips_of_parallel_fibres(counts: tuple[int, int]) -> None:
     """Straight fibres of uniform sensitivity give no position along them; across, they do where two respond."""

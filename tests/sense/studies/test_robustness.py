@@ -18,6 +18,7 @@ from padforge.design.networks import SimulatedPresses
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import MIN_NETWORKS, robustness_study
 from padforge.sense.studies.study import load_pads, run
+from tests.sense.conftest import blank_pictures
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 
@@ -34,7 +35,8 @@ def small() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("robustness")
-    return folder, run(robustness_study(PADS, max_failures=2, presses=144), folder)
+    with blank_pictures():
+        return folder, run(robustness_study(PADS, max_failures=2, presses=144), folder)
 
 
 def select_rows(document: dict, **values) -> list[dict]:
