@@ -9,6 +9,7 @@ import io
 import logging
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
+from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,9 +36,17 @@ _log = logging.getLogger(__name__)
 def load_typestore(purpose: str) -> "Typestore":
     """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
     try:
-        from rosbags.typesys import Stores, get_typestore
+        import rosbags.typesys  # noqa: F401
     except ImportError as error:
         raise InputError(f"{purpose} needs rosbags: pip install 'padforge[ros]'") from error
+    return _typestore()
+
+
+@cache
+def _typestore() -> "Typestore":
+    """One for all files: it compiles the code of a message when it first meets one."""
+    from rosbags.typesys import Stores, get_typestore
+
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
