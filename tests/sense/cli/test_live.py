@@ -23,8 +23,8 @@ from tests.sense.live.conftest import first_presses
 
 @pytest.fixture
 def replay(padforge_sense, model: Path, recording: Recording) -> Callable[..., tuple[int, str, str]]:
-    """Of ten presses on a pad that lay with its tracks up."""
-    replace(first_presses(recording, 10), source={"rig": {"mirrored": True}}).save("mirrored", {})
+    """Of six presses on a pad that lay with its tracks up."""
+    replace(first_presses(recording, 6), source={"rig": {"mirrored": True}}).save("mirrored", {})
     command = ("live", "--port", "0", "--model", str(model), "--replay", "mirrored", "--speed", "1e6")
     return lambda *words: padforge_sense(*command, *words)
 
@@ -47,7 +47,7 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     assert not [key for key in told[0] if key.startswith(("depth", "force"))]
     final = [each["press"] for each in told if each["final"]]
     assert final == list(range(len(final)))
-    assert 8 <= len(final) <= 10
+    assert 5 <= len(final) <= 6
     assert len(told) > 20 * len(final)  # every reading
     assert {view["mirrored"] for view in views} == {True}
     assert [view["ended"] for view in views][-2:] == ["", "ended"]
@@ -129,7 +129,7 @@ def test_live_shows_depth_and_force_of_models_that_estimate_them(
     padforge_sense, deep_localizer, deep_recording, views
 ) -> None:
     deep_localizer.save("deep")
-    first_presses(deep_recording, 12).save("rec", {})
+    first_presses(deep_recording, 8).save("rec", {})
     words = ("live", "--replay", "rec", "--speed", "1e6", "--port", "0", "--model", "deep")
     told = [json.loads(line) for line in padforge_sense(*words, "--json")[1].splitlines()]
     deep = [each["depth_mm"] for each in told if each["final"]]

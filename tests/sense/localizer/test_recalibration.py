@@ -120,7 +120,10 @@ def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: 
         evaluate(now, known_only(pad, NEW))
 
 
-def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording: Recording) -> None:
+def test_recalibrate_keeps_an_unchanged_pad(
+    localizer: LocalizerModel, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("padforge.sense.localizer.recalibration.SUBSETS", 2)
     now, result = recalibrate(localizer, known_only(recording, NEW))
     assert "corrected" not in result.changes
     # adapting is kept unless new presses speak against it by a standard error
