@@ -11,6 +11,8 @@ from padforge.sense.health import health_model, trace_model
 
 Array = NDArray[np.float64]
 TRAINED, PRESSES, BAD_FROM = 600, 760, 660
+FEW = 320
+"""Presses that a model can be trained on, but not enough to detect a reduced gain."""
 
 
 def fit(readings: Array, pad: Recording, presses: int = TRAINED) -> HealthModel:

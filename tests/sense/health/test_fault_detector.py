@@ -22,7 +22,7 @@ from padforge.sense import (
 from padforge.sense.health import fault_detector
 from padforge.sense.health.fault_detector import TEXTS, fault_lines, mask_faults
 from padforge.sense.health.fault_likelihoods import HYPOTHESES
-from tests.sense.health.pads import BAD_FROM, PRESSES, TRAINED, detect, detect_later, faulty, fit, part_of, plant
+from tests.sense.health.pads import BAD_FROM, FEW, PRESSES, TRAINED, detect, detect_later, faulty, fit, part_of, plant
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_dead_channels_are_ignored(pad: Recording) -> None:
     readings = pad.readings.copy()
     readings[:, 0] = 3.3
     readings[:, 3] = np.minimum(readings[:, 3], np.quantile(readings[:, 3], 0.2))
-    model = fit(readings, pad)
+    model = fit(readings, pad, FEW)
     assert model.dead == FaultMonitor(model).failed == (0, 3)
     assert detect_later(model, readings, pad) == []
     assert detect_later(model, plant(pad, "noisy", readings=readings), pad)[0].fibres == (1,)
@@ -200,7 +200,7 @@ def test_dead_channels_are_ignored(pad: Recording) -> None:
 
 def test_single_fibre_detects_faults_of_its_own_readings(pad: Recording) -> None:
     readings = pad.readings[:, 1:2].copy()
-    model = fit(readings, pad)
+    model = fit(readings, pad, FEW)
     readings[pad.down_command[BAD_FROM] :] = readings[pad.down_command[BAD_FROM]]
     assert [fault.kind for fault in detect_later(model, readings, pad)] == ["stuck"]
 

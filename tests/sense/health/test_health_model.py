@@ -15,11 +15,9 @@ from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
 from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, WARM_UP, find_dead_fibres
 from padforge.sense.health.trace_model import LEVEL_RATE, MEMBERS
 from padforge.sense.localizer.model_files import files_of
-from tests.sense.health.pads import detect_later, fit, part_of, plant
+from tests.sense.health.pads import FEW, detect_later, fit, part_of, plant
 
 DOCUMENT = files_of(Path(), COMMANDED).document.name
-FEW = 320
-"""Presses that a model can be trained on, but not enough to detect a reduced gain."""
 
 
 def detector_of(model: HealthModel) -> FaultDetector:
