@@ -178,7 +178,7 @@ def test_live_handles_presses_of_any_length_and_distance(recording, hasty, lengt
     _, events = replay(odd, hasty, delays=(0, 0))
     final = [each for each in events if each.final]
     np.testing.assert_allclose(positions(final), hasty.predict(odd).positions_mm, atol=1e-3)
-    assert_as_a_whole(odd, hasty, events)
+    assert_as_a_whole(odd, hasty, events[::2])
 
 
 def test_a_press_that_the_next_one_cuts_off_ends_where_that_began(recording, hasty) -> None:

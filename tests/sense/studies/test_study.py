@@ -19,6 +19,8 @@ from padforge.cli import main
 from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
+from padforge.sense.localizer import evaluation
+from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
@@ -60,6 +62,7 @@ SMALLER: dict[object, dict[str, object]] = {
         "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
     },
     contact: {"DEPTH_STEPS": 4},
+    evaluation: {"MOMENTS": MOMENTS[-1:]},
     indentation: {"FORCE_NOISES": (1.0,), "TOOLS": ("dome", "flat"), "SETS": {"tools": ("dome", "flat")}},
     scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
     sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "FACTORS": (0.5, 1.0)},
