@@ -81,7 +81,7 @@ def test_calibrate_warns_of_too_few_presses_for_health_and_removes_the_old_model
     assert Path("model/health.json").exists()
     code, _, err = few("calibrate", "rec", "--out", "model")
     assert (code, err.count("\n")) == (0, 1)
-    assert "health of the fibres is not monitored: 42 complete presses to learn from, expected 300 or more; 8 pr" in err
+    assert "health of the fibres is not monitored: 50 complete presses to learn from, expected 300 or more; 9 pr" in err
     assert not list(Path("model").glob("health.*"))
 
 
