@@ -108,8 +108,8 @@ def compare(
 ) -> dict[str, Any]:
     """Design and make every variant in its own folder, evaluate all alike, and write comparison.json and .png.
 
-    A pad is evaluated by a small network on responses with scatter, under its own contact and on its own sensed area,
-    beside straight fibres of the same layout (`errors_by_contact`).
+    A pad is evaluated by its expected errors under its own contact and on its own sensed area, beside straight fibres
+    of the same layout (`errors_by_contact`).
 
     Returns:
         The document: a row per variant, with errors in mm with 0, 1, ... failed fibres.
@@ -130,7 +130,7 @@ def compare(
                 raise KeyboardInterrupt  # ends the comparison, not only this search
             pad = result.morphology
         rows.append(_evaluate(variant, pad, seed) | dict(make_pad(pad, variant.spec, folder)))
-    origin = provenance("padforge design compare", seed or 0, packages=("torch",))
+    origin = provenance("padforge design compare", seed or 0)
     document = {"format": FORMAT, "rows": rows, "provenance": origin}
     write_json(out / NAME, document)
     _draw_comparison(rows, out / "comparison.png")
@@ -142,9 +142,7 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
     pad_settings = variant.spec.section(PadSettings, **pad.layout.settings)
     contact = design_contact(variant.spec, search)
     with stage("compare"):
-        results = errors_by_contact(
-            beside_straight(pad), {"assumed": contact}, pad_settings, search.response_scatter, search.seed
-        )
+        results = errors_by_contact(beside_straight(pad), {"assumed": contact}, pad_settings, search)
     errors_mm = {result.pad: list(result.errors_mm) for result in results}
     return {
         "name": variant.name,

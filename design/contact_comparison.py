@@ -1,6 +1,6 @@
-"""Sensitivity of simulated errors to the contact model: what becomes of them if the real contact is another one.
+"""Sensitivity of expected errors to the contact model: what becomes of them if the real contact is another one.
 
-A small network is trained afresh under every contact, as a calibration is. The result is `contacts.json`.
+The result is `contacts.json`.
 """
 
 from collections.abc import Mapping
@@ -9,43 +9,34 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from padforge.design.common.files import provenance, write_json
 from padforge.design.common.profiling import stage
-from padforge.design.contact import relative_stretch
-from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
-from padforge.design.objectives.fibre_loss import failure_subsets
+from padforge.design.morphology import Morphology
+from padforge.design.objectives.bayes_error import expected_errors
 from padforge.design.settings import (
     MEASURED_PROFILE,
     MEASURED_STD_MM,
     PUBLISHED_CONTACT,
     Contact,
     PadSettings,
-    Scatter,
     SearchSettings,
     read_contact,
 )
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
-    from padforge.design.networks import SimulatedPresses
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
-SIDE, N_TEST = 32, 500  # training presses a side, test presses
-HIDDEN = 20  # neurons: the 50 published ones overfit the scatter, and err a tenth more in more time
-MAX_FAILURES, SUBSETS = 3, 4  # failed fibres, and sets of a size: pads that differ by a tenth are told apart
 
 
 @dataclass(frozen=True)
 class ContactErrors:
-    """Mean errors of a small network for one pad under one contact."""
+    """Expected errors of one pad under one contact."""
 
     contact: str  # name of the contact
     pad: str  # name of the pad
-    errors_mm: tuple[float, ...]  # mean error with 0, 1, ... fibres failed
+    errors_mm: tuple[float, ...]  # with 0, 1, ... fibres failed
 
 
 def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
@@ -74,43 +65,18 @@ def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
 
 
 def errors_by_contact(
-    pads: Mapping[str, Morphology],
-    contacts: Mapping[str, Contact],
-    size: PadSettings,
-    scatter: Scatter,
-    seed: int = 0,
-    subsets: int = SUBSETS,
+    pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], size: PadSettings, search: SearchSettings
 ) -> list[ContactErrors]:
-    """Compute mean errors of a small network for pads of one layout under every contact, contact by contact.
-
-    At most `subsets` sets of failed fibres of each size are tried.
-    """
-    fibres = size.layout.fibres
-    failures = [failure_subsets(fibres, number, subsets) for number in range(min(MAX_FAILURES, fibres - 1) + 1)]
-    rows = []
-    for (contact_name, contact), (pad_name, pad) in product(contacts.items(), pads.items()):
-        errors = _simulate(pad, contact, size, scatter, seed).failure_errors(failures, HIDDEN)
-        rows.append(ContactErrors(contact_name, pad_name, tuple(pad.unit_mm * error.mean for error in errors)))
-    return rows
+    """Compute the expected errors of pads of one layout under every contact, contact by contact, by the same draws."""
+    return [
+        ContactErrors(contact_name, name, tuple(pad.unit_mm * e for e in expected_errors(pad, contact, search, size)))
+        for (contact_name, contact), (name, pad) in product(contacts.items(), pads.items())
+    ]
 
 
 def beside_straight(pad: Morphology) -> dict[str, Morphology]:
     """Return a pad, "designed", and straight fibres of its layout, by name."""
     return {"designed": pad, "straight": Morphology.straight(pad.layout)}
-
-
-def _simulate(pad: Morphology, contact: Contact, size: PadSettings, scatter: Scatter, seed: int) -> "SimulatedPresses":
-    """Simulate presses with scattered responses, by the same draws for every pad of as many fibres."""
-    from padforge.design.networks import SimulatedPresses  # imports torch, which a search does without
-
-    rng = np.random.default_rng([3, seed])
-    scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
-    scatter = scatter_of_full_scale(scatter, contact, scale)
-
-    def respond(positions: Array) -> Array:
-        return scatter.sample(relative_stretch(pad, positions, contact) / scale, rng)
-
-    return SimulatedPresses.simulate(pad, SIDE, N_TEST, seed, respond, size)
 
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
@@ -125,12 +91,12 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     size = spec.section(PadSettings, **pad.layout.settings)
     contacts = alternative_contacts(design_contact(spec, settings))
     with stage("contacts"):
-        errors = errors_by_contact(beside_straight(pad), contacts, size, settings.response_scatter, seed=settings.seed)
+        errors = errors_by_contact(beside_straight(pad), contacts, size, settings)
     document = {
         "format": FORMAT,
         "scatter": settings.response_scatter._asdict(),
         "rows": [{"contact": row.contact, "pad": row.pad, "errors_mm": list(row.errors_mm)} for row in errors],
-        "provenance": provenance("padforge run", settings.seed, [out / "morphology.json"], packages=("torch",)),
+        "provenance": provenance("padforge run", settings.seed, [out / "morphology.json"]),
     }
     write_json(out / NAME, document)
     return document

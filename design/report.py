@@ -299,7 +299,7 @@ def contact_line(document: Mapping[str, Any]) -> str:
     for pad in ("designed", "straight"):
         assumed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
         parts.append(f"{assumed:.2f} mm under the assumed contact, {min(others):.2f} to {max(others):.2f} mm otherwise")
-    return f"contact: mean error of a small network {parts[0]}; of straight fibres {parts[1]}"
+    return f"contact: expected error {parts[0]}; of straight fibres {parts[1]}"
 
 
 def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -308,9 +308,9 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
     levels = range(max(len(row["errors_mm"]) for row in rows))
     lead = (
         "The contact is assumed until a printed pad is identified. Here the pad, and straight fibres of the same pad,"
-        " are simulated under other contacts as well: mean error in mm of a small network, trained afresh under each"
-        f" on one reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
-        f" {float(scatter['floor']):.1%} of full scale. Where rows differ, simulated errors depend on the contact as"
+        " are judged under other contacts as well: expected error in mm of a localizer that has learnt each, by one"
+        f" reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
+        f" {float(scatter['floor']):.1%} of full scale. Where rows differ, errors depend on the contact as"
         " much as on the pad; where straight fibres are better, optimising has not paid off."
     )
     head = ["contact", "fibres", *(f"{n_failed} failed" for n_failed in levels)]

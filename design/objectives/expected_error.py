@@ -1,15 +1,17 @@
-"""Expected localisation error: the error of a regression of positions on responses, and the bound that noise sets.
+"""What a search minimises for the expected error: the error of a regression, and the bound that noise sets.
+
+The expected error of a finished pad is that of `bayes_error`; this has a gradient, and ranks pads alike.
 
 The response x of a fibre is its relative stretch in full scales of straight fibres. It scatters by a floor and by a
 share of itself, of whose variance all fibres have a part in common:
 
     x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
 
-For presses a and the set K of fibres that still work, two terms are added, as trained networks weigh them:
+For presses a and the set K of fibres that still work, two terms are added, as small trained networks weigh them:
 
     L_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|x_a - x_b|^2_K / 2 w^2),
     B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' S_a^-1 J_a + 12 / size^2,     J_a = dx / dp there,
-    expected error = 0.85 B_K + 0.47 L_K.
+    criterion = 0.85 B_K + 0.47 L_K.
 
 L_K is the leave-one-out error of kernel ridge regression, in closed form, with w the width of the kernel, r the ridge,
 c_aa C's diagonal and p the positions from their middle; B_K is the Cramer-Rao bound with a prior over the pad, S_a the
@@ -81,8 +83,8 @@ class PressWindow(NamedTuple):
         return np.concatenate([self.positions, self.far[partners]])
 
 
-def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Compute the expected errors, grid units, with 0, 1, ... fibres failed, always on the same presses.
+def criterion_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
+    """Compute the criterion, grid units, with 0, 1, ... fibres failed, always on the same presses.
 
     `search` says how many fibres may fail, and how responses scatter; `size` says what is pressed.
     """

@@ -20,7 +20,8 @@ from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_pr
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives import published as formula
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
-from padforge.design.objectives.expected_error import SEARCH_SIDE, expected_errors
+from padforge.design.objectives.bayes_error import expected_errors
+from padforge.design.objectives.expected_error import SEARCH_SIDE, criterion_errors
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
@@ -50,9 +51,10 @@ class ScoredPad:
 
     @property
     def objective(self) -> float:
-        """What a search minimises: the geometric mean of the expected errors over failures, and the weighted terms."""
-        shares = failure_shares(self.search.max_failures)[: len(self.expected_errors)]
-        total = float(np.exp(np.log(self.expected_errors) @ shares / sum(shares)))
+        """What a search minimises: the geometric mean of its criterion over failures, and the weighted terms."""
+        errors = criterion_errors(self.pad, self.contact, self.search, self.size)
+        shares = failure_shares(self.search.max_failures)[: len(errors)]
+        total = float(np.exp(np.log(errors) @ shares / sum(shares)))
         return sum((weight * self.terms([t.name])[t.name] for weight, t in weighted_terms(self.search)), start=total)
 
     @cached_property

@@ -58,10 +58,8 @@ MAX_SECONDS = 1e9
 LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
 """Keys of `[pad]` that say where fibres end."""
 TOLERANCE = 1.03
-"""Ratio of errors, to the better of the default pad and straight fibres, that counts as equal: that of trained networks
-is no more certain."""
-SUBSETS = 8
-"""Sets of failed fibres of a size by which pads are compared."""
+"""Ratio of errors, to the better of the default pad and straight fibres, that counts as equal: expected errors are no
+more certain."""
 BUDGET_SHARES = {"default": 0.35, "twin": 0.4, "from default": 0.2}
 """Of a time budget, by search for the next pad of a twin."""
 
@@ -410,10 +408,10 @@ def search_for_twin(
     """Find the next pad of a printed one, for its measured contact and scatter.
 
     It searches from random starts, and from the default pad, which needs no measurement. Of these pads, the default pad
-    and straight fibres it returns the one with the least error of networks trained under the contact, and never one
-    that locates less well than plain ones do. `candidate` is "twin", "from default", "default" or "straight fibres". A
-    search that is stopped ends with the best so far. `default_settings` are those of the search for the default pad,
-    which is for the default contact.
+    and straight fibres it returns the one with the least expected error under the contact, and never one that locates
+    less well than plain ones do. `candidate` is "twin", "from default", "default" or "straight fibres". A search that
+    is stopped ends with the best so far. `default_settings` are those of the search for the default pad, which is for
+    the default contact.
     """
     run = run or SearchOptions()
     plain = search(pad, None, default_settings, rules, run=_part_options(run, "default"))
@@ -430,7 +428,7 @@ def search_for_twin(
     sound = {name: fibres for name, fibres in pads.items() if not problem.violations(fibres)}
     pads = sound or {"twin": afresh.morphology}
     with profiling.stage("judge"):
-        rows = errors_by_contact(pads, {"": contact}, pad, settings.response_scatter, settings.seed, SUBSETS)
+        rows = errors_by_contact(pads, {"": contact}, pad, settings)
     name = choose({row.pad: np.array(row.errors_mm) for row in rows})
     straight = Candidate("straight fibres", _straight_pad(problem, Stop(time.perf_counter(), None)), problem)
     return replace(

@@ -18,7 +18,8 @@ from padforge.design.common.settings import commented_toml
 from padforge.design.contact import half_width_mm
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
-from padforge.design.objectives.expected_error import expected_errors, straight_full_scale
+from padforge.design.objectives.bayes_error import expected_errors
+from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult, settings_for_twin, state_folders
 from padforge.design.paths.curves import crossings

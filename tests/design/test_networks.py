@@ -1,6 +1,5 @@
-"""Evaluation by simulation: the published order of the pads, fresh test presses, and errors by contact."""
+"""Evaluation by simulation: the published order of the pads, and fresh test presses."""
 
-import math
 import os
 
 import numpy as np
@@ -9,16 +8,13 @@ import torch
 
 from padforge.design import Contact, Morphology, signals
 from padforge.design.common.validation import InputError
-from padforge.design.contact_comparison import alternative_contacts, beside_straight, errors_by_contact
 from padforge.design.networks import (
-    FailureError,
     SimulatedPresses,
     fresh_presses,
     localisation_error,
     training_presses,
 )
-from padforge.design.settings import PUBLISHED_CONTACT, Layout, PadSettings, Scatter, between_fibres
-from tests.helpers.less import compare_little
+from padforge.design.settings import Layout, PadSettings, between_fibres
 
 
 def means(pad, **settings):
@@ -99,52 +95,6 @@ def test_simulated_presses_beyond_the_fibres_with_noise():
     assert 0.005 < none.mean < one.mean < 0.6
 
 
-PAD = Morphology.random(2, knots=2, seed=1)
-ASKED = PadSettings(grid=2), Scatter(0.02, 0.05, 0.36)
-"""What is pressed, and the scatter of responses."""
-
-
-def test_alternative_contacts_begin_with_the_assumed_one():
-    """And have none of the others that is the same."""
-    profiles, disc = ["profile of 5 mm", "profile of 6.2 mm", "profile of 7.9 mm"], ["published disc, K = 0.6"]
-    presses = ["tool of 4.2 mm", "2.5 mm deep", "pressed flat alone"]
-    for assumed, others in (
-        (Contact(radius=0.9), profiles + disc),
-        (Contact(), presses),
-        (Contact(stretch=0.0), presses[:2]),
-        (Contact(model="profile"), [profiles[0], profiles[2], *disc]),
-        (PUBLISHED_CONTACT, profiles),
-    ):
-        contacts = alternative_contacts(assumed)
-        assert (list(contacts), contacts["as assumed"]) == (["as assumed", *others], assumed)
-
-
-def test_errors_by_contact_of_both_pads(monkeypatch):
-    compare_little(monkeypatch)
-    contacts = {"wide": Contact(), "narrow": Contact(radius=0.2)}
-    found = errors_by_contact(beside_straight(PAD), contacts, *ASKED, seed=4)
-    assert [(each.contact, each.pad) for each in found] == [
-        (contact, pad) for contact in contacts for pad in ("designed", "straight")
-    ]
-    for each in found:
-        assert len(each.errors_mm) == 4
-        assert all(math.isfinite(error) and 0 < error < 2 * 11.25 for error in each.errors_mm)
-        assert each.errors_mm[0] < each.errors_mm[3]
-    wide, narrow = found[1].errors_mm, found[3].errors_mm
-    assert wide[0] < 0.5 * narrow[0]
-    assert errors_by_contact(beside_straight(PAD), {"narrow": contacts["narrow"]}, *ASKED, seed=4) == found[2:]
-
-
-def test_errors_by_contact_grow_with_scatter_and_heed_keep_outs(monkeypatch):
-    compare_little(monkeypatch)
-    hole = PadSettings(grid=2, keep_out_mm=(((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0)),))
-    means = [
-        errors_by_contact({"pad": PAD}, {"contact": Contact()}, size, scatter, subsets=1)[0].errors_mm[0]
-        for size, scatter in ((ASKED[0], Scatter(0.01)), (ASKED[0], Scatter(0.1)), (hole, Scatter(0.01)))
-    ]
-    assert means[1] > 1.5 * means[0] != means[2]
-
-
 def test_networks_ignore_the_signals_of_failed_fibres():
     pad = Morphology.straight(3)
     presses = SimulatedPresses.simulate(pad, 12, 50, 0, lambda positions: signals(pad, positions))
@@ -154,10 +104,3 @@ def test_networks_ignore_the_signals_of_failed_fibres():
     changed[:, failed] = np.nan
     errors = presses.position_errors(network, failed, changed, presses.test_positions)
     np.testing.assert_array_equal(errors, presses.test_errors(network, failed))
-
-
-def test_errors_by_contact_are_means_in_mm(monkeypatch):
-    levels = [FailureError(0, 1, 0.25, 0.0, 0.25), FailureError(1, 4, 0.5, 0.125, 0.75)]
-    monkeypatch.setattr(SimulatedPresses, "failure_errors", lambda *_: levels)
-    [found] = errors_by_contact({"pad": Morphology.straight(2, 8.0)}, {"contact": PUBLISHED_CONTACT}, *ASKED)
-    assert found.errors_mm == (2.0, 4.0)

@@ -15,6 +15,6 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch, pixels: int = 100) -> None:
 
 
 def compare_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare pads and contacts by few presses and small networks."""
-    for name, value in (("SIDE", 10), ("N_TEST", 50), ("HIDDEN", 5)):
-        monkeypatch.setattr(f"padforge.design.contact_comparison.{name}", value)
+    """Compare pads and contacts by few presses."""
+    for name, value in (("PRESSES", 256), ("MIN_PRESSES", 8)):
+        monkeypatch.setattr(f"padforge.design.objectives.bayes_error.{name}", value)

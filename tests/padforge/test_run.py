@@ -75,8 +75,8 @@ def test_run_compares_contacts(finished: tuple[Path, str]) -> None:
     rows = json.loads((folder / "out/pad/contacts.json").read_text())["rows"]
     assert {row["pad"] for row in rows} == {"designed", "straight"}
     assert len(rows) == 8
-    assert all(len(row["errors_mm"]) == 4 and 0 < min(row["errors_mm"]) < 20 for row in rows)
-    assert printed.count("\ncontact: mean error of a small network ") == 1
+    assert all(0 < min(row["errors_mm"]) < 20 for row in rows)
+    assert printed.count("\ncontact: expected error ") == 1
 
 
 @pytest.mark.slow

@@ -13,9 +13,9 @@ from padforge.design.objectives.expected_error import (
     WIDTH,
     aggregate_failures,
     confusable,
+    criterion_errors,
     evaluation_windows,
     expected_error,
-    expected_errors,
     kernel_weights,
     place_window,
     straight_full_scale,
@@ -220,7 +220,7 @@ def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
     monkeypatch.setattr(module, "GRIDS", 1)
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
     pad = Morphology.straight(size.layout)
-    quiet, loud = (expected_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
+    quiet, loud = (criterion_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
     assert quiet == sorted(quiet)
     assert np.all(np.array(loud) > quiet)
 

@@ -7,6 +7,7 @@ import pytest
 
 from padforge.design import Contact, InputError, Morphology
 from padforge.design.contact import fibre_axes
+from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.published import published_terms
 from padforge.design.objectives.score import TERMS, ScoredPad, score, sharpness
 from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
@@ -44,8 +45,9 @@ def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fi
     pad = Morphology.straight(fibres)
     size = PadSettings().for_layout(pad.layout)
     scored = ScoredPad(pad, Contact(), SearchSettings(max_failures=3), RulesSettings(), size)
-    assert len(scored.expected_errors) == len(weights)
-    assert scored.objective == pytest.approx(np.prod(np.power(scored.expected_errors, weights)))
+    criterion = criterion_errors(pad, Contact(), scored.search, size)
+    assert len(scored.expected_errors) == len(criterion) == len(weights)
+    assert scored.objective == pytest.approx(np.prod(np.power(criterion, weights)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 from padforge.design import Contact, Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.morphology import MARGIN
-from padforge.design.objectives.expected_error import expected_errors
+from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
@@ -207,7 +207,7 @@ def test_gradient_search_for_several_contacts_serves_each():
     large = Contact(radius=1.2)
     one = BRIEF.model_copy(update={"steps": 60, "max_failures": 0, "knots": 4})
     for_one, for_both = (finished(each, FREE) for each in (one, one.model_copy(update={"contacts": (large,)})))
-    alone, together = (expected_errors(pad, large, one, PadSettings(grid=2)) for pad in (for_one, for_both))
+    alone, together = (criterion_errors(pad, large, one, PadSettings(grid=2)) for pad in (for_one, for_both))
     assert together[0] < 0.9 * alone[0]
 
 

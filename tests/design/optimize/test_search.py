@@ -8,7 +8,7 @@ import pytest
 from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, InputError, Morphology
 from padforge.design.networks import localisation_error
-from padforge.design.objectives.expected_error import expected_errors
+from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import describe_terms, score
 from padforge.design.optimize.gradient import GENTLE
@@ -54,7 +54,7 @@ def test_search_reports_scores_beside_those_of_straight_fibres():
 def test_search_from_an_origin_improves_on_it_and_on_straight_fibres():
     origin = Morphology.random(2, 3, seed=1)
     settings = QUICK.model_copy(update={"knots": 5, "steps": 30})
-    before = [origin.unit_mm * error for error in expected_errors(origin, PUBLISHED_CONTACT, settings, PAD)]
+    before = [origin.unit_mm * error for error in criterion_errors(origin, PUBLISHED_CONTACT, settings, PAD)]
     result = search(PAD, PUBLISHED_CONTACT, settings, FREE, origin=origin)
     assert result.morphology.knots.shape == (4, 7, 2)
     assert result.candidate == "start 1"
@@ -99,7 +99,7 @@ def test_search_prefers_a_pad_within_the_rules_to_one_that_errs_less(monkeypatch
     curved, rules = Morphology.random(2, 3, seed=1), RulesSettings(max_length_mm=34)
     result = search(PAD, PUBLISHED_CONTACT, QUICK, rules, origin=curved)
     assert (result.candidate, result.violations) == ("straight fibres", [])
-    error_mm = curved.unit_mm * expected_errors(curved, PUBLISHED_CONTACT, QUICK, PAD)[0]
+    error_mm = curved.unit_mm * criterion_errors(curved, PUBLISHED_CONTACT, QUICK, PAD)[0]
     assert error_mm < result.terms["expected_error_mm_0"]
 
 

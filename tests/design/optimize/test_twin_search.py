@@ -33,13 +33,11 @@ def test_choose_takes_the_least_bad_where_each_is_worse_somewhere():
 @pytest.mark.parametrize(
     ("rules", "expected"), [({"enforce": False}, "straight fibres"), ({"max_length_mm": 20}, "twin")]
 )
-def test_search_for_twin_hands_back_what_networks_locate_best_by_and_can_be_built_if_any_can(
-    rules, expected, monkeypatch
-):
+def test_search_for_twin_hands_back_what_locates_best_and_can_be_built_if_any_can(rules, expected, monkeypatch):
     """What a criterion promises does not count."""
     monkeypatch.setattr("padforge.design.optimize.gradient.REPAIR_STEPS", 20)
 
-    def judged(pads, contacts, size, scatter, seed, subsets):
+    def judged(pads, contacts, size, search):
         assert set(pads) == ({"default", "straight fibres", "twin", "from default"} if expected != "twin" else {"twin"})
         for name in pads:
             errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)

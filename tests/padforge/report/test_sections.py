@@ -264,7 +264,7 @@ def test_report_omits_pictures_of_other_mould(pad: Path) -> None:
 
 def test_report_shows_errors_by_contact(page: Path) -> None:
     assert contact_line(contacts_document()) == (
-        "contact: mean error of a small network 0.50 mm under the assumed contact, 4.00 to 4.00 mm otherwise;"
+        "contact: expected error 0.50 mm under the assumed contact, 4.00 to 4.00 mm otherwise;"
         " of straight fibres 1.00 mm under the assumed contact, 3.00 to 3.00 mm otherwise"
     )
     section = page.read_text().split("Contact model</h2>")[1].split("</section>")[0]
@@ -468,7 +468,7 @@ def test_contact_section_and_line_compare_pads_by_contact() -> None:
     assert "|published disc, K = 0.6|designed|4.00|6.00|published disc, K = 0.6|straight|3.00|5.00|" in text
     third = [{"contact": "half", "pad": pad, "errors_mm": [error]} for pad, error in (("designed", 2), ("straight", 7))]
     assert contact_line(document | {"rows": document["rows"] + third}) == (
-        "contact: mean error of a small network 0.50 mm under the assumed contact, 2.00 to 4.00 mm otherwise; of"
+        "contact: expected error 0.50 mm under the assumed contact, 2.00 to 4.00 mm otherwise; of"
         " straight fibres 1.00 mm under the assumed contact, 3.00 to 7.00 mm otherwise"
     )
 

@@ -1,0 +1,85 @@
+"""The expected error by Bayes' rule against closed forms and posteriors by explicit covariances."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from padforge.design import Contact, Morphology, PadSettings, SearchSettings
+from padforge.design.objectives import bayes_error as module
+from padforge.design.objectives.bayes_error import (
+    Positions,
+    bayes_positions,
+    expected_errors,
+    possible_positions,
+)
+from padforge.design.objectives.expected_error import evaluation_windows
+from padforge.design.settings import PUBLISHED_CONTACT, Scatter
+
+PLACES = np.stack(np.meshgrid(*[np.linspace(0, 4, 41)] * 2), axis=-1).reshape(-1, 2)
+
+
+def positions(responses: np.ndarray, blur: float = 0.0) -> Positions:
+    return Positions(PLACES, np.zeros(len(PLACES)), responses, np.full(responses.shape, blur))
+
+
+def test_readings_linear_in_the_position_are_located_by_their_noise():
+    """Of two fibres that say x and y with noise s, the mean distance is that of a Rayleigh distribution."""
+    rng, noise = np.random.default_rng(0), 0.2
+    pressed = 2 + rng.uniform(-0.5, 0.5, (4000, 2))
+    readings = pressed + noise * rng.standard_normal(pressed.shape)
+    found = bayes_positions(readings, positions(PLACES), Scatter(noise), np.array([True, True]))
+    error = np.hypot(*(found - pressed).T).mean()
+    assert error == pytest.approx(noise * np.sqrt(np.pi / 2), rel=0.02)
+
+
+@pytest.mark.parametrize("working", [[True, True, True], [True, False, True]])
+def test_posteriors_match_explicit_covariances(working):
+    rng, scatter, working = np.random.default_rng(1), Scatter(0.1, 0.3, 0.4), np.array(working)
+    responses = np.sin(PLACES @ rng.standard_normal((2, 3)))
+    readings = scatter.sample(responses[rng.integers(len(PLACES), size=6)], rng)
+    found = bayes_positions(readings, positions(responses, 0.01), scatter, working)
+    x = responses[:, working]
+    own = np.array([np.diag(0.1**2 + 0.3**2 * 0.6 * row**2 + 0.01) for row in x])
+    covariances = own + 0.3**2 * 0.4 * x[:, :, None] * x[:, None]
+    densities = [multivariate_normal(*each) for each in zip(x, covariances, strict=True)]
+    likelihoods = np.array([density.pdf(readings[:, working]) for density in densities]).T
+    expected = likelihoods @ PLACES / likelihoods.sum(axis=1)[:, None]
+    assert found == pytest.approx(expected, abs=1e-3)
+
+
+def test_positions_cover_the_pressed_area_once_and_no_keep_out():
+    corner = ((-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0))
+    size = PadSettings(grid=9, keep_out_mm=(corner,))
+    pad, window = Morphology.straight(size.layout), evaluation_windows(size.sensed)[-1]
+    possible = possible_positions(pad, PUBLISHED_CONTACT, size, window, 1.0)
+    area = np.ptp(np.array(size.sensed), axis=0).prod() - 40**2 / pad.unit_mm**2
+    assert np.exp(possible.log_prior).sum() == pytest.approx(area, rel=0.1)
+    assert not (abs(pad.to_mm(possible.places) + 20) < 20).all(axis=1).any()
+    near = ((possible.places > window[0]) & (possible.places < window[1])).all(axis=1)
+    assert np.ptp(possible.log_prior[near]) == pytest.approx(0)
+
+
+def test_huge_pads_are_sampled():
+    size = PadSettings(grid=96)
+    pad = Morphology.straight(size.layout)
+    possible = possible_positions(pad, PUBLISHED_CONTACT, size, evaluation_windows(size.sensed)[0], 1.0)
+    assert len(possible.places) < module.MAX_FAR + 5000
+
+
+@pytest.mark.parametrize("counts", [(4, 4), (3, 12), pytest.param((8, 8), marks=pytest.mark.slow)])
+def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
+    monkeypatch.setattr(module, "PRESSES", 1024)
+    size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
+    pad = Morphology.straight(size.layout)
+    quiet, loud = (expected_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
+    assert quiet == sorted(quiet)
+    assert np.all(np.array(loud) > quiet)
+
+
+def test_expected_errors_hardly_depend_on_the_presses(monkeypatch):
+    size, pad = PadSettings(grid=4), Morphology.random(4, 5, seed=1)
+    errors = expected_errors(pad, Contact(), SearchSettings(), size)
+    assert errors == expected_errors(pad, Contact(), SearchSettings(), size)
+    monkeypatch.setattr(module, "PRESSES", 4 * module.PRESSES)
+    monkeypatch.setattr(module, "STEP", 0.7 * module.STEP)
+    assert errors == pytest.approx(expected_errors(pad, Contact(), SearchSettings(), size), rel=0.06)
