@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
@@ -57,6 +58,7 @@ class Positions(NamedTuple):
     blur: Array  # variance of the responses within these areas; shape (P, F)
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # threads that wait for each other take longer beside other work
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
     """Compute the expected errors, grid units, with 0, 1, ... fibres failed, always of the same draws.
 
