@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from padforge.design.common.settings import Settings, Spec, as_tuple, null_as, to_builtins
+from padforge.design.common.settings import Settings, Spec, as_tuple, null_as, to_builtins, validate
 from padforge.design.common.units import to_unit
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 
@@ -165,9 +165,12 @@ _KEYS = {
 }
 """Keys that count for each model of `[contact]`, besides those for all."""
 
+PRESS_DEPTH_MM = 5.0  # default depth of a press
 SILICONE_MM = 6.0  # default thickness of the cast pad
 FIBRE_MM = 0.3  # default diameter of a fibre
 TRACK_DEPTHS_MM = (1.2, 0.4)  # default depths of the tracks of the deep family and of the other one
+_CAST_KEYS = "thickness_mm", "fibre_depths_mm"  # of `[contact]`, of the pad as it is cast
+CAST_SHARE = 0.02  # of the thickness: by how much lengths of the pad may differ from those of its contact
 _RIDGES = ("deep_ridge_height_mm", "shallow_ridge_height_mm")  # keys of `[mould]`, in that order
 FIBRE_DEPTHS_MM = (TRACK_DEPTHS_MM[0] - FIBRE_MM / 2, TRACK_DEPTHS_MM[1] - FIBRE_MM / 2)  # centre lines, at the bottom
 
@@ -211,7 +214,7 @@ class Contact(Settings, frozen=True):
     )
     tool: Literal["dome", "ball", "flat", "finger"] = Field(default="dome", description="what presses, of a layer")
     tool_radius_mm: float = Field(default=8.4, ge=0.1, le=1000, description="tip radius of the tool, mm")
-    depth_mm: float = Field(default=5.0, ge=0.01, le=100, description="depth of the press, of a layer, mm")
+    depth_mm: float = Field(default=PRESS_DEPTH_MM, ge=0.01, le=100, description="depth of the press, of a layer, mm")
     thickness_mm: float = Field(default=SILICONE_MM, ge=0.1, le=1000, description="thickness of the pad, mm")
     base: Literal["bonded", "slipping"] = Field(default="slipping", description="what the pad does on what it lies on")
     fibre_depths_mm: Annotated[FibreDepths, BeforeValidator(as_tuple)] = Field(
@@ -313,6 +316,20 @@ def read_contact(spec: Spec) -> Contact:
     return spec.section(Contact, **{key: value for key, value in as_cast.items() if key not in stated})
 
 
+def contact_designed_for(provenance: Mapping[str, Any]) -> Contact | None:
+    """Return the contact that a pad was designed for; None if its provenance, which is free, does not say so.
+
+    Args:
+        provenance: of the morphology.
+    """
+    settings = provenance.get("settings")
+    stated = settings.get("contact") if isinstance(settings, Mapping) else None
+    if not isinstance(stated, Mapping):
+        return None
+    with suppress(InputError):
+        return validate(Contact, stated, "the pad's contact")
+
+
 def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
     """Return settings whose mould makes the pad that `[contact]` describes, the inverse of `read_contact`.
 
@@ -320,15 +337,56 @@ def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
         spec: settings file.
         keys: of `[contact]` that the mould follows, of which those other than lengths of the pad do not count.
     """
+    return spec.replaced(_tables_of_cast(spec, keys))
+
+
+def fill_cast(spec: Spec) -> Spec:
+    """Return settings whose mould makes the pad that `[contact]` states, where they leave it open.
+
+    Args:
+        spec: settings file.
+
+    Raises:
+        InputError: they state another pad.
+    """
+    stated, tables = spec.stated(Contact), {}
+    if _stated_model(stated) != "layer":
+        return spec
+    slack_mm = CAST_SHARE * read_contact(spec).thickness_mm
+    for key in (name for name in _CAST_KEYS if name in stated):
+        for section, values in _tables_of_cast(spec, [key]).items():
+            for name, value in values.items():
+                _check_agrees(spec, section, name, value, slack_mm, key)
+            tables[section] = tables.get(section, {}) | values | spec.stated(section)
+    return spec.replaced(tables)
+
+
+def _check_agrees(spec: Spec, section: str, name: str, value: Any, slack_mm: float, key: str) -> None:
+    """Refuse a value that a section states beside another one, by which the pad is as `key` of `[contact]` says."""
+    stated = spec.stated(section).get(name, value)
+    if isinstance(value, float):
+        agrees = abs(_stated_mm(spec, section, name, value) - value) <= slack_mm
+    else:
+        agrees = stated == value
+    if not agrees:
+        allowed = f"allowed is {value}, as [contact] {key} says, or only one of these keys"
+        raise InputError(f"{spec.source}: [{section}] {name}: got {short_repr(stated)}, {allowed}")
+
+
+def _tables_of_cast(spec: Spec, keys: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Return the settings, by section, of a mould that makes the pad that some keys of `[contact]` describe."""
     contact, tables = read_contact(spec), {}
     if "thickness_mm" in keys:
         tables["mould"] = {"silicone_mm": contact.thickness_mm}
     if "fibre_depths_mm" in keys:
-        radius_mm, (horizontal, vertical) = _fibre_radius_mm(spec), contact.fibre_depths_mm
+        horizontal, vertical = contact.fibre_depths_mm
+        if min(horizontal, vertical) > contact.thickness_mm / 2:  # the face without tracks is pressed
+            horizontal, vertical = contact.thickness_mm - horizontal, contact.thickness_mm - vertical
+        radius_mm = _fibre_radius_mm(spec)
         heights_mm = [round(depth + radius_mm, 9) for depth in (max(horizontal, vertical), min(horizontal, vertical))]
         tables["mould"] = tables.get("mould", {}) | dict(zip(_RIDGES, heights_mm, strict=True))
         tables["pad"] = {"deep_family": "horizontal" if horizontal > vertical else "vertical"}
-    return spec.replaced(tables)
+    return tables
 
 
 def _fibre_radius_mm(spec: Spec) -> float:

@@ -11,7 +11,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from padforge.run import section_models
+from padforge.settings import section_models
 
 ROOT = Path(__file__).resolve().parents[1]
 HOUSE = {

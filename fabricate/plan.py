@@ -330,16 +330,22 @@ class Plan:
 
     @cached_property
     def heights_mm(self) -> tuple[float, ...]:
-        """Ridge height of every layer, ascending, mm above the tray's floor."""
+        """Ridge height of every layer, ascending, mm above the tray's floor.
+
+        The lowest is that of the shallow family, or of the deep one where the pad has no other: a pad is designed for
+        the depth of each family, whether there is another one or not.
+        """
         mould = self.settings.mould
+        has_shallow = self.pad.layout.counts[self.settings.pad.deep_family == "horizontal"] > 0
+        lowest_mm = mould.shallow_ridge_height_mm if has_shallow else mould.deep_ridge_height_mm
         layers = range(1 + max(self.layer_indices))
-        return tuple(round(mould.shallow_ridge_height_mm + layer * mould.level_step_mm, 9) for layer in layers)
+        return tuple(round(lowest_mm + layer * mould.level_step_mm, 9) for layer in layers)
 
     @cached_property
     def silicone_mm(self) -> float:
         """Thickness of the cast silicone, mm: as set, or more where many layers need it."""
-        needed = self.heights_mm[-1] + COVER_MM if len(self.heights_mm) > 2 else 0
-        return max(self.settings.mould.silicone_mm, needed)
+        mould, highest_mm = self.settings.mould, self.heights_mm[-1]
+        return max(mould.silicone_mm, highest_mm + COVER_MM if highest_mm > mould.deep_ridge_height_mm else 0)
 
     def outline(self, layer: int, below_mm: float = 0.0, tolerance_mm: float | None = None) -> BaseGeometry:
         """Draw the outline of a layer's ridges, mm, their ends inside the walls.

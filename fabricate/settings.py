@@ -16,6 +16,7 @@ from padforge.design.settings import (
     Layout,
     PadSettings,
     RulesSettings,
+    fill_cast,
     read_contact,
 )
 
@@ -194,8 +195,12 @@ class FabricationSettings:
 
         Args:
             spec: settings file.
+
+        Raises:
+            InputError: an unknown key or a value out of range, or a mould that makes another pad than `[contact]` says.
         """
-        sections = map(check_type("spec", spec, Spec).section, cls._models().values())
+        spec = fill_cast(check_type("spec", spec, Spec))
+        sections = map(spec.section, cls._models().values())
         return cls(*sections, contact=read_contact(spec) if spec.stated(Contact) else None)
 
     @property

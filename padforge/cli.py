@@ -19,7 +19,8 @@ from padforge.sense.cli.options import recording_line
 from padforge.sense.cli.studies import study as study_group
 
 from .report import write_report
-from .run import SECTIONS, Run, check_run, run_stages, section_models
+from .run import Run, check_run, run_stages
+from .settings import SECTIONS, check_settings, section_models
 
 try:
     from padforge.benchmarks.cli import bench
@@ -58,7 +59,7 @@ def cli(context: click.Context) -> None:
     padforge sense calibrate out/pad/recording    train a localizer on presses
     padforge study robustness                     figures of the paper
     """
-    context.obj = list(SECTIONS)
+    context.obj = common.SettingsFile(list(SECTIONS), check_settings)
 
 
 for command in (design_group, fabricate_group, sense_group, study_group, bench):

@@ -21,27 +21,14 @@ from padforge.design.common.command_line import INTERRUPTED
 from padforge.design.common.files import read_json, reraise_as_input_error, sha256, write_json
 from padforge.design.common.validation import InputError
 
+from .settings import SECTIONS, check_settings
+
 if TYPE_CHECKING:
     from padforge.design.common.progress import OnProgress
     from padforge.design.common.settings import Settings, Spec
     from padforge.design.optimize.search import SearchResult
 
 _log = logging.getLogger(__name__)
-
-SECTIONS = {
-    "pad": "padforge.design.settings:PadSettings",
-    "contact": "padforge.design.settings:Contact",
-    "search": "padforge.design.settings:SearchSettings",
-    "rules": "padforge.design.settings:RulesSettings",
-    "mould": "padforge.fabricate.settings:MouldSettings",
-    "printer": "padforge.fabricate.settings:PrinterSettings",
-    "silicone": "padforge.fabricate.materials:SiliconeSettings",
-    "fibre": "padforge.fabricate.materials:FibreSettings",
-    "dispenser": "padforge.fabricate.settings:DispenserSettings",
-    "rig": "padforge.sense.settings:RigSettings",
-    "localizer": "padforge.sense.settings:LocalizerSettings",
-}
-"""Sections of a `pad.toml`, and the model of each."""
 
 _STAGE_SECTIONS = {
     "design": ("pad", "contact", "search", "rules"),
@@ -60,11 +47,6 @@ FORMAT, NAME = "padforge-run/2", "run.json"
 PAD = "morphology.json"
 
 Result = TypeVar("Result")
-
-
-def section_models() -> "dict[str, type[Settings]]":
-    """Import the models of all sections, by name."""
-    return {name: resolve_name(path) for name, path in SECTIONS.items()}
 
 
 def _read_section(spec: "Spec", name: str) -> "Settings":
@@ -172,27 +154,35 @@ def check_run(run: Run) -> None:
     """
     import numpy as np
 
+    from padforge.design.contact_comparison import alternative_contacts, design_contact
     from padforge.design.design_run import check_design
-    from padforge.design.settings import PadSettings
+    from padforge.design.morphology import Morphology
+    from padforge.design.settings import PadSettings, SearchSettings
     from padforge.fabricate import FabricationSettings
     from padforge.fabricate.export import require_formats
     from padforge.sense.localizer.calibration import split_presses
     from padforge.sense.localizer.model import FORMAT as LOCALIZER_FORMAT
+    from padforge.sense.recording.press_plan import describe_other_depth
     from padforge.sense.recording.recording import check_replaceable
-    from padforge.sense.settings import LocalizerSettings, RigSettings
+    from padforge.sense.settings import LocalizerSettings, read_rig
+    from padforge.sense.simulation.simulated_recording import plan_simulation
 
-    for name in SECTIONS:
-        _read_section(run.spec, name)
+    check_settings(run.spec)
     require_formats(run.formats)
     metadata.version("torch")  # a missing one is refused here, not when contacts are compared
-    FabricationSettings.from_spec(run.spec).require_consistent(run.spec.section(PadSettings).layout)
+    pad, rig = run.spec.section(PadSettings), read_rig(run.spec, seed=run.seed)
+    FabricationSettings.from_spec(run.spec).require_consistent(pad.layout)
+    rig.inputs(pad.layout.fibres)
+    contact = design_contact(run.spec, run.spec.section(SearchSettings))
+    alternative_contacts(contact)
+    plan = plan_simulation(Morphology.straight(pad.layout), rig, contact, pad)
+    if notice := describe_other_depth(plan.depths_mm, contact):
+        _log.warning(notice)
     localizer = run.spec.section(LocalizerSettings)
     if run.time_budget is not None and localizer.method == "published":
         reason = "allowed is ensemble: the published training has no time limit"
         raise InputError(f"[localizer] method: got published with --time-budget, {reason}")
-    split_presses(
-        run.spec.section(RigSettings).presses, localizer.split, localizer.test_share, np.random.default_rng(0)
-    )
+    split_presses(len(plan), localizer.split, localizer.test_share, np.random.default_rng(0))
     check_replaceable(run.out / "recording")
     check_design(run.spec, run.out, {"seed": run.seed}, _regenerated_files(), run.force)
     path = run.out / "localizer.json"

@@ -1,14 +1,14 @@
 """Settings of sense, sections of `pad.toml`: `[rig]` and `[localizer]`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from padforge.design.common.settings import Settings, as_tuple, null_as
+from padforge.design.common.settings import Settings, Spec, as_tuple, null_as
 from padforge.design.common.validation import InputError
-from padforge.design.settings import Scatter
+from padforge.design.settings import PRESS_DEPTH_MM, Contact, Scatter, read_contact
 
 Method = Literal["ensemble", "published"]
 Split = Literal["random", "chronological"]
@@ -34,6 +34,7 @@ Input = Annotated[int, Field(ge=0, le=511)]
 class RigSettings(Settings):
     """`[rig]`: how presses are recorded, where a real arm may go, and how the simulated pad responds.
 
+    Presses are as deep as those that the pad is designed for, unless `depth_mm` or `depths_mm` says otherwise.
     No arm moves while `box_mm`, `contact_mm` or `pad_mm` is unknown, nor if its controller has another `tcp_mm`. While
     `mirrored` is unknown a pad's holder decides, and without one x runs to the right of y.
     """
@@ -48,7 +49,9 @@ class RigSettings(Settings):
     readings_per_press: int = Field(
         default=40, ge=8, le=100_000, description="readings in the cycle of a press: down at its half, up at its end"
     )
-    depth_mm: float = Field(default=5.0, gt=0, le=50, description="depth of a press, mm")
+    depth_mm: Annotated[Depth | None, *null_as("contact")] = Field(
+        default=None, description='depth of a press, mm, or "contact": that of [contact]'
+    )
     depths_mm: Annotated[tuple[Depth, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="depths that presses take in turn, in place of depth_mm"
     )
@@ -144,6 +147,24 @@ class RigSettings(Settings):
         return None if self.plan in PLANS else Path(self.plan)
 
     @property
+    def press_depths_mm(self) -> tuple[float, ...]:
+        """Depths that presses take in turn; that of the default contact where no contact is known (`for_contact`)."""
+        return self.depths_mm or (PRESS_DEPTH_MM if self.depth_mm is None else self.depth_mm,)
+
+    def for_contact(self, contact: Contact) -> "RigSettings":
+        """Return these settings with the depth of a contact, if they state none.
+
+        Args:
+            contact: contact that the pad is designed for.
+
+        Raises:
+            InputError: no rig presses as deep.
+        """
+        if self.depth_mm is not None:
+            return self
+        return type(self)(**{**self.model_dump(), "depth_mm": contact.depth_mm})
+
+    @property
     def response_scatter(self) -> Scatter:
         """Scatter of the responses of the simulated pad, besides the noise of readings."""
         return Scatter(0.0, self.scatter, self.scatter_common)
@@ -166,6 +187,25 @@ class RigSettings(Settings):
         if repeated := [number for number in inputs if inputs.count(number) > 1]:
             raise InputError(f"[rig] channels: got input {repeated[0]} for more than one fibre, expected one for each")
         return inputs
+
+
+def read_rig(spec: Spec, **overrides: Any) -> RigSettings:
+    """Read `[rig]` with the depth of `[contact]`, if it states none.
+
+    Args:
+        spec: settings file.
+        **overrides: values that replace those of the file, unless None.
+
+    Raises:
+        InputError: an unknown key or a value out of range, or a press as deep as the pad is thick.
+    """
+    contact, rig = read_contact(spec), spec.section(RigSettings, **overrides)
+    rig = rig.for_contact(contact)
+    if contact.model == "layer" and (deepest := max(rig.press_depths_mm)) >= contact.thickness_mm:
+        key = "depths_mm" if rig.depths_mm else "depth_mm"
+        allowed = f"less than the thickness of the pad, {contact.thickness_mm:g} mm"
+        raise InputError(f"{spec.source}: [rig] {key}: got {deepest:g}, allowed is {allowed}")
+    return rig
 
 
 IDEAL_RIG = RigSettings(

@@ -14,7 +14,7 @@ from io import TextIOWrapper
 from itertools import zip_longest
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -143,12 +143,23 @@ def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return with_profile
 
 
+class SettingsFile(NamedTuple):
+    """What the command line knows of a settings file: object of the root context, for `load_spec`."""
+
+    sections: Collection[str]
+    check: "Callable[[Spec], None]"  # raises InputError where sections contradict each other
+
+
 def load_spec(path: Path | None) -> "Spec":
-    """Load `path`, else pad.toml of the current folder, else the defaults; the context of the root lists sections."""
+    """Load and check `path`, else pad.toml of the current folder, else the defaults; see `SettingsFile`."""
     from .settings import Spec
 
     default, context = Path("pad.toml"), click.get_current_context(silent=True)
-    return Spec.load(path or (default if default.exists() else None), context.find_root().obj if context else None)
+    file: SettingsFile | None = context.find_root().obj if context else None
+    spec = Spec.load(path or (default if default.exists() else None), file.sections if file else None)
+    if file:
+        file.check(spec)
+    return spec
 
 
 @contextmanager

@@ -55,9 +55,16 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
                     uy += u[f] * y[f]
                     total += u[f] * u[f]
             xx, yy, xy = xx - ux * ux / total, yy - uy * uy / total, xy - ux * uy / total
-            # 2. under faint noise the product cancels where one direction alone is observed; the prior must not with it
-            product = xx * yy - xy * xy
-            volume = max(product, 0.0) + prior[0] * yy + prior[1] * xx + prior[0] * prior[1]
+            # 2. the determinant as in a QR decomposition, by the rest r of y beside x: under faint noise xx yy - xy^2
+            # cancels where one direction alone is observed
+            along_x, rr, ur = xy / xx if xx > 0 else 0.0, 0.0, 0.0
+            for f in range(fibres):
+                if masks[k, f] > 0:
+                    rest = y[f] - along_x * x[f]
+                    rr += rest * rest
+                    ur += u[f] * rest
+            rr -= ur * ur / total
+            volume = xx * rr + prior[0] * yy + prior[1] * xx + prior[0] * prior[1]
             trace = xx + yy + prior[0] + prior[1]
             bound = math.sqrt(trace / volume)
             out[k] += bound / len(cells)
@@ -65,18 +72,18 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
                 continue
             # 3. backwards, in the same order
             by_trace, by_volume = bound / (2 * trace * len(cells)), -bound / (2 * volume * len(cells))
-            whole = 1.0 if product > 0 else 0.0
-            by_xx = by_trace + by_volume * (whole * yy + prior[1])
-            by_yy = by_trace + by_volume * (whole * xx + prior[0])
-            by_xy = -2 * by_volume * whole * xy
-            by_ux = -(2 * by_xx * ux + by_xy * uy) / total
-            by_uy = -(2 * by_yy * uy + by_xy * ux) / total
-            by_total = (by_xx * ux * ux + by_yy * uy * uy + by_xy * ux * uy) / (total * total)
+            by_xx = by_trace + by_volume * (rr + prior[1])
+            by_yy = by_trace + by_volume * prior[0]
+            by_rr = by_volume * xx  # with along_x held: a multiple of x in y does not change the determinant
+            by_ux, by_uy, by_ur = -2 * by_xx * ux / total, -2 * by_yy * uy / total, -2 * by_rr * ur / total
+            by_total = (by_xx * ux * ux + by_yy * uy * uy + by_rr * ur * ur) / (total * total)
             for f in range(fibres):
                 if masks[k, f] > 0:
-                    by_x = 2 * by_xx * x[f] + by_xy * y[f] + by_ux * u[f]
-                    by_y = 2 * by_yy * y[f] + by_xy * x[f] + by_uy * u[f]
-                    by_u = by_ux * x[f] + by_uy * y[f] + 2 * by_total * u[f]
+                    rest = y[f] - along_x * x[f]
+                    by_rest = 2 * by_rr * rest + by_ur * u[f]
+                    by_x = 2 * by_xx * x[f] + by_ux * u[f] - along_x * by_rest
+                    by_y = 2 * by_yy * y[f] + by_uy * u[f] + by_rest
+                    by_u = by_ux * x[f] + by_uy * y[f] + by_ur * rest + 2 * by_total * u[f]
                     by_deviation = -(by_x * x[f] + by_y * y[f] + by_u * u[f]) / deviation[f]
                     by_middle = (by_u * shared + by_deviation * own * middle[f]) / deviation[f] / 4
                     along, across = by_x / (2 * step[0] * deviation[f]), by_y / (2 * step[1] * deviation[f])

@@ -3,6 +3,9 @@
 Samples of F fibres are `points` (F, P, 2), along and across their axes, or `plan` (F, P, 2), along x and y. `arc` are
 arc lengths (F, P), and `shares` the arc length (F, P) that each stands for. A sum is multiplied by `weight`, as is the
 gradient, which is added to arrays `by_...` of the shape of what it is by.
+
+Gradients hold the share of arc that a sample stands for, by which integrals along a fibre are weighted: what a breach
+costs pushes the fibre, but no fibre is drawn shorter where it costs.
 """
 
 import math
@@ -44,7 +47,8 @@ def sum_excess_turns(
 
     Windows begin at samples or, half of them for `all_bends`, end at samples: the most turn, linear between samples,
     is in one of both. Fibres go on straight from both ends, by their leads, which they may meet at a corner. They turn
-    by `rolled` more, at right angles, except where a window begins on a lead.
+    by `rolled` more, at right angles, except where a window begins on a lead. The gradient is by the turns and by where
+    windows end; the arc between samples that weights them is held.
     """
     fibres, n = arc.shape
     size, total, ways = n + 4, 0.0, 2 if all_bends else 1
@@ -104,7 +108,8 @@ def sum_closeness(
     """Sum what it costs that samples lie nearer than `gap` to another fibre, for pairs (K, 2) of fibre and other.
 
     Distances are to the piece of tangent that the nearest sample stands for, a step to both sides. Where a fibre is
-    paired with itself, those pieces count that lie `fold` of arc length away or more from end to end.
+    paired with itself, those pieces count that lie `fold` of arc length away or more from end to end. The gradient is
+    by both points; slope, arc and shares are held.
     """
     n, total = points.shape[1], 0.0
     for k in range(len(pairs)):
@@ -249,7 +254,10 @@ def sum_crossings(
 
 @kernel
 def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, by_slope: Any) -> float:
-    """Integrate by how much slopes are steeper than 45 degrees less than `zone` from either end of their fibre."""
+    """Integrate by how much slopes are steeper than 45 degrees less than `zone` from either end of their fibre.
+
+    The gradient is by the slopes; points and shares are held.
+    """
     total, (fibres, n) = 0.0, slope.shape
     for f in range(fibres):
         for i in range(n):

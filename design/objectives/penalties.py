@@ -54,7 +54,10 @@ MAX_COMPARISONS = 10**8
 
 
 class Gradient:
-    """The gradient of all penalties by what they are computed from, which each adds to."""
+    """The gradient of all penalties by what they are computed from, which each adds to.
+
+    Shares of arc, by which samples are weighted, are held (`rule_penalties`): it is not quite that of the sum.
+    """
 
     def __init__(self, samples: Array, knots: Array) -> None:
         self.points, self.slope, self.arc = (
@@ -69,7 +72,7 @@ class Penalties(NamedTuple):
     """Penalties of the rules that can be broken, and the gradient of their sum."""
 
     values: dict[str, float]  # by the key of `[rules]`
-    by_along: Array  # (F, N + 2), by the knots' coordinates along the fibres
+    by_along: Array  # (F, N + 2), by the knots' coordinates along the fibres, with shares of arc held
     by_across: Array  # (F, N + 2), by those across them
 
 
@@ -120,6 +123,7 @@ def penalties(
 ) -> Penalties:
     """Compute the penalty of each rule that can be broken, and the gradient of their sum by the knots.
 
+    The gradient holds the share of arc that each sample stands for.
     The knots are (F, N + 2) coordinates along and across the fibres, grid units; `margin` is a factor on the limits.
 
     Raises:

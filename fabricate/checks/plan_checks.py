@@ -1,7 +1,7 @@
 """Checks on the plan of a mould: whether it prints, releases its casting, and takes the fibres."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -12,11 +12,10 @@ import shapely
 from numpy.typing import NDArray
 from shapely import ops
 
-from padforge.design.common.settings import validate
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import bend_radius, beziers, flatten, slope_beziers, trace_curve
-from padforge.design.settings import Contact
+from padforge.design.settings import CAST_SHARE, contact_designed_for
 from padforge.fabricate.checks import Finding, Position, Status, check_result, grade
 from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.checks.surface import find_thin_patches
@@ -98,7 +97,6 @@ _BEND_TURN, _BEND_SLACK = 2.5e-3, 1e-3  # turn between points of a bend, rad; le
 _MAX_KINK = 0.5  # turn of a fibre in one point, rad, that the rule for bends lets pass
 _MAX_NAMES = 8  # more fibres are counted instead of named
 _PILLAR_LINES = 2  # printed lines, side by side, of a pillar that stands
-_BELIEF_SHARE = 0.02  # of the thickness: by how much lengths may differ from those of the design
 _STRAIN_SHARE = 0.5  # share of a fibre's greatest strain that bending may use: presses take the remainder
 
 
@@ -254,28 +252,16 @@ def _check_cover(plan: Plan) -> Finding:
     return Finding("cover", status, cover, COVER_MM, message)
 
 
-def _believed_contact(plan: Plan) -> Contact | None:
-    """Return the contact that the pad was designed for, or else that of the settings; None if neither says."""
-    settings = plan.pad.provenance.get("settings")
-    stated = settings.get("contact") if isinstance(settings, Mapping) else None
-    if not isinstance(stated, Mapping):
-        return plan.settings.contact
-    try:
-        return validate(Contact, stated, "the pad's contact")
-    except InputError:  # the provenance of a morphology is free
-        return None
-
-
 def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
     """Check that the pad is as thick, and its fibres lie as deep, as its design believes.
 
     Either face of the pad may be the one that is pressed, for all fibres.
     """
-    contact = _believed_contact(plan)
+    contact = contact_designed_for(plan.pad.provenance) or plan.settings.contact
     if contact is None or contact.model != "layer":
         return
     thickness, believed = plan.thickness_mm, contact.thickness_mm
-    slack = _BELIEF_SHARE * believed
+    slack = CAST_SHARE * believed
     fits = abs(thickness - believed) <= slack
     message = f"silicone is {thickness:.4g} mm thick, the design believes {believed:.4g}"
     yield Finding("silicone_thickness", "pass" if fits else "warn", thickness, believed, message)

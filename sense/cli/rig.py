@@ -101,7 +101,7 @@ def record(
     from padforge.sense.rig import operation
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import check_platform
-    from padforge.sense.settings import RigSettings
+    from padforge.sense.settings import read_rig
 
     check_rig(rig)
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
@@ -119,6 +119,8 @@ def record(
     follower = _make_follower(target, dry_run, resume) if mcap else None
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
+    options, contact = read_rig(settings, **overrides), read_contact(settings)
+    operation.check_press_depths(pad, options, contact, folder)
     if at_once:
         if resume or dry_run or model:
             raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
@@ -130,11 +132,9 @@ def record(
         recording = operation.record_simulated(settings, pressed, target, overrides, inputs, like)
     else:
         check_platform()
-        options = settings.section(RigSettings, **overrides)
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
-        contact = read_contact(settings)
         config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder, follower)
         recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
@@ -267,12 +267,12 @@ def doctor(
     from padforge.design.settings import PadSettings, read_contact
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import check_platform
-    from padforge.sense.settings import RigSettings
+    from padforge.sense.settings import read_rig
 
     check_rig(rig)
     check_platform()
     settings = common.load_spec(spec)
-    pad, options = _load_pad(morphology, settings.section(PadSettings)), settings.section(RigSettings)
+    pad, options = _load_pad(morphology, settings.section(PadSettings)), read_rig(settings)
     has_pad = morphology is not None or rig == "simulated" or virtual_hardware
     inputs = options.inputs(len(pad.knots)) if has_pad else options.channels
     contact, folder = read_contact(settings), common.pad_folder(morphology)

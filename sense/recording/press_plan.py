@@ -1,6 +1,6 @@
 """Press plans: where and how deep a probe presses, real or simulated, in this order."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.keep_outs import is_outside, keep_outs
-from padforge.design.settings import PadSettings
+from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import MAX_MM, Array, Indices, Mask, check_magnitude, check_numbers
 from padforge.sense.recording.csv_table import CsvTable
 from padforge.sense.settings import RigSettings
@@ -94,6 +94,41 @@ def pressable_test(pad: Morphology, pad_settings: PadSettings) -> PositionTest:
     return lambda positions_mm: is_outside(pad.to_grid(positions_mm), pad_settings)
 
 
+def planned_depths_mm(rig: RigSettings) -> Array:
+    """Return the depths of the presses of `[rig]`, or of the file of its plan; shape (n,), mm."""
+    file = rig.plan_file
+    return np.array(rig.press_depths_mm) if file is None else read_plan(file, rig.press_depths_mm).depths_mm
+
+
+def check_depths(depths_mm: Array, thickness_mm: float, pad: str) -> None:
+    """Check that presses do not go through a pad.
+
+    Args:
+        depths_mm: depths of the presses; shape (n,).
+        thickness_mm: thickness of the pad.
+        pad: what says so.
+
+    Raises:
+        InputError: a press is as deep as the pad is thick.
+    """
+    if (deepest := float(depths_mm.max())) >= thickness_mm:
+        raise InputError(f"[rig] presses {deepest:g} mm deep, allowed is less than {thickness_mm:g} mm, by {pad}")
+
+
+def describe_other_depth(depths_mm: Array, contact: Contact) -> str:
+    """Say that no press is as deep as the pad is designed for; return "" if one is, or the contact knows no depth.
+
+    Args:
+        depths_mm: depths of the presses; shape (n,).
+        contact: contact that the pad is designed for.
+    """
+    if contact.model != "layer" or contact.depth_mm in depths_mm:
+        return ""
+    low, high = f"{depths_mm.min():g}", f"{depths_mm.max():g}"
+    depths = low if low == high else f"{low} to {high}"
+    return f"[rig] presses {depths} mm deep, the pad is designed for presses of {contact.depth_mm:g} mm"
+
+
 def make_plan(
     pad: Morphology, rig: RigSettings, rng: np.random.Generator, pad_settings: PadSettings | None = None
 ) -> PressPlan:
@@ -119,8 +154,8 @@ def make_plan_in(
         is_pressable: which positions may be pressed.
     """
     if rig.plan_file is not None:
-        return check_pressable(read_plan(rig.plan_file, rig.depth_mm), rig.plan_file, is_pressable)
-    depths = np.array(rig.depths_mm or (rig.depth_mm,))
+        return check_pressable(read_plan(rig.plan_file, rig.press_depths_mm), rig.plan_file, is_pressable)
+    depths = np.array(rig.press_depths_mm)
     if rig.plan in ("grid", "serpentine"):
         n_grid = rig.presses
         while True:
@@ -176,13 +211,18 @@ def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> 
     return plan
 
 
-def read_plan(path: Path, depth_mm: float) -> PressPlan:
-    """Read a plan from a CSV file with the columns x_mm, y_mm and, unless all are `depth_mm` deep, depth_mm."""
+def read_plan(path: Path, depths_mm: Sequence[float]) -> PressPlan:
+    """Read a plan from a CSV file.
+
+    Args:
+        path: file with the columns x_mm, y_mm and, optionally, depth_mm.
+        depths_mm: depths that presses take in turn where the file has none.
+    """
     table = CsvTable(path, skip_empty=True)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(table.names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")
     values = table.read_columns(range(len(table.names)))
-    depths = np.full((len(values), 1), depth_mm)
+    depths = np.resize(depths_mm, (len(values), 1))
     try:
         return PressPlan.from_rows(np.column_stack([values, depths])[:, :3])
     except InputError as error:

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from padforge.design.common.files import provenance, read_json
+from padforge.design.common.files import provenance, read_json, reraise_as_input_error
 from padforge.design.common.settings import Settings, as_tuple, validate
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
@@ -97,6 +97,15 @@ class HolderFrame(Settings):
     pad_mm: Annotated[Millimetres | tuple[Millimetres, Millimetres], BeforeValidator(as_tuple)]
     surface_mm: Millimetres
     walls_mm: Millimetres
+
+
+def cast_thickness_mm(folder: Path) -> float | None:
+    """Return the thickness of the pad that the mould in a folder casts, mm; None if there is no mould."""
+    path = folder / FABRICATION_FILE
+    if not path.is_file():
+        return None
+    with reraise_as_input_error(path):
+        return float(read_json(path, FABRICATION_FORMAT)["sizes"]["pad_thickness_mm"])
 
 
 def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:

@@ -19,25 +19,36 @@ from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.design.settings import PadSettings, read_contact
+from padforge.design.settings import Contact, PadSettings, contact_designed_for, read_contact
 from padforge.design.twin import Twin
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import (
     PositionTest,
     PressPlan,
+    check_depths,
+    describe_other_depth,
     fit_pad_settings,
+    planned_depths_mm,
     pressable_test,
     sample_uniform,
 )
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import check_new_folder, check_new_recording
-from padforge.sense.rig.config import RigConfig, load_or_make_plan, locate_on_bed, open_recorder, plan_notice
+from padforge.sense.rig.config import (
+    FABRICATION_FILE,
+    RigConfig,
+    cast_thickness_mm,
+    load_or_make_plan,
+    locate_on_bed,
+    open_recorder,
+    plan_notice,
+)
 from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
 from padforge.sense.rig.press_loop import Interrupts, PressLoop, check_plan
 from padforge.sense.rig.safety import Limits, check_start_state, check_tcp
-from padforge.sense.settings import RigSettings
+from padforge.sense.settings import RigSettings, read_rig
 from padforge.sense.simulation.simulated_recording import simulate
 
 _log = logging.getLogger(__name__)
@@ -98,7 +109,7 @@ def record_simulated(
     """
     if not replacing:
         check_new_folder(out)
-    rig = spec.section(RigSettings, **overrides)
+    rig = read_rig(spec, **overrides)
     plan = pad.morphology if isinstance(pad, Twin) else pad
     pad_settings = spec.section(PadSettings, **plan.layout.settings)
     with stage("simulate"):
@@ -106,6 +117,27 @@ def record_simulated(
     inputs = [*inputs, *([rig.plan_file] if rig.plan_file else [])]
     recording.save(out, provenance("padforge sense record --rig simulated", rig.seed, inputs), replacing)
     return recording
+
+
+def check_press_depths(pad: Morphology, rig: RigSettings, contact: Contact, folder: Path) -> None:
+    """Check that presses do not go through a pad, and warn if none is as deep as the pad is designed for.
+
+    Args:
+        pad: pad that is pressed.
+        rig: how it is pressed.
+        contact: contact of the settings, which counts where the pad does not say what it is designed for.
+        folder: folder of the pad, with what fabricate has written of its mould.
+
+    Raises:
+        InputError: a press is as deep as the pad is thick, by `[contact]` or by its mould.
+    """
+    depths_mm = planned_depths_mm(rig)
+    if contact.model == "layer":
+        check_depths(depths_mm, contact.thickness_mm, "[contact] thickness_mm")
+    if (thickness_mm := cast_thickness_mm(folder)) is not None:
+        check_depths(depths_mm, thickness_mm, str(folder / FABRICATION_FILE))
+    if notice := describe_other_depth(depths_mm, contact_designed_for(pad.provenance) or contact):
+        _log.warning(notice)
 
 
 @contextmanager

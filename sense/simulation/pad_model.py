@@ -279,7 +279,7 @@ class LivePad:
         self._divider = Divider(channels, rate_hz, rig, rng)
         self._gains = Gains(rig.readings_per_press / rig.rate_hz, channels, rig, rng)
         self._pad, self._contact, self._rig, self._rate_hz = build_pad(pad, rig), contact, rig, rate_hz
-        self._depth_mm = max(rig.depths_mm, default=rig.depth_mm)
+        self._depth_mm = max(rig.press_depths_mm)
         self._responses: dict[tuple[float, float], PressParts[Array]] = {}  # (1, C) of the deepest press, by position
         self._presses: list[_Press] = []  # the last of them
         self._depth, self._n_read = 0.0, 0

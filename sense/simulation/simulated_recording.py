@@ -17,12 +17,16 @@ from scipy.optimize import nnls
 from padforge.design import Contact, Morphology, Twin
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import MAX_VALUES, InputError, check_int, check_type
+from padforge.design.contact import contact_press
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, TwinChannel, TwinPart
 from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array, Indices
 from padforge.sense.recording.press_plan import (
     PositionTest,
+    PressPlan,
+    check_depths,
     fit_pad_settings,
+    make_plan,
     make_plan_in,
     pad_source,
     pressable_test,
@@ -209,10 +213,10 @@ def simulate(
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
     channels = len(pad.channels) if isinstance(pad, Twin) else len(check_type("pad", pad, Morphology).knots)
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
-    if rig.plan == "adaptive":
-        raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
+    _check_plan_kind(rig)
     if measured := pad if isinstance(pad, Twin) else like:
-        rig = measured_rig(check_type("like", measured, Twin), rig)
+        rig, contact = measured_rig(check_type("like", measured, Twin), rig), measured.contact()
+    rig = rig.for_contact(contact)
     if isinstance(pad, Twin):
         model = model_twin(pad, rig, size)
     elif like is None:
@@ -221,9 +225,7 @@ def simulate(
         model = model_like_twin(pad, like, rig, size)
     rng = np.random.default_rng(rig.seed)
     plan = make_plan_in(model.corners_mm, rig, rng, model.free)
-    values = len(plan) * rig.readings_per_press * channels
-    if values > MAX_VALUES:
-        raise InputError(f"[rig] presses is {len(plan)}: they have {values} readings, allowed are {MAX_VALUES}")
+    _check_size(len(plan), rig, channels)
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     responses = model.responses(plan.positions_mm, plan.depths_mm)
     readings = simulate_readings(responses, plan.positions_mm, cycle, rig, rng, model.noise_v)
@@ -238,6 +240,38 @@ def simulate(
         depths_mm=plan.depths_mm,
         source={"kind": "simulated", "rig": rig.model_dump(mode="json"), **model.source},
     )
+
+
+def plan_simulation(pad: Morphology, rig: RigSettings, contact: Contact, size: PadSettings | None = None) -> PressPlan:
+    """Return the presses that `simulate` makes, without simulating them.
+
+    Args:
+        pad: any pad of the same layout.
+        rig: as of `simulate`.
+        contact: as of `simulate`.
+        size: as of `simulate`.
+
+    Raises:
+        InputError: as of `simulate`.
+    """
+    _check_plan_kind(rig)
+    plan = make_plan(pad, rig, np.random.default_rng(rig.seed), size)
+    _check_size(len(plan), rig, len(pad.knots))
+    if contact.model == "layer":
+        check_depths(plan.depths_mm, contact.thickness_mm, "the thickness of the pad")
+        contact_press(contact.model_copy(update={"depth_mm": float(plan.depths_mm.max())}))
+    return plan
+
+
+def _check_plan_kind(rig: RigSettings) -> None:
+    if rig.plan == "adaptive":
+        raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
+
+
+def _check_size(presses: int, rig: RigSettings, channels: int) -> None:
+    values = presses * rig.readings_per_press * channels
+    if values > MAX_VALUES:
+        raise InputError(f"[rig] presses is {presses}: they have {values} readings, allowed are {MAX_VALUES}")
 
 
 def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:

@@ -39,13 +39,14 @@ def simulate_strokes(
 
     They begin anywhere and go any way that stays on the pad; where it is too small for them, they are slower.
     """
+    rig = rig.for_contact(contact)
     model = model_plan(pad, contact, rig, size)
     starts = sample_uniform(model.corners_mm, strokes, rng, model.free)
     ends = np.array([_end(start, speed_mm_s * _duration_s(rig), model.corners_mm, rng) for start in starts])
     held, rest = rig.readings_per_press // 2, rig.readings_per_press - rig.readings_per_press // 2
     share = np.arange(held) / held
     paths = starts[:, None] + share[:, None] * (ends - starts)[:, None]
-    depth = np.minimum((np.arange(held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.depth_mm
+    depth = np.minimum((np.arange(held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.press_depths_mm[0]
     built = np.random.default_rng(rig.seed)
     make_plan(pad, rig, built, size)  # the presses of a recording are drawn before the pad is
     positions_mm = np.concatenate([np.repeat(starts[:, None], rest, axis=1), paths], axis=1).reshape(-1, 2)

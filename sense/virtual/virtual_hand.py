@@ -56,10 +56,11 @@ class Finger:
         mishaps: float = 0.05,
     ) -> None:
         """Hold the finger over a pad; `mishaps` is the share of presses that become one of `MISHAPS`."""
+        rig = rig.for_contact(contact)
         rng = np.random.default_rng(rig.seed)
         self._model = LivePad(pad, contact, rig, rate_hz, rng)
         self._model.prepare()  # before the board has to keep up
-        self._rng, self._depth_mm = rng.spawn(1)[0], rig.depth_mm
+        self._rng, self._depth_mm = rng.spawn(1)[0], rig.press_depths_mm[0]
         self._mishaps = mishaps
         self._view: Mapping[str, Any] = {"phase": "settle"}
         self._now_s = -math.inf

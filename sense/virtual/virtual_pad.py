@@ -39,12 +39,13 @@ class VirtualPad:
         size: PadSettings | None = None,
     ) -> None:
         """Make the pad; sampling starts with `connect`. `size` has sensed area and keep-outs, the pad's own if None."""
+        rig = rig.for_contact(contact)
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
             make_plan(pad, rig, rng, size)  # the presses of the recording are drawn before the pad is
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig = pad, contact, rig
-        self._depths_mm = rig.depths_mm or (rig.depth_mm,)
+        self._depths_mm = rig.press_depths_mm
         self._size = size
         self._position_rng = rng.spawn(1)[0]
         self._start_s: float | None = None

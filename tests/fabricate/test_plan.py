@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design.common.plotting import HORIZONTAL, VERTICAL
+from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
+from padforge.design.settings import FIBRE_MM, Layout, read_contact
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number, fibre_layers
 from padforge.sense.rig.config import RobotFrame
@@ -97,6 +99,24 @@ def test_layers_are_a_step_apart_and_thicken_the_pad():
     assert Plan(Morphology.straight(2), with_settings({"silicone_mm": 1.5})).silicone_mm == 1.5
     assert Plan(Morphology.straight(2)).layer_indices == (1, 1, 0, 0)
     assert Plan(Morphology.straight(2), with_settings(pad={"deep_family": "vertical"})).layer_indices == (0, 0, 1, 1)
+
+
+@pytest.mark.parametrize("deep", ["horizontal", "vertical"])
+@pytest.mark.parametrize("fibres", [(1, 0), (0, 2), (2, 3)])
+def test_every_family_is_laid_at_the_depth_that_it_is_designed_for(fibres, deep):
+    pad, settings = Morphology.straight(fibres), with_settings(pad={"deep_family": deep})
+    plan = Plan(pad, settings)
+    depths_mm = [plan.depths_mm[layer] - FIBRE_MM / 2 for layer in plan.layer_indices]
+    contact = read_contact(Spec({"pad": {"deep_family": deep}}))
+    assert depths_mm == pytest.approx(np.repeat(contact.fibre_depths_mm, fibres).tolist())
+    assert plan.silicone_mm == 6.0
+
+
+def test_deep_family_that_crosses_itself_alone_thickens_a_thin_pad():
+    pad = level_pad(1.8, 1.2)
+    strip = Morphology.from_layout(pad.knots[:2] * [1 / 3, 1], Layout(2, 0, 10.0, 10.0))  # one pitch wide
+    plan = Plan(strip, with_settings({"silicone_mm": 2.5}))
+    assert (plan.heights_mm, plan.silicone_mm) == ((1.2, 2.0), 2.0 + COVER_MM)
 
 
 def test_require_levels_refuses_crossings_of_a_family():

@@ -12,7 +12,7 @@ import pytest
 from padforge.cli import PRESETS
 from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
-from padforge.run import SECTIONS, section_models
+from padforge.settings import SECTIONS, section_models
 from tests.docs.pages import BLOCK, PAGES, relative
 from tests.helpers.door import called
 

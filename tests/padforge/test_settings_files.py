@@ -17,7 +17,8 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.settings import PadSettings, RulesSettings
 from padforge.fabricate.checks import plan_checks
 from padforge.fabricate.settings import FabricationSettings
-from padforge.run import Run, check_run, section_models
+from padforge.run import Run, check_run
+from padforge.settings import section_models
 
 MODELS = section_models()
 DEFAULTS = commented_toml(MODELS).encode()

@@ -15,7 +15,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
         "plan": "uniform",
         "rate_hz": 13.3,
         "readings_per_press": 40,
-        "depth_mm": 5.0,
+        "depth_mm": "contact",
         "seed": 0,
     }
     expected |= {"noise_mv": 2.0, "drift_mv": 20.0, "memory_mm": 10.0, "sensitivity": 0.6, "path_mm": 1.0}
@@ -39,7 +39,7 @@ def test_the_defaults_are_those_of_the_published_bench() -> None:
     ("model", "key", "kept", "refused"),
     [
         (RigSettings, "max_force_n", (0.1, 250.0, "unwatched"), (0.0, 250.1, "unknown")),
-        (RigSettings, "depth_mm", (0.1, 50.0), (0.0, 50.1)),
+        (RigSettings, "depth_mm", (0.1, 50.0, "contact"), (0.0, 50.1, "deep")),
         (RigSettings, "depths_mm", ([0.1, 50.0],), ([5.0, 0.0], [50.1])),
         (RigSettings, "max_depth_mm", (0.1, 50.0), (0.0, 50.1)),
         (RigSettings, "press_mm_s", (0.1, 250.0), (0.0, 250.1)),

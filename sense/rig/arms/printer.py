@@ -338,7 +338,7 @@ class Printer:
     def _check_press_time(self, max_mm_s: Position, max_mm_s2: Position) -> None:
         """Refuse presses that would be over before the tip is down."""
         rig = self._rig
-        depth_mm = rig.clearance_mm + max(rig.depths_mm or (rig.depth_mm,))
+        depth_mm = rig.clearance_mm + max(rig.press_depths_mm)
         down = StraightMove((0, 0, depth_mm), (0, 0, 0), rig.press_mm_s, rig.acceleration_mm_s2)
         down_s = down.limit_axes(max_mm_s, max_mm_s2).duration_s
         if down_s >= (half_s := rig.readings_per_press / 2 / rig.rate_hz):

@@ -9,7 +9,7 @@ from padforge.design.common.settings import Spec
 from padforge.design.common.units import to_unit
 from padforge.design.common.validation import InputError
 from padforge.design.settings import SILICONE_MM, read_contact
-from padforge.run import section_models
+from padforge.settings import section_models
 
 MODELS = section_models()
 

@@ -339,9 +339,9 @@ def test_finding_names_what_mould_and_design_differ_in():
 
 
 def test_contact_of_settings_counts_if_the_pad_has_none():
-    tables = {"mould": {"silicone_mm": 8.0}, "contact": {"thickness_mm": 6.0}}
-    pad = Morphology.straight(2)
-    assert find(pad, "silicone_thickness", FabricationSettings.from_spec(Spec(tables))).status == "warn"
+    tables: dict[str, dict[str, object]] = {"mould": {"silicone_mm": 8.0}}
+    pad, settings = Morphology.straight(2), FabricationSettings.from_spec(Spec(tables))
+    assert find(pad, "silicone_thickness", replace(settings, contact=Contact())).status == "warn"
     for contact in ({"radius": 0.6}, {}):
         settings = FabricationSettings.from_spec(Spec(tables | {"contact": contact}))
         assert "silicone_thickness" not in {finding.name for finding in check_plan(Plan(pad, settings))}

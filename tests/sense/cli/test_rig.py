@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -11,10 +12,12 @@ import numpy as np
 import pytest
 
 from padforge.benchmarks.twin import printed_pad
-from padforge.design import Morphology
+from padforge.design import Contact, Morphology
 from padforge.design.common.files import sha256
 from padforge.design.common.settings import commented_toml
 from padforge.design.settings import PadSettings
+from padforge.fabricate import MouldSettings, build
+from padforge.fabricate.settings import DEFAULTS
 from padforge.sense import Recording
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.rig import operation
@@ -31,6 +34,28 @@ def test_record_writes_beside_its_pad(padforge_sense) -> None:
     assert code == 0
     assert out.endswith(" -> mine/recording\n")
     assert Recording.open("mine/recording").source["rig"]["seed"] == 7
+
+
+def test_record_follows_the_depth_of_the_contact_and_says_if_the_pad_is_designed_for_another(padforge_sense) -> None:
+    Path("soft.toml").write_text("[contact]\ndepth_mm = 2\n[rig]\npresses = 4\n")
+    assert padforge_sense("record", "--spec", "soft.toml", "--out", "soft")[::2] == (0, "")
+    assert set(Recording.open("soft").depths_mm) == {2.0}
+    origin = {"settings": {"contact": Contact(depth_mm=2.0).model_dump(mode="json")}}
+    Morphology.from_layout(PAD.knots, PAD.layout, origin).save("pad/morphology.json")
+    code, _, err = padforge_sense("record", "--presses", "4", "--morphology", "pad/morphology.json")
+    assert (code, err) == (0, "[rig] presses 5 mm deep, the pad is designed for presses of 2 mm\n")
+
+
+@pytest.mark.parametrize("rig", ["simulated", "ur5", "hand"])
+def test_record_refuses_a_depth_that_the_cast_pad_does_not_have(padforge_sense, rig: str) -> None:
+    thin = replace(DEFAULTS, mould=MouldSettings(silicone_mm=4.0))
+    Path("thin").mkdir()
+    PAD.save("thin/morphology.json")
+    build(PAD, "thin", ["svg"], thin)
+    code, _, err = padforge_sense("record", "--rig", rig, "--morphology", "thin/morphology.json")
+    line = "padforge: [rig] presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json\n"
+    assert (code, err) == (2, line)
+    assert not Path("thin/recording").exists()
 
 
 def test_record_writes_an_mcap_file_as_export_does(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None:

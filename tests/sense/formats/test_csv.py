@@ -139,7 +139,7 @@ def test_csv_table_refuses_ambiguous_numbers(tmp_path: Path, separator: str) -> 
             text = "\n".join([*rows[:2], comment + rows[2]])
             (tmp_path / "t.csv").write_text(text, encoding="utf-8")
             with pytest.raises(InputError, match=rf"t\.csv: line {3 + bool(comment)} holds no numbers"):
-                read_plan(tmp_path / "t.csv", 1.0)
+                read_plan(tmp_path / "t.csv", (1.0,))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_csv_table_refuses_ambiguous_numbers(tmp_path: Path, separator: str) -> 
 def test_csv_table_refuses_what_is_no_table(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "t.csv").write_bytes(content)
     with pytest.raises(InputError, match=rf"t\.csv: {message}") as refused:
-        read_plan(tmp_path / "t.csv", 1.0)
+        read_plan(tmp_path / "t.csv", (1.0,))
     assert len(str(refused.value)) < 300 + len(str(tmp_path))
 
 

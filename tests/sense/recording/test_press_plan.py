@@ -27,9 +27,9 @@ def test_plan_round_trip_and_from_file(tmp_path):
     assert again.depths_mm.tolist() == [2, 4, 2, 4, 2, 4, 2]
     assert set(plan_of(presses=30).depths_mm) == {5.0}
     (tmp_path / "gaps.csv").write_text("x_mm,y_mm\n1,2\n\n-3.5,4\n\n")
-    assert read_plan(tmp_path / "gaps.csv", 2.5).to_rows() == [[1, 2, 2.5], [-3.5, 4, 2.5]]
+    assert read_plan(tmp_path / "gaps.csv", (2.5, 1)).to_rows() == [[1, 2, 2.5], [-3.5, 4, 1]]
     (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,1.5\n")
-    assert read_plan(tmp_path / "deep.csv", 3.0).to_rows() == [[1, 2, 1.5]]
+    assert read_plan(tmp_path / "deep.csv", (3.0,)).to_rows() == [[1, 2, 1.5]]
 
 
 def test_make_plan_of_grids_row_by_row():
@@ -108,6 +108,6 @@ def test_make_plan_depths_alternate_along_rows_that_begin_with_the_next(tmp_path
 def test_read_plan_refuses_other_files(tmp_path, content, line):
     (tmp_path / "plan.csv").write_text(content)
     with pytest.raises(InputError, match=line) as refusal:
-        read_plan(tmp_path / "plan.csv", 3.0)
+        read_plan(tmp_path / "plan.csv", (3.0,))
     assert "plan.csv" in str(refusal.value)
     assert "\n" not in str(refusal.value)

@@ -54,6 +54,15 @@ def test_simulate_has_the_published_protocol() -> None:
     np.testing.assert_allclose(np.abs(strip.presses_mm).max(axis=0), [25, 4], rtol=0.02)
 
 
+def test_simulate_presses_as_deep_as_the_contact_unless_the_rig_says_otherwise() -> None:
+    gentle, hard = (simulate(PAD, RigSettings(presses=4), Contact(depth_mm=depth)) for depth in (2.0, 5.0))
+    assert (set(gentle.depths_mm), set(hard.depths_mm)) == ({2.0}, {5.0})
+    assert gentle.source["rig"]["depth_mm"] == 2.0
+    assert np.ptp(responses(gentle)) < np.ptp(responses(hard))
+    stated = simulate(PAD, RigSettings(presses=4, depth_mm=5.0), Contact(depth_mm=2.0))
+    np.testing.assert_array_equal(stated.readings, hard.readings)
+
+
 @pytest.mark.parametrize(("contact", "least", "most"), [(Contact(), 8, 16), (Contact(model="profile"), 3.8, 4.2)])
 def test_simulate_responds_by_depth(contact: Contact, least: float, most: float) -> None:
     """A layer is pressed wider as well as deeper; a profile grows in proportion to the depth."""

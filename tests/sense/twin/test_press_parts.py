@@ -24,7 +24,7 @@ def split(recording: Recording) -> SplitPresses:
 
 
 def test_parts_are_those_that_were_simulated(recording: Recording, split: SplitPresses) -> None:
-    depths_mm = np.full(500, RIG.depth_mm)
+    depths_mm = np.full(500, RIG.press_depths_mm)
     changes = resistance_changes(build_pad(PAD, RIG), recording.presses_mm, depths_mm, Contact(), RIG)
     rest_v = np.median(recording.readings[:10], axis=0)
     slope_v = rest_v * (1 - rest_v / SUPPLY_V)  # by which a divider falls for a small change of resistance

@@ -44,7 +44,7 @@ def test_finger_presses_where_asked_lifts_and_errs() -> None:
         assert (stroke.kind == "echo") == (before.kind == "double")
     of_kind = {stroke.kind: stroke for stroke in strokes}
     assert of_kind["short"].up_s - of_kind["short"].down_s == pytest.approx(SHORT_S)
-    assert of_kind["light"].depth_mm < 1.2 * LIGHT * RigSettings().depth_mm
+    assert of_kind["light"].depth_mm < 1.2 * LIGHT * RigSettings().press_depths_mm[0]
     slid, still = (of_kind[kind].contact(of_kind[kind].down_s + 1)[0] for kind in ("slide", "double"))
     assert slid - of_kind["slide"].position_mm == pytest.approx([-SLIDE_MM, 0])  # to the other half of the pad
     np.testing.assert_array_equal(still, of_kind["double"].position_mm)

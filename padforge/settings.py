@@ -1,0 +1,54 @@
+"""All sections of a `pad.toml`, and whether they agree with each other."""
+
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from padforge.design.common.settings import Settings, Spec
+
+SECTIONS = {
+    "pad": "padforge.design.settings:PadSettings",
+    "contact": "padforge.design.settings:Contact",
+    "search": "padforge.design.settings:SearchSettings",
+    "rules": "padforge.design.settings:RulesSettings",
+    "mould": "padforge.fabricate.settings:MouldSettings",
+    "printer": "padforge.fabricate.settings:PrinterSettings",
+    "silicone": "padforge.fabricate.materials:SiliconeSettings",
+    "fibre": "padforge.fabricate.materials:FibreSettings",
+    "dispenser": "padforge.fabricate.settings:DispenserSettings",
+    "rig": "padforge.sense.settings:RigSettings",
+    "localizer": "padforge.sense.settings:LocalizerSettings",
+}
+"""Sections of a `pad.toml`, and the model of each."""
+
+_LAYOUT_KEYS = {"grid", "horizontals", "verticals", "pitch_mm"}
+
+
+def section_models() -> "dict[str, type[Settings]]":
+    """Import the models of all sections, by name."""
+    return {name: resolve_name(path) for name, path in SECTIONS.items()}
+
+
+def check_settings(spec: "Spec") -> None:
+    """Check every section, and each against the others, whichever of them a command needs.
+
+    Fibres and pitch of the pad are compared only if they are stated: most commands take them from a morphology.
+
+    Args:
+        spec: settings file.
+
+    Raises:
+        InputError: an unknown key, a value out of range, or two sections that contradict each other.
+    """
+    from padforge.design.settings import PadSettings
+    from padforge.fabricate import FabricationSettings
+    from padforge.sense.settings import read_rig
+
+    for model in section_models().values():
+        if model.section() != "contact":  # is read below, with the lengths of the pad as it will be cast
+            spec.section(model)
+    fabrication, rig = FabricationSettings.from_spec(spec), read_rig(spec)
+    if spec.stated(PadSettings).keys() & _LAYOUT_KEYS:
+        layout = spec.section(PadSettings).layout
+        fabrication.require_consistent(layout)
+        rig.inputs(layout.fibres)

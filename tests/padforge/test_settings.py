@@ -1,0 +1,88 @@
+"""Sections of settings that contradict each other: refused before any work, or followed by what they leave open."""
+
+from pathlib import Path
+
+import pytest
+
+from padforge.design import Morphology
+from padforge.design.common.settings import Spec
+from padforge.fabricate import FabricationSettings
+from padforge.run import Run, check_run
+from padforge.settings import check_settings
+from tests.helpers.door import called, refused
+
+THIN = '[contact]\nthickness_mm = 4\ndepth_mm = 2.5\ntool = "ball"\n[mould]\nsilicone_mm = 4\n'
+CONTRADICTIONS = {
+    THIN + "[rig]\ndepth_mm = 5\n": "[rig] depth_mm: got 5, allowed is less than the thickness of the pad, 4 mm",
+    THIN + "[rig]\ndepths_mm = [1, 4]\n": "[rig] depths_mm: got 4, allowed is less than the thickness of the pad, 4 mm",
+    "[contact]\ndepth_mm = 60\nthickness_mm = 70\n": "[rig] depth_mm: got 60.0, ",
+    "[contact]\nthickness_mm = 7\n[mould]\nsilicone_mm = 8\n": "[mould] silicone_mm: got 8, allowed is 7.0, as ",
+    "[contact]\nfibre_depths_mm = [1.05, 0.45]\n[mould]\nshallow_ridge_height_mm = 0.4\n": (
+        "[mould] shallow_ridge_height_mm: got 0.4, allowed is 0.6, as [contact] fibre_depths_mm says"
+    ),
+    '[contact]\nfibre_depths_mm = [0.25, 1.05]\n[pad]\ndeep_family = "horizontal"\n': (
+        "[pad] deep_family: got 'horizontal', allowed is vertical, as [contact] fibre_depths_mm says"
+    ),
+    "[pad]\ngrid = 3\n[rig]\nchannels = [0, 1]\n": "[rig] channels: got 2 inputs, the pad has 6 fibres",
+    "[pad]\npitch_mm = 3\n": "[mould] exit_width_mm: got 3, allowed is less than the pitch between slots",
+    "[pad]\nsensed_mm = [80, 10]\n": "[pad] sensed_mm: got [80, 10], the pad itself is 56.25 mm wide",
+    '[printer]\nresin = "yes"\n': "[printer] resin: got 'yes', ",
+}
+
+
+@pytest.mark.parametrize(("text", "line"), CONTRADICTIONS.items(), ids=range(len(CONTRADICTIONS)))
+def test_every_command_refuses_sections_that_contradict_each_other(tmp_path: Path, text: str, line: str) -> None:
+    (tmp_path / "pad.toml").write_text(text)
+    Morphology.straight(2).save(tmp_path / "morphology.json")
+    for command in (("design", "check", "morphology.json"), ("fabricate", "check", "morphology.json"), ("run",)):
+        assert line in refused(*command, cwd=tmp_path), command
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[rig]\nchannels = [0, 1]\n", "[rig] channels: got 2 inputs, the pad has 8 fibres"),
+        ("[mould]\nexit_width_mm = 12\n", "[mould] exit_width_mm: got 12, allowed is less than the pitch"),
+        ('[rig]\nplan = "adaptive"\n', "[rig] plan is adaptive"),
+        ('[rig]\nplan = "deep.csv"\n', "[rig] presses 6 mm deep, allowed is less than 6 mm"),
+        ("[contact]\ntool_radius_mm = 0.1\n", "[contact] tool_radius_mm: got 0.05, "),
+        (
+            "[pad]\nkeep_out_mm = [[[-40, -40], [40, -40], [40, 40], [-40, 40]]]\n",
+            "[pad] keep_out_mm leaves 0.0% of what is pressed",
+        ),
+    ],
+)
+def test_run_refuses_at_its_start_what_would_end_it_later(tmp_path: Path, text: str, line: str) -> None:
+    (tmp_path / "pad.toml").write_text(text)
+    (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,6\n")
+    assert line in refused("run", cwd=tmp_path)
+
+
+def test_thin_pad_is_pressed_as_deep_as_it_is_designed_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Without a word, which it takes only if the rig presses otherwise."""
+    (tmp_path / "thin.toml").write_text(THIN)
+    check_run(Run(Spec.load(tmp_path / "thin.toml"), tmp_path / "out"))
+    assert not caplog.records
+    (tmp_path / "thin.toml").write_text(THIN + "[rig]\ndepths_mm = [1, 3]\n")
+    check_run(Run(Spec.load(tmp_path / "thin.toml"), tmp_path / "out"))
+    assert caplog.messages == ["[rig] presses 1 to 3 mm deep, the pad is designed for presses of 2.5 mm"]
+
+
+def test_mould_follows_contact_where_it_leaves_the_pad_open() -> None:
+    contact = {"thickness_mm": 8.0, "fibre_depths_mm": [6.45, 7.65]}  # pressed on the face without tracks
+    spec = Spec({"contact": contact, "mould": {"floor_mm": 3.0, "deep_ridge_height_mm": "1.7 mm"}})
+    check_settings(spec)
+    cast = FabricationSettings.from_spec(spec)
+    heights_mm = cast.mould.deep_ridge_height_mm, cast.mould.shallow_ridge_height_mm
+    assert (cast.mould.silicone_mm, cast.mould.floor_mm, heights_mm) == (8.0, 3.0, (1.7, 0.5))
+    assert cast.pad.deep_family == "horizontal"
+    measured = Spec({"contact": {"thickness_mm": 6.1}, "mould": {"silicone_mm": 6.0}})
+    assert FabricationSettings.from_spec(measured).mould.silicone_mm == 6.0
+
+
+def test_written_settings_agree_and_let_the_rig_follow(tmp_path: Path) -> None:
+    for preset in ("", "published", "built", "ideal"):
+        path = tmp_path / f"{preset}.toml"
+        assert called("init", str(path), *(("--preset", preset) if preset else ()), cwd=tmp_path).code == 0
+        check_settings(Spec.load(path))
+        assert '\ndepth_mm = "contact" ' in path.read_text()

@@ -1,0 +1,1 @@
+../../padforge/settings.py
