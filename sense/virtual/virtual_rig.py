@@ -9,7 +9,7 @@ from padforge.design import Contact, Morphology
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.printer import Printer
-from padforge.sense.rig.arms.ur5 import UR5, Driver
+from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards.board_reader import BoardDriver
 from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
@@ -29,18 +29,18 @@ BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any
 
 @contextmanager
 def emulate_ur5(
-    pad: Morphology, contact: Contact, rig: RigSettings, driver: Driver | None = None, series: Series = "e"
+    pad: Morphology, contact: Contact, rig: RigSettings, series: Series = "e"
 ) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, SerialBoard]]:
     """Open drivers of arm and board, not yet connected, and the emulators behind them; `rig` is of `ur5_settings`.
 
-    The driver of the arm is one of `UR5`'s, or its default. An arm of the series "cb3" measures no force.
+    An arm of the series "cb3" measures no force.
     """
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
     with (
         EmulatedUR5(series, tip, rig.contact_mm, STIFFNESS_N_MM, HOST, tcp_mm) as robot,
         _emulate_board(pad, contact, rig, robot.true_poses) as (board_driver, board),
-        closing(UR5.from_settings(rig.model_copy(update={"host": HOST}), driver)) as arm,
+        closing(UR5.from_settings(rig.model_copy(update={"host": HOST}))) as arm,
     ):
         yield arm, board_driver, robot, board
 

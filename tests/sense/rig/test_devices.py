@@ -48,7 +48,7 @@ def test_start_imports_nothing_from_the_current_folder(
         monkeypatch.delenv("PYTHONPATH", raising=False)
     else:
         monkeypatch.setenv("PYTHONPATH", python_path)
-    process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", "urscript", "null", stderr=subprocess.PIPE)
+    process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", stderr=subprocess.PIPE)
     assert os.getsid(process.pid) == process.pid, "an interrupt from the keyboard would reach it"
     _, stderr = process.communicate(timeout=20)  # the end of its stdin ends it
     assert not (tmp_path / "pwned").exists(), stderr
