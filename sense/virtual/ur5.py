@@ -22,12 +22,15 @@ from numpy.typing import ArrayLike
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.devices import Array, Pose, RigFault
+from padforge.sense.virtual.rtde_types import n_values, recipe_layout, variable_type
 from padforge.sense.virtual.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
 
 HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
 """Where the emulated arm stands at first: 200 mm up, the tool pointing down."""
-PORTS = {"rtde": rtde.RTDE_PORT, "script": rtde.SCRIPT_PORT, "dashboard": rtde.DASHBOARD_PORT}
+SCRIPT_PORT = 30003
+PORTS = {"rtde": rtde.RTDE_PORT, "script": SCRIPT_PORT, "dashboard": rtde.DASHBOARD_PORT}
+INPUTS = ord("I")  # the kind of frame by which a client claims registers
 TO_MM = np.array([1000.0, 1000.0, 1000.0, 1.0, 1.0, 1.0])
 COMMAND_S = 5.0  # longest wait for a command to be executed
 
@@ -138,9 +141,9 @@ class EmulatedUR5:
         """Receive and send nothing, and close no connection: the cable is out."""
         self._unplugged = unplugged
 
-    def popups(self) -> list[str]:
-        """Return what the pendant has shown of programs that are wrong."""
-        return list(self._controller.popups)
+    def break_force_sensor(self, broken: bool) -> None:
+        """Send no number for the force, or a number again."""
+        self._controller.has_force = not broken
 
     def push(self, sideways_n: float) -> None:
         """Push the tool along x with a force from now on."""
@@ -261,14 +264,14 @@ class EmulatedUR5:
         answer = b"\x01"
         if kind == rtde.CONTROLLER:
             answer = struct.pack(">4I", *VERSIONS[self._controller.series])
-        elif kind in (rtde.OUTPUTS, rtde.INPUTS):
+        elif kind in (rtde.OUTPUTS, INPUTS):
             # A rate of eight bytes precedes the names of outputs, and ur-rtde leaves a comma after the last name.
             names = payload[8 * (kind == rtde.OUTPUTS) :].decode().strip(",").split(",")
-            types = [rtde.variable_type(name) for name in names]
+            types = [variable_type(name) for name in names]
             if kind == rtde.OUTPUTS:
-                connection.outputs = names, [rtde.n_values(name) for name in types], rtde.recipe_layout(types)
+                connection.outputs = names, [n_values(name) for name in types], recipe_layout(types)
             elif "IN_USE" not in (types := [self._claim(connection, name) for name in names]):
-                connection.inputs.append((names, rtde.recipe_layout(types)))
+                connection.inputs.append((names, recipe_layout(types)))
                 answer = bytes([len(connection.inputs)])
             answer += ",".join(types).encode()
         elif kind != rtde.VERSION:
@@ -279,7 +282,7 @@ class EmulatedUR5:
         """Return the type of an input, or "IN_USE" if another client writes it."""
         others = [other for other in self._connections if other is not connection]
         in_use = any(name in names for other in others for names, _ in other.inputs)
-        return "IN_USE" if in_use else rtde.variable_type(name)
+        return "IN_USE" if in_use else variable_type(name)
 
     def _do(self, action: Callable[[], None]) -> None:
         """Run an action now, or later if answers are slow."""

@@ -1,9 +1,10 @@
 """The emulated UR controller without its sockets: motions, registers, programs, watchdog and safety.
 
-Of ur-rtde's control program the commands are emulated that our driver uses; any other program is interpreted. Lengths
-are m and angles rad, poses and velocities have six numbers. The true poses are logged in mm.
+Of ur-rtde's control program the commands are emulated that our driver uses; any other program waits until it is
+stopped. Lengths are m and angles rad, poses and velocities have six numbers. The true poses are logged in mm.
 """
 
+import itertools
 import threading
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -14,8 +15,7 @@ from numpy.typing import ArrayLike
 
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.motion import TrapezoidalProfile
-from padforge.sense.rig.arms.rtde import PAUSED, PLAYING, RUNNING, STOPPED
-from padforge.sense.virtual.urscript_interpreter import Pose, Program, UrscriptError
+from padforge.sense.rig.arms.rtde import PLAYING, RUNNING, STOPPED
 
 Series = Literal["cb3", "e"]
 RATES_HZ = {"cb3": 125, "e": 500}
@@ -23,9 +23,8 @@ VERSIONS = {"cb3": (3, 15, 8, 106339), "e": (5, 12, 2, 1101534)}
 HALT_M_S2 = 4.0  # deceleration when the controller itself stops the arm
 START_S = 0.02  # from the last byte of a program to its first step
 NORMAL, PROTECTIVE, EMERGENCY = 1 << 0, 1 << 2, 1 << 7
-POWER_OFF = 3
-REACH_M = 0.95  # from the base to the flange, as far as poses are within the safety limits
-N_REGISTERS = 48
+POWER_OFF = 3  # robot mode
+PAUSED = 4  # runtime state
 UR_RTDE_PROGRAM = "def rtde_control():"
 
 MOVE_L, STOP, WATCHDOG, GET_TCP, END = 3, 33, 35, 40, 255
@@ -131,8 +130,8 @@ class Controller:
         self.motion = Motion(pose)
         self._surface, self._stiffness = surface, stiffness
         self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
+        self.has_force = True  # whether the force of the states is a number
         self.dashboard_log: list[str] = []
-        self.popups: list[str] = []  # what the pendant shows of programs that are wrong
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -174,14 +173,7 @@ class Controller:
         if self._safety != NORMAL:
             return
         self.stop_program()
-        if UR_RTDE_PROGRAM in text:
-            self._program = self._emulate_ur_rtde()
-        else:
-            try:
-                self._program = self._interpret(text)
-            except UrscriptError as error:
-                self.popups.append(str(error))
-                return
+        self._program = self._emulate_ur_rtde() if UR_RTDE_PROGRAM in text else itertools.repeat(None)
         self._program_start = self.now + START_S
 
     def stop_program(self) -> None:
@@ -241,27 +233,12 @@ class Controller:
             "target_TCP_pose": self.motion.pose,
             "actual_TCP_speed": self.motion.velocity,
             "target_TCP_speed": self.motion.velocity,
-            "actual_TCP_force": force,
+            "actual_TCP_force": force if self.has_force else np.full(6, np.nan),
             "robot_mode": self._mode,
             "runtime_state": self._runtime,
             "robot_status_bits": 1 | (self._runtime == PLAYING) << 1,
             "safety_status_bits": self._safety,
         }
-
-    def _interpret(self, text: str) -> Iterator[None]:
-        functions = ScriptFunctions(self)
-        program = Program(text, functions.functions, functions.motions)
-
-        def run() -> Iterator[None]:
-            try:
-                while program.threads:
-                    program.step()
-                    yield
-            except UrscriptError as error:
-                self.popups.append(str(error))
-            self.stop_program()
-
-        return run()
 
     def _emulate_ur_rtde(self) -> Iterator[None]:
         """Run the loop of ur-rtde's control program: a command, then done, then ready once the client has noted it."""
@@ -327,64 +304,6 @@ class Controller:
 
     def _read_double(self, index: int) -> float:
         return self.inputs[f"input_double_register_{index}"]
-
-
-class ScriptFunctions:
-    """What programs in URScript may call; names, units (m, rad) and defaults as in its manual."""
-
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
-        self.functions = {
-            function.__name__: function
-            for function in (
-                *(self.read_input_integer_register, self.read_input_float_register),
-                *(self.write_output_integer_register, self.write_output_float_register),
-                *(self.get_actual_tcp_pose, self.get_tcp_offset, self.is_within_safety_limits),
-            )
-        }
-        self.motions = {motion.__name__: motion for motion in (self.movel, self.stopl, self.sync)}
-
-    def read_input_integer_register(self, address: int) -> int:
-        return int(self._controller.inputs[f"input_int_register_{_address(address)}"])
-
-    def read_input_float_register(self, address: int) -> float:
-        return float(self._controller.inputs[f"input_double_register_{_address(address)}"])
-
-    def write_output_integer_register(self, address: int, value: int) -> None:
-        self._controller.outputs[f"output_int_register_{_address(address)}"] = value
-
-    def write_output_float_register(self, address: int, value: float) -> None:
-        self._controller.outputs[f"output_double_register_{_address(address)}"] = value
-
-    def get_actual_tcp_pose(self) -> Pose:
-        return Pose(self._controller.motion.pose.tolist())
-
-    def get_tcp_offset(self) -> Pose:
-        return Pose((*map(float, self._controller.tcp), 0.0, 0.0, 0.0))
-
-    def is_within_safety_limits(self, pose: Pose) -> bool:
-        return float(np.linalg.norm(pose[:3])) <= REACH_M + float(np.linalg.norm(self._controller.tcp))
-
-    def movel(self, pose: Pose, a: float = 1.2, v: float = 0.25) -> Iterator[None]:
-        motion = self._controller.motion
-        motion.move_to(np.array(pose), v, a, self._controller.now)
-        while motion.moving:
-            yield
-
-    def stopl(self, a: float) -> Iterator[None]:
-        motion = self._controller.motion
-        motion.brake(a, self._controller.now)
-        while motion.moving:
-            yield
-
-    def sync(self) -> Iterator[None]:
-        yield
-
-
-def _address(address: int) -> int:
-    if not 0 <= address < N_REGISTERS:
-        raise ValueError(f"register {address}; allowed 0 to {N_REGISTERS - 1}")
-    return address
 
 
 class PoseLog:

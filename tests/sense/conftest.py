@@ -1,6 +1,5 @@
 """A simulated recording and a quickly trained localizer, shared by the tests of sense."""
 
-import importlib.util
 import sys
 import tempfile
 import time
@@ -20,7 +19,7 @@ from padforge.sense import settings as sense_settings
 from padforge.sense.localizer import calibration, evaluation
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
-from padforge.sense.rig.arms.ur5 import UR5, Driver
+from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.twin import identification as twin_identification
@@ -168,10 +167,6 @@ WAIT_S = 180.0
 ADDRESSES = [f"127.0.0.{last}" for last in range(1, 33 if sys.platform == "linux" else 2)]
 """Of this machine: on Linux all that begin with 127, elsewhere the first alone."""
 
-HAS_UR_RTDE = importlib.util.find_spec("rtde_control") is not None
-NEEDS_UR_RTDE = pytest.mark.skipif(not HAS_UR_RTDE, reason="ur-rtde is not here")
-BY_URSCRIPT = pytest.mark.skip(reason="the URScript driver is to leave, and its tests go by the clock")
-
 FORBIDDEN = ("play", "unlock", "power", "brake", "safety")
 """Words of orders to the dashboard that are for a person alone."""
 
@@ -182,7 +177,6 @@ class Robots:
     def __init__(self, host: str) -> None:
         self.host, self.series, self.robot = host, "", None
         self.arm: UR5 | None = None
-        self.driver: Driver = "urscript"
 
     def get(self, series: Series, **settings: Any) -> EmulatedUR5:
         if self.robot is None or settings or self.series != series:
@@ -190,13 +184,9 @@ class Robots:
             self.series, self.robot = series, EmulatedUR5(series, host=self.host, **settings).__enter__()
         return self.robot
 
-    def connected(self, host: str, driver: Driver) -> UR5:
-        """The arm by one of its names, at rest, moved by a driver."""
-        if self.arm is not None and self.driver != driver:
-            self.arm.close()
-            self.arm = None
-        self.driver = driver
-        arm = self.arm = self.arm or UR5(host, driver)
+    def connected(self, host: str) -> UR5:
+        """The arm by one of its names, at rest."""
+        arm = self.arm = self.arm or UR5(host)
         try:
             if arm.state().moving:
                 arm.stop()
@@ -209,9 +199,8 @@ class Robots:
         if arm is not None:
             arm.close()
         if robot is not None:
-            asked, popups = robot.dashboard_log(), robot.popups()
+            asked = robot.dashboard_log()
             robot.__exit__()
-            assert not popups
             assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
 
 
@@ -259,6 +248,7 @@ def host(address: str) -> str:
 
 @pytest.fixture(scope="module")
 def robots(address: str) -> Iterator[Robots]:
+    pytest.importorskip("rtde_control")
     robots = Robots(address)
     yield robots
     robots.free()
@@ -274,18 +264,6 @@ def robot(robots: Robots, series: Series) -> EmulatedUR5:
     return robots.get(series)
 
 
-@pytest.fixture(
-    params=[
-        pytest.param("ur-rtde", marks=NEEDS_UR_RTDE),
-        pytest.param("urscript", marks=BY_URSCRIPT),
-    ],
-    scope="module",
-)
-def driver(request: pytest.FixtureRequest) -> Driver:
-    """What moves the arm."""
-    return request.param
-
-
 @pytest.fixture
-def arm(robots: Robots, robot: EmulatedUR5, host: str, driver: Driver) -> UR5:
-    return robots.connected(host, driver)
+def arm(robots: Robots, robot: EmulatedUR5, host: str) -> UR5:
+    return robots.connected(host)

@@ -1,10 +1,9 @@
-"""RTDE, the data link of Universal Robots controllers: frames, recipes, registers, the dashboard, a reader of states.
+"""RTDE, the data link of Universal Robots controllers: frames, a reader of states, and the dashboard.
 
 Frames are big-endian, both ways.
 """
 
 import math
-import re
 import socket
 import struct
 import time
@@ -13,51 +12,30 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
-VERSION, CONTROLLER, OUTPUTS, INPUTS, START, PAUSE, DATA = b"VvOISPU"
+RTDE_PORT, DASHBOARD_PORT = 30004, 29999
+VERSION, CONTROLLER, OUTPUTS, START, DATA = b"VvOSU"
 PROTOCOL = 2  # the only version of the protocol that is used here
 RUNNING = 7  # robot mode of an arm that is powered on and has its brakes released
-STOPPED, PLAYING, PAUSED = 1, 2, 4  # runtime states of the program
+STOPPED, PLAYING = 1, 2  # runtime states of the program; a paused one has another
 PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 """Protective and safeguard stop, recovery, violation, fault: the controller does not move the arm."""
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
-VARIABLES = (
-    *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
-    *("robot_mode", "runtime_state", "safety_status_bits"),
-)
-"""What the reader asks for, besides the register of moves."""
+VARIABLES = {
+    "timestamp": "DOUBLE",
+    "actual_TCP_pose": "VECTOR6D",
+    "actual_TCP_speed": "VECTOR6D",
+    "actual_TCP_force": "VECTOR6D",
+    "robot_mode": "INT32",
+    "runtime_state": "UINT32",
+    "safety_status_bits": "UINT32",
+    "output_int_register_2": "INT32",
+}
+"""What the reader asks for, and of which type it is; the register is that of the moves of ur-rtde's program."""
 FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
 MAX_CLOCK_SKEW = 2e-4  # relative difference of the controller's clock and the host's
 
 _HEADER = struct.Struct(">HB")
-_CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}
-_CODES |= {"VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i"}
-_TYPES = (
-    (r"robot_mode|safety_mode|(input|output)_int_register_\d+", "INT32"),
-    (r"runtime_state|robot_status_bits|safety_status_bits|output_bit_registers\d+_to_\d+", "UINT32"),
-    (r"actual_digital_(in|out)put_bits", "UINT64"),
-    (r"actual_tool_accelerometer|payload_cog", "VECTOR3D"),
-    (r"joint_mode", "VECTOR6INT32"),
-    (r"actual_robot_(current|voltage)|actual_main_voltage", "DOUBLE"),
-    (r"(actual|target)_(q|qd|qdd|current|moment|TCP_\w+)|actual_current_as_torque|actual_joint_voltage", "VECTOR6D"),
-    (r"joint_(control_output|temperatures)|ft_raw_wrench|payload_inertia", "VECTOR6D"),
-    (r"\w+", "DOUBLE"),
-)
-
-
-def variable_type(name: str) -> str:
-    """Return the type of a variable by its name, as ur-rtde decodes it."""
-    return next(kind for pattern, kind in _TYPES if re.fullmatch(pattern, name))
-
-
-def recipe_layout(types: Sequence[str]) -> struct.Struct:
-    """Return the layout of the values of a recipe; KeyError for an unknown type."""
-    return struct.Struct(">" + "".join(_CODES[kind] for kind in types))
-
-
-def n_values(kind: str) -> int:
-    """Return how many values a variable of a type has."""
-    return int(_CODES[kind][:-1] or 1)
+_LAYOUT = struct.Struct(">19diIIi")  # the values of `VARIABLES`, which follow the number of their recipe
 
 
 def pack_frame(kind: int, payload: bytes = b"") -> bytes:
@@ -137,60 +115,54 @@ class HostClock:
         return self._last_s
 
 
-class RtdeLink:
-    """A link to the RTDE port. Methods raise OSError if there is none or it ends, TimeoutError if nothing comes."""
+class RtdeReader:
+    """A link to the RTDE port that reads every state of the arm.
+
+    Methods raise OSError if there is no link or it ends, TimeoutError if nothing comes, ValueError for what is damaged.
+    """
 
     def __init__(self, host: str, timeout_s: float) -> None:
-        """Connect; ValueError if the controller lacks the protocol."""
+        """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
         self._link = socket.create_connection((host, RTDE_PORT), timeout_s)
         self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._splitter = FrameSplitter()
         self._queue: deque[tuple[float, bytes]] = deque()
-        self._recipe, self._inputs, self._outputs = b"", struct.Struct(""), struct.Struct("")
+        self._clock = HostClock()
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
         self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of the controller
         self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # control cycles, and states, a second
+        self._start()
 
-    def set_inputs(self, names: Sequence[str]) -> None:
-        """Claim registers for `write`; ValueError if the controller lacks one, or another client has claimed it."""
-        self._recipe, self._inputs = self._negotiate(INPUTS, b"", names)
-
-    def write(self, *values: float) -> None:
-        """Write all registers that were claimed, in one package."""
-        self._link.sendall(pack_frame(DATA, self._recipe + self._inputs.pack(*values)))
-
-    def start(self, names: Sequence[str]) -> None:
-        """Start the stream of variables; ValueError if the controller lacks one."""
-        _, self._outputs = self._negotiate(OUTPUTS, struct.pack(">d", self.rate_hz), names)
-        self._request(START)
-
-    def receive(self, timeout_s: float) -> tuple[float, tuple[Any, ...]]:
-        """Return host time and values of the next package of the stream; TimeoutError after `timeout_s` without a byte.
-
-        ValueError for a damaged one.
-        """
+    def read(self, timeout_s: float) -> RtdeState:
+        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
         self._link.settimeout(timeout_s)
         while not self._queue:
             self._read_frames()
         arrival_s, payload = self._queue.popleft()
-        return arrival_s, _unpack(self._outputs, payload[1:])
+        values = _unpack(_LAYOUT, payload[1:])
+        if not all(map(math.isfinite, values)):
+            raise ValueError("the controller sent a state that holds NaN or infinity")
+        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
+        has_sensor = self.version[0] >= FORCE_SERIES
+        return RtdeState(
+            time_s=self._clock.host_time(stamp, arrival_s),
+            pose=pose,
+            speed=math.hypot(*speed),
+            force_n=force[2] if has_sensor else None,
+            sideways_n=math.hypot(*force[:2]) if has_sensor else 0.0,
+            **dict(zip(("mode", "runtime", "safety", "progress"), values[19:], strict=True)),
+        )
 
-    def pause(self) -> None:
-        """Pause the stream for good."""
-        self._request(PAUSE)
-        self._queue.clear()
-
-    def _negotiate(self, kind: int, head: bytes, names: Sequence[str]) -> tuple[bytes, struct.Struct]:
-        """Agree on a recipe with the controller; return its number and its layout."""
-        answer = self._request(kind, head + ",".join(names).encode())
+    def _start(self) -> None:
+        """Agree on the variables with the controller, and let it stream them."""
+        answer = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(VARIABLES).encode())
         types = answer[1:].decode().split(",")
-        for problem, message in (("NOT_FOUND", "has no"), ("IN_USE", "lets another program write")):
-            if problem in types:
-                raise ValueError(f"the controller {message} {names[types.index(problem) % len(names)]}")
-        if types != [variable_type(name) for name in names]:
-            raise ValueError(f"the controller would take or send {','.join(types)[:200]!r} for {','.join(names)}")
-        return answer[:1], recipe_layout(types)
+        if missing := [name for name, kind in zip(VARIABLES, types, strict=False) if kind == "NOT_FOUND"]:
+            raise ValueError(f"the controller has no {', '.join(missing)}")
+        if types != list(VARIABLES.values()):
+            raise ValueError(f"the controller would send {','.join(types)[:200]!r} for {','.join(VARIABLES)}")
+        self._request(START)
 
     def _request(self, kind: int, payload: bytes = b"") -> bytes:
         self._link.sendall(pack_frame(kind, payload))
@@ -212,32 +184,6 @@ class RtdeLink:
             else:
                 answers.append((kind, payload))
         return answers
-
-
-class RtdeReader(RtdeLink):
-    """A link that reads the states of the arm."""
-
-    def __init__(self, host: str, timeout_s: float, progress_register: int) -> None:
-        """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
-        super().__init__(host, timeout_s)
-        self._clock = HostClock()
-        self.start((*VARIABLES, f"output_int_register_{progress_register}"))
-
-    def read(self, timeout_s: float) -> RtdeState:
-        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
-        arrival_s, values = self.receive(timeout_s)
-        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
-        has_sensor = self.version[0] >= FORCE_SERIES
-        if not all(map(math.isfinite, values)):
-            raise ValueError("the controller sent a state that holds NaN or infinity")
-        return RtdeState(
-            time_s=self._clock.host_time(stamp, arrival_s),
-            pose=pose,
-            speed=math.hypot(*speed),
-            force_n=force[2] if has_sensor else None,
-            sideways_n=math.hypot(*force[:2]) if has_sensor else 0.0,
-            **dict(zip(("mode", "runtime", "safety", "progress"), map(int, values[19:]), strict=True)),
-        )
 
 
 def _unpack(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:

@@ -1,9 +1,9 @@
 """The worker process that controls a UR arm: commands on stdin, states and replies on stdout.
 
-Run as `python -m padforge.sense.rig.arms.rtde_worker HOST DRIVER RETREAT`; the driver is ur-rtde, which can hang and
-crash, or our URScript program. All are JSON lines; an empty one is a heartbeat. The arm's watchdog is kicked from here
-alone, so the arm stops by itself if this process ends or hangs. It also stops if the parent ends, or gives no sign of
-life during a move. Nothing here unlocks, powers or starts an arm.
+Run as `python -m padforge.sense.rig.arms.rtde_worker HOST`; ur-rtde, which it calls, can hang and crash. All are JSON
+lines; an empty one is a heartbeat. The arm's watchdog is kicked from here alone, so the arm stops by itself if this
+process ends or hangs. It also stops if the parent ends, or gives no sign of life during a move. Nothing here unlocks,
+powers or starts an arm.
 """
 
 import contextlib
@@ -16,14 +16,12 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState
 from padforge.sense.rig.arms.ur_rtde import UrRtdeControl
-from padforge.sense.rig.arms.urscript import Retreat, UrscriptControl
 
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
 HEARTBEAT_TIMEOUT_S = 0.3  # silence of the parent during a move; its heart beats six times as often
@@ -38,37 +36,6 @@ UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 class CommandRejected(Exception):  # noqa: N818  the parent raises it as a RigFault
     """A command that fails: cause, message and advice of the fault that the parent raises."""
-
-
-class Control(Protocol):
-    """A program on the arm that moves it; its methods raise an error if the arm is lost. Lengths are m."""
-
-    moving: bool  # whether the last move is under way
-    identity: dict[str, Any]  # the driver
-
-    def tcp_offset(self) -> Sequence[float]:
-        """Return the tool centre point from the flange, m and rad."""
-        ...
-
-    def update(self, progress: int, is_stopped: bool) -> None:
-        """Note the newest register of progress, and whether a protective or emergency stop holds the arm."""
-        ...
-
-    def kick(self) -> None:
-        """Kick the watchdog, which stops the arm after 0.25 s without."""
-        ...
-
-    def move(self, pose: Sequence[float], speed: float, acceleration: float) -> bool:
-        """Start a straight move (m, rad, m/s, m/s²); return whether the arm accepts it."""
-        ...
-
-    def stop(self) -> None:
-        """Stop the arm, and return once it is at rest."""
-        ...
-
-    def end(self) -> None:
-        """Stop the arm and end the program."""
-        ...
 
 
 def _check_ready(state: RtdeState) -> None:
@@ -137,11 +104,11 @@ class WorkerProcess:
     Three threads: the main one reads stdin, one calls the driver, and one reads the states.
     """
 
-    def __init__(self, host: str, driver: str, retreat: Retreat | None, out: int) -> None:
-        self._host, self._driver, self._retreat, self._out = host, driver, retreat, out
+    def __init__(self, host: str, out: int) -> None:
+        self._host, self._out = host, out
         self._write_lock = threading.Lock()
         self._commands: queue.Queue[dict[str, Any]] = queue.Queue()
-        self._control: Control | None = None
+        self._control: UrRtdeControl | None = None
         self._arm_lock: int | None = None
         self._latest: RtdeState | None = None
         self._new_state = threading.Event()
@@ -189,10 +156,9 @@ class WorkerProcess:
             control.kick()
 
     def _do_connect(self) -> dict[str, Any]:
-        driver = UrRtdeControl if self._driver == "ur-rtde" else UrscriptControl
         try:
             self._arm_lock = lock_arm(self._host)
-            reader = RtdeReader(self._host, ANSWER_S, driver.progress_register)
+            reader = RtdeReader(self._host, ANSWER_S)
             state = reader.read(ANSWER_S)
             _check_ready(state)
             state = _wait_until_idle(reader, state)
@@ -203,7 +169,7 @@ class WorkerProcess:
             advice = "check its address, its cable and that it is switched on"
             raise CommandRejected("refused", message, advice) from None
         threading.Thread(target=self._report_states, args=(reader, state), daemon=True).start()
-        control = UrRtdeControl(self._host) if driver is UrRtdeControl else UrscriptControl(self._host, self._retreat)
+        control = UrRtdeControl(self._host)
         tcp = control.tcp_offset()
         self._control = control
         if not self._program_running.wait(ANSWER_S):
@@ -254,7 +220,7 @@ class WorkerProcess:
         if control := self._playing():
             control.end()
 
-    def _playing(self) -> Control | None:
+    def _playing(self) -> UrRtdeControl | None:
         """Return the control if its program runs."""
         is_playing = self._latest is not None and self._latest.runtime == rtde.PLAYING
         return self._control if is_playing else None
@@ -331,10 +297,8 @@ def main() -> None:
     """Keep stdout for the parent alone: what ur-rtde prints goes to stderr."""
     out = os.dup(1)
     os.dup2(2, 1)
-    host, driver, retreat = sys.argv[1:]
-    fields = json.loads(retreat)
     with contextlib.suppress(KeyboardInterrupt):
-        WorkerProcess(host, driver, Retreat(**fields) if fields else None, out).run()
+        WorkerProcess(sys.argv[1], out).run()
 
 
 if __name__ == "__main__":

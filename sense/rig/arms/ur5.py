@@ -1,7 +1,4 @@
-"""A Universal Robots arm, driven from a process that can be killed, since ur-rtde can hang and crash.
-
-Where ur-rtde cannot be installed, a URScript program of ours moves the arm.
-"""
+"""A Universal Robots arm, driven by ur-rtde from a process that can be killed, since it can hang and crash."""
 
 import importlib.util
 import itertools
@@ -12,20 +9,17 @@ import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms.rtde import stop_program
-from padforge.sense.rig.arms.urscript import Retreat
 from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, start
-from padforge.sense.rig.safety import EDGE_MM, RETREAT_MM, RETREAT_MM_S, check_finite_move
+from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
-
-Driver = Literal["ur-rtde", "urscript"]
 
 MAX_STATES = 300_000  # states kept for `drain`: 10 minutes at 500 Hz
 HEARTBEAT_S = 0.05
@@ -40,9 +34,8 @@ DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 class RtdeWorker:
     """The worker process of the driver, seen from its parent: requests have a deadline, and it can be killed."""
 
-    def __init__(self, host: str, driver: Driver, retreat: Retreat | None) -> None:
+    def __init__(self, host: str) -> None:
         self._host = host
-        self.retreats = driver == "urscript" and retreat is not None  # by itself, once it hears no more of the worker
         self.fault: RigFault | None = None  # why the worker has ended; None while it runs
         self.latest: ArmState | None = None  # last state of the arm
         self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
@@ -52,11 +45,7 @@ class RtdeWorker:
         self._received = threading.Condition()
         self._supervised_s = clock.now()
         self._killed = threading.Event()
-        self.process = start(
-            "padforge.sense.rig.arms.rtde_worker",
-            *(host, driver, json.dumps(asdict(retreat) if retreat else None)),
-            stderr=subprocess.DEVNULL,
-        )
+        self.process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
         assert self.process.stdin is not None
         os.set_blocking(self.process.stdin.fileno(), False)
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._receive, self._send_heartbeats)]
@@ -99,11 +88,8 @@ class RtdeWorker:
                 pipe.close()
 
     def stop_program(self) -> bool:
-        """Stop the arm by its dashboard once the worker has ended; return whether that is confirmed.
-
-        A program that retreats by itself is left to do so: a stop would end it with the tool on the pad.
-        """
-        self.stopped = self.stopped or (not self.retreats and stop_program(self._host, DASHBOARD_S))
+        """Stop the arm by its dashboard once the worker has ended; return whether that is confirmed."""
+        self.stopped = self.stopped or stop_program(self._host, DASHBOARD_S)
         return self.stopped
 
     def _write(self, line: bytes) -> None:
@@ -145,47 +131,36 @@ class RtdeWorker:
 
 
 class UR5:
-    """The arm at a network address; implements `Arm`. Linux and macOS.
-
-    The driver is ur-rtde, or, where that is not installed, our URScript program.
+    """The arm at a network address; implements `Arm`. It needs ur-rtde and POSIX.
 
     During a move `state` or `drain` must be called at least every 2 s, or the arm is stopped; it also stops within
     0.5 s if this process ends or is suspended. A protective or emergency stop ends the move for good: a person has to
     unlock the arm, and `connect` starts anew. Nothing here unlocks, powers or starts an arm.
     """
 
-    def __init__(self, host: str, driver: Driver | None = None, retreat: Retreat | None = None) -> None:
-        """Describe an arm.
-
-        Args:
-            host: its address.
-            driver: what moves it; None for ur-rtde if that is installed, or else "urscript".
-            retreat: what the arm does by itself if this computer fails after a move; by "urscript" only.
-        """
-        self._host, self._retreat = host, retreat
-        self._driver: Driver = driver or ("ur-rtde" if importlib.util.find_spec("rtde_control") else "urscript")
+    def __init__(self, host: str) -> None:
+        """Describe the arm at an address."""
+        self._host = host
         self._worker: RtdeWorker | None = None
         self._move_s = 0.0
 
     @classmethod
-    def from_settings(cls, rig: RigSettings, driver: Driver | None = None) -> "UR5":
-        """Return the arm that `[rig]` names, which retreats if its workspace and the pad's surface are known."""
-        if rig.box_mm is None or rig.contact_mm is None:
-            return cls(rig.host, driver)
-        x0, x1, y0, y1, _, top = rig.box_mm
-        height_mm = min(rig.contact_mm + RETREAT_MM, top)
-        sides = (x0 - EDGE_MM, x1 + EDGE_MM), (y0 - EDGE_MM, y1 + EDGE_MM)
-        return cls(rig.host, driver, Retreat(height_mm, *sides, RETREAT_MM_S))
+    def from_settings(cls, rig: RigSettings) -> "UR5":
+        """Return the arm that `[rig]` names."""
+        return cls(rig.host)
 
     def connect(self) -> Mapping[str, Any]:
         """Open the link, ending an earlier one of this object.
 
-        RigFault("refused") if there is no arm, it is not in remote control or not powered, another program uses it, on
-        this computer or elsewhere, or it lacks what the driver needs; "protective_stop", "emergency_stop"; "deadline"
-        after 4.5 s.
+        RigFault("refused") if ur-rtde is not installed, there is no arm, it is not in remote control or not powered,
+        another program uses it, on this computer or elsewhere, or it lacks what ur-rtde needs; "protective_stop",
+        "emergency_stop"; "deadline" after 4.5 s.
         """
+        if importlib.util.find_spec("rtde_control") is None:
+            advice = "it has wheels for Linux on x86-64 and Windows, Python 3.11 and 3.12: pip install 'padforge[rig]'"
+            raise RigFault("refused", "ur-rtde, which moves the arm, is not installed", advice)
         self._end_worker()
-        self._worker = RtdeWorker(self._host, self._driver, self._retreat)
+        self._worker = RtdeWorker(self._host)
         try:
             return self._worker.request("connect", timeout_s=CONNECT_S)
         except BaseException:
@@ -239,8 +214,7 @@ class UR5:
         except RigFault:
             if not self._abandon():
                 reason = f"the arm {self._host} did not confirm the stop"
-                lift = " and lifts the tool off" if self._worker.retreats else ""
-                raise RigFault("lost", reason, f"its watchdog stops it within 0.3 s{lift}, but look at it") from None
+                raise RigFault("lost", reason, "its watchdog stops it within 0.3 s, but look at it") from None
 
     def close(self) -> None:
         """Stop the arm and close the link; never raises."""

@@ -10,9 +10,10 @@ OPERATION, UNDER_WAY = 0x7F << 24, 1 << 15  # of ur-rtde's register of moves
 
 
 class UrRtdeControl:
-    """ur-rtde's program at work; see `Control` in `rtde_worker`."""
+    """ur-rtde's program at work; its methods raise an error if the arm is lost. Lengths are m.
 
-    progress_register = 2
+    `moving` tells whether the last move is under way, `identity` the version of the driver.
+    """
 
     def __init__(self, host: str) -> None:
         """Send ur-rtde's program and set its watchdog; RuntimeError if there is no arm."""
@@ -37,7 +38,7 @@ class UrRtdeControl:
             self.moving = False
 
     def kick(self) -> None:
-        """Kick the watchdog."""
+        """Kick the watchdog, which stops the arm after 0.25 s without."""
         self._control.kickWatchdog()
 
     def move(self, pose: Sequence[float], speed: float, acceleration: float) -> bool:

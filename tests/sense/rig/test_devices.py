@@ -48,7 +48,7 @@ def test_start_imports_nothing_from_the_current_folder(
         monkeypatch.delenv("PYTHONPATH", raising=False)
     else:
         monkeypatch.setenv("PYTHONPATH", python_path)
-    process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", "urscript", "null", stderr=subprocess.PIPE)
+    process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", stderr=subprocess.PIPE)
     assert os.getsid(process.pid) == process.pid, "an interrupt from the keyboard would reach it"
     _, stderr = process.communicate(timeout=20)  # the end of its stdin ends it
     assert not (tmp_path / "pwned").exists(), stderr
@@ -100,7 +100,7 @@ def test_ports_of_boards_are_found(
     for find_port in (due.find_due_port, line_board.find_line_port):
         assert find_port(RigSettings(port="COM3")) == "COM3"
     monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (DueBoard("/dev/ttyACM0", 1000).connect, due.list_due_ports):
+    for action in (DueBoard("/dev/ttyACM0", 921_600, 1000).connect, due.list_due_ports):
         with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
             action()
         assert caught.value.cause == "refused"

@@ -1,6 +1,5 @@
 """Whole rigs without hardware: real drivers, and emulators that share one simulated pad, through faults and noise."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -64,7 +63,6 @@ class Rig:
 
     def __init__(self, settings: RigSettings, emulate: Callable[..., Any]) -> None:
         self.settings, self.emulate, self.stack = settings, emulate, ExitStack()
-        self.retreats = importlib.util.find_spec("rtde_control") is None
         self.replace()
 
     def replace(self) -> None:
@@ -118,14 +116,11 @@ class Rig:
         return self.record(run, plan, report)
 
     def is_at_rest(self) -> bool:
-        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds.
-
-        An arm that retreats by itself has 2 s more.
-        """
+        """Return whether the arm truly rests half a second from now, and the printer for the next nine seconds."""
         if isinstance(self.robot, EmulatedPrinter):
             now = clock.now()
             return bool(np.ptp(self.robot.true_positions([now, now + 9]), axis=0).max() == 0)
-        clock.sleep(2.5 if self.retreats else 0.5)
+        clock.sleep(0.5)
         now = clock.now()
         a, b = self.robot.true_poses([now - 0.05, now - 0.01])[:, :3]
         return bool(np.linalg.norm(b - a) / 0.04 < 1)
@@ -264,9 +259,6 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
         if name == "board_of_printer":  # the probe is lifted
             tip = rig.robot.true_positions(clock.now())[0] + PRINTER.tcp_mm
             assert tip[2] == pytest.approx((PRINTER.contact_mm or 0) + RETREAT_MM, abs=0.05)
-        if name == "drop" and rig.retreats:
-            height_mm = rig.robot.true_poses(clock.now())[0, 2]
-            assert height_mm == pytest.approx((ARM.contact_mm or 0) + RETREAT_MM, abs=0.05)
         assert set(read_journal(run / "journal.ndjson")) >= set(range(press)), name
         cure(rig)
     rig.finished(run, plan, lambda done, of, what: rig.board.garble(1e-3))

@@ -1,4 +1,4 @@
-"""The arm behind the real ur-rtde, and behind our URScript program: what it does, and that it rests after a fault."""
+"""The arm behind the real ur-rtde: what it does, and that it rests after a fault."""
 
 import importlib.util
 import os
@@ -17,14 +17,12 @@ import pytest
 
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig.arms import rtde, ur5
-from padforge.sense.rig.arms.ur5 import UR5, Driver
-from padforge.sense.rig.arms.urscript import Retreat
+from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual.ur5 import HOME, EmulatedUR5
-from tests.sense.conftest import BY_URSCRIPT
+from padforge.sense.virtual.ur5 import HOME, INPUTS, SCRIPT_PORT, EmulatedUR5
 
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
 LIMITS = Limits(
@@ -124,10 +122,8 @@ def test_stop_ends_move_within_half_a_second(robot: EmulatedUR5, arm: UR5) -> No
     assert arm.state().speed_mm_s == 0
 
 
-def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5, driver: Driver) -> None:
+def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5) -> None:
     before = arm.state().pose
-    if driver == "urscript":  # which asks the controller
-        assert fault_of(arm.move, (2000.0, *HOME[1:]), 10, 10) == "refused"
     assert fault_of(arm.move, (*HOME[:5], float("inf")), 10, 10) == "refused"
     assert fault_of(arm.move, HOME, -1, 10) == "refused"
     assert arm.state().pose == before
@@ -139,9 +135,9 @@ def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure:
     cure()
 
 
-def test_connect_refuses_unavailable_arm(robots: Any, host: str, driver: Driver) -> None:
+def test_connect_refuses_unavailable_arm(robots: Any, host: str) -> None:
     robots.free()
-    with closing(UR5(host, driver)) as arm:
+    with closing(UR5(host)) as arm:
         assert fault_of(arm.connect) == "refused"
         assert fault_of(arm.state) == "lost"
         arm.stop()
@@ -152,23 +148,17 @@ def test_connect_refuses_unavailable_arm(robots: Any, host: str, driver: Driver)
         arm.connect()
 
 
-@pytest.mark.parametrize("installed", [True, pytest.param(False, marks=BY_URSCRIPT)])
-def test_driver_is_ur_rtde_where_it_is_installed(
-    robots: Any, host: str, monkeypatch: pytest.MonkeyPatch, installed: bool
-) -> None:
-    robots.free()
-    robots.get("cb3")
-    if installed:
-        pytest.importorskip("rtde_control")
-    else:
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with closing(UR5(host)) as arm:
-        assert arm.connect()["driver"].startswith("ur-rtde 1" if installed else "URScript")
+def test_connect_without_ur_rtde_says_where_it_has_wheels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    message = "ur-rtde, which moves the arm, is not installed; it has wheels for Linux on x86-64 and Windows, Python 3"
+    with pytest.raises(RigFault, match=message) as refused:
+        UR5("192.0.2.1").connect()
+    assert refused.value.exit_code == 2
 
 
 @pytest.mark.slow
-def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, driver: Driver, monkeypatch) -> None:
-    with closing(UR5(host, driver)) as arm:
+def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, monkeypatch) -> None:
+    with closing(UR5(host)) as arm:
         refused_until_cured(arm, lambda: robot.refuse(True), "refused", lambda: robot.refuse(False))
         refused_until_cured(arm, lambda: robot.unplug(True), "refused", lambda: robot.unplug(False))
         monkeypatch.setattr(ur5, "CONNECT_S", 1.0)
@@ -176,13 +166,11 @@ def test_connect_refuses_silent_arm_in_time(robot: EmulatedUR5, host: str, drive
         arm.connect()
 
 
-def test_connect_refuses_arm_in_use_on_this_computer(
-    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
-) -> None:
+def test_connect_refuses_arm_in_use_on_this_computer(robot: EmulatedUR5, arm: UR5, address: str) -> None:
     """Nor looked over by `doctor`; the move that is under way goes on."""
     go(arm, HOME)
     arm.move(LOW, 50, 500)
-    (diagnosis,) = examine_arm(UR5(address, driver), RigSettings())
+    (diagnosis,) = examine_arm(UR5(address), RigSettings())
     assert diagnosis.status == "fail"
     assert "another program on this computer uses the arm" in diagnosis.message
     assert arm.state().moving
@@ -190,24 +178,22 @@ def test_connect_refuses_arm_in_use_on_this_computer(
 
 
 @pytest.mark.slow
-def test_connect_refuses_arm_in_use_by_another_computer(
-    robot: EmulatedUR5, arm: UR5, address: str, driver: Driver
-) -> None:
+def test_connect_refuses_arm_in_use_by_another_computer(robot: EmulatedUR5, arm: UR5, address: str) -> None:
     go(arm, HOME)
     arm.move(LOW, 50, 500)
     from padforge.sense.rig.arms.rtde_worker import LOCK_FOLDER  # not on Windows
 
     (LOCK_FOLDER / f"padforge-arm-{address}.lock").unlink()  # as if the other arm's program ran on another computer
     with pytest.raises(RigFault, match="a program runs on the arm"):
-        UR5(address, driver).connect()
+        UR5(address).connect()
     assert arm.state().moving
     assert wait_until_still(arm, LIMITS).pose == pytest.approx(LOW, abs=0.1)
     go(arm, HOME)
 
 
-def test_force_is_limited_in_all_directions(robots: Any, host: str, driver: Driver) -> None:
+def test_force_is_limited_in_all_directions(robots: Any, host: str) -> None:
     robot = robots.get("e", surface_mm=100, stiffness_n_mm=2.0, tcp_mm=(0.0, 1.5, 150.0))
-    with closing(UR5(host, driver)) as arm:
+    with closing(UR5(host)) as arm:
         assert arm.connect()["tcp"] == [0, 1.5, 150, 0, 0, 0]
         assert go(arm, (*HOME[:2], 90.0, *HOME[3:]), 300).force_n == pytest.approx(20)
         arm.move(LOW, 10, 500)  # slowly: this arm's time does not wait for a driver that gets no processor
@@ -242,7 +228,7 @@ def signal_worker(name: str) -> Callable[[EmulatedUR5, UR5], None]:
 
 def upload_other_program(robot: EmulatedUR5) -> None:
     """Another computer sends a program, which replaces the one that moves the arm."""
-    with socket.create_connection((robot.host, rtde.SCRIPT_PORT)) as script:
+    with socket.create_connection((robot.host, SCRIPT_PORT)) as script:
         script.sendall(b"def other():\n  while True:\n    sync()\n  end\nend\n")
 
 
@@ -251,6 +237,10 @@ FAULTS: dict[str, tuple[Callable[[EmulatedUR5, UR5], object], str, float, Callab
     "stream frozen": (lambda robot, arm: robot.freeze(True), "stale", 1.0, lambda robot: robot.freeze(False)),
     "other program": (lambda robot, arm: upload_other_program(robot), "lost", 1.0, lambda robot: robot.stop_program()),
     "program stopped": (lambda robot, arm: robot.stop_program(), "lost", 1.0, lambda robot: None),
+    "force without value": (
+        *(lambda robot, arm: robot.break_force_sensor(True), "lost", 1.0),
+        lambda robot: robot.break_force_sensor(False),
+    ),
     "worker killed": (signal_worker("SIGKILL"), "lost stale", 1.5, lambda robot: None),
     "worker hangs": (signal_worker("SIGSTOP"), "lost stale", 1.5, lambda robot: None),
     "emergency stop": (lambda robot, arm: robot.emergency_stop(), "emergency_stop", 0.5, unlock_and_play),
@@ -260,7 +250,7 @@ FAULTS: dict[str, tuple[Callable[[EmulatedUR5, UR5], object], str, float, Callab
     "slow": (lambda robot, arm: robot.slow(1.0), "lost", 3.0, lambda robot: robot.slow(0.0)),
 }
 """What goes wrong, its cause, how soon it is raised, and the remedy."""
-QUICK = ("protective stop", "stream frozen", "program stopped", "worker killed")
+QUICK = ("protective stop", "stream frozen", "force without value", "program stopped", "worker killed")
 
 
 @pytest.mark.parametrize(
@@ -268,7 +258,7 @@ QUICK = ("protective stop", "stream frozen", "program stopped", "worker killed")
     [
         *(("cb3", name) for name in QUICK),
         *(pytest.param("cb3", name, marks=pytest.mark.slow) for name in FAULTS if name not in QUICK),
-        *(pytest.param("e", name, marks=pytest.mark.slow) for name in (*QUICK[:2], "links closed")),
+        *(pytest.param("e", name, marks=pytest.mark.slow) for name in (*QUICK[:3], "links closed")),
     ],
 )
 def test_arm_rests_after_fault_during_move(robot: EmulatedUR5, arm: UR5, name: str) -> None:
@@ -307,9 +297,7 @@ def test_play_does_not_resume_old_move(robot: EmulatedUR5, arm: UR5) -> None:
 PARENT = f"""
 import sys, time
 from padforge.sense.rig.arms.ur5 import UR5
-from padforge.sense.rig.arms.urscript import Retreat
-host, driver, *height_mm = sys.argv[1:]
-arm = UR5(host, driver, Retreat(float(*height_mm), *{LIMITS.box_mm[:2]}, 100.0) if height_mm else None)
+arm = UR5(sys.argv[1])
 arm.connect()
 arm.move({LOW}, 50, 500)
 print("moving", flush=True)
@@ -327,12 +315,10 @@ while True:
         pytest.param("e", "SIGKILL", marks=pytest.mark.slow),
     ],
 )
-def test_arm_rests_after_program_dies_or_is_suspended(
-    robot: EmulatedUR5, arm: UR5, host: str, driver: Driver, name: str
-) -> None:
+def test_arm_rests_after_program_dies_or_is_suspended(robot: EmulatedUR5, arm: UR5, host: str, name: str) -> None:
     go(arm, HOME)
     arm.close()
-    with subprocess.Popen([sys.executable, "-c", PARENT, host, driver], stdout=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen([sys.executable, "-c", PARENT, host], stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         assert program.stdout.readline() == "moving\n"
         time.sleep(0.15)
@@ -341,25 +327,6 @@ def test_arm_rests_after_program_dies_or_is_suspended(
         time.sleep(0.55)
         program.kill()
     assert start_s < last_motion_s(robot) < start_s + REST_S
-
-
-@BY_URSCRIPT
-@pytest.mark.parametrize("name", ["SIGKILL", pytest.param("SIGSTOP", marks=pytest.mark.slow)])
-def test_arm_retreats_by_itself_after_program_dies_or_is_suspended(robots: Any, host: str, name: str) -> None:
-    """Nobody is left to lift the tool but the program on the arm."""
-    robot = robots.get("e", pose=HOME)
-    height_mm = HOME[2] - 1.0  # its way down is slow
-    command = [sys.executable, "-c", PARENT, host, "urscript", str(height_mm)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
-        assert program.stdout is not None
-        assert program.stdout.readline() == "moving\n"
-        time.sleep(0.15)
-        program.send_signal(signal.Signals[name])
-        assert robot.true_poses(time.monotonic() - 0.05)[0, 2] < height_mm
-        time.sleep(1.5)
-        program.kill()
-    assert robot.true_poses(time.monotonic() - 0.05)[0, 2] == pytest.approx(height_mm, abs=0.1)
-    robots.free()
 
 
 @pytest.mark.slow
@@ -381,48 +348,11 @@ def test_stop_works_without_script_connection(robot: EmulatedUR5, arm: UR5) -> N
     assert go(arm, LOW).pose == pytest.approx(LOW)
 
 
-@BY_URSCRIPT
-def test_arm_retreats_by_itself_after_its_worker_is_killed_in_a_press(robots: Any, host: str) -> None:
-    """The program on the arm does; a parent that lives on leaves it to do so."""
-    robot = robots.get("e", pose=(*HOME[:2], 120.0, *HOME[3:]), surface_mm=100)
-    with closing(UR5(host, "urscript", Retreat(110.0, *LIMITS.box_mm[:2], 100.0))) as arm:
-        arm.connect()
-        go(arm, (*HOME[:2], 95.0, *HOME[3:]))
-        signal_worker("SIGKILL")(robot, arm)
-        with pytest.raises(RigFault, match="lifts the tool off"):
-            within(REST_S, arm.stop)
-        time.sleep(0.7)
-        assert robot.true_poses(time.monotonic())[0, 2] == pytest.approx(110, abs=0.1)
-        arm.connect()
-        robots.free()
-
-
-@BY_URSCRIPT
-@pytest.mark.parametrize("driver", ["urscript"], scope="module")
-def test_connect_refuses_registers_that_another_client_writes(robots: Any, host: str, driver: Driver) -> None:
+def test_connect_refuses_registers_that_another_client_writes(robots: Any, host: str) -> None:
     robots.free()
     robot = robots.get("cb3")
-    with socket.create_connection((robot.host, rtde.RTDE_PORT)) as other, closing(UR5(host, driver)) as arm:
-        other.sendall(rtde.pack_frame(rtde.INPUTS, b"input_int_register_25"))
+    with socket.create_connection((robot.host, rtde.RTDE_PORT)) as other, closing(UR5(host)) as arm:
+        other.sendall(rtde.pack_frame(INPUTS, b"input_int_register_0"))
         assert other.recv(100)
-        with pytest.raises(RigFault, match="lets another program write input_int_register_25"):
+        with pytest.raises(RigFault, match="input registers are already in use"):
             arm.connect()
-
-
-@pytest.mark.parametrize(("top_mm", "height_mm"), [(300.0, 110.0), (104.0, 104.0)])
-def test_arm_of_settings_retreats_above_the_pad_within_its_workspace(
-    monkeypatch: pytest.MonkeyPatch, top_mm: float, height_mm: float
-) -> None:
-    """By 10 mm, at 10 mm/s, and up to 1 mm beside the box."""
-    told: list[object] = []
-
-    def refuse(*arguments: object) -> None:
-        told.extend(arguments)
-        raise RigFault("refused", "no arm")
-
-    monkeypatch.setattr(ur5, "RtdeWorker", refuse)
-    box_mm = (-50.0, 60.0, -450.0, -350.0, 95.0, top_mm)
-    rig = RigSettings(host="192.0.2.1", box_mm=box_mm, contact_mm=100.0)
-    with pytest.raises(RigFault, match="no arm"):
-        UR5.from_settings(rig, "urscript").connect()
-    assert told == ["192.0.2.1", "urscript", Retreat(height_mm, (-51.0, 61.0), (-451.0, -349.0), 10.0)]
