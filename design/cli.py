@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import Violation
-    from padforge.design.settings import PadSettings
+    from padforge.design.settings import Contact, PadSettings
 
 SEARCH = "padforge.design.settings:SearchSettings"
 EDIT_PORT = 8322
@@ -106,6 +106,7 @@ def design(
     from padforge.design.common.parallel import cluster
     from padforge.design.design_run import run_design, summary_lines
     from padforge.design.optimize.search import SearchOptions
+    from padforge.design.settings import Contact
     from padforge.design.twin import Twin
 
     with locked_folder(out), cluster(scheduler) as executor, search_progress() as on_progress:
@@ -113,6 +114,7 @@ def design(
         document, result = run_design(common.load_spec(spec), out, overrides, start_from, options, twin, force=force)
     if twin is not None and (omitted := Twin.load(twin).ignored_effects()):
         click.echo(f"{twin}: {omitted}", err=True)
+    _echo_large_strain(Contact(**document["provenance"]["settings"]["contact"]))
     common.show_result(document, summary_lines(result, out), as_json)
     context.exit(common.INTERRUPTED if result.stopped == "interrupted" else int(bool(result.violations)))
 
@@ -180,7 +182,15 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     terms = score_terms(
         pad, contact, search.max_failures, rules=rules, size=pad_settings, scatter=search.response_scatter
     )
+    _echo_large_strain(contact)
     common.show_result({"terms": terms, "violations": list(map(asdict, violations))}, [], as_json=True)
+
+
+def _echo_large_strain(contact: "Contact") -> None:
+    from padforge.design.contact import describe_large_strain
+
+    if notice := describe_large_strain(contact):
+        click.echo(notice, err=True)
 
 
 def _load_and_check(

@@ -53,6 +53,8 @@ not follow the step of the strains at the edge of the contact, which signals, th
 PANEL_SHARE = 0.4
 """Length of a panel of distances, on which strains are one polynomial, as a share of its distance from the edge of the
 contact, or if more of the depth of the fibres: polynomials of degree 7 are then within 1e-8 of the largest strain."""
+STRAIN_SAMPLES, STRAIN_HEIGHTS = 50, 9
+"""Distances and heights at which the largest strain is sought."""
 DEPTH_STEPS = 16
 """Solved depths by which signals and forces are interpolated. More would not take longer for each press; fewer err more
 than 0.5 % of full scale, since signals bend where the edge of the contact passes a fibre."""
@@ -412,6 +414,27 @@ def contact_press(contact: Contact) -> LayerPress:
         contact: a layer.
     """
     return solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
+
+
+def describe_large_strain(contact: Contact) -> str:
+    """Say that the linear layer is strained by more than 1, which no real one can be; return "" if it is not.
+
+    Args:
+        contact: any contact; those other than a layer have no strains.
+    """
+    if contact.model != "layer":
+        return ""
+    press, fibres_mm = contact_press(contact), contact.thickness_mm - min(contact.fibre_depths_mm)
+    distances_mm = np.linspace(0, 2 * press.contact_radius_mm, STRAIN_SAMPLES)
+    heights_mm = np.linspace(0, fibres_mm, STRAIN_HEIGHTS)  # the fibres, and the silicone that they are pressed into
+    strains = [press.strains(distances_mm, height_mm, FIBRE_BLUR_MM) for height_mm in heights_mm.tolist()]
+    largest = float(np.abs(strains).max())
+    if largest <= 1:
+        return ""
+    return (
+        f"[contact] strains the silicone by up to {largest:.2f}, {contact.depth_mm:g} mm deep in"
+        f" {contact.thickness_mm:g} mm, as a linear layer has it and no real one can be: signals and errors are rough"
+    )
 
 
 @lru_cache(maxsize=128)

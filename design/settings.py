@@ -444,6 +444,8 @@ class RulesSettings(Settings):
     """`[rules]`: what makes a pad buildable, checked exactly on the finished curves (`check_rules` has the formulas).
 
     Attributes:
+        min_mean_bend_radius_mm: R, by which a fibre turns by no more than half a radian (29 degrees) in any length of
+            R / 2. Within that length it may bend more tightly.
         max_crossings: greatest number of crossings of a horizontal with a vertical fibre, or None for any number
             ("any" in pad.toml). Every horizontal has to cross every vertical, so a limit below grid^2 cannot be met.
         max_common_track_mm: greatest length in which a horizontal and a vertical fibre run nearer to each other than
@@ -453,7 +455,9 @@ class RulesSettings(Settings):
     """
 
     enforce: bool = Field(default=True, description="false drops every rule: a choice to design the unbuildable")
-    min_bend_radius_mm: RuleMm = Field(default=1.0, description="least bend radius of a fibre, mm")
+    min_mean_bend_radius_mm: RuleMm = Field(
+        default=1.0, description="least bend radius of a fibre, in the mean over half of it along the fibre, mm"
+    )
     min_gap_mm: RuleMm = Field(default=0.8, description="least gap of centre lines in a family, or folds of one, mm")
     same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
     max_crossings: MaxCrossings = Field(default=None, description='crossings of families (at least grid^2), or "any"')

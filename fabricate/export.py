@@ -321,7 +321,7 @@ def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[s
             "mould": settings.mould.model_dump(),
             "printer": settings.printer.model_dump(),
             "pad": pad_document(plan),
-            "rules": settings.rules.model_dump(include={"min_bend_radius_mm"}),
+            "rules": settings.rules.model_dump(include={"min_mean_bend_radius_mm"}),
             "silicone": settings.silicone.model_dump(mode="json"),
             "fibre": settings.fibre.model_dump(),
             **({"dispenser": settings.dispenser.model_dump(mode="json")} if "toolpath.svg" in files else {}),

@@ -243,8 +243,8 @@ class FabricationSettings:
 
     @property
     def min_bend_radius_mm(self) -> float:
-        """Minimum bend radius by the rules and the fibre, mm."""
-        return max(self.rules.min_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
+        """Minimum bend radius by the rules and the fibre, mm, in the mean over half of it along a fibre."""
+        return max(self.rules.min_mean_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
 
     def require_consistent(self, layout: Layout) -> None:
         """Check that settings do not contradict each other or the pitch of the pad.

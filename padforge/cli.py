@@ -93,11 +93,16 @@ def _compare(
     """
     from padforge.design.common.files import locked_folder
     from padforge.design.compare import compare, comparison_lines, read_variants
+    from padforge.design.contact import describe_large_strain
     from padforge.design.optimize.search import SearchOptions
+    from padforge.design.settings import Contact
 
     variants = read_variants(sources, vary, common.load_spec)
     with locked_folder(out), search_progress() as on_progress:
         document = compare(variants, out, SearchOptions(on_progress, time_budget=time_budget), seed, mould_costs)
+    notices = (describe_large_strain(Contact(**row["contact"])) for row in document["rows"])
+    for notice in filter(None, dict.fromkeys(notices)):
+        click.echo(notice, err=True)
     common.show_result(document, [*comparison_lines(document), f"comparison -> {out / 'comparison.json'}"], as_json)
 
 

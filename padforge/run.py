@@ -154,6 +154,7 @@ def check_run(run: Run) -> None:
     """
     import numpy as np
 
+    from padforge.design.contact import describe_large_strain
     from padforge.design.contact_comparison import alternative_contacts, design_contact
     from padforge.design.design_run import check_design
     from padforge.design.morphology import Morphology
@@ -176,7 +177,7 @@ def check_run(run: Run) -> None:
     contact = design_contact(run.spec, run.spec.section(SearchSettings))
     alternative_contacts(contact)
     plan = plan_simulation(Morphology.straight(pad.layout), rig, contact, pad)
-    if notice := describe_other_depth(plan.depths_mm, contact):
+    for notice in filter(None, (describe_other_depth(plan.depths_mm, contact), describe_large_strain(contact))):
         _log.warning(notice)
     localizer = run.spec.section(LocalizerSettings)
     if run.time_budget is not None and localizer.method == "published":

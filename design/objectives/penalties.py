@@ -160,7 +160,7 @@ def _bends(fibres: FibreSamples, by: Gradient) -> float | None:
     Where the pad is worn bent, fibres turn by `rolled` more at right angles to that, as a fibre along x does; leads are
     outside the pad.
     """
-    radius_mm = fibres.rules.min_bend_radius_mm
+    radius_mm = fibres.rules.min_mean_bend_radius_mm
     if radius_mm == 0:
         return None
     radius, window = fibres.scale(radius_mm), radius_mm / fibres.layout.unit_mm / 2
@@ -181,7 +181,9 @@ def _gaps(fibres: FibreSamples, by: Gradient) -> float | None:
 def _folds(fibres: FibreSamples, by: Gradient) -> float | None:
     """Penalise a fibre that comes nearer than the gap to a part of itself FOLD gaps or more away along it."""
     gap = fibres.scale(fibres.rules.min_gap_mm)
-    if gap <= fibres.scale(fibres.rules.min_bend_radius_mm):  # fibres that keep the bend radius keep their folds apart
+    if gap <= fibres.scale(
+        fibres.rules.min_mean_bend_radius_mm
+    ):  # fibres that keep the bend radius keep their folds apart
         return None
     check_comparisons(*fibres.arc.shape)
     return _closeness(fibres, [(fibre, fibre) for fibre in range(len(fibres.arc))], gap, by)
@@ -286,7 +288,7 @@ def _lengths(fibres: FibreSamples, by: Gradient) -> float:
 
 
 PENALTIES: dict[str, Callable[[FibreSamples, Gradient], float | None]] = {
-    "min_bend_radius_mm": _bends,
+    "min_mean_bend_radius_mm": _bends,
     "min_gap_mm": _gaps,
     "folds": _folds,
     "same_family_crossings": _family_crossings,

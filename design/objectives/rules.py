@@ -60,11 +60,11 @@ class Violation:
 def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None = None) -> list[Violation]:
     """Check every rule of `[rules]`, and return the worst violation per fibre or pair of fibres.
 
-    - `min_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left and
-      right added up; the measured radius is R / 2 divided by the greatest such angle. So a long bend is as wide as R,
-      while a kink of up to half a radian (29 degrees) passes where R / 2 around it is straight. A fibre goes on
-      straight from its ends, by its leads: it may meet them at such a kink. Where the pad is worn bent, the angle is
-      that in space (`rolled_turns`).
+    - `min_mean_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left
+      and right added up; the measured radius is R / 2 divided by the greatest such angle, the mean over that stretch.
+      So a long bend is as wide as R, while a short one may be tighter, and a kink of up to half a radian (29 degrees)
+      passes where R / 2 around it is straight. A fibre goes on straight from its ends, by its leads: it may meet them
+      at such a kink. Where the pad is worn bent, the angle is that in space (`rolled_turns`).
     - `min_gap_mm` g: two fibres of a family keep the distance g; and so do any two points of one fibre that lie at
       least pi g / 2 apart along it, which is half a turn around a circle of diameter g.
     - `same_family_crossings`: the number of points at which fibres of one family meet, in the whole pad.
@@ -90,7 +90,7 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
     lines = [pad.to_mm(points) for points in curves.flatten(pad, TOLERANCE_MM / pad.unit_mm)]
     size = or_default("size", size, PadSettings).for_layout(pad.layout)
     return [
-        *_check_bends(pad, rules.min_bend_radius_mm, size.bent_radius_mm),
+        *_check_bends(pad, rules.min_mean_bend_radius_mm, size.bent_radius_mm),
         *_check_gaps(lines, pad.layout, rules.min_gap_mm),
         *_check_folds(pad, lines, rules.min_gap_mm),
         *_check_crossings(pad, rules),
@@ -102,7 +102,7 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
 
 
 def _check_bends(pad: Morphology, limit: float, bent_radius_mm: float | None) -> Iterator[Violation]:
-    """Yield the tightest bend of every fibre that breaks `min_bend_radius_mm`."""
+    """Yield the tightest bend of every fibre that breaks `min_mean_bend_radius_mm`."""
     if limit == 0:
         return
     window = min(limit / 2, *pad.layout.size_mm)  # no fibre is shorter than the pad
@@ -113,7 +113,7 @@ def _check_bends(pad: Morphology, limit: float, bent_radius_mm: float | None) ->
         path = spans[fibre].tobytes(), slopes[fibre].tobytes()
         radius, place = _min_bend(*path, pad.layout.family(fibre), pad.unit_mm, window, limit, bent_radius_mm)
         if radius < limit:
-            yield _violation("min_bend_radius_mm", [fibre], radius, limit, pad.to_mm(place))
+            yield _violation("min_mean_bend_radius_mm", [fibre], radius, limit, pad.to_mm(place))
 
 
 @lru_cache(maxsize=CACHE_SIZE)

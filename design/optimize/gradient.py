@@ -185,7 +185,7 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
     PCHIP has slope 0 at a turn, so that one knot alone bends sharper the higher the flanks; with shoulders
     beside it the flanks may be as steep as they like.
     """
-    radius = rules.min_bend_radius_mm / layout.unit_mm if rules.enforce else 0.0
+    radius = rules.min_mean_bend_radius_mm / layout.unit_mm if rules.enforce else 0.0
     per_turn = KNOTS_PER_TURN if radius > 0 and knots >= 2 * KNOTS_PER_TURN else 1
     extent = min(extent for extent, count in zip(layout.extent, layout.counts, strict=True) if count)
     turns = max(1, min(knots // per_turn, int(extent / (4 * radius)) if radius > 0 else knots))

@@ -62,10 +62,11 @@ def build_problem(
     free_presses(pad)
     if rules.enforce:
         check_fibre_ends(pad, rules)
-        if pad.bent_radius_mm is not None and pad.bent_radius_mm < rules.min_bend_radius_mm:
+        if pad.bent_radius_mm is not None and pad.bent_radius_mm < rules.min_mean_bend_radius_mm:
             raise InputError(
-                f"[pad] bent_radius_mm is {pad.bent_radius_mm:g}, allowed is at least {rules.min_bend_radius_mm:g}, "
-                'to which fibres may be bent ([rules] min_bend_radius_mm), or "flat"'
+                f"[pad] bent_radius_mm is {pad.bent_radius_mm:g}, allowed is at least "
+                f"{rules.min_mean_bend_radius_mm:g}, to which fibres may be bent "
+                '([rules] min_mean_bend_radius_mm), or "flat"'
             )
     if settings.method == "genetic":
         # Offspring are compared with all pads of the generation, and all their knots are held several times over.

@@ -70,7 +70,7 @@ class _Passage:
         self.lanes[below:] = np.maximum(levels[below:], high + spacing[1] * np.arange(above))
         # 3. transitions: a cubic with zero end slopes that rises by h over a length l has curvature 6 h / l^2
         rise = float(np.abs(self.lanes - levels).max(initial=0))
-        length = max(_LENGTH * np.sqrt(6 * rise * rules.min_bend_radius_mm / unit), rise)
+        length = max(_LENGTH * np.sqrt(6 * rise * rules.min_mean_bend_radius_mm / unit), rise)
         available = self.begin, layout.extent[family] - self.end  # the search has to mend a steeper transition
         self.transitions = [max(min(length, limit), MARGIN) for limit in available]
         self.marks = [self.begin - self.transitions[0], self.begin, self.end, self.end + self.transitions[1]]

@@ -289,7 +289,8 @@ def _check_fibre_bend(plan: Plan) -> Finding:
     tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_SLACK)]
     radius = min((radius for _, radius, _ in tight), default=limit)
     names = _list_fibres("fibre", [fibre for fibre, _, _ in tight])
-    message = f"{names} bent as tightly as {radius:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
+    bent = f"{names} bent as tightly as {radius:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
+    message = f"{bent}, in the mean over {limit / 2:g} mm" if limit else bent
     return check_result("fibre_bend", not tight, radius, limit, message, [position for _, _, position in tight])
 
 

@@ -385,10 +385,10 @@ def identify(
     """
     from padforge.design.common.files import locked_folder
     from padforge.design.morphology import Morphology
-    from padforge.design.settings import Contact
+    from padforge.design.settings import read_contact
     from padforge.sense.report.identification import identification_lines, identify_into
 
-    contact = common.load_spec(spec).section(Contact)
+    contact = read_contact(common.load_spec(spec))
     folder, pad = out or common.pad_folder(recording), Morphology.load(morphology)
     inputs = [path for path in (recording, morphology) if not path.is_dir()]
     with locked_folder(folder), common.progress_bar("identify") as show:

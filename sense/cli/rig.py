@@ -96,8 +96,10 @@ def record(
     is recorded, and after a kill, it holds all finished presses. It needs the extra ros (pip install '.[ros]').
     Software is not the emergency stop: keep the robot's own one within reach.
     """
+    from padforge.design.contact import describe_large_strain
     from padforge.design.settings import PadSettings, read_contact
     from padforge.design.twin import Twin
+    from padforge.sense.recording.press_plan import deepest_contact, planned_depths_mm
     from padforge.sense.rig import operation
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import check_platform
@@ -126,6 +128,9 @@ def record(
             raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
         if plan == "adaptive":
             raise InputError("--plan is adaptive, which needs --virtual-hardware or a real rig")
+        deepest = deepest_contact(contact, planned_depths_mm(options))
+        if like is None and (notice := describe_large_strain(deepest)):
+            _warn(notice)
         pressed = like if like and not morphology else pad
         if like and morphology and (ignored := like.ignored_effects()):
             _warn(f"{twin}: {ignored}")

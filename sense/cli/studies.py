@@ -17,6 +17,7 @@ from padforge.sense.cli.options import fibre_indices, fibres_option, max_failure
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
     from padforge.design.morphology import Morphology
+    from padforge.design.settings import Contact
     from padforge.sense.studies.press_model import PressModel
     from padforge.sense.studies.study import Study
 
@@ -100,12 +101,24 @@ def _pads(
 
 def _press_model(settings: "Spec") -> "PressModel":
     """Return the contact and the scatter that settings state, those of the paper if they state no contact."""
-    from padforge.design.settings import Contact, SearchSettings, read_contact
+    from padforge.design.settings import SearchSettings
     from padforge.sense.studies.press_model import PressModel
 
+    contact = _stated_contact(settings)
+    return PressModel(contact, settings.section(SearchSettings).response_scatter) if contact else PressModel()
+
+
+def _stated_contact(settings: "Spec") -> "Contact | None":
+    """Return the contact that settings state, with a line on stderr if it strains the silicone too much."""
+    from padforge.design.contact import describe_large_strain
+    from padforge.design.settings import Contact, read_contact
+
     if not settings.stated(Contact):
-        return PressModel()
-    return PressModel(read_contact(settings), settings.section(SearchSettings).response_scatter)
+        return None
+    contact = read_contact(settings)
+    if notice := describe_large_strain(contact):
+        click.echo(notice, err=True)
+    return contact
 
 
 def _check_square(context: click.Context, param: click.Parameter, value: int) -> int:
@@ -149,11 +162,10 @@ def robustness(
 
     For recordings of a built pad (figures 13 and 14) see `padforge sense fibre-loss`.
     """
-    from padforge.design.settings import Contact, read_contact
     from padforge.sense.studies.robustness import robustness_study
 
     settings = common.load_spec(spec)
-    contact = read_contact(settings) if settings.stated(Contact) else None
+    contact = _stated_contact(settings)
     pads = _pads(names, seed, settings)
     options["failed"] = fibre_indices(failed, min(pad.layout.fibres for pad in pads.values()))
     return robustness_study(pads, seed=seed, contact=contact, **options)
@@ -220,11 +232,11 @@ def _add_study(name: str, module: str, text: str, example: str) -> None:
     """Add the command of a study without options of its own; `example` are its pads in the help."""
 
     def make(names: tuple[str, ...], *, seed: int, spec: Path | None = None) -> "Study":
-        from padforge.design.settings import Contact
+        from padforge.design.settings import read_contact
 
         make_study = getattr(import_module(f"padforge.sense.studies.{module}"), f"{name}_study")
         settings = common.load_spec(spec)
-        return make_study(_pads(names, seed, settings), seed=seed, contact=settings.section(Contact))
+        return make_study(_pads(names, seed, settings), seed=seed, contact=read_contact(settings))
 
     make.__doc__ = f"{text}\n\n\b\npadforge study {name} {example}"
     _command(name)(common.spec_option(make))

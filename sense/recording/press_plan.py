@@ -115,6 +115,16 @@ def check_depths(depths_mm: Array, thickness_mm: float, pad: str) -> None:
         raise InputError(f"[rig] presses {deepest:g} mm deep, allowed is less than {thickness_mm:g} mm, by {pad}")
 
 
+def deepest_contact(contact: Contact, depths_mm: Array) -> Contact:
+    """Return a layer contact as the deepest of some presses has it.
+
+    Args:
+        contact: a layer.
+        depths_mm: depths of the presses, less than its thickness; shape (n,).
+    """
+    return contact.model_copy(update={"depth_mm": float(depths_mm.max())})
+
+
 def describe_other_depth(depths_mm: Array, contact: Contact) -> str:
     """Say that no press is as deep as the pad is designed for; return "" if one is, or the contact knows no depth.
 

@@ -25,6 +25,7 @@ from padforge.sense.recording.press_plan import (
     PositionTest,
     PressPlan,
     check_depths,
+    deepest_contact,
     fit_pad_settings,
     make_plan,
     make_plan_in,
@@ -259,7 +260,7 @@ def plan_simulation(pad: Morphology, rig: RigSettings, contact: Contact, size: P
     _check_size(len(plan), rig, len(pad.knots))
     if contact.model == "layer":
         check_depths(plan.depths_mm, contact.thickness_mm, "the thickness of the pad")
-        contact_press(contact.model_copy(update={"depth_mm": float(plan.depths_mm.max())}))
+        contact_press(deepest_contact(contact, plan.depths_mm))
     return plan
 
 

@@ -119,7 +119,7 @@ def test_defaults_are_those_of_the_built_pad_and_its_mould():
     assert BUILT_CONTACT.model_dump() == Contact().model_dump() | built
     distances_mm = {"min_gap_mm": 0.8, "border_mm": 2.0, "keep_out_mm": 1.5, "max_length_mm": 500.0}
     crossings = {"same_family_crossings": 0, "max_crossings": "any", "min_crossing_angle_deg": 0.0}
-    others = {"enforce": True, "max_common_track_mm": 2.0, "min_bend_radius_mm": 1.0}
+    others = {"enforce": True, "max_common_track_mm": 2.0, "min_mean_bend_radius_mm": 1.0}
     assert RulesSettings().model_dump() == distances_mm | crossings | others
 
 

@@ -196,7 +196,7 @@ def test_laying_page_of_a_pad_without_crossings(tmp_path):
 
 def test_leads_to_one_side_leave_two_printed_lines_between_their_slots():
     """At the rim, to which both walls of a slot lean outwards; without slots ridges and rules set the distance."""
-    rules: dict[str, object] = {"min_gap_mm": 1.5, "min_bend_radius_mm": 4.0}
+    rules: dict[str, object] = {"min_gap_mm": 1.5, "min_mean_bend_radius_mm": 4.0}
     printer: dict[str, object] = {"nozzle_mm": 0.5}
     mould: dict[str, object] = {"exit_width_mm": 3.0, "border_mm": 1.0, "ridge_width_mm": 0.6, "min_silicone_mm": 0.7}
     slots = lead_spacing(with_settings(mould, printer, rules=rules), 1.2, 0.25)

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design import Morphology
+from padforge.design import Contact, InputError, Morphology
 from padforge.design.common.settings import Spec
 from padforge.fabricate import FabricationSettings
 from padforge.run import Run, check_run
 from padforge.settings import check_settings
 from tests.helpers.door import called, refused
+from tests.helpers.less import blank_pictures, compare_little
 
 THIN = '[contact]\nthickness_mm = 4\ndepth_mm = 2.5\ntool = "ball"\n[mould]\nsilicone_mm = 4\n'
 CONTRADICTIONS = {
@@ -66,6 +67,46 @@ def test_thin_pad_is_pressed_as_deep_as_it_is_designed_for(tmp_path: Path, caplo
     (tmp_path / "thin.toml").write_text(THIN + "[rig]\ndepths_mm = [1, 3]\n")
     check_run(Run(Spec.load(tmp_path / "thin.toml"), tmp_path / "out"))
     assert caplog.messages == ["[rig] presses 1 to 3 mm deep, the pad is designed for presses of 2.5 mm"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("design", "score", "morphology.json"),
+        ("sense", "record", "--presses", "4"),
+        ("design", "compare", "morphology.json", "other.json"),
+    ],
+)
+def test_commands_say_once_that_a_layer_is_strained_too_much(
+    tmp_path: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compare_little(monkeypatch)
+    blank_pictures(monkeypatch)
+    for name in ("morphology", "other"):
+        Morphology.straight(1).save(tmp_path / f"{name}.json")
+    (tmp_path / "pad.toml").write_text('[pad]\ngrid = 1\n[contact]\nbase = "bonded"\n')
+    ended = called(*command, cwd=tmp_path)
+    assert ended.code == 0, ended
+    assert ended.err.count("[contact] strains the silicone by up to 1.0") == 1
+
+
+def test_run_says_once_that_a_layer_is_strained_too_much(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    check_run(Run(Spec({"contact": {"base": "bonded"}}), tmp_path / "out"))
+    (message,) = caplog.messages
+    assert message.startswith("[contact] strains the silicone by up to 1.0")
+
+
+def test_studies_press_the_pad_as_it_will_be_cast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contacts = []
+
+    def force_study(pads: object, seed: int, contact: Contact) -> None:
+        contacts.append(contact)
+        raise InputError("seen")
+
+    monkeypatch.setattr("padforge.sense.studies.indentation.force_study", force_study)
+    (tmp_path / "pad.toml").write_text("[contact]\ndepth_mm = 6.5\n[mould]\nsilicone_mm = 8\n")
+    assert called("study", "force", "square", "--spec", "pad.toml", cwd=tmp_path).code == 2
+    assert [(contact.depth_mm, contact.thickness_mm) for contact in contacts] == [(6.5, 8.0)]
 
 
 def test_mould_follows_contact_where_it_leaves_the_pad_open() -> None:

@@ -6,7 +6,7 @@ from padforge.design import Morphology
 from padforge.design.settings import RulesSettings
 
 NONE = RulesSettings(
-    min_bend_radius_mm=0,
+    min_mean_bend_radius_mm=0,
     min_gap_mm=0,
     same_family_crossings=10**6,
     border_mm=0,

@@ -39,7 +39,7 @@ def slanting(shift):
 
 def test_vanishing_penalties_imply_kept_rules():
     """On random gentle pads; those with a penalty are only counted, so that the test is seen to look at both kinds."""
-    rng, rules = np.random.default_rng(0), RulesSettings(min_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70)
+    rng, rules = np.random.default_rng(0), RulesSettings(min_mean_bend_radius_mm=3, min_gap_mm=5, max_length_mm=70)
     assert set(found(Morphology.straight(4), RulesSettings()).values()) == {0.0}
     passed = 0
     for _ in range(16):
@@ -133,11 +133,11 @@ def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm, all_b
     pad = torch.nn.functional.pad
     arc = pad(torch.hypot(t.diff(dim=1), v.diff(dim=1)).cumsum(dim=1), (1, 0))
     halves = lambda at: pad(at.detach().diff(dim=1) / 2, (1, 0)) + pad(at.detach().diff(dim=1) / 2, (0, 1))  # noqa: E731
-    radius, window, run = (x / unit_mm for x in (rules.min_bend_radius_mm, rules.min_bend_radius_mm / 2, 1.0))
+    radius, window, run = (x / unit_mm for x in (rules.min_mean_bend_radius_mm, rules.min_mean_bend_radius_mm / 2, 1.0))
     run = t[:, -1].mean().detach()
     beyond = torch.cat([0 * arc[:, :1] - window, 0 * arc[:, :1], arc, arc[:, -1:], arc[:, -1:] + window], dim=1)
     turned = pad(pad(rate.atan(), (2, 2)).diff(dim=1).abs().cumsum(dim=1), (1, 0))
-    beside = rules.min_bend_radius_mm / 2 / bent_radius_mm
+    beside = rules.min_mean_bend_radius_mm / 2 / bent_radius_mm
     excess = []
     for towards in [1, -1][: 1 + all_bends]:  # windows begin or end at samples
         other = beyond + towards * window
@@ -156,13 +156,13 @@ def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm, all_b
 @pytest.mark.parametrize("bent_radius_mm", [1e6, 30.0])
 def test_gradients_of_turns_and_border_slopes_are_those_of_torch(bent_radius_mm, all_bends):
     """With the arc lengths that samples stand for held: their changes are left out of the gradient."""
-    pad, rules = Morphology.random(2, 4, seed=5), only(min_bend_radius_mm=9.0, border_mm=12.0)
+    pad, rules = Morphology.random(2, 4, seed=5), only(min_mean_bend_radius_mm=9.0, border_mm=12.0)
     along, across = (torch.tensor(axis, requires_grad=True) for axis in axes(pad))
     expected = turns_and_border_slopes(along, across, rules, bent_radius_mm, pad.unit_mm, all_bends)
     torch.stack(expected).sum().backward()
     size = PadSettings(grid=2, bent_radius_mm=bent_radius_mm)
     values, *gradient = penalties(*axes(pad), size, rules, all_bends=all_bends)
-    assert values["min_bend_radius_mm"] == pytest.approx(expected[0].item(), rel=1e-9)
+    assert values["min_mean_bend_radius_mm"] == pytest.approx(expected[0].item(), rel=1e-9)
     assert values["border_mm"] == pytest.approx(expected[1].item(), rel=1e-9)
     assert along.grad is not None
     assert across.grad is not None
@@ -226,19 +226,21 @@ def test_min_bend_radius_penalty_integrates_the_excess_turn(margin, bent_radius_
         window = limit_mm / pad.unit_mm / 2
         over = np.hypot(np.interp(arc + window, arc, turned) - turned, around) * margin * 2 - 1
         expected += np.trapezoid(np.maximum(over, 0), arc) / (pad.grid + 1) / 8
-    rules, size = only(min_bend_radius_mm=limit_mm), PadSettings(bent_radius_mm=bent_radius_mm)
+    rules, size = only(min_mean_bend_radius_mm=limit_mm), PadSettings(bent_radius_mm=bent_radius_mm)
     assert expected > 0
-    assert penalties(*axes(pad), size, rules, margin).values["min_bend_radius_mm"] == pytest.approx(expected, rel=0.05)
+    assert penalties(*axes(pad), size, rules, margin).values["min_mean_bend_radius_mm"] == pytest.approx(
+        expected, rel=0.05
+    )
 
 
 @given(st.integers(1, 8), st.integers(0, 10**6))
 @settings(max_examples=60)
 def test_no_bend_that_breaks_the_rule_clearly_goes_without_a_penalty(knots, seed):
     """Also one between two samples, from which a whole window leads past it; of one fibre, whose bends are few."""
-    size, rules = PadSettings(horizontals=1, verticals=0), only(min_bend_radius_mm=2.0)
+    size, rules = PadSettings(horizontals=1, verticals=0), only(min_mean_bend_radius_mm=2.0)
     pad = Morphology.random(size.layout, knots, seed=seed)
     if any(bend.measured < 0.93 * 2.0 for bend in check_rules(pad, rules)):
-        assert penalties(*axes(pad), size, rules, 1.05).values["min_bend_radius_mm"] > 0
+        assert penalties(*axes(pad), size, rules, 1.05).values["min_mean_bend_radius_mm"] > 0
 
 
 @pytest.mark.parametrize(("cross", "travel", "fibre"), [(1.9, 0.3, 0), (3.0, 4.6, 5)])

@@ -79,22 +79,24 @@ def test_same_family_crossings_are_placed():
     assert check_rules(bent(2.5), only(same_family_crossings=2)) == []
 
 
-def test_min_bend_radius_is_placed():
+def test_min_mean_bend_radius_is_placed():
     at = np.array([0, 0.1, 0.6, 0.9, 1.0, 1.1, 1.4, 1.9, 2])  # level at both ends, where it meets its leads
     knots = np.column_stack([at, [1, 1, 1.2, 1.8, 1.9, 1.8, 1.2, 1, 1]])
     pad = Morphology(np.stack([knots, np.column_stack([np.ones(9), at])]), pitch_mm=2.0)
-    found = check_rules(pad, only(min_bend_radius_mm=2.0))
+    found = check_rules(pad, only(min_mean_bend_radius_mm=2.0))
     assert [v.fibres for v in found] == [(1,)]
     assert found[0].place_mm == pytest.approx((0, 0.9 * 2), abs=0.01)
 
 
 @pytest.mark.parametrize(("rise", "breaks"), [(0.145, False), (0.155, True)])
-def test_min_bend_radius_passes_kinks_up_to_half_a_radian(rise, breaks):
+def test_min_mean_bend_radius_passes_kinks_up_to_half_a_radian(rise, breaks):
     """Two straight branches that meet in a peak within 1e-7 of it, where the PCHIP's slope overshoots by a third."""
     at = np.array([0, 0.5, 1 - 1e-7, 1, 1 + 1e-7, 1.5, 2])
     roof = np.column_stack([at, 1 + rise * (1 - np.abs(at - 1))])
     turn = 2 * (2 * np.arctan(4 / 3 * rise) - np.arctan(rise))
-    found = check_rules(Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_bend_radius_mm=3.0))
+    found = check_rules(
+        Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_mean_bend_radius_mm=3.0)
+    )
     assert (turn > 0.5) == breaks
     assert [v.measured for v in found] == ([pytest.approx(1.5 / turn, rel=1e-3)] if breaks else [])
 
@@ -195,14 +197,14 @@ def test_max_common_track_names_each_pair_once():
 @pytest.mark.parametrize(("rise", "breaks"), [(0.5, False), (0.6, True)])
 @pytest.mark.parametrize("family", [0, 1])
 @pytest.mark.parametrize("end", [0, -1])
-def test_min_bend_radius_passes_lead_kinks_up_to_half_a_radian(rise, breaks, family, end):
+def test_min_mean_bend_radius_passes_lead_kinks_up_to_half_a_radian(rise, breaks, family, end):
     """Of the check and of the penalty; leads go straight on along the fibre's axis."""
-    pad, rules = climbing(rise, family, end), only(min_bend_radius_mm=1.0)
+    pad, rules = climbing(rise, family, end), only(min_mean_bend_radius_mm=1.0)
     angle = np.arctan(slopes(pad)[family, end])
     found = check_rules(pad, rules)
     assert (abs(angle) > 0.5) == breaks
     along, across = (axis[0] for axis in fibre_axes(pad)[:2])
-    assert (penalties(along, across, PadSettings(grid=1), rules).values["min_bend_radius_mm"] > 0) == breaks
+    assert (penalties(along, across, PadSettings(grid=1), rules).values["min_mean_bend_radius_mm"] > 0) == breaks
     assert [v.fibres for v in found] == ([(family + 1,)] if breaks else [])
     if breaks:
         assert found[0].measured == pytest.approx(0.5 / abs(angle), rel=0.02)

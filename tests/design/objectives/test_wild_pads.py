@@ -22,10 +22,10 @@ CONTACTS = [
 RULES = [
     RulesSettings(max_crossings=3, min_crossing_angle_deg=45.0, min_gap_mm=5.0),
     RulesSettings(
-        min_bend_radius_mm=0, min_gap_mm=1e-9, same_family_crossings=2, border_mm=0, min_crossing_angle_deg=1e-9
+        min_mean_bend_radius_mm=0, min_gap_mm=1e-9, same_family_crossings=2, border_mm=0, min_crossing_angle_deg=1e-9
     ),
     RulesSettings(
-        min_bend_radius_mm=1000, min_gap_mm=1000, border_mm=1000, max_length_mm=1e-3, min_crossing_angle_deg=90
+        min_mean_bend_radius_mm=1000, min_gap_mm=1000, border_mm=1000, max_length_mm=1e-3, min_crossing_angle_deg=90
     ),
 ]
 

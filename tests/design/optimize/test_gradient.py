@@ -257,7 +257,7 @@ def test_common_tracks_count_at_the_end_of_a_search(monkeypatch):
 
 def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
     """Fibre 1 is the one that turns too sharply; the same bits whether or not a state lies between the steps."""
-    pad, rules = Morphology.straight(2), RulesSettings(min_bend_radius_mm=4.0)
+    pad, rules = Morphology.straight(2), RulesSettings(min_mean_bend_radius_mm=4.0)
     knots = refine(pad.knots, 5, pad.layout)
     knots[0, 3, 1] += 0.35
     search = SearchSettings(knots=5, steps=1, starts=1)
@@ -279,7 +279,7 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
 
 def test_fine_steps_leave_what_has_no_finite_gradient(monkeypatch):
     """As those of the search do: one value that is none must not lose a pad."""
-    run = begun(SearchSettings(knots=5, steps=1, starts=1), RulesSettings(min_bend_radius_mm=4.0))
+    run = begun(SearchSettings(knots=5, steps=1, starts=1), RulesSettings(min_mean_bend_radius_mm=4.0))
     run.finish()
     before, gradient = run.morphology().knots, np.full((2, *run.fibres.axes()[0].shape), np.nan)
     monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: gradient)

@@ -107,7 +107,7 @@ def test_search_prefers_a_pad_within_the_rules_to_one_that_errs_less(monkeypatch
     ("rules", "broken"),
     [
         ({"min_gap_mm": 30.0, "max_crossings": 3, "border_mm": 500.0}, {"min_gap_mm", "max_crossings", "border_mm"}),
-        ({"min_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, {"border_mm"}),
+        ({"min_mean_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, {"border_mm"}),
         ({"max_length_mm": 20.0}, {"max_length_mm"}),
     ],
 )
@@ -124,7 +124,7 @@ def test_search_reports_rules_that_cannot_hold(rules, broken, monkeypatch):
     ("settings", "rules", "pitch_mm"),
     [
         ({"knots": 1, "max_failures": 8, "noise": 1e-9, "sharpness": 1e6}, {"min_gap_mm": 1000.0}, 0.1),
-        ({"knots": 64, "max_failures": (1e-300, 1e6), "noise": 10.0}, {"min_bend_radius_mm": 1000.0}, 1000.0),
+        ({"knots": 64, "max_failures": (1e-300, 1e6), "noise": 10.0}, {"min_mean_bend_radius_mm": 1000.0}, 1000.0),
         (
             {"method": "genetic", "population": 4, "max_failures": (5e-324,), "seed": 2**32 - 1},
             {"border_mm": 1000.0},
@@ -170,7 +170,7 @@ def test_search_around_a_keep_out_obeys_the_rules():
 def test_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
     """One fibre rises and falls within the rules as long as the pad is flat."""
     monkeypatch.setattr(REPAIR, 20)
-    pad, rules = PadSettings(horizontals=2, verticals=1, bent_radius_mm=6.0), RulesSettings(min_bend_radius_mm=4.0)
+    pad, rules = PadSettings(horizontals=2, verticals=1, bent_radius_mm=6.0), RulesSettings(min_mean_bend_radius_mm=4.0)
     knots = refine(Morphology.straight(pad.layout).knots, 3, pad.layout)
     knots[0, 2, 1] += 0.13
     origin = Morphology.from_layout(knots, pad.layout)

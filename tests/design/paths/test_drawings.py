@@ -301,7 +301,7 @@ def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:
 
 def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    stated = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_bend_radius_mm = 0\n"
+    stated = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_mean_bend_radius_mm = 0\n"
     Path("pad.toml").write_text(stated)
     svg(tmp_path, PATHS)
     ended = CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)

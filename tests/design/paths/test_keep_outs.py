@@ -14,7 +14,9 @@ from padforge.design.paths.curves import bend_radius, rolled_turns
 from padforge.design.paths.keep_outs import check_fibre_ends, is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 
-NONE = RulesSettings(min_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6)
+NONE = RulesSettings(
+    min_mean_bend_radius_mm=0, min_gap_mm=0, same_family_crossings=10**6, border_mm=0, max_length_mm=1e6
+)
 
 
 def only(**limits):
@@ -145,7 +147,7 @@ def test_bend_radius_on_a_cylinder_matches_curves_in_space():
 
 
 def test_min_bend_radius_of_a_bent_pad():
-    rules, pad = only(min_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
+    rules, pad = only(min_mean_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
     assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
     found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
     assert [(v.fibres, v.measured) for v in found] == [((f,), pytest.approx(9)) for f in (1, 2, 3)]
@@ -155,7 +157,7 @@ def test_min_bend_radius_of_a_bent_pad():
         # the penalty takes every fibre to run around the cylinder
         expected *= float((travel[:, -1] / travel[:, -1].mean()).mean())
         for all_bends, rel in ((False, 0.0), (True, 0.01)):  # which windows end on the pad is known to a sample
-            found = penalties(travel, cross, size, rules, all_bends=all_bends).values["min_bend_radius_mm"]
+            found = penalties(travel, cross, size, rules, all_bends=all_bends).values["min_mean_bend_radius_mm"]
             assert found == pytest.approx(expected, rel=rel, abs=1e-9)
 
 

@@ -125,7 +125,9 @@ class TestFibres:
         """Fibres that swing gently: their bends are of some 13 mm."""
         knots = np.array([[0, 1], [0.1, 1.01], [0.5, 1.1], [1.5, 0.9], [1.9, 0.99], [2, 1]])
         pad = Morphology(np.stack([knots, knots[:, ::-1]]), 15.0)
-        settings = with_settings(rules={"min_bend_radius_mm": float(rule)}, fibre={"min_bend_radius_mm": float(bears)})
+        settings = with_settings(
+            rules={"min_mean_bend_radius_mm": float(rule)}, fibre={"min_bend_radius_mm": float(bears)}
+        )
         finding = find(pad, "fibre_bend", settings)
         assert (finding.status, finding.limit) == (status, limit)
 
@@ -149,9 +151,9 @@ class TestFibres:
             assert bends.positions_mm[0] == pytest.approx((-11.25, 0), abs=0.02)
 
     def test_fibre_bend_includes_leads(self):
-        one_side = with_settings(pad={"leads": "one side"}, rules={"min_bend_radius_mm": 3.0})
+        one_side = with_settings(pad={"leads": "one side"}, rules={"min_mean_bend_radius_mm": 3.0})
         assert find(Morphology.straight(2), "fibre_bend", one_side).status == "pass"
-        tighter = replace(one_side, rules=RulesSettings(min_bend_radius_mm=3.1))
+        tighter = replace(one_side, rules=RulesSettings(min_mean_bend_radius_mm=3.1))
         plan = Plan(Morphology.straight(2), tighter)
         plan.__dict__["leads"] = Plan(Morphology.straight(2), one_side).leads  # planted: those of the other radius
         finding = {finding.name: finding for finding in check_plan(plan)}["fibre_bend"]
@@ -359,7 +361,7 @@ def test_messages_of_findings_have_their_lengths_in_mm():
         "crossing_gap": "0.550 mm lie between fibres of neighbouring depths where they cross",  # 1.3 - 0.4 - 0.35
         "same_family_crossings": "0 crossings of fibres of one family",
         "cover": "4.2 mm of silicone lie beyond the deepest tracks",
-        "fibre_bend": "no fibre bends below 1 mm",
+        "fibre_bend": "no fibre bends below 1 mm, in the mean over 0.5 mm",
         "lead_kinks": "fibres meet their leads at corners of 0.0 degrees at most, allowed are 28.6; fibre 1",
         "numbers": "every number has room",
     }
@@ -384,4 +386,4 @@ def test_fibre_bend_is_that_of_the_tightest_fibre():
     for pad in pads:
         both = find(pad, "fibre_bend")
         assert (both.measured, len(both.positions_mm)) == (pytest.approx(radii[1], rel=1e-3), 2)
-        assert both.message == f"fibres 1, 2 bent as tightly as {radii[1]:.2f} mm"
+        assert both.message == f"fibres 1, 2 bent as tightly as {radii[1]:.2f} mm, in the mean over 0.5 mm"

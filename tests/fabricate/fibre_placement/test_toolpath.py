@@ -64,7 +64,7 @@ def test_feed_in_a_bend_follows_from_its_radius(radius_mm, acceleration, stretch
     """Leads to one side turn by quarters of a circle, of the least radius of the rules; all else here is straight."""
     settings = with_settings(
         pad={"leads": "one side"},
-        rules={"min_bend_radius_mm": radius_mm},
+        rules={"min_mean_bend_radius_mm": radius_mm},
         dispenser={"acceleration_mm_s2": acceleration, "feed_mm_s": 10.0},
     )
     (horizontal,) = (each for each in strokes(Plan(Morphology.straight(2), settings), stretch) if each.fibre == 0)

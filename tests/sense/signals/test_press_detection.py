@@ -71,8 +71,8 @@ def test_detect_presses_of_simulated_pads(grid: Counts, rig: RigSettings) -> Non
     recording = simulate(Morphology.straight(grid), rig)
     recall, false, touches, releases = evaluate(detect_presses(recording.readings, recording.times_s), recording)
     # at half the depth some places answer by no more than a few times the noise
-    assert recall >= (0.985 if rig.depth_mm == 5 else 0.88)
-    assert false <= (0.015 if rig.depth_mm == 5 else 0.06)
+    assert recall >= (0.985 if rig.press_depths_mm == (5.0,) else 0.88)
+    assert false <= (0.015 if rig.press_depths_mm == (5.0,) else 0.06)
     for offsets in (touches, releases):  # commands take up to 0.22 s to show, and a block or two of 0.07 s passes
         assert np.mean((offsets / rig.rate_hz > -0.1) & (offsets / rig.rate_hz < 0.5)) >= 0.95
 
