@@ -41,8 +41,8 @@ _STAGE_SECTIONS = {
 
 SEARCH_SHARE = 0.5
 """Largest share of the time budget that the search may use."""
-RESERVE_S = 12.0
-"""Part of the time budget reserved for fault detection, figures and report after the training, s."""
+RESERVE_S = 30.0
+"""Part of the time budget reserved for radii, errors, fault detection, figures and report after the training, s."""
 FORMAT, NAME = "padforge-run/2", "run.json"
 PAD = "morphology.json"
 
@@ -183,6 +183,9 @@ def check_run(run: Run) -> None:
     if run.time_budget is not None and localizer.method == "published":
         reason = "allowed is ensemble: the published training has no time limit"
         raise InputError(f"[localizer] method: got published with --time-budget, {reason}")
+    if run.time_budget is not None and run.time_budget <= RESERVE_S:
+        reason = f"more than {RESERVE_S:g}, which are reserved for what comes after the training"
+        raise InputError(f"--time-budget: got {run.time_budget:g} s, expected {reason}")
     split_presses(len(plan), localizer.split, localizer.test_share, np.random.default_rng(0))
     check_replaceable(run.out / "recording")
     check_design(run.spec, run.out, {"seed": run.seed}, _regenerated_files(), run.force)
@@ -241,6 +244,9 @@ def run_stages(
 
     def calibrate(note: object) -> dict[str, Any]:
         options, budget = spec.section(LocalizerSettings, **seed), run.remaining_s(reserve_s=RESERVE_S)
+        if budget == 0:
+            reason = "nothing of it remains for the training; continue with --resume and more"
+            raise InputError(f"--time-budget: got {run.time_budget:g} s, {reason}")
         with training_progress() as report:
             return calibrate_into(recording, out, options, time_budget=budget, on_progress=report, force=True)
 

@@ -14,6 +14,7 @@ from padforge.sense.cli.options import (
     FILE,
     FOLDER,
     METHODS,
+    PARTS,
     SPLITS,
     fibre_indices,
     fibres_option,
@@ -34,7 +35,18 @@ from padforge.sense.cli.options import (
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
 )
 @click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
-@click.option("--time-budget", type=common.FiniteRange(min=0), metavar="S", help="Train for S seconds.")
+@click.option(
+    "--time-budget",
+    type=common.FiniteRange(min=0, min_open=True),
+    metavar="S",
+    help="Train for S seconds; radii, errors and health come on top.",
+)
+@click.option(
+    "--without",
+    type=click.Choice(PARTS),
+    multiple=True,
+    help="Leave out the health of the fibres, the figures, or the errors by moment; may be given several times.",
+)
 @common.seed_option
 @common.spec_option
 @common.out_option()
@@ -50,10 +62,15 @@ def calibrate(
     \b
     padforge sense calibrate out/pad/recording --test-split chronological
     padforge sense calibrate out/pad/recording --time-budget 600
+    padforge sense calibrate out/pad/recording --time-budget 20 --without health --without moments
 
     Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
     error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
     right, or presses that cannot lie where it says.
+
+    A time budget is that of the training. On top come radii and errors, which may take as long as a training, and what
+    --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when
+    the localizer is not trained out.
     """
     from padforge.design.common.files import locked_folder
     from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
@@ -61,7 +78,7 @@ def calibrate(
     from padforge.sense.settings import LocalizerSettings
 
     folder = out or common.pad_folder(recording)
-    run = {name: options.pop(name) for name in ("time_budget", "force")}
+    run = {name: options.pop(name) for name in ("time_budget", "without", "force")}
     with locked_folder(folder):
         settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
         with common.progress_bar("training") as show:

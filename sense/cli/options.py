@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 
 METHODS, SPLITS = ("ensemble", "published"), ("random", "chronological")
+PARTS = "health", "figures", "moments"
+"""Of a calibration, that may be left out."""
 REFRESH_HZ = 15
 """How often lines on a terminal are redrawn."""
 FILE = click.Path(path_type=Path, dir_okay=False)

@@ -69,6 +69,7 @@ def calibrate(
     options: LocalizerSettings | None = None,
     *,
     time_budget: float | None = None,
+    by_moment: bool = True,
     on_progress: OnProgress = ignore_progress,
 ) -> tuple[LocalizerModel, Evaluation]:
     """Train a localizer on a part of the presses and test it on the others.
@@ -80,6 +81,7 @@ def calibrate(
         options: how to train; the defaults if None.
         time_budget: seconds to train for, with as many members as that is good for; the result then depends on the
             pace of the machine. None for the length and the members of `options`.
+        by_moment: as in `evaluate`.
         on_progress: called with (steps done, steps in all, "") in the training, with a time budget in seconds; before
             and after it with what is being done.
 
@@ -87,8 +89,8 @@ def calibrate(
         The localizer, and its evaluation on the test presses.
 
     Raises:
-        InputError: an option out of range, a time budget for the published method, too few presses, or a training
-            that diverged.
+        InputError: an option out of range, a time budget for the published method or too short to train in, too few
+            presses, or a training that diverged.
     """
     check_type("recording", recording, Recording)
     options = or_default("options", options, LocalizerSettings)
@@ -105,7 +107,8 @@ def calibrate(
     origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
     model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
     with stage("evaluate"):
-        evaluation = evaluate(model, recording, range(_n_levels(options, recording.fibres)), on_progress=on_progress)
+        levels = range(_n_levels(options, recording.fibres))
+        evaluation = evaluate(model, recording, levels, by_moment=by_moment, on_progress=on_progress)
     evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())
     return replace(model, errors=evaluation.errors), evaluation
 
@@ -169,9 +172,10 @@ def fit_model(
     on_progress(0, 0, "response model")
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures, data.rate_hz)
-    bayes, residual_network = (), {}
+    bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
-        networks, bayes, residual_network = train_members(presses, table, options, rng, on_progress, time_budget)
+        trained = train_members(presses, table, options, rng, on_progress, time_budget)
+        networks, bayes, residual_network, trained_share = trained
     else:
         held_back = scaler.training_presses(data.features[early_stop], data.positions_mm[early_stop])
         networks = {"press": train_published(presses, held_back, rng)}
@@ -187,6 +191,7 @@ def fit_model(
         interval_factors=np.ones((n_timed + 1, 1, 3 + len(measures))),
         rate_hz=data.rate_hz,
         training_recording_sha256=data.sha256,
+        trained_share=trained_share,
     )
     if data.at is None:
         moments = [scaler.transform(data.features[calibration])]

@@ -22,6 +22,8 @@ BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself
 """What a simulated error is, beside the errors of the published recording with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # sets of failed fibres of a size that each moment is evaluated with, at most
+NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
+TRAINED_OUT = 0.5  # share of the steps of a training from which errors are within a twentieth of those of a whole one
 ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 
@@ -43,6 +45,7 @@ class Evaluation:
         provenance: of the localizer, and the kind of the recording.
         training_presses: their number, after a calibration.
         settings: of the training, after a calibration.
+        trained_share: of the localizer: share of the usual steps of a training that it had.
         doubts: what makes the evaluation doubtful, each in a line.
     """
 
@@ -58,6 +61,7 @@ class Evaluation:
     provenance: dict[str, Any]
     training_presses: int | None = None
     settings: dict[str, Any] | None = None
+    trained_share: float = 1.0
     doubts: Sequence[str] = ()
 
     def to_dict(self) -> dict[str, Any]:
@@ -70,6 +74,7 @@ def evaluate(
     recording: Recording,
     levels: Iterable[int] = (0, 1, 2, 3),
     *,
+    by_moment: bool = True,
     on_progress: OnProgress = ignore_progress,
 ) -> Evaluation:
     """Evaluate a localizer for every set of failed fibres of some sizes.
@@ -80,6 +85,7 @@ def evaluate(
         model: to evaluate.
         recording: of a pad with the fibres and the rate of the training.
         levels: numbers of failed fibres.
+        by_moment: whether presses are evaluated while they are read, too.
         on_progress: called with (steps done, total, what is evaluated).
 
     Raises:
@@ -117,7 +123,7 @@ def evaluate(
         test_presses=len(test),
         by_subset=by_subset,
         by_position=errors_by_position(prediction.positions_mm, positions_mm),
-        **errors_by_moment(model, recording, test, levels, on_progress),
+        **(errors_by_moment(model, recording, test, levels, on_progress) if by_moment else NO_MOMENTS),
         idle_share=idle_share(recording).tolist(),
         test={
             "press": test.tolist(),
@@ -134,6 +140,7 @@ def evaluate(
             },
         },
         provenance={**model.provenance, "recording_kind": recording.source.get("kind")},
+        trained_share=model.trained_share,
         doubts=doubts,
     )
 
@@ -191,7 +198,7 @@ def errors_by_moment(
     "time_s", "predicted_mm" and "r90_mm". Both are empty of a localizer that knows whole presses only.
     """
     if model.features != "windows":
-        return {"by_moment": [], "focus": {}}
+        return NO_MOMENTS
     from padforge.sense.signals.press_detection import first_readings  # compiled kernels take long to import
 
     commands = recording.down_command, recording.up_command
@@ -357,7 +364,13 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
     doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
-    return [*lines, *([BUILT_PAD] if is_simulated else []), *doubts]
+    return [*lines, *([BUILT_PAD] if is_simulated else []), *untrained_lines(document), *doubts]
+
+
+def untrained_lines(document: Mapping[str, Any]) -> list[str]:
+    """Say in a line that a localizer of a calibration document is not trained out, if so."""
+    share = document.get("trained_share", 1.0)
+    return [f"not trained out: {share:.0%} of the usual steps; errors fall with more time"] * (share < TRAINED_OUT)
 
 
 def moment_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:

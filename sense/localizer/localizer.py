@@ -102,7 +102,8 @@ class Localizer:
             on_progress: as in `calibrate`.
 
         Raises:
-            InputError: an option or array out of range, too few presses, or a training that diverged.
+            InputError: an option or array out of range, too few presses, too short a time budget, or a training that
+                diverged.
         """
         params = self.get_params()
         settings = validate(LocalizerSettings, {"seed": params.pop("random_state"), **params}, "[localizer]")

@@ -119,6 +119,7 @@ class LocalizerDocument:
     recalibrated_by: tuple[Digest, ...] = ()  # recordings all of whose presses it has seen
     fibre_names: tuple[str, ...] = ()  # of the recording of the training, if that was imported
     pad_sha256: Digest | Literal[""] = ""  # of its `pad_digest`
+    trained_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the usual steps of a training
     errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
 

@@ -24,6 +24,7 @@ from torch.optim.adamw import adamw
 
 from padforge.design.common.parallel import makespan, one_torch_thread, run_tasks
 from padforge.design.common.progress import OnProgress, ignore_progress
+from padforge.design.common.validation import InputError
 from padforge.design.networks import fit_batch
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
@@ -153,6 +154,9 @@ PUBLISHED_HIDDEN = 50  # neurons of the published network, of one tanh layer
 PACE_STEPS, MIN_LENGTHS, MAX_MEMBERS = 12, 5, 64
 """With a time budget: steps that measure the pace, usual lengths of a training before there is another for each core,
 and the most networks."""
+MIN_STEPS = 36
+"""Steps that a time budget must allow each network: with 9 the error on the example is three times that of a whole
+training, with 36 a third greater."""
 
 
 class TrainedNetworks(NamedTuple):
@@ -161,6 +165,7 @@ class TrainedNetworks(NamedTuple):
     networks: Networks
     bayes: tuple[BayesianLocalizer, ...]
     residual_network: Weights
+    trained_share: float  # of its usual steps, of the network that took the least
 
 
 def train_members(
@@ -176,14 +181,14 @@ def train_members(
     A member has a network for each phase of a press. Where depths vary there is no Bayesian localizer. Networks are
     trained in threads. `table` is the (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
     `time_budget` is in seconds, for as many members as these are good for, and the progress is in seconds then, else in
-    steps of all networks.
+    steps of all networks. InputError is raised if it ends before each network has taken `MIN_STEPS`.
     """
     begin = time.monotonic()
     n_timed, presses = presses.seen.shape[1], leave_one_out_residuals(presses, table)
     phases = PHASES[n_timed]
     steps = training_steps(len(presses.inputs), options) * (HARDER if presses.depth_gain else 1)
     length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
-    members, cores = max(1, options.members - has_bayes), os.cpu_count() or 1
+    members, cores, pace_s = max(1, options.members - has_bayes), os.cpu_count() or 1, 0.0
     if time_budget is not None:
         with one_torch_thread():
             pace_s = Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
@@ -203,6 +208,7 @@ def train_members(
         in_turn = [remaining_s * part / makespan(all_steps, cores) for part in all_steps]
         totals, seconds = [max(1, round(each)) for each in in_turn], list[float | None](in_turn)
     on_progress(0, sum(totals), "")
+    n_steps = [0] * len(tasks)
     joint = JointProgress(totals, on_progress)
     smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
 
@@ -210,9 +216,14 @@ def train_members(
         name, phase = tasks[number]
         size, corrected = (options, ()) if name else (options.model_copy(update=smaller), bayes)
         training = Training(presses, table, size, seeds[number], phase, corrected)
+
+        def loss_of_batch() -> Tensor:
+            n_steps[number] += 1
+            return training.loss()
+
         fitted = fit_network(
             dict(training.network.named_parameters()),
-            training.loss,
+            loss_of_batch,
             all_steps[number],
             options.learning_rate,
             seconds=seconds[number],
@@ -222,11 +233,19 @@ def train_members(
 
     with one_torch_thread(), joint:
         weights = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
+    missing = [max(0, min(MIN_STEPS, usual) - taken) for taken, usual in zip(n_steps, all_steps, strict=True)]
+    if time_budget is not None and any(missing):
+        needed_s = time.monotonic() - begin + pace_s * makespan(missing, cores)
+        raise InputError(
+            f"time budget: got {time_budget:.3g} s for the training, in which a network took {min(n_steps)} steps; "
+            f"expected at least {MIN_STEPS}, about {math.ceil(needed_s)} s"
+        )
     networks = {
         name: stack_members([weights[number] for number, task in enumerate(tasks) if task[0] == name])
         for name in phases
     }
-    return TrainedNetworks(networks, bayes, weights[len(tasks) - 1] if has_bayes else {})
+    trained_share = min(min(taken / usual, 1.0) for taken, usual in zip(n_steps, all_steps, strict=True))
+    return TrainedNetworks(networks, bayes, weights[len(tasks) - 1] if has_bayes else {}, trained_share)
 
 
 def training_steps(presses: int, options: LocalizerSettings) -> int:

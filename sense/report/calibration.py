@@ -1,6 +1,7 @@
 """What a calibration leaves in a folder: localizer, health models, document and figures."""
 
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,18 @@ from padforge.design.common.profiling import stage
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
-from padforge.sense.localizer.calibration import unlearnt_lines
+from padforge.sense.localizer.calibration import calibrate, unlearnt_lines
 from padforge.sense.localizer.evaluation import Evaluation
-from padforge.sense.localizer.localizer import Localizer
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import draw_errors_by_loss
 
 _log = logging.getLogger(__name__)
 
-BY_MOMENT = "error_by_moment.png"  # where the localizer knows moments
-FILES = (
-    *("localizer.json", "localizer.safetensors", "calibration.json", "error_map.png", "error_by_loss.png"),
-    BY_MOMENT,
-    *sorted(HEALTH_FILES),
-)
-"""Names of all files of a calibration; those of health where it can be learnt."""
+MAP, BY_LOSS, BY_MOMENT = "error_map.png", "error_by_loss.png", "error_by_moment.png"
+FILES = ("localizer.json", "localizer.safetensors", "calibration.json", MAP, BY_LOSS, BY_MOMENT, *sorted(HEALTH_FILES))
+"""Names of all files of a calibration; those of health and of moments where these can be learnt."""
 
 
 def calibrate_into(
@@ -40,10 +37,11 @@ def calibrate_into(
     options: LocalizerSettings,
     *,
     time_budget: float | None = None,
+    without: Collection[str] = (),
     on_progress: OnProgress = ignore_progress,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Calibrate, and write all FILES; nothing changes before all are done.
+    """Calibrate, and write FILES; nothing changes before all are done.
 
     What the recording does not suffice for (depth, force, health) is logged as a warning.
 
@@ -52,6 +50,7 @@ def calibrate_into(
         out: folder.
         options: of the localizer.
         time_budget: seconds to train for, see `calibrate`.
+        without: parts that are left out, of "health", "figures" and "moments".
         on_progress: as in `calibrate`, and called with (0, 0, "health") when that is learnt.
         force: whether a localizer is replaced that other files in `out` were made from.
 
@@ -64,33 +63,47 @@ def calibrate_into(
     check_writable(out)
     path, origin = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
     check_replaceable(path, origin, FILES, force)
-    localizer = Localizer.from_settings(options).fit(recording, time_budget=time_budget, on_progress=on_progress)
-    model, evaluation = localizer.model_, localizer.calibration_
+    by_moment = "moments" not in without
+    model, evaluation = calibrate(
+        recording, options, time_budget=time_budget, by_moment=by_moment, on_progress=on_progress
+    )
     for line in unlearnt_lines(recording, model):
         _log.warning(line)
-    on_progress(0, 0, "health")
-    with stage("health"):
-        try:
-            detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)
-        except InputError as error:
-            detector = None
-            held_out = f"{len(model.test)} presses are held out"
-            _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
+    detector = None
+    if "health" not in without:
+        on_progress(0, 0, "health")
+        with stage("health"):
+            detector = _fit_detector(recording, model, options.seed)
     # Those of an earlier calibration must not stay.
-    with atomic_files(out, without={*HEALTH_FILES, BY_MOMENT}) as folder:
-        localizer.save(folder)
+    with atomic_files(out, without={*HEALTH_FILES, MAP, BY_LOSS, BY_MOMENT}) as folder:
+        model.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone
         if detector:
             detector.save(folder)
         write_json(folder / "calibration.json", evaluation.to_dict())
-        with stage("figures"):
-            draw_error_map(evaluation, folder / "error_map.png")
-            figure, axes = new_figure(6.0, 4.4)
-            draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
-            save_figure(figure, folder / "error_by_loss.png")
-            if evaluation.by_moment:
-                draw_errors_by_moment(evaluation, folder / BY_MOMENT)
+        if "figures" not in without:
+            with stage("figures"):
+                _draw_figures(evaluation, folder)
     return evaluation.to_dict()
+
+
+def _fit_detector(recording: Recording, model: LocalizerModel, seed: int) -> FaultDetector | None:
+    """Fit the health models of a localizer; None, with a warning, where the recording does not suffice."""
+    try:
+        return FaultDetector(seed=seed).fit(recording, model.test, model.provenance)
+    except InputError as error:
+        held_out = f"{len(model.test)} presses are held out"
+        _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
+        return None
+
+
+def _draw_figures(evaluation: Evaluation, folder: Path) -> None:
+    draw_error_map(evaluation, folder / MAP)
+    figure, axes = new_figure(6.0, 4.4)
+    draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
+    save_figure(figure, folder / BY_LOSS)
+    if evaluation.by_moment:
+        draw_errors_by_moment(evaluation, folder / BY_MOMENT)
 
 
 def draw_error_map(evaluation: Evaluation, path: Path) -> None:

@@ -99,6 +99,7 @@ def test_init_writes_published_preset(tmp_path: Path) -> None:
         ("", "design --start-from wavy", "--start-from is wavy, allowed are random, straight and a .json or .mat"),
         ("", "run --formats stl,obj", "Invalid value for '--formats': got 'obj', allowed are stl, 3mf"),
         ("", "run --time-budget nan", "Invalid value for '--time-budget': got 'nan', expected a finite number"),
+        ("", "run --time-budget 0", "--time-budget: got 0 s, expected more than"),
         ("[pad]\ngrid = 2\n", "design compare --vary pad.grid=2,0", "pad.toml with --vary: [pad] grid: got 0"),
         ("", "fabricate check m.json --picture a.jpg", "--picture is a.jpg, allowed is a name that ends in .png"),
         ('[localizer]\nmethod = "published"\n', "run --time-budget 9", "method: got published with --time-budget"),

@@ -252,6 +252,7 @@ def test_time_budget_covers_all_stages(tmp_path: Path, monkeypatch: pytest.Monke
     compare_little(monkeypatch)
     blank_pictures(monkeypatch)
     monkeypatch.setattr("padforge.run.RESERVE_S", 1.0)
+    monkeypatch.setattr("padforge.sense.localizer.training.MIN_STEPS", 1)
     (tmp_path / "pad.toml").write_text(
         SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
     )
@@ -262,14 +263,24 @@ def test_time_budget_covers_all_stages(tmp_path: Path, monkeypatch: pytest.Monke
         return run(*arguments, **more)
 
     monkeypatch.setattr("padforge.sense.report.calibration.calibrate_into", noted)
-    words = ("run", "--time-budget", "5", "--formats", "stl")
+    words = ("run", "--time-budget", "20", "--formats", "stl")
     ended = called(*words, cwd=tmp_path)
     assert ended.code in (0, 1), ended
     assert "(out of time: the best so far)" in ended.out
     assert len(given) == 1
-    assert 0 <= given[0] < 4
+    assert 0 < given[0] < 19
+    assert "not trained out" in ended.out
     again = called(*words, "--resume", cwd=tmp_path)
     assert f"earlier run: {ALL}" in again.err, again
+
+
+def test_run_trains_nothing_in_a_time_budget_that_is_spent(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("padforge.run.RESERVE_S", 4.999)
+    (folder / "out" / "pad" / "localizer.json").unlink()
+    said = "--time-budget: got 5 s, nothing of it remains for the training; continue with --resume and more"
+    ended = called("run", "--resume", "--time-budget", "5", cwd=folder)
+    assert (ended.code, ended.err) == (2, f"padforge: {said}\n"), ended
+    assert not (folder / "out" / "pad" / "localizer.json").exists()
 
 
 def test_remaining_time_counts_from_the_start_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:

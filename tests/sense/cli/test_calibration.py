@@ -68,6 +68,15 @@ def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
     assert few("calibrate", "rec", "--force")[0] == 0
 
 
+def test_calibrate_leaves_parts_out(enough) -> None:
+    """And what an earlier calibration left of them, in the folder of which it is."""
+    assert {"health.json", "error_map.png"} < files_in("model").keys()
+    words = [word for part in ("health", "figures", "moments") for word in ("--without", part)]
+    code, out, _ = enough("calibrate", "rec", "--out", "model", *words, "--json")
+    assert (code, json.loads(out)["by_moment"]) == (0, [])
+    assert files_in("model").keys() == {"localizer.json", "localizer.safetensors", "calibration.json"}
+
+
 def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextmanager
     def progress_bar(name: str) -> Iterator[object]:

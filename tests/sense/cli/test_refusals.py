@@ -62,6 +62,8 @@ doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, 
 doctor --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 {live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
+calibrate rec --time-budget 0                   | Invalid value for '--time-budget': 0.0 is not in the range x>0
+calibrate rec --without radii                   | Invalid value for '--without': 'radii' is not one of 'health'
 calibrate rec --time-budget nan                 | Invalid value for '--time-budget': got 'nan', expected a finite number
 {live} --model model --port {taken}             | port {taken} of 127.0.0.1: another program uses it
 {live} --model model --replay other             | readings are of 6 fibres, the localizer was learnt from 4

@@ -4,6 +4,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from sklearn.model_selection import cross_val_score
 from padforge.design.common.validation import InputError
 from padforge.sense import Evaluation, Localizer, Recording, calibrate, evaluate, import_mat
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
+from padforge.sense.localizer import training
 from padforge.sense.localizer.calibration import calibrate_uncertainty, known_measures, split_presses, unlearnt_lines
-from padforge.sense.localizer.evaluation import distances
+from padforge.sense.localizer.evaluation import calibration_lines, distances
 from padforge.sense.localizer.features import DOWN, N_TIMED, compute_features
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import N_DOWN, complete_at
@@ -168,8 +170,6 @@ def test_calibrate_short_on_the_published_recording(published: Path) -> None:
 
 
 def test_calibrate_reports_divergence(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    from padforge.sense.localizer import training
-
     train = training.train_members
 
     def diverged(*arguments: Any) -> Any:
@@ -299,8 +299,26 @@ def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
     assert evaluation.errors[0]["mean_mm"] < 9
 
 
-def test_calibrate_takes_a_step_without_time(recording: Recording) -> None:
-    """Progress is shown before and after it, too."""
+def test_calibrate_refuses_a_time_budget_that_cannot_train(recording: Recording) -> None:
+    said = r"got 0 s for the training, in which a network took 1 steps; expected at least 36, about \d+ s$"
+    with pytest.raises(InputError, match=said):
+        calibrate(recording, SHORT.model_copy(update={"epochs": 99}), time_budget=0)
+
+
+def test_calibrate_says_when_a_localizer_is_not_trained_out(recording: Recording, short: LocalizerModel) -> None:
+    assert short.trained_share == 1
+    options = SHORT.model_copy(update={"epochs": 10**5})
+    with few_moments(), mock.patch.object(training, "MIN_STEPS", 1):
+        model, evaluation = calibrate(recording, options, time_budget=0.5, by_moment=False)
+    assert 0 < model.trained_share < 0.5
+    assert evaluation.trained_share == model.trained_share
+    assert (evaluation.by_moment, evaluation.focus) == ([], {})
+    line = f"not trained out: {model.trained_share:.0%} of the usual steps; errors fall with more time"
+    assert line in calibration_lines(evaluation.to_dict())
+    assert not any("not trained out" in line for line in calibration_lines(evaluation.to_dict() | {"trained_share": 1}))
+
+
+def test_calibrate_shows_the_progress_of_all_its_parts(recording: Recording) -> None:
     steps: dict[str, list[int]] = {}
     totals: dict[str, int] = {}
 
@@ -308,7 +326,7 @@ def test_calibrate_takes_a_step_without_time(recording: Recording) -> None:
         steps.setdefault(what, []).append(done)
         totals[what] = total
 
-    localizer, _ = calibrate(recording, SHORT, time_budget=0, on_progress=show)
+    localizer, _ = calibrate(recording, SHORT.model_copy(update={"members": 2}), on_progress=show)
     assert np.isfinite(localizer.predict_features(localizer.scaled_features(recording)).positions_mm).all()
     before, after = ("features", "response model", "Bayesian localizer"), ("expected errors", "radii")
     assert list(steps) == [*before, "", *after, "sets of failed fibres", "moments of a press"]
