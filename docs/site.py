@@ -18,7 +18,6 @@ HOUSE = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     "CHANGELOG.md": "CHANGELOG.md",
-    "sense/rig/boards/firmware/padforge_due/README.md": "firmware-due.md",
     "sense/rig/boards/firmware/padforge_line/README.md": "firmware-line.md",
 }
 """Pages of the site by the files that they are."""

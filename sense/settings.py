@@ -96,9 +96,16 @@ class RigSettings(Settings):
         default=0.7, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
     )
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
-    board: str = Field(default="due", min_length=1, max_length=100, description="name of the board")
+    board: str = Field(
+        default="due",
+        min_length=1,
+        max_length=100,
+        description='name of the board: "due", "line", or another that is installed',
+    )
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
-    baud: int = Field(default=921_600, ge=9600, le=20_000_000, description="of a line board; USB boards take any")
+    baud: int = Field(
+        default=921_600, ge=9600, le=20_000_000, description="speed of the board's port; native USB takes any"
+    )
     printer_port: Annotated[Annotated[str, Field(min_length=1, max_length=4096)] | None, *Unknown] = Field(
         default=None, description='serial port of the 3D printer, or "unknown"'
     )

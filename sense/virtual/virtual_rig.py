@@ -10,19 +10,18 @@ from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.ur5 import UR5
-from padforge.sense.rig.boards.board_reader import BoardDriver
-from padforge.sense.rig.boards.due import DueBoard
 from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.config import RigConfig, RobotFrame
 from padforge.sense.rig.devices import Arm, Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import SUPPLY_V, LivePad
-from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard, SampleSource, SerialBoard
+from padforge.sense.virtual.boards import EmulatedLineBoard, SampleSource
 from padforge.sense.virtual.printer import EmulatedPrinter
 from padforge.sense.virtual.ur5 import HOST, EmulatedUR5
 from padforge.sense.virtual.ur5_controller import Series
 
 STIFFNESS_N_MM = 2.0  # of the pad under the emulated UR5, which has a force sensor: 10 N at the 5 mm of a usual press
+DUE_INPUTS = 12
 MIN_LINE_INPUTS = 16  # inputs of the emulated line board, which has more if higher ones are named
 BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any pad
 
@@ -30,7 +29,7 @@ BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any
 @contextmanager
 def emulate_ur5(
     pad: Morphology, contact: Contact, rig: RigSettings, series: Series = "e"
-) -> Iterator[tuple[UR5, BoardDriver, EmulatedUR5, SerialBoard]]:
+) -> Iterator[tuple[UR5, LineBoard, EmulatedUR5, EmulatedLineBoard]]:
     """Open drivers of arm and board, not yet connected, and the emulators behind them; `rig` is of `ur5_settings`.
 
     An arm of the series "cb3" measures no force.
@@ -48,7 +47,7 @@ def emulate_ur5(
 @contextmanager
 def emulate_printer(
     pad: Morphology, contact: Contact, rig: RigSettings
-) -> Iterator[tuple[Printer, BoardDriver, EmulatedPrinter, SerialBoard]]:
+) -> Iterator[tuple[Printer, LineBoard, EmulatedPrinter, EmulatedLineBoard]]:
     """Open drivers and emulators as `emulate_ur5` does, with a printer as the arm and `rig` of `printer_settings`."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp = np.array(rig.tcp_mm)
@@ -63,31 +62,33 @@ def emulate_printer(
             yield printer, driver, robot, board
 
 
+def board_header(rig: RigSettings, n_inputs: int) -> LineHeader:
+    """Return the header of the board that `[rig]` names, with room for a number of inputs: "due" or "line"."""
+    if rig.board == "due":
+        extra = (("name", "padforge-due"), ("serial", "0"))
+        return LineHeader(rig.board_rate_hz, 16, SUPPLY_V, DUE_INPUTS, extra=extra)
+    extra = (("name", "emulated"), ("serial", "0"))
+    return LineHeader(rig.board_rate_hz, 12, SUPPLY_V, max(MIN_LINE_INPUTS, n_inputs), extra=extra)
+
+
 @contextmanager
 def _emulate_board(
     pad: Morphology, contact: Contact, rig: RigSettings, tip_positions: SampleSource
-) -> Iterator[tuple[BoardDriver, SerialBoard]]:
+) -> Iterator[tuple[LineBoard, EmulatedLineBoard]]:
     """Open the driver of a board, and the board, which samples the pad below the tip."""
     frame, inputs = RobotFrame.from_settings(rig), rig.inputs(len(pad.knots))
-    n_inputs = max(MIN_LINE_INPUTS, 1 + max(inputs))
+    n_inputs = 1 + max(inputs)
+    header = board_header(rig, n_inputs)
     model = LivePad(pad, contact, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))
     model.prepare()  # before the board has to keep up
 
     def source(times_s: Array) -> Array:
-        volts = np.zeros((len(times_s), n_inputs))
+        volts = np.zeros((len(times_s), max(header.channels, n_inputs)))
         volts[:, inputs] = model.volts(*frame.tip(tip_positions(times_s)))
         return volts
 
-    if rig.board == "due":
-        emulated, driver_type = EmulatedDue(source), DueBoard
-    elif rig.board == "line":
-        extra = (("name", "emulated"), ("serial", "0"))
-        header = LineHeader(rig.board_rate_hz, 12, SUPPLY_V, n_inputs, extra=extra)
-        emulated, driver_type = EmulatedLineBoard(source, header), LineBoard
-    else:
-        raise InputError(f"[rig] board: got {rig.board!r}, emulated are due and line")
-    with emulated as board:
-        driver = driver_type.from_settings(rig.model_copy(update={"port": board.port}), inputs)
+    with EmulatedLineBoard(source, header) as board:
+        driver = LineBoard.from_settings(rig.model_copy(update={"port": board.port}), inputs)
         with closing(driver):
             yield driver, board
 

@@ -1,23 +1,20 @@
-"""What all boards need: a driver without its protocol, a thread that drains the port, and host times of the samples."""
+"""What a board needs besides its protocol: a thread that drains the port, and host times of the samples."""
 
 import threading
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
-from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
+from padforge.sense.rig.devices import RigFault
 
 POLL_S = 0.1  # longest wait for bytes
 SETTLE_S = 0.5
 """Time of blocks before the first samples are returned, so that their times rest on more than one arrival."""
 BUFFER_S = 60.0  # time of samples that are buffered for a program that does not read
-QUARTZ_SKEW = 500e-6  # relative difference of two quartz clocks; anything beyond is noise of the first seconds
 
 _START_S = 1.5
 _STALL_S = 1.0
@@ -28,60 +25,6 @@ _MIN_STEP, _MAX_STEP = 0.5, 1.5  # between two returned times, in periods, while
 
 Arrivals = list[tuple[float, Any]]
 """Blocks of samples with their host times; the length of a block is the number of its samples."""
-
-
-class BoardDriver(ABC):
-    """The driver of a board at a serial port; implements `Board`."""
-
-    STOP_MESSAGE = b""  # ends the sampling
-
-    def __init__(self, port: str, baud: int) -> None:
-        """Take the port; nothing is opened before `connect`."""
-        self._port, self._baud = port, baud
-        self._stream: SerialStream | None = None
-        self._reader: BlockReader | None = None
-        self._assemble: Callable[[Arrivals], BoardSamples] | None = None
-
-    @abstractmethod
-    def _start(self, stream: SerialStream) -> dict[str, Any]:
-        """Identify the board, start it by `_read_blocks`, and return the board's identity."""
-
-    def connect(self) -> dict[str, Any]:
-        """Open the port and start the board; see `Board`."""
-        self.close()
-        self._stream = SerialStream(self._port, self._baud, POLL_S)
-        try:
-            return self._start(self._stream)
-        except BaseException:
-            self.close()
-            raise
-
-    def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
-        if self._reader is None or self._assemble is None:
-            raise RigFault("refused", f"{self._port}: not connected")
-        return self._assemble(self._reader.drain())
-
-    def close(self) -> None:
-        """Stop sampling and close the port; never raises."""
-        if self._reader is not None:
-            self._reader.stop()
-        if self._stream is not None:
-            with suppress(RigFault):
-                self._stream.send(self.STOP_MESSAGE)
-            self._stream.close()
-        self._stream = self._reader = None
-
-    def _read_blocks(
-        self,
-        receive: Callable[[], tuple[float, list[Any]]],
-        rate_hz: float,
-        assemble: Callable[[Arrivals], BoardSamples],
-        request_start: Callable[[], object] = lambda: None,
-    ) -> None:
-        """Read from now on, return once times are settled; `assemble` makes samples of the blocks."""
-        self._reader, self._assemble = BlockReader(self._port, receive, rate_hz), assemble
-        self._reader.start_settled(request_start)
 
 
 class BlockReader(threading.Thread):
@@ -98,13 +41,11 @@ class BlockReader(threading.Thread):
         self._stopped = threading.Event()
         self._fault: RigFault | None = None
 
-    def start_settled(self, request_start: Callable[[], object]) -> None:
-        """Start, call `request_start` until blocks come, return after `SETTLE_S`; RigFault("stale") without."""
+    def start_settled(self) -> None:
+        """Start, and return after `SETTLE_S` of blocks; RigFault("stale") without."""
         self.start()
         deadline = clock.now() + _START_S
         while self._buffered_s() < SETTLE_S:
-            if self._buffered_s() == 0:
-                request_start()
             self._raise_fault()
             if clock.now() > deadline:
                 raise RigFault("stale", f"{self._port}: the board does not send", "reset it and connect again")
@@ -160,11 +101,11 @@ class BlockReader(threading.Thread):
                 raise RigFault("stale", f"{self._port}: no sample for {silent_s:.1f} s", "reset the board")
 
 
-def select_inputs(inputs: Sequence[int], n_inputs: int, board: str) -> tuple[int, ...]:
+def select_inputs(inputs: Sequence[int], n_inputs: int) -> tuple[int, ...]:
     """Return the inputs to read, all in order if empty; RigFault("refused") for one that the board lacks."""
     for fibre, number in enumerate(inputs, start=1):
         if not 0 <= number < n_inputs:
-            message = f"[rig] channels: fibre {fibre} is on input {number}, {board} has 0 to {n_inputs - 1}"
+            message = f"[rig] channels: fibre {fibre} is on input {number}, the board has 0 to {n_inputs - 1}"
             raise RigFault("refused", message, "it may take a board with more inputs")
     return tuple(inputs) or tuple(range(n_inputs))
 
@@ -181,7 +122,7 @@ class SampleClock:
     cannot be observed and stays in the times.
     """
 
-    def __init__(self, period_s: float, max_skew: float = QUARTZ_SKEW) -> None:
+    def __init__(self, period_s: float, max_skew: float) -> None:
         """Start without arrivals; the period is of one count of the board, the skew its largest relative error."""
         self._period_s, self._max_skew = period_s, max_skew
         self._origin: tuple[int, float] | None = None

@@ -10,7 +10,7 @@ import numpy as np
 
 from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards.board_reader import BoardDriver, SampleClock, select_inputs
+from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
@@ -178,7 +178,7 @@ def find_line_port(rig: RigSettings) -> str:
     return ports[0]
 
 
-class LineBoard(BoardDriver):
+class LineBoard:
     """A board at a serial port that sends samples as lines; implements `Board`.
 
     The host time of a sample is when it was measured by the board's clock, but for the least delay of the port.
@@ -186,8 +186,11 @@ class LineBoard(BoardDriver):
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
         """Take the settings; nothing is opened before `connect`, where the board's header must state `rate_hz`."""
-        super().__init__(port, baud)
+        self._port, self._baud = port, baud
         self._rate_hz, self._inputs = rate_hz, inputs
+        self._stream: SerialStream | None = None
+        self._reader: BlockReader | None = None
+        self._assembler: LineAssembler | None = None
         self._decoder = LineDecoder()
         self._settled, self._last_sample_s = False, 0.0
 
@@ -196,13 +199,38 @@ class LineBoard(BoardDriver):
         """Return the board that `[rig]` names; see `__init__` and `find_line_port`."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
 
+    def connect(self) -> dict[str, Any]:
+        """Open the port, and return the board's identity once times are settled; see `Board`."""
+        self.close()
+        self._stream = SerialStream(self._port, self._baud, POLL_S)
+        try:
+            return self._start(self._stream)
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self) -> BoardSamples:
+        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
+        if self._reader is None or self._assembler is None:
+            raise RigFault("refused", f"{self._port}: not connected")
+        return self._assembler.assemble(self._reader.drain())
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        if self._reader is not None:
+            self._reader.stop()
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = self._reader = None
+
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         self._decoder, self._settled = LineDecoder(), False
         header = self._identify(stream)
-        inputs = select_inputs(self._inputs, header.channels, "the board")
-        assembler = LineAssembler(header, inputs)
+        inputs = select_inputs(self._inputs, header.channels)
+        self._assembler = LineAssembler(header, inputs)
         self._last_sample_s = clock.now()
-        self._read_blocks(lambda: self._receive_blocks(stream, header), header.rate_hz, assembler.assemble)
+        self._reader = BlockReader(self._port, lambda: self._receive_blocks(stream, header), header.rate_hz)
+        self._reader.start_settled()
         self._settled = True
         return {
             **dict(header.extra),
@@ -220,7 +248,7 @@ class LineBoard(BoardDriver):
         while self._decoder.header is None:
             if (now := clock.now()) > deadline:
                 reason = self._decoder.error or "no board that speaks the line protocol answers"
-                raise RigFault("refused", f"{self._port}: {reason}", "is [rig] baud that of the board?")
+                raise RigFault("refused", f"{self._port}: {reason}", "check the port, the firmware and [rig] baud")
             if now >= resend_s:
                 stream.send(HEADER_REQUEST)
                 resend_s = now + _RESEND_S

@@ -100,7 +100,7 @@ def test_ports_of_boards_are_found(
     for find_port in (due.find_due_port, line_board.find_line_port):
         assert find_port(RigSettings(port="COM3")) == "COM3"
     monkeypatch.setitem(sys.modules, "serial", None)
-    for action in (DueBoard("/dev/ttyACM0", 1000).connect, due.list_due_ports):
+    for action in (DueBoard("/dev/ttyACM0", 921_600, 1000).connect, due.list_due_ports):
         with pytest.raises(RigFault, match=r"pip install 'padforge\[rig\]'") as caught:
             action()
         assert caught.value.cause == "refused"

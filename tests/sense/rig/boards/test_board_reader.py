@@ -12,6 +12,7 @@ from scipy.optimize import linprog
 from padforge.sense.rig.boards.board_reader import SampleClock
 
 SETTLE_S = 0.5
+QUARTZ_SKEW = 500e-6  # relative difference of two quartz clocks
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def block_indices(last: int, samples: int) -> np.ndarray:
 def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     """Error of the time of each block's last sample; check that all times ascend."""
     last, measured, arrived = link.blocks()
-    clock, before, errors = SampleClock(1 / link.rate_hz), -np.inf, []
+    clock, before, errors = SampleClock(1 / link.rate_hz, QUARTZ_SKEW), -np.inf, []
     n_done = 0
     for i in range(len(last)):
         clock.observe(int(last[i]), arrived[i])
@@ -85,7 +86,7 @@ def test_times_stay_accurate_in_bounded_memory() -> None:
 
 
 def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
-    clock = SampleClock(1e-3)
+    clock = SampleClock(1e-3, QUARTZ_SKEW)
     with pytest.raises(ValueError, match="no block"):
         clock.times(block_indices(0, 1))
     clock.observe(15, 100.015)
@@ -93,7 +94,7 @@ def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
     clock.observe(1015, 101.015)
     late = clock.times(block_indices(1015, 16))
     assert late[0] - early[-1] == pytest.approx(0.985)
-    clock, before = SampleClock(1e-3), -np.inf
+    clock, before = SampleClock(1e-3, QUARTZ_SKEW), -np.inf
     for first in range(0, 3200, 16):
         clock.observe(first + 15, (first + 15) * 1e-3 + (0.3 if first < 320 else 0.0))
         times = clock.times(block_indices(first + 15, 16))
@@ -121,7 +122,7 @@ def test_times_follow_highest_line_below_arrivals(seed: int, count: int, size: f
     """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
     rng = np.random.default_rng(seed)
     x, y = np.sort(rng.choice(100, count, replace=False)), size * rng.uniform(0, 1, count)
-    clock = SampleClock(1.0)
+    clock = SampleClock(1.0, QUARTZ_SKEW)
     for second, delay_s in zip(x.tolist(), y.tolist(), strict=True):
         clock.observe(second, second + delay_s)
     clock.observe(101, 102.0)  # so late that it does not matter

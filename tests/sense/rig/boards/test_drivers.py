@@ -1,4 +1,4 @@
-"""Both boards' drivers through real pseudo-terminals and real pyserial, against emulated boards and their faults."""
+"""The driver of boards through real pseudo-terminals and real pyserial, against emulated boards and their faults."""
 
 import os
 import sys
@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards import board_reader, due, line_board
-from padforge.sense.rig.boards.due import DueBoard
+from padforge.sense.rig.boards import board_reader, line_board
 from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.devices import BoardSamples
-from padforge.sense.virtual.boards import EmulatedDue, EmulatedLineBoard
+from padforge.sense.virtual.boards import EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")
@@ -28,8 +27,6 @@ pytestmark = [
 STEP_V = 3.3 / 4095
 HEADER = LineHeader(1000, 12, 3.3, 16, extra=(("name", "emulated"), ("serial", "7")))
 BAUD = 921_600
-Board = EmulatedDue | EmulatedLineBoard
-Driver = DueBoard | LineBoard
 
 
 def waves(times_s: np.ndarray) -> np.ndarray:
@@ -37,19 +34,17 @@ def waves(times_s: np.ndarray) -> np.ndarray:
     return 1.65 + 1.5 * np.sin(2 * np.pi * (0.7 + 0.1 * np.arange(16)) * times_s[:, None])
 
 
-def emulated(kind: str, header: Any = HEADER, **options: Any) -> Board:
-    return EmulatedDue(waves, **options) if kind == "due" else EmulatedLineBoard(waves, header, **options)
+def emulated(header: LineHeader = HEADER, **options: Any) -> EmulatedLineBoard:
+    return EmulatedLineBoard(waves, header, **options)
 
 
-def make_driver(board: Board, rate_hz: float = 1000.0, **options: Any) -> Driver:
-    if isinstance(board, EmulatedDue):
-        return DueBoard(board.port, rate_hz, **options)
-    return LineBoard(board.port, BAUD, rate_hz, **options)
+def make_driver(board: EmulatedLineBoard, rate_hz: float = 1000.0, inputs: Sequence[int] = ()) -> LineBoard:
+    return LineBoard(board.port, BAUD, rate_hz, inputs)
 
 
 @contextmanager
-def connected(board: Board, rate_hz: float = 1000.0, **options: Any) -> Iterator[Driver]:
-    with board, closing(make_driver(board, rate_hz, **options)) as driver:
+def connected(board: EmulatedLineBoard, rate_hz: float = 1000.0, inputs: Sequence[int] = ()) -> Iterator[LineBoard]:
+    with board, closing(make_driver(board, rate_hz, inputs)) as driver:
         driver.connect()
         yield driver
 
@@ -64,7 +59,7 @@ def concatenate(*parts: BoardSamples) -> BoardSamples:
     return BoardSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
-def read_for(driver: Driver, seconds: float) -> BoardSamples:
+def read_for(driver: LineBoard, seconds: float) -> BoardSamples:
     parts, end = [driver.read()], clock.now() + seconds
     while clock.now() < end:
         clock.sleep(0.02)
@@ -73,11 +68,15 @@ def read_for(driver: Driver, seconds: float) -> BoardSamples:
 
 
 def check(
-    samples: BoardSamples, board: Board, atol_s: float = 0.05, inputs: Sequence[int] = (), step_v: float = STEP_V
+    samples: BoardSamples,
+    board: EmulatedLineBoard,
+    atol_s: float = 0.05,
+    inputs: Sequence[int] = (),
+    step_v: float = STEP_V,
 ) -> None:
     """Every reading is what the board read at that index, at the right time.
 
-    What a line board had sent before it was asked is not counted: the index of its first reading is looked for.
+    What the board had sent before it was asked is not counted: the index of its first reading is looked for.
     """
     columns = list(inputs or range(samples.volts.shape[1]))
 
@@ -85,34 +84,25 @@ def check(
         return np.abs(samples.volts[: len(index)] - waves(board.true_times(index))[:, columns]).max()
 
     index = np.cumsum(1 + samples.missing) - 1
-    if isinstance(board, EmulatedLineBoard):
-        index -= index[0]
-        period_s = float(board.true_times(1) - board.true_times(0))
-        guess = max(round((samples.times_s[0] - float(board.true_times(0))) / period_s), 60)
-        near = range(guess - 60, guess + 60)
-        index += next(first for first in near if worst_v(first + index[:5]) < 0.502 * step_v)
+    index -= index[0]
+    period_s = float(board.true_times(1) - board.true_times(0))
+    guess = max(round((samples.times_s[0] - float(board.true_times(0))) / period_s), 60)
+    near = range(guess - 60, guess + 60)
+    index += next(first for first in near if worst_v(first + index[:5]) < 0.502 * step_v)
     assert worst_v(index) < 0.502 * step_v
     assert (np.diff(samples.times_s) > 0).all()
     assert np.abs(samples.times_s - board.true_times(index)).max() < atol_s
 
 
-SLOW_LINE = pytest.param("line", marks=pytest.mark.slow)
-SKEWED = {"due": {"skew_ppm": 150}, "line": {"skew_ppm": 2000}}
-SAYS: dict[str, dict[str, Any]] = {
-    "due": {"name": "padforge-due", "firmware": "1.0.0", "channels": 12, "bits": 12, "supply_v": 3.3},
-    "line": {"name": "emulated", "serial": "7", "channels": 16, "bits": 12, "supply_v": 3.3},
-}
-
-
-@pytest.mark.parametrize("kind", ["due", SLOW_LINE])
-def test_read_returns_exact_samples_on_time(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_returns_exact_samples_on_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    board = emulated(kind, **SKEWED[kind])
+    board = emulated(skew_ppm=2000)
     with board, closing(make_driver(board)) as driver:
         identity = driver.connect()
-        assert identity.items() >= SAYS[kind].items()
+        assert identity.items() >= {"name": "emulated", "serial": "7", "channels": 16, "bits": 12}.items()
         assert identity["rate_hz"] == pytest.approx(1000)
-        assert identity["inputs"] == list(range(SAYS[kind]["channels"]))
+        assert identity["supply_v"] == 3.3
+        assert identity["inputs"] == list(range(16))
         assert "warning" not in identity
         samples = read_for(driver, 0.6)
         assert len(samples.times_s) > 900
@@ -121,38 +111,36 @@ def test_read_returns_exact_samples_on_time(kind: str, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(
-    ("kind", "header", "options"),
+    ("header", "inputs"),
     [
-        ("due", replace(HEADER, rate_hz=10.0), {}),
-        ("due", HEADER, {"inputs": range(8), "averaging": 16}),
-        ("due", replace(HEADER, rate_hz=500.0), {"inputs": (11, 3, 0)}),
-        ("line", LineHeader(333.0, 16, 5.0, 16), {"inputs": (15, 0, 7)}),
+        (replace(HEADER, rate_hz=10.0), ()),
+        (replace(HEADER, bits=16, channels=12), (11, 3, 0)),  # of a Due
+        (LineHeader(333.0, 16, 5.0, 16), (15, 0, 7)),
     ],
 )
-def test_read_at_other_rates_inputs_and_averages(kind: str, header: LineHeader, options: dict[str, Any]) -> None:
-    board = emulated(kind, header)
-    with connected(board, header.rate_hz, **options) as driver:
+def test_read_at_other_rates_inputs_and_resolutions(header: LineHeader, inputs: tuple[int, ...]) -> None:
+    board = emulated(header)
+    with connected(board, header.rate_hz, inputs) as driver:
         samples = read_for(driver, 0.15)
         assert len(samples.times_s) > 0.15 * header.rate_hz
         step_v = header.reference_v / header.full_scale + 1e-9
-        check(samples, board, inputs=options.get("inputs", ()), step_v=step_v)
+        check(samples, board, inputs=inputs, step_v=step_v)
 
 
 def test_line_board_connects_through_noise_and_warns_without_checks() -> None:
-    board = emulated("line", seed=1)
+    board = emulated(seed=1)
     board.garble(5e-3)
     with connected(board) as driver:
         board.garble(0)
         check(read_for(driver, 0.1), board)
-    board = emulated("line", replace(HEADER, checked=False))
+    board = emulated(replace(HEADER, checked=False))
     with board, closing(make_driver(board)) as driver:
         assert "a damaged one may pass" in driver.connect()["warning"]
         check(read_for(driver, 0.1), board)
 
 
-@pytest.mark.parametrize("kind", ["due", "line"])
-def test_read_counts_garbled_samples_and_returns_no_wrong_one(kind: str) -> None:
-    board = emulated(kind, seed=3)
+def test_read_counts_garbled_samples_and_returns_no_wrong_one() -> None:
+    board = emulated(seed=3)
     with connected(board) as driver:
         board.garble(4e-3)
         samples = read_for(driver, 0.4)
@@ -162,19 +150,8 @@ def test_read_counts_garbled_samples_and_returns_no_wrong_one(kind: str) -> None
         assert samples.missing.sum() > 50
 
 
-def test_due_counts_overruns_and_raises_for_lost_conversions() -> None:
-    board = EmulatedDue(waves)
-    with connected(board) as driver:
-        board.overrun(160)
-        samples = read_for(driver, 0.25)
-        check(samples, board)
-        assert samples.missing.max() == samples.missing.sum() == 160
-        board.halt()
-        fault_of(driver.read, "data", "lost conversions")
-
-
 def test_read_raises_when_unplugged_after_last_samples() -> None:
-    board = EmulatedLineBoard(waves, HEADER)
+    board = emulated()
     with connected(board) as driver:
         board.unplug()
         assert len(driver.read().times_s) >= 96
@@ -185,9 +162,8 @@ def test_read_raises_when_unplugged_after_last_samples() -> None:
     assert not any(thread.name == f"reader of {board.port}" for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize("kind", ["due", SLOW_LINE])
-def test_read_raises_when_board_stalls_and_connect_recovers(kind: str) -> None:
-    board = emulated(kind)
+def test_read_raises_when_board_stalls_and_connect_recovers() -> None:
+    board = emulated()
     with connected(board) as driver:
         board.stall()
         assert 0.5 < fault_of(driver.read, "stale") < 2.5
@@ -198,7 +174,7 @@ def test_read_raises_when_board_stalls_and_connect_recovers(kind: str) -> None:
 
 def test_read_raises_after_buffer_overflow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board_reader, "BUFFER_S", 0.3)
-    board = EmulatedDue(waves)
+    board = emulated()
     with connected(board) as driver:
         clock.sleep(0.35)
         check(driver.read(), board)
@@ -208,7 +184,7 @@ def test_read_raises_after_buffer_overflow(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize("garbled", [0.0, pytest.param(2e-2, marks=pytest.mark.slow)], ids=["its header", "its times"])
 def test_read_raises_when_line_board_resets(garbled: float) -> None:
     """A header among so many damaged bytes is hardly ever read, nor is every other line: the times show it."""
-    board = EmulatedLineBoard(waves, HEADER, seed=5)
+    board = emulated(seed=5)
     with connected(board) as driver:
         board.garble(garbled)
         before = read_for(driver, 0.1)
@@ -232,7 +208,7 @@ def quick_switches() -> Iterator[None]:
 @pytest.mark.usefixtures("quick_switches")
 def test_line_board_survives_resets_at_any_moment() -> None:
     """Also within one of its steps; a board whose thread has died would not answer again."""
-    board = EmulatedLineBoard(waves, replace(HEADER, rate_hz=10_000))
+    board = emulated(replace(HEADER, rate_hz=10_000))
     with board, closing(make_driver(board, 10_000)) as driver:
         end = clock.now() + 0.3
         while clock.now() < end:
@@ -241,28 +217,23 @@ def test_line_board_survives_resets_at_any_moment() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "board_options", "rate_hz", "options", "match"),
+    ("silent", "rate_hz", "inputs", "match"),
     [
-        ("due", {"silent": True}, 1000, {}, "no padforge board answers.*native USB port"),
-        ("due", {"firmware": (9, 1, 0)}, 1000, {}, r"firmware 9\.1\.0"),
-        ("due", {}, 10_000, {"averaging": 16}, "12 channels at 10000 Hz"),
-        ("due", {}, 1000, {"inputs": (3, 12)}, "fibre 2 is on input 12, an Arduino Due has 0 to 11"),
-        ("line", {"silent": True}, 1000, {}, "no board that speaks.*baud"),
-        ("line", {}, 500, {}, "takes 1000 samples a second, .rig. says 500; set board_rate_hz = 1000"),
-        ("line", {}, 1000, {"inputs": (3, 16)}, "channels: fibre 2 is on input 16, the board has 0 to 15"),
+        (True, 1000, (), "no board that speaks.*check the port, the firmware and .rig. baud"),
+        (False, 500, (), "takes 1000 samples a second, .rig. says 500; set board_rate_hz = 1000"),
+        (False, 1000, (3, 16), "channels: fibre 2 is on input 16, the board has 0 to 15"),
     ],
 )
 def test_connect_refuses_unsuitable_board(
-    kind: str, board_options: dict, rate_hz: float, options: dict, match: str, monkeypatch: pytest.MonkeyPatch
+    silent: bool, rate_hz: float, inputs: tuple[int, ...], match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (due, line_board):
-        monkeypatch.setattr(module, "_ANSWER_S", 0.3)
-    with emulated(kind, **board_options) as board:
-        assert fault_of(lambda: make_driver(board, rate_hz, **options).connect(), "refused", match) < 5
+    monkeypatch.setattr(line_board, "_ANSWER_S", 0.3)
+    with emulated(silent=silent) as board:
+        assert fault_of(make_driver(board, rate_hz, inputs).connect, "refused", match) < 5
 
 
 def test_connect_refuses_port_in_use_until_closed() -> None:
-    with EmulatedDue(waves) as board:
+    with emulated() as board:
         first, second = make_driver(board), make_driver(board)
         first.connect()
         fault_of(second.connect, "refused", "another program uses it")

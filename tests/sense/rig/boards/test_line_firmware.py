@@ -23,6 +23,9 @@ NAME = (("name", "padforge-line"),)
 HEADERS = {
     "ESP32": LineHeader(500, 12, 3.3, 16, extra=(*NAME, ("serial", "a1b2c3d4e5f6"))),
     "TEENSY": LineHeader(500, 12, 3.3, 16, extra=NAME),
+    "ARDUINO_SAM_DUE": LineHeader(
+        1000, 16, 3.3, 12, extra=(("name", "padforge-due"), ("serial", b"serial-of-a-chip".hex()))
+    ),
 }
 BOOT_US, PERIOD_US = 4_294_900_000, 2000
 
@@ -47,12 +50,13 @@ def assemble(header: LineHeader, samples: list[LineSample]) -> BoardSamples:
     return LineAssembler(header, range(header.channels)).assemble([(1.0, samples)])
 
 
-@pytest.mark.parametrize("board", ["ESP32", pytest.param("TEENSY", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("board", ["ESP32", "ARDUINO_SAM_DUE", pytest.param("TEENSY", marks=pytest.mark.slow)])
 def test_firmware_sends_header_at_start_and_on_request(board: str, program: Path, tmp_path: Path) -> None:
     runs = program if board == "ESP32" else compile_sketch("line", FIRMWARE, tmp_path, board)
     items, _ = read(runs, "run 5000", "host x", "host ?", "run 5000")
-    assert [place for place, item in enumerate(items) if isinstance(item, LineHeader)] == [0, 4]
-    assert items[0] == items[4] == HEADERS[board]
+    n_samples = 6 if board == "ARDUINO_SAM_DUE" else 3  # within 5 ms, and as the host says x
+    assert [place for place, item in enumerate(items) if isinstance(item, LineHeader)] == [0, 1 + n_samples]
+    assert items[0] == items[1 + n_samples] == HEADERS[board]
 
 
 def test_firmware_samples_every_input_once_a_period(program: Path) -> None:
@@ -66,6 +70,20 @@ def test_firmware_samples_every_input_once_a_period(program: Path) -> None:
     header, *lines = stream.splitlines(keepends=True)
     assert header == format_header(HEADERS["ESP32"])
     assert lines == [format_sample(item.time_us, item.counts, True) for item in samples]
+
+
+def test_due_averages_conversions_of_every_input(tmp_path: Path) -> None:
+    """Eight, after one that is dropped; the mean of 12 bits is told in 16."""
+    header = HEADERS["ARDUINO_SAM_DUE"]
+    items, _ = read(compile_sketch("line", FIRMWARE, tmp_path, "ARDUINO_SAM_DUE"), "run 200000")
+    samples = select_samples(items)
+    assert len(samples) == 200
+    conversions = (256 * np.arange(12)[:, None] + np.arange(8 * 200)) % 4096
+    means = conversions.reshape(12, 200, 8).mean(axis=2).T
+    assert [sample.counts for sample in samples] == [tuple(row) for row in np.floor(means * 65535 / 4095 + 0.5)]
+    volts = assemble(header, samples).volts
+    assert volts == pytest.approx(means * 3.3 / 4095, abs=3.3 / 65535)
+    assert not assemble(header, samples).missing.any()
 
 
 @pytest.mark.parametrize("trouble", ["held 9000", "room 700"])

@@ -1,4 +1,4 @@
-// The line protocol in plain C++ without Arduino; docs/devices.md describes it.
+// The line protocol in plain C++ without Arduino; docs/howto-boards.md describes it.
 #pragma once
 
 #include <stddef.h>
@@ -47,6 +47,12 @@ class Line {
     add('\n');
   }
 };
+
+// The mean of conversions as a count of `bits`, up to 16: its highest stands for that of the converter.
+inline uint16_t mean_count(uint32_t sum, unsigned conversions, unsigned adc_bits, unsigned bits) {
+  const uint32_t most = conversions * ((1u << adc_bits) - 1);
+  return static_cast<uint16_t>((sum * ((1u << bits) - 1) + most / 2) / most);
+}
 
 inline void write_sample(Line &line, uint32_t time_us, const uint16_t *counts, unsigned inputs) {
   line.add_number(time_us);

@@ -17,7 +17,6 @@ void pinMode(int pin, int mode);
 struct StubSerial {
   std::deque<uint8_t> in;
   std::vector<uint8_t> out;
-  bool open = true;
   int room = 1 << 20;  // bytes that can be sent before the host takes some
 
   void begin(int) {}
@@ -30,7 +29,6 @@ struct StubSerial {
     in.pop_front();
     return byte;
   }
-  bool dtr() { return open; }
   size_t write(const uint8_t *data, size_t size) {
     out.insert(out.end(), data, data + size);
     room -= static_cast<int>(size);
