@@ -22,9 +22,7 @@ from pathlib import Path
 
 from padforge.design.common.files import read_json, recover, sha256
 from padforge.design.common.validation import InputError
-from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import read_journal
 from tools.kills import KILLED, forked, kill_at
 
 SETTINGS = """
@@ -78,13 +76,12 @@ class Command:
 
     Attributes:
         words: of the command line. again: what may be added where it is run again; one is drawn.
-        old: whether results may be there before. real_time: whether its results differ from run to run.
+        old: whether results may be there before.
     """
 
     words: str
     again: Sequence[tuple[str, ...]] = ((),)
     old: bool = True
-    real_time: bool = False
 
 
 COMMANDS = {
@@ -92,12 +89,6 @@ COMMANDS = {
     "fabricate": Command("fabricate other/morphology.json --out pad"),
     "run": Command("run --seed 1 --formats stl,svg --out pad", ((), RESUMED)),
     "record": Command("sense record --morphology other/morphology.json --seed 1 --out pad/recording", old=False),
-    "drivers": Command(
-        "sense record --virtual-hardware --presses 2 --morphology other/morphology.json --out pad/recording"
-        " --resume --mcap",
-        old=False,
-        real_time=True,
-    ),
     "calibrate": Command("sense calibrate other/recording --out pad"),
     "study": Command("study robustness square@2 --presses 16 --max-failures 1 --seed 1 --out pad", ((), RESUMED)),
     "csv": Command("sense export other/recording pad/out.csv"),
@@ -132,13 +123,11 @@ def results(folder: Path) -> dict[str, str]:
     return found
 
 
-def require_whole(folder: Path, old: dict[str, str], new: dict[str, str], real_time: bool) -> str:
+def require_whole(folder: Path, old: dict[str, str], new: dict[str, str]) -> str:
     """See that what belongs together is all old or all new; which of it was there."""
     now, told = results(folder), set()
     for names in _TOGETHER:
         part, before, after = ({name: all_[name] for name in names & all_.keys()} for all_ in (now, old, new))
-        if part and real_time:
-            continue
         assert part in (before, after) or (not part and "recording" in names), (sorted(names), part, before, after)
         if before != after:
             told.add("new" if part == after else "old")
@@ -147,11 +136,8 @@ def require_whole(folder: Path, old: dict[str, str], new: dict[str, str], real_t
         digest = read_json(design, "padforge-design/2")["morphology_sha256"]
         assert digest == sha256(folder / "pad" / "morphology.json")
     recording = folder / "pad" / "recording"
-    if (recording / "start.json").exists() and not real_time:
+    if (recording / "start.json").exists():
         Recording.open(recording)
-    if (folder / "pad" / "recording.mcap").exists():
-        n_done = len(read_journal(recording / "journal.ndjson"))
-        assert len(import_bag(folder / "pad" / "recording.mcap").presses_mm) >= n_done
     return " and ".join(sorted(told))
 
 
@@ -214,13 +200,12 @@ class Rounds:
         code = ended(child)
         assert code in (-signal.SIGKILL, KILLED, 0), (code, Path(f"{folder}.err").read_text())
         left = len(litter(folder))
-        told = require_whole(folder, before, self._new[old], self._command.real_time)
+        told = require_whole(folder, before, self._new[old])
         words += rng.choice(self._command.again)
-        time.sleep(0.3 if self._command.real_time else 0)  # an emulated arm finds that its program has ended
         code, error = ended(started(words, folder)), Path(f"{folder}.err").read_text()
         whole_already = code == 2 and "exists and is not empty" in error and told == "new"
         assert code == 0 or whole_already, (code, error)
-        require_whole(folder, self._new[old], self._new[old], self._command.real_time)
+        require_whole(folder, self._new[old], self._new[old])
         if whole_already and left:  # it has refused before it wrote anything
             return f"{told}, refused"
         assert not litter(folder), litter(folder)

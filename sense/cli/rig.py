@@ -19,23 +19,19 @@ if TYPE_CHECKING:
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.doctor import Diagnosis
-    from padforge.sense.rig.operation import OpenedRig
 
 
 _RIG_SETTINGS = "padforge.sense.settings:RigSettings"
 _RIGS = "simulated, ur5, printer, hand, or an installed arm."
 rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
 _warn = partial(click.echo, err=True)
-virtual_hardware_option = click.option(
-    "--virtual-hardware", is_flag=True, help="Run the drivers of the rig on emulated devices, in real time."
-)
 
 
-def check_rig(name: str) -> None:
-    """Raise InputError unless `--rig` names a rig."""
+def check_rig(name: str, simulated: bool = True) -> None:
+    """Raise InputError unless `--rig` names a rig, a real one if none is `simulated`."""
     from importlib.metadata import entry_points
 
-    names = ["simulated", "hand", *sorted(entry_points(group="padforge.arms").names)]
+    names = [*["simulated"] * simulated, "hand", *sorted(entry_points(group="padforge.arms").names)]
     if name not in names:
         raise InputError(f"--rig is {name!r}, allowed are {', '.join(dict.fromkeys(names))}")
 
@@ -56,7 +52,6 @@ def check_rig(name: str) -> None:
 @click.option("--dry-run", is_flag=True, help="Move through the whole plan above the pad without touching it.")
 @click.option("--resume", is_flag=True, help="Continue an unfinished recording.")
 @click.option("--mcap", is_flag=True, help="Write OUT.mcap as well, for ROS 2 and Foxglove, whole after every press.")
-@virtual_hardware_option
 @common.seed_option
 @common.spec_option
 @common.out_option(what="Folder of the recording; must be new or empty")
@@ -71,7 +66,6 @@ def record(
     dry_run: bool,
     resume: bool,
     mcap: bool,
-    virtual_hardware: bool,
     seed: int | None,
     spec: Path | None,
     out: Path | None,
@@ -82,10 +76,9 @@ def record(
     padforge sense record --morphology out/pad/morphology.json --presses 1500
 
     \b
-    --rig simulated                     a simulated pad, at once
-    --virtual-hardware                  any rig on emulated devices, in real time
-    --rig ur5, --rig printer            a UR robot or a 3D printer, and the board, as set in [rig]
-    --rig hand                          you and the board: a page and the terminal show where to press
+    --rig simulated             a simulated pad, at once: to rehearse
+    --rig ur5, --rig printer    a UR robot or a 3D printer, and the board, as set in [rig]
+    --rig hand                  you and the board: a page and the terminal show where to press
 
     --twin twin.json, which identify writes, makes the simulated pad respond like the measured one: paths of the fibres,
     wiring, pose, gain and noise. With --morphology as well, the fibres are those of that plan, and only the sensitivity
@@ -108,11 +101,11 @@ def record(
     check_rig(rig)
     settings, folder = common.load_spec(spec), common.pad_folder(morphology or twin)
     target = out or folder / "recording"
-    at_once = rig == "simulated" and not virtual_hardware
-    if twin and not at_once:
-        raise InputError("--twin is of the simulated pad, allowed with --rig simulated and without --virtual-hardware")
+    simulated = rig == "simulated"
+    if twin and not simulated:
+        raise InputError("--twin is of the simulated pad, allowed with --rig simulated")
     like = Twin.load(twin) if twin else None
-    if not (rig == "simulated" or virtual_hardware or morphology):
+    if not (simulated or morphology):
         morphology = target.parent / "morphology.json"  # a real pad is named, never guessed
         if not morphology.is_file():
             raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
@@ -123,11 +116,11 @@ def record(
     overrides = {"presses": presses, "plan": plan, "seed": seed}
     options, contact = read_rig(settings, **overrides), read_contact(settings)
     operation.check_press_depths(pad, options, contact, folder)
-    if at_once:
+    if simulated:
         if resume or dry_run or model:
-            raise InputError("--resume, --dry-run and --model need --virtual-hardware or a real rig")
+            raise InputError("--resume, --dry-run and --model need a real rig")
         if plan == "adaptive":
-            raise InputError("--plan is adaptive, which needs --virtual-hardware or a real rig")
+            raise InputError("--plan is adaptive, which needs a real rig")
         deepest = deepest_contact(contact, planned_depths_mm(options))
         if like is None and (notice := describe_large_strain(deepest)):
             _warn(notice)
@@ -138,10 +131,10 @@ def record(
     else:
         check_platform()
         inputs += [] if options.plan_file is None else [options.plan_file]
-        command = f"padforge sense record --rig {rig}" + " --virtual-hardware" * virtual_hardware
+        command = f"padforge sense record --rig {rig}"
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
         config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder, follower)
-        recording = _record_with(rig, config, model, dry_run, resume, virtual_hardware)
+        recording = _record_with(rig, config, model, dry_run, resume)
     click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
     if follower is not None and recording is not None:
         from padforge.sense.formats.import_export import arm_states, export_file
@@ -174,9 +167,7 @@ def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morpholo
     return Morphology.load(morphology) if morphology else Morphology.straight(pad_settings.layout)
 
 
-def _record_with(
-    rig: str, config: "RigConfig", model: Path | None, dry_run: bool, resume: bool, virtual_hardware: bool
-) -> "Recording | None":
+def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: bool, resume: bool) -> "Recording | None":
     """Record with an arm, or by hand."""
     from padforge.sense.recording.run_directory import START
     from padforge.sense.rig import operation
@@ -188,37 +179,21 @@ def _record_with(
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
-        return _record_by_hand(config, resume, virtual_hardware)
-    opened = _opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)), virtual_hardware)
+        return _record_by_hand(config, resume)
+    opened = operation.opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)))
     with common.progress_bar("presses") as show:
         return operation.record(config, opened, model=model, dry=dry_run, resume=resume, on_progress=show)
 
 
-def _opened_rig(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "OpenedRig":
-    if rig == "simulated" or virtual_hardware:
-        from padforge.sense.virtual.virtual_rig import opened_virtual_rig
-
-        return opened_virtual_rig(rig, config, inputs)
-    from padforge.sense.rig import operation
-
-    return operation.opened_rig(rig, config, inputs)
-
-
-def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -> "Recording":
+def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
     """Show a person where to press, on a page and in the terminal, and take commands of both."""
     from padforge.sense.live.outputs import LivePage
     from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
     from padforge.sense.rig.operation import make_board
-    from padforge.sense.virtual.virtual_hand import pressed_by_finger
 
     commands = {row["key"]: row["command"] for row in COMMANDS}
     with ExitStack() as stack:
-        finger = None
-        if virtual_hardware:
-            board, finger = stack.enter_context(pressed_by_finger(config.pad, config.contact, config.rig))
-        else:
-            inputs = config.rig.inputs(len(config.pad.knots))
-            board = stack.enter_context(closing(make_board(config.rig, inputs)))
+        board = stack.enter_context(closing(make_board(config.rig, config.rig.inputs(len(config.pad.knots)))))
         page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(redrawn_lines()), stack.enter_context(typed_keys())
@@ -237,28 +212,28 @@ def _record_by_hand(config: "RigConfig", resume: bool, virtual_hardware: bool) -
                 click.echo("\a", nl=False)  # eyes are on the pad
             latest = pad | view
             page.show(latest)
-            if finger is not None:
-                finger.look(latest)
             if draw is not None:
                 draw(view_lines(latest))
 
         def poll_commands() -> list[str]:
-            by_key = (commands[key] for key in typed() if key in commands)
-            return [*page.read_commands(), *by_key, *(finger.commands() if finger is not None else ())]
+            return [*page.read_commands(), *(commands[key] for key in typed() if key in commands)]
 
         return record_by_hand(config, board, show, poll_commands, resume)
 
 
 @click.command()
-@rig_option
+@click.option(
+    "--rig",
+    metavar="NAME",
+    default="hand",
+    show_default=True,
+    help="hand (the board), ur5, printer, or an installed arm.",
+)
 @click.option("--morphology", type=FILE, help="Pad whose fibres are examined (default: all inputs that are named).")
-@virtual_hardware_option
 @common.spec_option
 @common.json_option
 @click.pass_context
-def doctor(
-    ctx: click.Context, rig: str, morphology: Path | None, virtual_hardware: bool, spec: Path | None, as_json: bool
-) -> None:
+def doctor(ctx: click.Context, rig: str, morphology: Path | None, spec: Path | None, as_json: bool) -> None:
     """Examine the rig before a long run; nothing moves. Exit 1 if something fails.
 
     \b
@@ -274,15 +249,14 @@ def doctor(
     from padforge.sense.rig.devices import check_platform
     from padforge.sense.settings import read_rig
 
-    check_rig(rig)
+    check_rig(rig, simulated=False)
     check_platform()
     settings = common.load_spec(spec)
     pad, options = _load_pad(morphology, settings.section(PadSettings)), read_rig(settings)
-    has_pad = morphology is not None or rig == "simulated" or virtual_hardware
-    inputs = options.inputs(len(pad.knots)) if has_pad else options.channels
+    inputs = options.inputs(len(pad.knots)) if morphology else options.channels
     contact, folder = read_contact(settings), common.pad_folder(morphology)
     config = RigConfig(pad, contact, options, Path(), "padforge sense doctor", folder=folder)
-    diagnoses = _diagnose(rig, config, inputs, virtual_hardware)
+    diagnoses = _diagnose(rig, config, inputs)
     passed = all(diagnosis.status != "fail" for diagnosis in diagnoses)
     lines = [f"{diagnosis.status:<4} {diagnosis.name}: {diagnosis.message}" for diagnosis in diagnoses]
     rows = [asdict(diagnosis) for diagnosis in diagnoses]
@@ -290,17 +264,9 @@ def doctor(
     ctx.exit(0 if passed else 1)
 
 
-def _diagnose(rig: str, config: "RigConfig", inputs: Sequence[int], virtual_hardware: bool) -> "list[Diagnosis]":
+def _diagnose(rig: str, config: "RigConfig", inputs: Sequence[int]) -> "list[Diagnosis]":
     from padforge.sense.rig.operation import diagnose, make_arm, make_board
 
-    if rig == "hand" and virtual_hardware:
-        from padforge.sense.virtual.virtual_hand import pressed_by_finger
-
-        with pressed_by_finger(config.pad, config.contact, config.rig) as (board, _):
-            return diagnose(lambda: board)
     if rig == "hand":
         return diagnose(lambda: make_board(config.rig, inputs))
-    if rig == "simulated" or virtual_hardware:
-        with _opened_rig(rig, config, inputs, virtual_hardware) as (arm, board, settings):
-            return diagnose(lambda: board, lambda: (arm, settings))
     return diagnose(lambda: make_board(config.rig, inputs), lambda: make_arm(rig, config, inputs))

@@ -31,9 +31,9 @@ def open_board(rig: str, model: Path, options: RigSettings, fibres: int) -> Boar
         InputError: a board that is not installed, or a model of no simulated pad.
     """
     if rig == "simulated":
-        from padforge.sense.virtual.virtual_pad import virtual_pad_of
+        from padforge.sense.rig.simulated_board import simulated_board_of
 
-        return virtual_pad_of(model)
+        return simulated_board_of(model)
     return load_device("padforge.boards", options.board)(options, options.inputs(fibres))
 
 

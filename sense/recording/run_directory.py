@@ -1,6 +1,6 @@
 """The run directory of a recording: written so that no finished press is ever lost.
 
-It holds `start.json` (what was recorded, and with what), `readings.bin` and, for a real or emulated arm, `states.bin`
+It holds `start.json` (what was recorded, and with what), `readings.bin` and, for an arm, `states.bin`
 (see `block_file`), and `journal.ndjson`: one line as a press begins, with its position and the index of its first
 reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done: after
 a kill all presses that the journal calls done can be used, and the others are repeated. `start.json` is written last

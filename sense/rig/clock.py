@@ -1,4 +1,4 @@
-"""The clock of a rig: drivers, the press loop and emulated devices take all their times from it.
+"""The clock of a rig: drivers and the press loop take all their times from it.
 
 It is the host's `time.monotonic`, s. Tests put one in its place that stands still while a thread gets no processor.
 """

@@ -1,6 +1,6 @@
 """Devices of a rig behind two small protocols: an arm that presses and a board that reads the fibres.
 
-Real, emulated and third-party devices are used alike. Times are seconds of one clock, the host's `time.monotonic`;
+Ours and third-party devices are used alike. Times are seconds of one clock, the host's `time.monotonic`;
 lengths are mm in the arm's base frame, angles radians. Arms and boards are found by name, as entry points of installed
 packages: `padforge.arms` names functions of `RigSettings` that return an `Arm`; `padforge.boards` functions of
 `RigSettings` and the inputs to read, in the order of the fibres, that return a `Board`.
@@ -140,7 +140,7 @@ def load_device(group: Group, name: str) -> Callable[..., Any]:
 
 
 def check_platform() -> None:
-    """Raise InputError if rigs and their emulators, which need POSIX, cannot run here."""
+    """Raise InputError if rigs, which need POSIX, cannot run here."""
     if (system := platform.system()) not in ("Linux", "Darwin"):
         raise InputError(f"a rig needs Linux or macOS, this is {system}; allowed here is --rig simulated")
 

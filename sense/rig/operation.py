@@ -172,7 +172,7 @@ def record(
     resume: bool = False,
     on_progress: OnProgress = ignore_progress,
 ) -> Recording | None:
-    """Record with a rig, of `opened_rig` or `opened_virtual_rig`; what is done is on the disk whatever happens.
+    """Record with a rig, see `opened_rig`; what is done is on the disk whatever happens.
 
     An adaptive plan needs the folder of a localizer, `model`. If `dry`, the pad is not touched, nothing is kept, and
     None is returned. Raises RigFault if the rig failed, or the plan is not safe.

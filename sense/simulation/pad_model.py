@@ -270,7 +270,7 @@ def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
 
 
 class LivePad:
-    """A simulated pad under a moving tip; one physical model for every virtual rig."""
+    """A simulated pad under a moving tip; one physical model for all that press it in real time."""
 
     def __init__(
         self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, rng: np.random.Generator

@@ -25,9 +25,9 @@ from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.twin import identification as twin_identification
 from padforge.sense.twin import wiring
 from padforge.sense.twin.identification import Identification, identify_pad
-from padforge.sense.virtual import virtual_rig
-from padforge.sense.virtual.ur5 import EmulatedUR5
-from padforge.sense.virtual.ur5_controller import Series
+from tests.emulators import rigs
+from tests.emulators.ur5 import EmulatedUR5
+from tests.emulators.ur5_controller import Series
 from tests.helpers.once import Once
 from tests.helpers.rigs import ideal_rig
 from tests.helpers.steady_clock import SteadyClock, steady_clock
@@ -236,7 +236,7 @@ def address() -> Iterator[str]:
 def own_address(address: str) -> Iterator[None]:
     """Whole rigs are emulated at the address."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual_rig, "HOST", address)
+        patch.setattr(rigs, "HOST", address)
         yield
 
 

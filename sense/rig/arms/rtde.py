@@ -118,6 +118,9 @@ class HostClock:
 class RtdeReader:
     """A link to the RTDE port that reads every state of the arm.
 
+    ur-rtde's own receiver has the latest state alone: whoever polls it misses states, and takes a silent arm for a
+    connected one.
+
     Methods raise OSError if there is no link or it ends, TimeoutError if nothing comes, ValueError for what is damaged.
     """
 

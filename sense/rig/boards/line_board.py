@@ -61,23 +61,6 @@ class LineSample:
     counts: tuple[int, ...]
 
 
-def format_header(header: LineHeader) -> bytes:
-    """Return a header as it is sent."""
-    numbers = ((name, f"{getattr(header, name):g}") for name in _LIMITS)
-    words = [*header.extra, *numbers, *([("check", "crc32")] if header.checked else [])]
-    return _format_line(f"{_MAGIC} {_VERSION} " + " ".join(map("=".join, words)), header.checked)
-
-
-def format_sample(time_us: int, counts: Sequence[int], checked: bool) -> bytes:
-    """Return a sample as it is sent."""
-    return _format_line(",".join(map(str, (time_us, *counts))), checked)
-
-
-def _format_line(text: str, checked: bool) -> bytes:
-    body = text.encode("ascii")
-    return body + (b"*%08x\n" % crc32(body) if checked else b"\n")
-
-
 class LineDecoder:
     """Decodes headers and samples from a stream of bytes that comes in any portions."""
 

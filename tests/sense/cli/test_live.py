@@ -15,8 +15,8 @@ from padforge.sense.live import outputs
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.rig import simulated_board
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.virtual import virtual_pad
 from tests.helpers.page_names import names_in_view
 from tests.sense.live.conftest import first_presses
 
@@ -93,7 +93,7 @@ def test_live_shows_a_rig_until_it_ends(padforge_sense, model, views, monkeypatc
     recording = Recording.open(model / "recording")
     source = {**recording.source, "rig": {**recording.source["rig"], "mirrored": True}}
     replace(recording, source=source).save("mine/recording", {})
-    monkeypatch.setattr(virtual_pad, "VirtualPad", lambda *pad, **size: board)
+    monkeypatch.setattr(simulated_board, "SimulatedBoard", lambda *pad, **size: board)
     monkeypatch.setattr(outputs, "MessageBuilder", told)
     ended, out, err = padforge_sense("live", "--port", "0", "--model", "mine", "--json")
     assert (ended, out) == (code, "")

@@ -90,7 +90,7 @@ def test_locate_works_without_optional_libraries(few) -> None:
     assert run[2].endswith("pip install 'padforge[design,cad,train]'\n")
 
 
-@pytest.mark.parametrize("words", ["record --rig ur5", "record --virtual-hardware", "doctor"])
+@pytest.mark.parametrize("words", ["record --rig ur5", "record --rig hand", "doctor"])
 def test_rig_commands_fail_on_windows_in_one_line(padforge_sense, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
     Morphology.straight(4).save("morphology.json")
     monkeypatch.setattr("platform.system", lambda: "Windows")

@@ -47,11 +47,11 @@ deploy --model model other l.onnx               | readings are of 6 fibres, the 
 record --seed 9 --out rec                       | never written over
 record --presses -3 --out rec                   | Invalid value for '--presses': got -3, input should be greater
 record --plan rows --out rec                    | Invalid value for '--plan': got 'rows', expected uniform, grid,
-record --plan adaptive                          | --plan is adaptive, which needs --virtual-hardware or a real rig
-record --resume                                 | --resume, --dry-run and --model need --virtual-hardware or a real rig
+record --plan adaptive                          | --plan is adaptive, which needs a real rig
+record --resume                                 | --resume, --dry-run and --model need a real rig
 record --mcap --out rec2                        | rec2.mcap: exists, recordings are never written over; choose
-record --mcap --dry-run --virtual-hardware      | --mcap writes what is recorded, and --dry-run keeps nothing
-record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated and
+record --mcap --dry-run --rig ur5 {five}        | --mcap writes what is recorded, and --dry-run keeps nothing
+record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip
 record --rig ur5 --spec none.toml               | --morphology is needed, of the pad under the arm: there is none at
@@ -59,7 +59,9 @@ record --rig ur5 --spec 3.toml --out mine/r     | [rig] channels: got 3 inputs, 
 record --rig ur5 {unread} --plan adaptive       | [rig] plan is adaptive, which needs --model
 record --rig hand {straight} --dry-run          | --dry-run and --model need an arm
 doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
-doctor --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
+doctor --rig crane                              | --rig is 'crane', allowed are hand, printer, ur5
+doctor --rig simulated                          | --rig is 'simulated', allowed are hand, printer, ur5
+record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 {live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
 calibrate rec --time-budget 0                   | Invalid value for '--time-budget': 0.0 is not in the range x>0

@@ -3,9 +3,11 @@
 import json
 import os
 import sys
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -14,16 +16,21 @@ import pytest
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import Contact, Morphology
 from padforge.design.common.files import sha256
-from padforge.design.common.settings import commented_toml
-from padforge.design.settings import PadSettings
 from padforge.fabricate import MouldSettings, build
 from padforge.fabricate.settings import DEFAULTS
 from padforge.sense import Recording
 from padforge.sense.formats.ros_recording import import_bag
+from padforge.sense.live import outputs
 from padforge.sense.rig import operation
 from padforge.sense.rig.doctor import Diagnosis
 from padforge.sense.settings import RigSettings
+from tests.emulators.boards import EmulatedLineBoard, emulated_header
+from tests.emulators.finger import Finger
+from tests.emulators.rigs import emulate_printer, printer_settings
+from tests.helpers.rigs import rig_toml
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
+
+EMULATED = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
 
 def test_record_writes_beside_its_pad(padforge_sense) -> None:
@@ -90,15 +97,17 @@ def test_record_simulates_a_twin(padforge_sense) -> None:
     assert Recording.open("other").fibres == 6
 
 
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
-def test_record_with_a_virtual_printer(padforge_sense) -> None:
-    pytest.importorskip("serial")
-    rig = "rate_hz = 50\nreadings_per_press = 30\nclearance_mm = 1\ndepth_mm = 1\ntravel_mm_s = 400\n"
-    Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{rig}")
-    Morphology.straight(2).save("morphology.json")
-    pad = ("--morphology", "morphology.json", "--spec", "pad.toml")
-    code, out, _ = padforge_sense("record", "--rig", "printer", "--virtual-hardware", "--presses", "2", *pad)
-    assert (code, out[:14]) == (0, "2 presses over")
+@EMULATED
+def test_record_with_a_printer(padforge_sense) -> None:
+    fast = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 1, "depth_mm": 1, "travel_mm_s": 400}
+    pad = Morphology.straight(2)
+    pad.save("morphology.json")
+    rig = printer_settings(RigSettings.model_validate(fast), pad)
+    with emulate_printer(pad, Contact(), rig) as (settings, _, _):
+        Path("pad.toml").write_text(rig_toml(settings, pad.grid))
+        words = ("record", "--rig", "printer", "--presses", "2", "--morphology", "morphology.json")
+        code, out, err = padforge_sense(*words)
+    assert (code, out[:14]) == (0, "2 presses over"), err
     assert Recording.open("recording").source["rig"]["tcp_mm"] == [30.0, 0.0, -20.0]
 
 
@@ -120,8 +129,7 @@ def test_record_checks_the_tcp_before_anything_moves(
     monkeypatch.setattr(operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeBoard(arm), setup.rig)))
     monkeypatch.setattr(operation, "PressLoop", session)
     rig = RIG.model_copy(update={"tcp_mm": tcp_mm, "max_force_n": max_force_n})
-    tables = {"pad": PadSettings(grid=PAD.grid), "rig": rig}
-    Path("rig.toml").write_text(commented_toml({"pad": PadSettings, "rig": RigSettings}, tables))
+    Path("rig.toml").write_text(rig_toml(rig, PAD.grid))
     PAD.save("pad.json")
     words = ("record", "--rig", "ur5", "--dry-run", "--spec", "rig.toml", "--morphology", "pad.json")
     ended, _, err = padforge_sense(*words)
@@ -144,16 +152,34 @@ def test_record_says_that_an_mcap_file_is_not_resumed(padforge_sense, monkeypatc
     )
 
 
-HAND = '[pad]\ngrid = 2\n[rig]\npresses = 2\nreadings_per_press = 10\nport = "/dev/nosuch"\n'
+@pytest.fixture
+def finger(padforge_sense) -> Iterator[Finger]:
+    """One that presses a pad, whose board pad.toml names, in the folder of the command."""
+    pad, rig = Morphology.straight(2), RigSettings(presses=2, readings_per_press=10)
+    pad.save("morphology.json")
+    finger = Finger(pad, Contact(), rig, rig.board_rate_hz)
+    with EmulatedLineBoard(finger.volts, emulated_header(rig.board_rate_hz, len(pad.knots))) as board:
+        Path("pad.toml").write_text(rig_toml(rig.model_copy(update={"port": board.port}), pad.grid))
+        yield finger
 
 
+@EMULATED
 @pytest.mark.slow
-def test_record_with_a_virtual_hand(padforge_sense) -> None:
+def test_record_by_hand(padforge_sense, finger: Finger, monkeypatch: pytest.MonkeyPatch) -> None:
     """In real time, which the board needs."""
-    Path("pad.toml").write_text(HAND)
-    by_hand = ("record", "--rig", "hand", "--virtual-hardware", "--out", "rec")
+
+    class WatchedPage(outputs.LivePage):
+        def show(self, view: Mapping[str, Any]) -> None:
+            super().show(view)
+            finger.look(view)
+
+        def read_commands(self) -> list[str]:
+            return [*super().read_commands(), *finger.commands()]
+
+    monkeypatch.setattr(outputs, "LivePage", WatchedPage)
+    by_hand = ("record", "--rig", "hand", "--out", "rec")
     code, out, err = padforge_sense(*by_hand)
-    assert code == 0
+    assert code == 0, err
     assert "http://127.0.0.1:" in err
     recording = Recording.open("rec")
     assert recording.has_position.sum() == 2
@@ -177,12 +203,13 @@ def test_doctor_examines_each_device_without_the_other(padforge_sense) -> None:
     assert "fail arm: [rig] tcp_mm is unknown" in out
 
 
+@EMULATED
 @pytest.mark.slow
-def test_doctor_examines_the_board_alone_for_a_hand(padforge_sense) -> None:
-    Path("pad.toml").write_text(HAND)
-    code, out, _ = padforge_sense("doctor", "--rig", "hand", "--virtual-hardware")
+@pytest.mark.usefixtures("finger")
+def test_doctor_examines_the_board_alone(padforge_sense) -> None:
+    code, out, _ = padforge_sense("doctor")
     assert code == 0
-    assert "name padforge-due" in out
+    assert "name emulated" in out
     assert "arm" not in out
 
 

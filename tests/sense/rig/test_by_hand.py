@@ -39,7 +39,7 @@ from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
-from padforge.sense.virtual.virtual_hand import SCATTER_MM, Finger
+from tests.emulators.finger import SCATTER_MM, Finger
 from tests.helpers.page_names import names_in_view
 from tests.sense.conftest import QUICK
 from tests.sense.rig.fakes import Time

@@ -11,9 +11,9 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Evaluation, Recording, calibrate, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import pad_source
+from padforge.sense.rig.simulated_board import simulated_board_of
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.virtual.virtual_pad import virtual_pad_of
 from tests.helpers.rigs import ideal_rig
 from tests.sense.conftest import few_moments
 
@@ -41,7 +41,7 @@ def test_recording_describes_its_pad(recording: Recording, tmp_path: Path) -> No
     assert Morphology.from_dict(recording.source["morphology"]) == PAD
     assert recording.source["keep_out_mm"] == [[list(corner) for corner in KEEP_OUT]]
     recording.save(tmp_path / "recording", {})
-    assert virtual_pad_of(tmp_path).connect()["channels"] == 5
+    assert simulated_board_of(tmp_path).connect()["channels"] == 5
     square = Morphology.straight(2)
     assert json.dumps(pad_source(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
 

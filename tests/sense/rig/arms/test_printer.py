@@ -15,9 +15,9 @@ from padforge.sense.rig.arms.printer_link import MarlinLink
 from padforge.sense.rig.boards.line_board import LineHeader
 from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual import printer as firmware
-from padforge.sense.virtual.boards import EmulatedLineBoard
-from padforge.sense.virtual.printer import EmulatedPrinter
+from tests.emulators import printer as firmware
+from tests.emulators.boards import EmulatedLineBoard
+from tests.emulators.printer import EmulatedPrinter
 from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")

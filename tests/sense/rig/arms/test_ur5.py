@@ -22,7 +22,7 @@ from padforge.sense.rig.devices import ArmState, Pose, RigFault
 from padforge.sense.rig.doctor import examine_arm
 from padforge.sense.rig.safety import Limits, wait_until_still
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual.ur5 import HOME, INPUTS, SCRIPT_PORT, EmulatedUR5
+from tests.emulators.ur5 import HOME, INPUTS, SCRIPT_PORT, EmulatedUR5
 
 BOTH = pytest.mark.parametrize("series", ["cb3", pytest.param("e", marks=pytest.mark.slow)], scope="module")
 LIMITS = Limits(

@@ -15,7 +15,7 @@ from padforge.sense.rig import clock
 from padforge.sense.rig.boards import board_reader, line_board
 from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.devices import BoardSamples
-from padforge.sense.virtual.boards import EmulatedLineBoard
+from tests.emulators.boards import EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
 pytest.importorskip("serial")

@@ -11,10 +11,9 @@ from padforge.sense.rig.boards.line_board import (
     LineDecoder,
     LineHeader,
     LineSample,
-    format_header,
-    format_sample,
 )
 from padforge.sense.rig.devices import BoardSamples
+from tests.emulators.boards import format_header, format_sample
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
 FIRMWARE = Path(line_board.__file__).parent / "firmware" / "padforge_line"

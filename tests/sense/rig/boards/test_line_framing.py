@@ -13,10 +13,9 @@ from padforge.sense.rig.boards.line_board import (
     LineDecoder,
     LineHeader,
     LineSample,
-    format_header,
-    format_sample,
 )
 from padforge.sense.rig.devices import BoardSamples, RigFault
+from tests.emulators.boards import format_header, format_sample
 
 PAGE = Path(__file__).parents[4] / "docs" / "howto-boards.md"
 HEADER = LineHeader(500, 12, 3.3, 4, extra=(("name", "my-board"),))

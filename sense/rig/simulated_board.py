@@ -23,7 +23,7 @@ from padforge.sense.simulation.pad_model import SUPPLY_V, TRAVEL_S, LivePad
 from padforge.sense.simulation.simulated_recording import sample_positions
 
 
-class VirtualPad:
+class SimulatedBoard:
     """A board that samples a simulated pad at `[rig] rate_hz`; implements `Board`.
 
     The pad is the one that `simulate` records with the same arguments, down to the readings of its fibres at rest.
@@ -85,7 +85,7 @@ class VirtualPad:
         return self._position_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(share, 0.0)
 
 
-def virtual_pad_of(model: Path) -> VirtualPad:
+def simulated_board_of(model: Path) -> SimulatedBoard:
     """Return the simulated pad whose recording a model folder was trained on; InputError if there is none."""
     path = model / RECORDED / START
     if not path.is_file():
@@ -102,7 +102,7 @@ def virtual_pad_of(model: Path) -> VirtualPad:
         size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
-    return VirtualPad(
+    return SimulatedBoard(
         pad,
         validate(RigSettings, rig, f"{path}: rig"),
         validate(Contact, contact, f"{path}: contact"),

@@ -10,9 +10,9 @@ import pytest
 
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.devices import RigFault
-from padforge.sense.virtual import ur5_controller
-from padforge.sense.virtual.ur5 import EmulatedUR5
-from padforge.sense.virtual.ur5_controller import Controller
+from tests.emulators import ur5_controller
+from tests.emulators.ur5 import EmulatedUR5
+from tests.emulators.ur5_controller import Controller
 
 
 def test_pose_log_keeps_newest_rows(monkeypatch: pytest.MonkeyPatch) -> None:

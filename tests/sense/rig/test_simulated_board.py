@@ -1,4 +1,4 @@
-"""The virtual pad is pressed as the simulated recording was, and is found by the model that was trained on that."""
+"""A simulated board is of the pad of a simulated recording, and is found by the model that was trained on that."""
 
 import json
 from pathlib import Path
@@ -12,19 +12,19 @@ from padforge.design.settings import PUBLISHED_CONTACT, Contact
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START
 from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.simulated_board import SimulatedBoard, simulated_board_of
 from padforge.sense.rig.streams import RECORDED
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.virtual.virtual_pad import VirtualPad, virtual_pad_of
 from tests.helpers.rigs import quiet_rig
 from tests.sense.rig.fakes import Time
 
 
-def test_virtual_pad_is_the_pad_of_the_recording() -> None:
+def test_simulated_board_is_the_pad_of_the_recording() -> None:
     pad = Morphology.random(2, knots=3, seed=5)
     rig = quiet_rig(presses=20, seed=4)
     recorded, time = simulate(pad, rig), Time(least_s=0)
-    board = VirtualPad(pad, rig, PUBLISHED_CONTACT)
+    board = SimulatedBoard(pad, rig, PUBLISHED_CONTACT)
     with time.of_all():
         with pytest.raises(RigFault, match="not connected"):
             board.read()
@@ -45,10 +45,10 @@ def test_virtual_pad_is_the_pad_of_the_recording() -> None:
     assert 0.5 < np.abs(volts - volts[0]).max() / np.abs(recorded.readings - volts[0]).max() < 2
 
 
-def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
+def test_simulated_board_is_pressed_to_its_depths_in_turn() -> None:
     rig = quiet_rig(presses=4, seed=4, depths_mm=(0.5, 5.0), readings_per_press=20)
     time = Time(least_s=0)
-    board = VirtualPad(Morphology.straight(2), rig, Contact())
+    board = SimulatedBoard(Morphology.straight(2), rig, Contact())
     with time.of_all():
         board.connect()
         time.sleep(4.01 * 20 / rig.rate_hz)
@@ -64,16 +64,16 @@ def test_virtual_pad_is_pressed_to_its_depths_in_turn() -> None:
         ({"morphology": {}}, "no pad that can be simulated"),
     ],
 )
-def test_virtual_pad_of_a_model_needs_its_simulated_recording(
+def test_simulated_board_of_a_model_needs_its_simulated_recording(
     brief: Recording, tmp_path: Path, change: dict, error: str
 ) -> None:
     with pytest.raises(InputError, match=r"start\.json: not there"):
-        virtual_pad_of(tmp_path)
+        simulated_board_of(tmp_path)
     brief.save(tmp_path / RECORDED, {})
     path = tmp_path / RECORDED / START
     source = simulate(Morphology.straight(2), RigSettings(presses=1)).source
     path.write_text(json.dumps({"format": FORMAT, "source": source}))
-    assert virtual_pad_of(tmp_path).connect()["channels"] == 4
+    assert simulated_board_of(tmp_path).connect()["channels"] == 4
     path.write_text(json.dumps({"format": FORMAT, "source": {**source, **change}}))
     with pytest.raises(InputError, match=error):
-        virtual_pad_of(tmp_path)
+        simulated_board_of(tmp_path)

@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design import Contact, Morphology
 from padforge.sense.settings import RigSettings
-from padforge.sense.virtual.virtual_hand import LIGHT, MISHAPS, REACTION_S, SHORT_S, SLIDE_MM, Finger, FingerStroke
+from tests.emulators.finger import LIGHT, MISHAPS, REACTION_S, SHORT_S, SLIDE_MM, Finger, FingerStroke
 
 RATE_HZ = 50.0
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import PUBLISHED_CONTACT
@@ -27,15 +26,19 @@ from padforge.sense.recording.press_plan import PressPlan, make_plan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig import clock
+from padforge.sense.rig.arms.printer import Printer
+from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards import board_reader
+from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.config import RobotFrame
-from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.devices import Arm, RigFault
 from padforge.sense.rig.press_loop import PressLoop
 from padforge.sense.rig.safety import RETREAT_MM
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import LivePad
-from padforge.sense.virtual import virtual_rig
-from padforge.sense.virtual.printer import EmulatedPrinter
+from tests.emulators import rigs
+from tests.emulators.printer import EmulatedPrinter
+from tests.helpers.rigs import rig_toml
 
 pytest.importorskip("serial")
 pytestmark = [
@@ -50,26 +53,31 @@ FAST_AXES = {"max_mm_s": (500.0, 500.0, 100.0), "max_mm_s2": (3000.0, 3000.0, 30
 QUICK = {"rate_hz": 125, "readings_per_press": 20, "clearance_mm": 5}
 QUICK |= {"travel_mm_s": 500, "press_mm_s": 250, "acceleration_mm_s2": 3000}
 SLOWER = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 2.0, "depth_mm": 3.0, "press_mm_s": 100}
-ARM = virtual_rig.ur5_settings(RigSettings.model_validate(QUICK | QUIET | {"max_force_n": "unwatched"}), PAD)
-PRINTER = virtual_rig.printer_settings(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
+ARM = rigs.ur5_settings(RigSettings.model_validate(QUICK | QUIET | {"max_force_n": "unwatched"}), PAD)
+PRINTER = rigs.printer_settings(RigSettings.model_validate(QUICK | SLOWER | QUIET), PAD)
 
 
 ATTEMPTS = 3  # to disturb a recording
-emulate_arm = partial(virtual_rig.emulate_ur5, series="cb3")  # 125 states a second, not 500, for a busy machine
+emulate_arm = partial(rigs.emulate_ur5, series="cb3")  # 125 states a second, not 500, for a busy machine
 
 
 class Rig:
     """An emulated rig that lives through several recordings; `robot` is the emulated arm or printer."""
 
-    def __init__(self, settings: RigSettings, emulate: Callable[..., Any]) -> None:
-        self.settings, self.emulate, self.stack = settings, emulate, ExitStack()
+    def __init__(
+        self, settings: RigSettings, emulate: Callable[..., Any], make_arm: Callable[[RigSettings], Any]
+    ) -> None:
+        self.settings, self.emulate, self.make_arm, self.stack = settings, emulate, make_arm, ExitStack()
         self.replace()
 
     def replace(self) -> None:
         """Replace the devices by new ones."""
         self.stack.close()
-        devices = self.stack.enter_context(self.emulate(PAD, PUBLISHED_CONTACT, self.settings))
-        self.arm, self.board_driver, self.robot, self.board = devices
+        emulated = self.emulate(PAD, PUBLISHED_CONTACT, self.settings)
+        settings, self.robot, self.board = self.stack.enter_context(emulated)
+        inputs = settings.inputs(len(PAD.knots))
+        self.board_driver = self.stack.enter_context(closing(LineBoard.from_settings(settings, inputs)))
+        self.arm: Arm = self.stack.enter_context(closing(self.make_arm(settings)))
 
     def plan(self, presses: int) -> PressPlan:
         return make_plan(PAD, self.settings.model_copy(update={"presses": presses}), np.random.default_rng(0))
@@ -135,21 +143,23 @@ class Rig:
 def quick() -> Iterator[None]:
     """Make printers fast, and boards settle soon: their times are exact in one test only."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual_rig, "EmulatedPrinter", partial(EmulatedPrinter, **FAST_AXES))
+        patch.setattr(rigs, "EmulatedPrinter", partial(EmulatedPrinter, **FAST_AXES))
         patch.setattr(board_reader, "SETTLE_S", 0.15)
         yield
 
 
 RIGS = {
-    "arm": (ARM, emulate_arm),
-    "line": (ARM.model_copy(update={"board": "line", "channels": (3, 1, 0, 2)}), emulate_arm),
-    "printer": (PRINTER, virtual_rig.emulate_printer),
+    "arm": (ARM, emulate_arm, UR5.from_settings),
+    "line": (ARM.model_copy(update={"channels": (3, 1, 0, 2)}), emulate_arm, UR5.from_settings),
+    "printer": (PRINTER, rigs.emulate_printer, Printer.from_settings),
 }
 
 
 @pytest.fixture
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     """Open one of `RIGS`."""
+    if request.param != "printer":
+        pytest.importorskip("rtde_control")
     rig = Rig(*RIGS[request.param])
     with rig.stack:
         yield rig
@@ -191,8 +201,9 @@ def test_readings_show_presses_when_tip_goes_down(rig: Rig, tmp_path: Path, monk
 def test_line_board_has_every_input_that_is_named() -> None:
     """Sixteen, or one more than the highest; pad and probe of a printer are where its settings say."""
     for channels in ((0, 1, 2, 3), (3, 0, 16, 1)):
-        rig = PRINTER.model_copy(update={"board": "line", "channels": channels})
-        with virtual_rig.emulate_printer(PAD, PUBLISHED_CONTACT, rig) as (_, driver, robot, _):
+        rig = PRINTER.model_copy(update={"channels": channels})
+        emulated = rigs.emulate_printer(PAD, PUBLISHED_CONTACT, rig)
+        with emulated as (settings, robot, _), closing(LineBoard.from_settings(settings, channels)) as driver:
             identity = driver.connect()
             assert (identity["inputs"], identity["name"]) == (list(channels), "emulated")
             samples = driver.read()
@@ -267,13 +278,14 @@ def test_recording_survives_faults_and_arm_stops(rig: Rig, presses: int, names: 
     assert np.abs(readings - np.median(readings, axis=0)).max() < 0.6  # a wrong reading would be an outlier
 
 
-@pytest.mark.parametrize(("board", "grid"), [("due", 6), ("line", 8)])
-def test_readings_are_in_order_of_fibres(board: str, grid: int) -> None:
+def test_readings_are_in_order_of_fibres() -> None:
     """As many as the board has inputs, in another order."""
+    grid = 8
     pad = Morphology.straight(grid)
     channels = np.random.default_rng(1).permutation(2 * grid).tolist()
-    rig = virtual_rig.ur5_settings(RigSettings.model_validate({"board": board, "channels": channels, **QUIET}), pad)
-    with virtual_rig.emulate_ur5(pad, PUBLISHED_CONTACT, rig) as (_, board_driver, _, _):
+    rig = rigs.ur5_settings(RigSettings.model_validate({"channels": channels, **QUIET}), pad)
+    emulated = rigs.emulate_ur5(pad, PUBLISHED_CONTACT, rig)
+    with emulated as (settings, _, _), closing(LineBoard.from_settings(settings, channels)) as board_driver:
         said = board_driver.connect()
         assert said["inputs"] == list(rig.channels)
         volts = np.median(board_driver.read().volts, axis=0)
@@ -281,15 +293,6 @@ def test_readings_are_in_order_of_fibres(board: str, grid: int) -> None:
     rests_v = still.volts(np.zeros((1, 2)), np.full(1, -10.0))[0]
     assert volts == pytest.approx(rests_v, abs=3.3 / 4095)
     assert np.unique(volts).size > grid
-
-
-PROGRAM = """
-import sys
-from padforge.sense.virtual import virtual_rig
-virtual_rig.HOST = sys.argv.pop(1)
-from padforge.cli import main
-main()
-"""
 
 
 def places_mm(path: Path) -> tuple[list[list[float]], list[list[float]]]:
@@ -312,41 +315,42 @@ def places_mm(path: Path) -> tuple[list[list[float]], list[list[float]]]:
 
 
 @pytest.mark.slow
-def test_killed_recording_resumes_to_complete_plan(
-    tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Killed again and again; whenever that is, the MCAP file beside it opens and has every press that is done."""
+def test_killed_recording_resumes_to_complete_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed again and again; whenever that is, the MCAP file beside it opens and has every press that is done.
+
+    The arm stays on, pressed where the watchdog stopped it.
+    """
+    pytest.importorskip("rtde_control")
     monkeypatch.chdir(tmp_path)
-    settings = "\n".join(f"{name} = {value}" for name, value in (QUICK | {"rate_hz": 125.0}).items())
-    Path("pad.toml").write_text(f"[pad]\ngrid = 2\n[rig]\n{settings}\n", encoding="utf-8")
-    words = ["sense", "record", "--virtual-hardware", "--presses", "7", "--out", "run", "--mcap", "--resume"]
+    PAD.save("pad.json")
+    command = [sys.executable, "-m", "padforge", "sense", "record", "--rig", "ur5", "--morphology", "pad.json"]
+    command += ["--presses", "7", "--out", "run", "--mcap", "--resume"]
     journal, n_done = Path("run", "journal.ndjson"), 0
 
     def start() -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, "-c", PROGRAM, address, *words], stderr=subprocess.DEVNULL)
+        return subprocess.Popen(command, stderr=subprocess.DEVNULL)
 
-    for wait_s in (0.0, 0.1, 0.35):
-        process, end = start(), time.monotonic() + 60
-        while not (journal.exists() and len(read_journal(journal)) > n_done):
-            assert time.monotonic() < end
-            if process.poll() == 1:  # a busy machine disturbs the arm, too
-                process = start()
-            time.sleep(0.002)
-        time.sleep(wait_s)
-        process.kill()
-        process.wait()
-        presses_before_kill = read_journal(journal)
-        n_done = len(presses_before_kill)
-        for places in places_mm(Path("run.mcap")):
-            positions = [[press.x_mm, press.y_mm] for press in presses_before_kill.values()]
-            np.testing.assert_allclose(places[:n_done], positions, rtol=1e-12)
-            assert len(places) <= n_done + 1  # one that was not yet in the journal
-    monkeypatch.setattr(sys, "argv", ["padforge", *words])
-    with pytest.raises(SystemExit) as done:
-        main()
-    assert not done.value.code
+    with rigs.emulate_ur5(PAD, PUBLISHED_CONTACT, ARM) as (settings, _, _):
+        Path("pad.toml").write_text(rig_toml(settings, PAD.grid), encoding="utf-8")
+        for wait_s in (0.0, 0.1, 0.35):
+            process, end = start(), time.monotonic() + 60
+            while not (journal.exists() and len(read_journal(journal)) > n_done):
+                assert time.monotonic() < end
+                if process.poll() == 1:  # a busy machine disturbs the arm, too
+                    process = start()
+                time.sleep(0.002)
+            time.sleep(wait_s)
+            process.kill()
+            process.wait()
+            presses_before_kill = read_journal(journal)
+            n_done = len(presses_before_kill)
+            for places in places_mm(Path("run.mcap")):
+                positions = [[press.x_mm, press.y_mm] for press in presses_before_kill.values()]
+                np.testing.assert_allclose(places[:n_done], positions, rtol=1e-12)
+                assert len(places) <= n_done + 1  # one that was not yet in the journal
+        assert start().wait(60) == 0
     recording = Recording.open(Path("run"))
     assert len(recording.presses_mm) == 7
     assert read_journal(journal).items() >= presses_before_kill.items()
     assert import_bag("run.mcap") == recording
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.toml", "run", "run.mcap"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.json", "pad.toml", "run", "run.mcap"]

@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.devices import Array, Pose, RigFault
-from padforge.sense.virtual.rtde_types import n_values, recipe_layout, variable_type
-from padforge.sense.virtual.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
+from tests.emulators.rtde_types import n_values, recipe_layout, variable_type
+from tests.emulators.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
 
 HOST = "127.0.0.1"
 HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)

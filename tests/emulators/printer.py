@@ -16,7 +16,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms.motion import Position, StraightMove
 from padforge.sense.rig.arms.printer_link import checksum
-from padforge.sense.virtual.boards import SerialDevice
+from tests.emulators.boards import SerialDevice
 
 MAX_PLANNED = 16  # moves that the planner holds; a further one waits
 START_S = 0.1  # how long the first move waits for others

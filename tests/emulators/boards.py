@@ -8,7 +8,8 @@ import os
 import select
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from binascii import crc32
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Self
 
@@ -16,7 +17,8 @@ import numpy as np
 
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards.line_board import HEADER_REQUEST, LineHeader, format_header, format_sample
+from padforge.sense.rig.boards.line_board import HEADER_REQUEST, LineHeader
+from padforge.sense.simulation.pad_model import SUPPLY_V
 
 SampleSource = Callable[[Array], Array]
 """(n,) host times in s to (n, C) volts, C the number of inputs of the board or more."""
@@ -24,6 +26,28 @@ SampleSource = Callable[[Array], Array]
 MAX_OUT_BYTES = 65_536  # bytes that wait for a slow host; what comes then is dropped, whole samples at a time
 
 _POLL_S = 0.01
+
+
+def emulated_header(rate_hz: float, channels: int) -> LineHeader:
+    """Return the header of an emulated board."""
+    return LineHeader(rate_hz, 12, SUPPLY_V, channels, extra=(("name", "emulated"), ("serial", "0")))
+
+
+def format_header(header: LineHeader) -> bytes:
+    """Return a header as it is sent."""
+    numbers = ((name, f"{getattr(header, name):g}") for name in ("rate_hz", "bits", "reference_v", "channels"))
+    words = [*header.extra, *numbers, *([("check", "crc32")] if header.checked else [])]
+    return _format_line("# padforge-line 1 " + " ".join(map("=".join, words)), header.checked)
+
+
+def format_sample(time_us: int, counts: Sequence[int], checked: bool) -> bytes:
+    """Return a sample as it is sent."""
+    return _format_line(",".join(map(str, (time_us, *counts))), checked)
+
+
+def _format_line(text: str, checked: bool) -> bytes:
+    body = text.encode("ascii")
+    return body + (b"*%08x\n" % crc32(body) if checked else b"\n")
 
 
 class SerialDevice(ABC):

@@ -1,8 +1,7 @@
 """An emulated finger that presses a simulated pad where a page or a terminal asks for it, and errs as people do."""
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +9,8 @@ import numpy as np
 
 from padforge.design import Contact, Morphology
 from padforge.sense.arrays import Array
-from padforge.sense.rig.boards.line_board import LineBoard
-from padforge.sense.rig.devices import Board
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.pad_model import TRAVEL_S, LivePad
-from padforge.sense.virtual.boards import EmulatedLineBoard
-from padforge.sense.virtual.virtual_rig import board_header
 
 SCATTER_MM = 1.5  # standard deviation of the position of a press, in x and in y
 DEPTHS = (0.7, 1.1)  # range of depths, relative to `depth_mm`
@@ -114,13 +109,3 @@ class Finger:
             stroke.slide_mm = -math.copysign(SLIDE_MM, position_mm[0])
         self.strokes.append(stroke)
         return stroke
-
-
-@contextmanager
-def pressed_by_finger(pad: Morphology, contact: Contact, rig: RigSettings) -> Iterator[tuple[Board, Finger]]:
-    """Open the driver of an emulated board over a simulated pad, not yet connected, and the finger that presses it."""
-    finger = Finger(pad, contact, rig, rig.board_rate_hz)
-    with EmulatedLineBoard(finger.volts, board_header(rig, len(pad.knots))) as emulated:
-        settings = rig.model_copy(update={"port": emulated.port})
-        with closing(LineBoard.from_settings(settings, range(len(pad.knots)))) as board:
-            yield board, finger

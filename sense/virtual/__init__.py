@@ -1,1 +1,0 @@
-"""Emulated devices: a rig without hardware."""
