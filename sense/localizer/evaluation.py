@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, isnan
+from math import isnan
 from typing import Any
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.validation import InputError, check_int, check_type
@@ -24,8 +25,13 @@ CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # sets of failed fibres of a size that each moment is evaluated with, at most
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
 TRAINED_OUT = 0.5  # share of the steps of a training from which errors are within a twentieth of those of a whole one
+PRIOR_PRESSES, RATIO_SHAPE, N_PRIOR = 80, 2.1, 200
+"""Presses that what other pads have shown counts as in radii; the shape of the gamma distribution that the ratio of
+distance to expected radius had there, whatever the pad, the moment and the fibres lost; and the quantiles of it."""
+FEW_PRESSES = 100  # radii that rest on fewer are said to
 ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
+_NO_PRIOR = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -284,20 +290,31 @@ def distances(predicted_mm: Array, pressed_mm: Array) -> Array:
     return np.hypot(*(predicted_mm - pressed_mm).T)
 
 
-def conformal(predictions: Sequence[Localization], positions_mm: Array, measures: Measures | None = None) -> Array:
+def conformal(
+    predictions: Sequence[Localization],
+    positions_mm: Array,
+    measures: Measures | None = None,
+    prior_ratio: float | None = None,
+) -> Array:
     """Return the factors by which standard deviations, radii and r90 of measures must grow to hold on these presses.
 
     Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): a quantile of
     distance over radius on presses that entered nothing before, one rank higher than the share, so that of few presses
     they are more cautious. The (3 + T,) factors are of the standard deviation, the radii of 50 and 90 %, and the r90 of
     T measures (1 where no true value is known); arguments are as in `error_row`.
+
+    Of few presses a quantile is a lottery. `prior_ratio` is the mean ratio of distance to radius that other pads let
+    expect: a gamma distribution about it counts as PRIOR_PRESSES further presses.
     """
+    prior = _NO_PRIOR
+    if prior_ratio is not None:
+        prior = prior_ratio / RATIO_SHAPE * gammaincinv(RATIO_SHAPE, (np.arange(N_PRIOR) + 0.5) / N_PRIOR)
     standardized = [(each.positions_mm - positions_mm) / each.std_mm for each in predictions]
     errors = np.array([distances(each.positions_mm, positions_mm) for each in predictions])
     factors = [
-        float(np.sqrt(np.square(standardized).mean())),
-        _conformal_quantile(0.5, errors / [each.r50_mm for each in predictions]),
-        _conformal_quantile(0.9, errors / [each.r90_mm for each in predictions]),
+        float(np.sqrt(_joint_mean(np.square(standardized), len(positions_mm), prior**2))),
+        _conformal_quantile(0.5, errors / [each.r50_mm for each in predictions], prior),
+        _conformal_quantile(0.9, errors / [each.r90_mm for each in predictions], prior),
     ]
     for measure_errors, r90 in _measure_errors(predictions, measures).values():
         ratios = measure_errors / r90
@@ -306,17 +323,28 @@ def conformal(predictions: Sequence[Localization], positions_mm: Array, measures
     return np.array(factors)
 
 
-def _conformal_quantile(share: float, ratios: Array) -> float:
+def _joint_mean(values: Array, presses: int, prior: Array) -> float:
+    """The mean of values of so many presses and of those of the prior, if any."""
+    if not len(prior):
+        return float(values.mean())
+    return float((presses * values.mean() + PRIOR_PRESSES * prior.mean()) / (presses + PRIOR_PRESSES))
+
+
+def _conformal_quantile(share: float, ratios: Array, prior: Array = _NO_PRIOR) -> float:
     """The least of (sets, Q) ratios that a share of them, and one more, does not exceed; the greatest if they are few.
 
     The sets of one press are not independent: they count for as many as presses differ in how often they keep within.
+    Values of the prior count as PRIOR_PRESSES together.
     """
-    ranked = np.sort(ratios, axis=None)
     within = (ratios <= np.quantile(ratios, share)).mean(axis=0)
     presses, variance = len(within), float(within.var())
-    effective = min(max(presses, share * (1 - share) * presses / variance), ranked.size) if variance else ranked.size
-    rank = ceil(round(share * (1 + 1 / effective) * ranked.size, 9))
-    return float(ranked[min(rank, ranked.size) - 1])
+    effective = min(max(presses, share * (1 - share) * presses / variance), ratios.size) if variance else ratios.size
+    values = np.concatenate([ratios.ravel(), prior])
+    weights = np.repeat([effective / ratios.size, PRIOR_PRESSES / max(len(prior), 1)], [ratios.size, len(prior)])
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    rank = np.searchsorted(below, share * (below[-1] + 1) - 1e-9)
+    return float(values[order[min(rank, len(order) - 1)]])
 
 
 def errors_by_position(predicted_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
