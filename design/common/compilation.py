@@ -1,27 +1,36 @@
 """How kernels are compiled, and kept on disk by Numba; and a note to users whose first command compiles them."""
 
+import atexit
 import gc
 import logging
 import os
+import shutil
 import time
-from collections.abc import Callable
-from contextlib import suppress
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
-from threading import Timer
+from tempfile import TemporaryFile, mkdtemp
+from threading import Lock, Timer
 from typing import Any, Protocol, TypeVar, overload
 
 # else each overload that is tried in vain has its message coloured, a thirtieth of the time
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 from numba import njit
+from numba.core import config
 from numba.core import event as events
 
 PATIENCE_S = 1.5  # time spent on compiling, s, after which the user is told why nothing happens
+ROOMS = ("design", "fabricate", "sense")  # packages whose sources are compiled
+MAX_CACHES = 4  # in a folder, of the latest versions of the sources
+_PREFIX = "padforge-kernels-"
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
+_decorating = Lock()
+_numba: Any = config  # its names are made of the environment, which type checkers cannot know
 
 
 class _Decorator(Protocol):
@@ -33,28 +42,72 @@ class _Decorator(Protocol):
     def __call__(self, **options: Any) -> Callable[[_Function], _Function]: ...
 
 
-kernel: _Decorator = partial(njit, cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
+def cache_bases() -> Iterator[Path]:
+    """Yield the folders that a cache of kernels may be in, the best first."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        yield Path(given)
+    yield Path(__file__).parent / "__pycache__"
+    if given := os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA"):
+        yield Path(given)
+    with suppress(RuntimeError):  # this user has no home
+        yield Path.home() / ".cache"
+
+
+@cache
+def cache_folder() -> Path:
+    """Return the folder of the compiled kernels of these sources, a temporary one where none can be written.
+
+    Numba compares the source of a kernel alone, not those of the kernels and constants in it: a digest of all sources
+    is part of the name.
+    """
+    root = Path(__file__).parents[2]
+    sources = sorted(path for room in ROOMS for path in (root / room).rglob("*.py"))
+    name = _PREFIX + sha256(b"\0".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    for base in cache_bases():
+        folder = base / name
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=folder).close()
+            os.utime(folder)
+            _delete_older_caches(base)
+            return folder
+    folder = Path(mkdtemp(prefix="padforge-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _delete_older_caches(base: Path) -> None:
+    with suppress(OSError):  # another process does the same
+        caches = sorted(base.glob(_PREFIX + "[0-9a-f]" * 16), key=lambda path: path.stat().st_mtime)
+        for folder in caches[:-MAX_CACHES]:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _caching_in(folder: Path) -> Iterator[None]:
+    """Let Numba cache what is decorated in a folder; functions of others stay where they are."""
+    with _decorating:
+        before, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
+        try:
+            yield
+        finally:
+            _numba.CACHE_DIR = before
+
+
+def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Decorate as `numba.njit` does, and keep what is compiled in `cache_folder`."""
+    if function is None:
+        return partial(_cached_njit, **options)
+    with _caching_in(cache_folder()):
+        return njit(function, cache=True, **options)
+
+
+kernel: _Decorator = partial(_cached_njit, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
 """Compiles a function when it is first called, for Python alone, without its checks of divisions and its lock."""
 inner_kernel: _Decorator = partial(kernel, no_cpython_wrapper=True)
 """Compiles a function that only kernels call, in less time: Python, if it called it, would crash."""
 inline_kernel: _Decorator = partial(inner_kernel, inline="always")
 """Makes a function that one kernel calls a part of that kernel: it is not compiled by itself."""
-
-
-def clear_stale_kernels(package: Path) -> None:
-    """Delete the compiled kernels of a package if any of its sources has changed since the last call.
-
-    Numba compares the source of a kernel alone, not of those that it inlines.
-    """
-    cached = package / "__pycache__"
-    with suppress(OSError):  # a folder that cannot be written: no kernels are cached there
-        cached.mkdir(exist_ok=True)
-        digest = sha256(b"\0".join(source.read_bytes() for source in sorted(package.rglob("*.py")))).digest()
-        stamp = cached / "kernels.sha256"
-        if not stamp.exists() or stamp.read_bytes() != digest:
-            for compiled in package.rglob("__pycache__/*.nb[ic]"):
-                compiled.unlink(missing_ok=True)
-            stamp.write_bytes(digest)
 
 
 class Compilations(events.Listener):

@@ -13,9 +13,3 @@ Arguments that several of them share:
     begin, end       the first index to compute, counted through the population, and the one to stop before
     scratch          work arrays of one thread, from `make_scratch`
 """
-
-from pathlib import Path
-
-from padforge.design.common.compilation import clear_stale_kernels
-
-clear_stale_kernels(Path(__file__).parent)

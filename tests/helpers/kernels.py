@@ -3,7 +3,6 @@
 `python -m tests.helpers.kernels` does it by hand; with the name of a task, for that alone.
 """
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -13,21 +12,14 @@ from pathlib import Path
 import numpy as np
 
 import padforge
-
-PACKAGES = ("design", "fabricate", "sense")
+from padforge.design.common.compilation import ROOMS, cache_folder
 
 
 def missing() -> bool:
-    """Whether of a file of kernels nothing is kept that is as new; taken to be so where they are kept elsewhere."""
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return True
-    folders = [Path(folder) / package for folder in padforge.__path__ for package in PACKAGES]
-    for path in (path for folder in folders for path in folder.rglob("*.py")):
-        if b"\n@kernel" in path.read_bytes():
-            cached = (path.parent / "__pycache__").glob(f"{path.stem}.*.nbi")
-            if not any(index.stat().st_mtime >= path.stat().st_mtime for index in cached):
-                return True
-    return False
+    """Whether of a file of kernels nothing is cached."""
+    folders = [Path(folder) / room for folder in padforge.__path__ for room in ROOMS]
+    sources = [path for folder in folders for path in folder.rglob("*.py") if b"\n@kernel" in path.read_bytes()]
+    return any(not any(cache_folder().glob(f"{path.parent.name}_*/{path.stem}.*.nbi")) for path in sources)
 
 
 def compile_all() -> None:

@@ -1,10 +1,14 @@
-"""The note on kernels that are compiled: not where it is short or they are read from disk."""
+"""Kernels are compiled once for the sources that there are, and a note says so where it takes long."""
 
 import ast
 import logging
+import os
 import re
 import shutil
+import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +18,6 @@ from numba.core import event as events
 
 import padforge
 from padforge.design.common import compilation
-from tests.helpers.kernels import PACKAGES
 
 KERNELS = """
 from padforge.design.common.compilation import inner_kernel, kernel
@@ -62,30 +65,77 @@ def test_compilation_is_announced_unless_it_is_short_or_cached(
     assert set(notes(1.5)) == {"compiling kernels"}  # another type is compiled
 
 
-def test_clear_stale_kernels_deletes_when_a_source_changes(tmp_path: Path) -> None:
-    package = tmp_path / "kernels"
-    (package / "room").mkdir(parents=True)
-    for name in ("inner.py", "outer.py", "room/outer.py"):
-        (package / name).write_text("x = 1")
-    kept = [folder / "__pycache__" / "outer.py311.1.nbc" for folder in (package, package / "room")]
-    compilation.clear_stale_kernels(package)
-    for path in kept:
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-    compilation.clear_stale_kernels(package)
-    assert all(path.exists() for path in kept)
-    (package / "inner.py").write_text("x = 2")
-    compilation.clear_stale_kernels(package)
-    assert not any(path.exists() for path in kept)
-    shutil.rmtree(package / "__pycache__")
-    (package / "__pycache__").touch()  # a folder that cannot be written
-    compilation.clear_stale_kernels(package)
-    assert (package / "__pycache__").is_file()
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The root of other sources, which have a folder of compiled kernels of their own; no other folder is theirs."""
+    root = tmp_path / "padforge"
+    (root / "design/common").mkdir(parents=True)
+    monkeypatch.setattr(compilation, "__file__", str(root / "design/common/compilation.py"))
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    compilation.cache_folder.cache_clear()
+    yield root
+    compilation.cache_folder.cache_clear()
+
+
+@pytest.mark.parametrize("is_chosen", [False, True])
+def test_kernels_are_compiled_anew_when_what_they_call_has_changed(
+    root: Path, monkeypatch: pytest.MonkeyPatch, is_chosen: bool
+) -> None:
+    """In the folder of the user's choice, too."""
+    if is_chosen:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(root / "chosen"))
+    inner, outer = KERNELS.split("@kernel")
+    (root / "design/inner.py").write_text(inner)
+    (root / "design/outer.py").write_text(
+        inner.partition("@")[0] + "from inner_of_a_test import inner\n@kernel" + outer
+    )
+
+    def compute() -> tuple[int, int]:
+        """Do what a new process does; returns the result, and how many kernels are compiled for it."""
+        compilation.cache_folder.cache_clear()
+        monkeypatch.setitem(sys.modules, "inner_of_a_test", loaded(root / "design/inner.py"))
+        module = loaded(root / "design/outer.py")
+        return module.outer(1), sum(module.outer.stats.cache_misses.values())
+
+    assert [compute(), compute()] == [(4, 1), (4, 0)]
+    (root / "design/inner.py").write_text(inner.replace("x + 1", "x + 2"))
+    assert [compute(), compute()] == [(6, 1), (6, 0)]
+    base = root / ("chosen" if is_chosen else "design/common/__pycache__")
+    assert len({path.parents[1] for path in root.rglob("*.nbc")}) == len(list(base.iterdir())) == 2
+
+
+def test_kernels_are_cached_where_the_user_can_write(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files take the place of folders that cannot be written, one after the other."""
+    bases = [root / name for name in ("chosen", "design/common/__pycache__", "xdg", "home/.cache", "temporary")]
+    variables = {"NUMBA_CACHE_DIR": "chosen", "XDG_CACHE_HOME": "xdg", "HOME": "home", "USERPROFILE": "home"}
+    for variable, name in variables.items():
+        monkeypatch.setenv(variable, str(root / name))
+    bases[-1].mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(bases[-1]))
+    for base in bases:
+        compilation.cache_folder.cache_clear()
+        folder = compilation.cache_folder()
+        assert folder.parent == base
+        shutil.rmtree(base)
+        base.touch()
+
+
+def test_few_caches_of_other_sources_stay(root: Path) -> None:
+    base, mine = root / "design/common/__pycache__", "compilation.cpython-311.pyc"
+    base.mkdir()
+    (base / mine).touch()
+    for number in range(6):
+        (base / f"padforge-kernels-{number:016x}").mkdir()
+        os.utime(base / f"padforge-kernels-{number:016x}", (number, number))
+    latest = compilation.cache_folder().name
+    numbers = range(7 - compilation.MAX_CACHES, 6)
+    assert {path.name for path in base.iterdir()} == {mine, latest, *(f"padforge-kernels-{n:016x}" for n in numbers)}
 
 
 def test_inner_kernels_are_called_by_kernels_alone() -> None:
     """Whichever name they are imported by: Python would crash."""
-    folders = [Path(folder) / package for folder in padforge.__path__ for package in PACKAGES]
+    folders = [Path(folder) / package for folder in padforge.__path__ for package in compilation.ROOMS]
     sources, tests = (
         [path.read_text(encoding="utf-8") for folder in where for path in folder.rglob("*.py")]
         for where in (folders, [Path(__file__).parents[2]])
