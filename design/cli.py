@@ -113,7 +113,7 @@ def design(
         options = SearchOptions(on_progress, resume=resume, time_budget=time_budget, executor=executor)
         document, result = run_design(common.load_spec(spec), out, overrides, start_from, options, twin, force=force)
     if twin is not None and (omitted := Twin.load(twin).ignored_effects()):
-        click.echo(f"{twin}: {omitted}", err=True)
+        common.echo(f"{twin}: {omitted}", err=True)
     _echo_large_strain(Contact(**document["provenance"]["settings"]["contact"]))
     common.show_result(document, summary_lines(result, out), as_json)
     context.exit(common.INTERRUPTED if result.stopped == "interrupted" else int(bool(result.violations)))
@@ -140,7 +140,7 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
         raise InputError(f"--out is {path}, allowed are .svg and .png")
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec)
     save_figure(draw_plan(pad, read_contact(settings), violations, pad_settings.keep_out_mm), path)
-    click.echo(f"plan -> {path}")
+    common.echo(f"plan -> {path}")
 
 
 @design.command()
@@ -243,7 +243,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     session = EditSession(common.load_spec(spec), pad, out, lambda view: page.show(view), force)
     with LocalPage(port, text, {"/edit": session.edit, "/save": session.save}) as page:
         replaces = " in place of its content" * out.exists()
-        click.echo(f"page: {page.url} (Ctrl-C ends), saves to {out}{replaces}", err=True)
+        common.echo(f"page: {page.url} (Ctrl-C ends), saves to {out}{replaces}", err=True)
         try:
             session.begin()
             while True:
@@ -251,7 +251,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
         finally:
             session.end()
             if session.unsaved:
-                click.echo("edits since the last save are discarded", err=True)
+                common.echo("edits since the last save are discarded", err=True)
 
 
 @design.command("import")

@@ -127,7 +127,7 @@ def _init(path: Path, preset: str | None) -> None:
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or move it away")
     write_text(path, commented_toml(section_models(), resolve_name(PRESETS[preset]) if preset else None))
-    click.echo(f"settings -> {path}")
+    common.echo(f"settings -> {path}")
 
 
 @cli.command("schema")
@@ -178,10 +178,10 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
     run = Run(common.load_spec(spec), out, formats=formats, **options)
     check_run(run)
     with locked_folder(out):
-        code = run_stages(run, click.echo, search_progress, partial(common.progress_bar, "training"))
+        code = run_stages(run, common.echo, search_progress, partial(common.progress_bar, "training"))
         if code != common.INTERRUPTED:
             with stage("report"):
-                click.echo(f"report: {write_report(out)}")
+                common.echo(f"report: {write_report(out)}")
     context.exit(code)
 
 
@@ -203,11 +203,11 @@ def _example(out: Path) -> None:
     with locked_folder(out):
         recording = write_example(out)
     repository, file = PUBLISHED_RECORDING
-    click.echo(f"{recording.fibres} fibres -> {out / 'morphology.json'}")
-    click.echo(recording_line(recording, out / "recording"))
-    click.echo("simulated, with the properties of the published pad, whose recording is the authors':")
-    click.echo(f"  {file} of {repository}")
-    click.echo(f"  padforge sense calibrate {Path(file).name}")
+    common.echo(f"{recording.fibres} fibres -> {out / 'morphology.json'}")
+    common.echo(recording_line(recording, out / "recording"))
+    common.echo("simulated, with the properties of the published pad, whose recording is the authors':")
+    common.echo(f"  {file} of {repository}")
+    common.echo(f"  padforge sense calibrate {Path(file).name}")
 
 
 @cli.command("report")
@@ -218,7 +218,7 @@ def _report(folder: Path) -> None:
     \b
     padforge report out/pad
     """
-    click.echo(f"report: {write_report(folder)}")
+    common.echo(f"report: {write_report(folder)}")
 
 
 def main() -> None:

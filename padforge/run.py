@@ -207,7 +207,7 @@ def _regenerated_files() -> set[str]:
 
 def run_stages(
     run: Run,
-    on_result: Callable[[str], None],
+    on_line: Callable[[str], None],
     search_progress: "Callable[[], AbstractContextManager[OnProgress]]",
     training_progress: "Callable[[], AbstractContextManager[OnProgress]]",
 ) -> int:
@@ -215,7 +215,7 @@ def run_stages(
 
     Args:
         run: the request.
-        on_result: receives the summary of every stage.
+        on_line: receives the lines that summarize every stage, one by one.
         search_progress: opens a display that receives the progress of the search.
         training_progress: opens a display that receives the progress of the training.
 
@@ -259,7 +259,8 @@ def run_stages(
         search,
         lambda: load_result(out),
     )
-    on_result("\n".join(summary_lines(design, out)))
+    for line in summary_lines(design, out):
+        on_line(line)
     if design.stopped == "interrupted":
         return INTERRUPTED
     if not design.stopped:
@@ -274,7 +275,8 @@ def run_stages(
         pad=digest,
         formats=sorted(run.formats),
     )
-    on_result("\n".join(mould_lines(mould, out)))
+    for line in mould_lines(mould, out):
+        on_line(line)
     plan = spec.section(RigSettings).plan_file
     recording = cache.get(
         "recording",
@@ -284,7 +286,7 @@ def run_stages(
         pad=digest,
         plan=plan and sha256(plan),
     )
-    on_result(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {out / 'recording'}")
+    on_line(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {out / 'recording'}")
     contacts = cache.get(
         "contacts",
         lambda document: ["contacts.json"],
@@ -299,8 +301,9 @@ def run_stages(
         partial(read_document, "calibration.json"),
         recording=recording.digest,
     )
-    on_result("\n".join(f"  {line}" for line in calibration_lines(calibration)))
-    on_result(contact_line(contacts))
+    for line in calibration_lines(calibration):
+        on_line(f"  {line}")
+    on_line(contact_line(contacts))
     if cache.reused:
         _log.info("%s: reused from an earlier run: %s", out, ", ".join(cache.reused))
     return int(bool(design.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from padforge.design.common.validation import Fault, InputError, missing_extra
+from padforge.design.common.validation import Fault, InputError, missing_extra, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -187,9 +187,19 @@ def progress_bar(name: str) -> Iterator["OnProgress"]:
         yield show
 
 
+def echo(line: str, err: bool = False) -> None:
+    """Print a line, whatever the texts of files in it.
+
+    Args:
+        line: without its end.
+        err: whether to print it on stderr.
+    """
+    click.echo(printable(line), err=err)
+
+
 def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> None:
     """Print the machine-readable result or its summary for people, both on stdout."""
-    click.echo(json.dumps(document, indent=1) if as_json else "\n".join(lines))
+    click.echo(json.dumps(document, indent=1) if as_json else "\n".join(map(printable, lines)))
 
 
 def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0,)) -> list[str]:
@@ -206,7 +216,7 @@ class _StderrHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         # Not by click.echo, which writes past the sys.stderr of a progress bar, and so into the bar.
-        print(self.format(record), file=sys.stderr)
+        print(printable(self.format(record)), file=sys.stderr)
 
 
 _HANDLER = _StderrHandler()
@@ -271,8 +281,6 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:
-    # Control characters of a file could give orders to a terminal.
-    line = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in " ".join(message.split()))
     with suppress(OSError):  # on a full disk the exit code has to say it
-        print(f"{name}: {line}", file=sys.stderr)
+        print(f"{name}: {printable(' '.join(message.split()))}", file=sys.stderr)
     return code

@@ -21,6 +21,15 @@ MAX_PATH = 4096  # characters, as of the system
 Kind = TypeVar("Kind")
 
 
+def printable(text: str) -> str:
+    """Escape what is not printable: that of a file could feign lines, and give orders to a terminal.
+
+    Args:
+        text: of one line.
+    """
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
+
+
 class InputError(ValueError):
     """An error of the user: a file, setting or argument that cannot be used.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import FiniteRange, json_option, load_spec, spec_option
+from padforge.design.common.command_line import FiniteRange, echo, json_option, load_spec, spec_option
 from padforge.design.common.server import HOST
 from padforge.sense.cli.options import FOLDER, redrawn_lines
 from padforge.sense.cli.rig import check_rig, rig_option
@@ -103,14 +103,14 @@ def live(
         pipeline = Live(localizer, _load_health(model), stream.fibres, stream.rate_hz)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         if replay is None and rig == "simulated":
-            click.echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
+            echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
         touches = replay or ("simulated touches" if rig == "simulated" else f"{rig} rig")
         scaler, title = localizer.scaler, f"{touches}, {model}"
         half_mm = scaler.half_size_mm.tolist() if scaler.half_size_mm.any() else [scaler.scale_mm] * 2
         area = {"centre_mm": scaler.origin_mm.tolist(), "half_mm": half_mm}
         outputs, addresses = _open_outputs(stack, stream, area, **output)
         for line in (f"page: {page.url} (Ctrl-C ends)", *addresses):
-            click.echo(line, err=True)
+            echo(line, err=True)
         builder = MessageBuilder(pipeline, mirrored)
         draw, printer = None if as_json else stack.enter_context(redrawn_lines()), EventPrinter(as_json)
         pad = {"title": title, **area, "mirrored": mirrored}
@@ -181,7 +181,7 @@ def _load_health(model: Path) -> "HealthModel | None":
 
     health = load_health(model)
     if health is None:
-        click.echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
+        echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
     return health
 
 
@@ -198,12 +198,12 @@ class EventPrinter:
 
         for event in events:
             is_estimate = isinstance(event, Estimate)
-            # `click.echo` flushes, so that each line appears at once
+            # echo flushes, so that each line appears at once
             if self._as_json:
                 values = event.to_dict() if is_estimate else asdict(event)
                 click.echo(json.dumps({"event": type(event).__name__.lower()} | values))
             elif not is_estimate or self._is_news(event):
-                click.echo(event.text)
+                echo(event.text)
 
     def _is_news(self, estimate: "Estimate") -> bool:
         told = self._told

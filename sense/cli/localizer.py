@@ -165,11 +165,11 @@ def locate(
     localization, faults, shifts, _ = predict_despite_faults(model, opened, exclude_fibres, moment)
     for fault in faults:
         masked = f"; masked from press {fault.since} on" if fault.is_masked else ""
-        click.echo(f"{fault.text}{masked}", err=True)
+        common.echo(f"{fault.text}{masked}", err=True)
     for shift in shifts:
-        click.echo(shift.text, err=True)
+        common.echo(shift.text, err=True)
     write_localization(localization, file)
-    click.echo(f"{len(localization.r50_mm)} positions -> {file}")
+    common.echo(f"{len(localization.r50_mm)} positions -> {file}")
 
 
 @click.command()
@@ -234,7 +234,7 @@ def deploy(model: Path, files: tuple[Path, ...]) -> None:
     check_writable(path.parent)
     localizer, digest = LocalizerModel.load(model), sha256(model / "localizer.json")
     opened = None if recording is None else read_recording(recording)
-    click.echo(f"{export_onnx(localizer, digest, path, opened).text} -> {path}")
+    common.echo(f"{export_onnx(localizer, digest, path, opened).text} -> {path}")
 
 
 @click.command()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from padforge.design.common.command_line import SectionedGroup, out_option, pad_folder
+from padforge.design.common.command_line import SectionedGroup, echo, out_option, pad_folder
 from padforge.sense.cli import localizer, rig
 from padforge.sense.cli.live import live
 from padforge.sense.cli.options import (
@@ -78,13 +78,13 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     recording = read(file, columns)
     echo_note(recording, file)
     if PRESSES_DETECTED.items() <= recording.source.items():
-        click.echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
+        echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
     for doubt in find_doubts(recording):
-        click.echo(f"doubtful: {doubt}", err=True)
+        echo(f"doubtful: {doubt}", err=True)
     recording.save(folder, provenance("padforge sense import", inputs=[file]))
     if recording.fibre_names:
-        click.echo(f"fibres from 1 on: {join_names(recording.fibre_names)}")
-    click.echo(recording_line(recording, folder))
+        echo(f"fibres from 1 on: {join_names(recording.fibre_names)}")
+    echo(recording_line(recording, folder))
 
 
 @click.command()
@@ -120,7 +120,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
     opened = read_recording(recording)
     annotations = _annotate(model, opened) if model else None
     export_file(opened, file, kind or "", annotations, arm_states(recording))
-    click.echo(f"{recording} -> {file}")
+    echo(f"{recording} -> {file}")
 
 
 def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":

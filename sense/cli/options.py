@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from padforge.design.common.command_line import echo
 from padforge.design.common.validation import InputError
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def read_recording(path: Path) -> "Recording":
 
     recording = open_recording(path)
     if recording.torn_presses:
-        click.echo(f"{path}: the end is torn off, its last {recording.torn_presses} presses are left out", err=True)
+        echo(f"{path}: the end is torn off, its last {recording.torn_presses} presses are left out", err=True)
     if path.is_file():
         echo_note(recording, path)
     return recording
@@ -70,7 +71,7 @@ def read_recording(path: Path) -> "Recording":
 def echo_note(recording: "Recording", file: Path) -> None:
     """Print on stderr which part of a file is not in its recording."""
     if note := recording.source.get("note"):
-        click.echo(f"{file}: {note}", err=True)
+        echo(f"{file}: {note}", err=True)
 
 
 def pressed_line(recording: "Recording") -> str:

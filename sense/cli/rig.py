@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _RIG_SETTINGS = "padforge.sense.settings:RigSettings"
 _RIGS = "simulated, ur5, printer, hand, or an installed arm."
 rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
-_warn = partial(click.echo, err=True)
+_warn = partial(common.echo, err=True)
 
 
 def check_rig(name: str, simulated: bool = True) -> None:
@@ -135,12 +135,12 @@ def record(
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
         config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder, follower)
         recording = _record_with(rig, config, model, dry_run, resume)
-    click.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
+    common.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
     if follower is not None and recording is not None:
         from padforge.sense.formats.import_export import arm_states, export_file
 
         export_file(recording, follower.path, states=arm_states(target))
-        click.echo(f"{target} -> {follower.path}")
+        common.echo(f"{target} -> {follower.path}")
 
 
 def _make_follower(target: Path, dry_run: bool, resume: bool) -> "McapFollower":
@@ -207,7 +207,7 @@ def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
         def show(view: dict[str, Any]) -> None:
             nonlocal latest
             if draw is None and view["message"] != latest.get("message", ""):
-                click.echo(view["message"])
+                common.echo(view["message"])
             if draw is not None and view["phase"] == "lift" != latest.get("phase"):
                 click.echo("\a", nl=False)  # eyes are on the pad
             latest = pad | view

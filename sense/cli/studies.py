@@ -69,7 +69,7 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
                     with cluster(scheduler) as executor:
                         document = run(study, out, jobs=jobs, executor=executor, resume=resume, on_progress=show)
             except KeyboardInterrupt:
-                click.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
+                common.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
                 # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
                 os._exit(common.INTERRUPTED)
             common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)

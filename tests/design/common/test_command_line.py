@@ -105,6 +105,23 @@ def test_errors_end_in_one_line(
     assert (out, err.lstrip("\n")) == ("", f"padforge: {line}\n")  # click ends the line of a ^C
 
 
+def test_texts_of_files_feign_no_lines(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nor do they give orders to the terminal, on whichever way they reach it."""
+
+    @click.command()
+    def show() -> None:
+        text = "µ\x1b[2K\nall fibres sound"
+        command_line.echo(text)
+        command_line.echo(text, err=True)
+        command_line.show_result({}, [text, "next"], as_json=False)
+        logging.getLogger("padforge").warning("%s", text)
+
+    monkeypatch.setattr("sys.argv", ["padforge"])
+    assert command_line.run_to_end(show, "padforge", {}) == 0
+    line = r"µ\x1b[2K\nall fibres sound" + "\n"
+    assert capsys.readouterr() == (f"{line}{line}next\n", line * 2)
+
+
 def test_help_lists_a_command_a_line_under_its_heading() -> None:
     """However narrow the terminal is, and in the order in which they were added."""
     group = command_line.SectionedGroup()
