@@ -1,8 +1,7 @@
 """A web page for browsers on this machine: it shows messages as they come, and may post to agreed addresses.
 
 Messages are Server-Sent Events, each the whole of what the page shows, so that a browser that comes late, comes back or
-is slow needs nothing but the latest. Only the page's own script may post: browsers state the origin of a request, and
-requests of other pages are refused.
+is slow needs nothing but the latest. Browsers state where a request comes from: those of other pages are refused.
 """
 
 import base64
@@ -46,8 +45,8 @@ Handler = Callable[[bytes], Mapping[str, Any] | None]
 class ConnectionServer(socketserver.ThreadingTCPServer):
     """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate.
 
-    Connections that have not authenticated themselves take no place of those that have, and the oldest gives way to a
-    new one: however many there are, a client that authenticates itself at once is served.
+    Connections that have not authenticated themselves take no place of those that have, and of each kind the oldest
+    gives way to a new one: however many there are, a client that authenticates itself at once is served.
     """
 
     daemon_threads = True
@@ -73,7 +72,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         self.token = token
         self._lock = threading.Lock()  # of the connections: threads add and remove them
         self._strangers = dict[Any, float]()  # not admitted, oldest first, and when they are cut off
-        self._admitted = set[Any]()
+        self._admitted = dict[Any, None]()  # oldest first
         reasons = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "this user may not use it"}
         try:
             super().__init__(address, handler)
@@ -100,15 +99,19 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         raise NotImplementedError
 
     def admit(self, request: Any) -> None:
-        """Lift the time limit of a connection, which has authenticated itself.
+        """Lift the time limit of a connection, which has authenticated itself; beyond MAX_CONNECTIONS the oldest ends.
 
         Raises:
-            ConnectionAbortedError: it was cut off meanwhile, or MAX_CONNECTIONS are admitted already.
+            ConnectionAbortedError: it was cut off meanwhile.
         """
         with self._lock:
-            if self._strangers.pop(request, None) is None or len(self._admitted) >= MAX_CONNECTIONS:
+            if self._strangers.pop(request, None) is None:
                 raise ConnectionAbortedError
-            self._admitted.add(request)
+            self._admitted[request] = None
+            if len(self._admitted) > MAX_CONNECTIONS:
+                oldest = next(iter(self._admitted))
+                del self._admitted[oldest]
+                _cut_off(oldest)
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Register a connection; beyond MAX_CONNECTIONS the oldest that is not admitted is cut off."""
@@ -124,7 +127,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         """Unregister and close a connection."""
         with self._lock:
             self._strangers.pop(request, None)
-            self._admitted.discard(request)
+            self._admitted.pop(request, None)
         super().close_request(request)
 
     def service_actions(self) -> None:
@@ -146,6 +149,19 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         """Report errors other than those of a connection that was closed by its client."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
+
+
+def is_this_machine(host: str, port: int) -> bool:
+    """Return whether the Host of a request names a port of this machine.
+
+    Otherwise a page from elsewhere could reach it by a host name that resolves to this machine (DNS rebinding).
+
+    Args:
+        host: the header.
+        port: that is served.
+    """
+    name, _, number = host.partition(":")
+    return name in (HOST, "localhost") and (number or str(HTTP_PORT)) == str(port)
 
 
 def _cut_off(connection: socket.socket) -> None:
@@ -272,10 +288,7 @@ class _PageHandler(BaseHTTPRequestHandler):
                 self._send(HTTPStatus.OK, "application/json", json.dumps(result, allow_nan=False).encode())
 
     def _is_authorised(self) -> bool:
-        """Whether the request has the token; without one, whether it names this machine.
-
-        Otherwise a page from elsewhere could reach the server by a host name that resolves to it (DNS rebinding).
-        """
+        """Whether the request has the token, or without one names this machine, and is not of another page."""
         try:
             self._url = urlsplit(self.path)
         except ValueError:  # a malformed address
@@ -285,12 +298,21 @@ class _PageHandler(BaseHTTPRequestHandler):
             token = token or self.headers.get("Authorization", "").removeprefix("Bearer ")
             is_authorised = hmac.compare_digest(token.encode(), self.server.token.encode())
         else:
-            host, _, port = self.headers.get("Host", "").partition(":")
-            served = str(self.server.server_address[1])
-            is_authorised = host in (HOST, "localhost") and (port or str(HTTP_PORT)) == served
-        if is_authorised:
-            self.server.admit(self.request)
-        return is_authorised
+            is_authorised = is_this_machine(self.headers.get("Host", ""), self.server.server_address[1])
+        if not is_authorised or self._is_foreign():
+            return False
+        self.server.admit(self.request)
+        return True
+
+    def _is_foreign(self) -> bool:
+        """Whether another page makes the request; links to the page itself are no requests of that kind.
+
+        Browsers leave out the origin of images and the like, and say in Sec-Fetch-Site that they are foreign.
+        """
+        own = f"http://{self.headers['Host']}"
+        is_linked = self._url.path == "/"
+        is_foreign = not is_linked and self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none")
+        return is_foreign or self.headers.get("Origin", own) != own
 
     def _send(self, status: HTTPStatus, content_type: str = "", body: bytes = b"", **headers: str) -> None:
         self.send_response(status)

@@ -23,6 +23,8 @@ BLUE, GREY = (0.13, 0.47, 0.71, 0.8), (0.5, 0.5, 0.5, 0.3)  # red, green, blue, 
 class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
     """A WebSocket server of this machine for Foxglove: all messages as JSON, and the scene; in m, frame `pad`.
 
+    Web pages cannot read it, but for the Foxglove app.
+
     Args:
         port: 0 for any that is free.
         centre_mm: x and y of the middle of the sensed area.
@@ -35,6 +37,8 @@ class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
     def __init__(self, port: int, centre_mm: list[float], half_mm: list[float]) -> None:
         import foxglove
         from foxglove.channels import SceneUpdateChannel
+
+        from padforge.sense.live.foxglove_gate import FoxgloveGate, hidden_host
 
         channels: dict[str, foxglove.Channel] = {}
         latest: dict[str, dict[str, Any]] = {}
@@ -49,16 +53,18 @@ class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
         self._channels, self._latest = channels, latest
         self._context = foxglove.Context()  # not that of the process, which may show two pads
         options = {"context": self._context, "server_listener": Listener()}
-        try:
-            self._server = foxglove.start_server(name="padforge", host=HOST, port=port, **options)
-        except RuntimeError as error:
-            raise InputError(f"--foxglove is {port}: no server can be started there ({error})") from error
-        self.url = f"ws://{HOST}:{self._server.port}"
+        host = hidden_host()
+        with contextlib.ExitStack() as stack:
+            server = foxglove.start_server(name="padforge", host=host, port=0, **options)
+            stack.callback(server.stop)
+            gate = stack.enter_context(FoxgloveGate(port, (host, server.port)))
+            self._stack = stack.pop_all()
+        self.url = f"ws://{HOST}:{gate.server_address[1]}"
         self._scene = SceneUpdateChannel(SCENE, context=self._context)
         self._centre_mm, self._half_mm = centre_mm, half_mm
 
     def __exit__(self, *error: object) -> None:
-        self._server.stop()
+        self._stack.close()
 
     def send(self, message: Message) -> None:
         import foxglove

@@ -39,7 +39,9 @@ class Client:
         key = base64.b64encode(os.urandom(16)).decode()
         upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13"
         protocol = "Sec-WebSocket-Protocol: foxglove.sdk.v1"
-        request = f"GET / HTTP/1.1\r\nHost: pad\r\n{upgrade}\r\nSec-WebSocket-Key: {key}\r\n{protocol}\r\n\r\n"
+        request = (
+            f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{upgrade}\r\nSec-WebSocket-Key: {key}\r\n{protocol}\r\n\r\n"
+        )
         self.socket.sendall(request.encode())
         assert b" 101 " in self.file.readline()
         while self.file.readline() != b"\r\n":
@@ -96,6 +98,41 @@ def test_foxglove_gets_messages_and_a_scene() -> None:
     assert (area.pose.position.x, area.pose.position.y, area.size.x, area.size.y) == (0.001, 0.002, 0.02, 0.01)
 
 
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ("", 101),
+        ("Origin: https://app.foxglove.dev", 101),
+        ("Origin: http://localhost:8080", 101),
+        ("Origin: file://", 101),
+        ("Origin: https://elsewhere.example", 403),
+        ("Origin: https://app.foxglove.dev.elsewhere.example", 403),
+        ("Origin: http://localhost.elsewhere.example", 403),
+        ("Origin: null", 403),
+        ("Origin: http://[", 403),
+        ("Host: elsewhere.example:{port}", 403),
+        ("Host: 127.0.0.1:1", 403),
+    ],
+)
+def test_foxglove_refuses_foreign_pages(foxglove_port: int, headers: str, status: int) -> None:
+    with socket.create_connection(("127.0.0.1", foxglove_port), timeout=20) as client:
+        lines = [
+            "GET / HTTP/1.1",
+            *([] if headers.startswith("Host") else [f"Host: localhost:{foxglove_port}"]),
+            *("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"),
+            *("Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Protocol: foxglove.sdk.v1"),
+            *filter(None, [headers.format(port=foxglove_port)]),
+        ]
+        client.sendall("\r\n".join([*lines, "", ""]).encode())
+        assert client.recv(100).split()[1] == str(status).encode()
+
+
+@pytest.fixture(scope="module")
+def foxglove_port() -> Iterator[int]:
+    with FoxgloveOutput(0, **AREA) as output:
+        yield int(output.url.rpartition(":")[2])
+
+
 def decode(channel: dict[str, Any], content: bytes) -> Any:
     """Return a message of Protobuf by the schema of its channel."""
     files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))
@@ -108,7 +145,9 @@ def decode(channel: dict[str, Any], content: bytes) -> Any:
 def test_foxglove_names_a_port_in_use() -> None:
     with FoxgloveOutput(0, **AREA) as output:
         port = int(output.url.rpartition(":")[2])
-        with pytest.raises(InputError, match=rf"^--foxglove is {port}: no server can be started there \(.*in use"):
+        with pytest.raises(
+            InputError, match=rf"^port {port} of 127.0.0.1: another program uses it; choose .*--foxglove"
+        ):
             FoxgloveOutput(port, **AREA)
 
 
