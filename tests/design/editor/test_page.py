@@ -81,7 +81,8 @@ def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, 
     assert program.post("/save", b"{}")[0] == 200
     program.ask(do="undo")
     code, said = program.end()
-    assert (code, said.splitlines()[0]) == (130, "edits since the last save are discarded")
+    assert code == 130
+    assert "edits since the last save are discarded" in said.splitlines()  # a first use says that it compiles, too
     assert "Traceback" not in said
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pad-edited.json", "pad.json"]
     assert Morphology.load(tmp_path / "pad-edited.json").knots.shape == (4, 6, 2)
