@@ -190,7 +190,7 @@ def _echo_large_strain(contact: "Contact") -> None:
     from padforge.design.contact import describe_large_strain
 
     if notice := describe_large_strain(contact):
-        click.echo(notice, err=True)
+        common.echo(notice, err=True)
 
 
 def _load_and_check(

@@ -102,7 +102,7 @@ def _compare(
         document = compare(variants, out, SearchOptions(on_progress, time_budget=time_budget), seed, mould_costs)
     notices = (describe_large_strain(Contact(**row["contact"])) for row in document["rows"])
     for notice in filter(None, dict.fromkeys(notices)):
-        click.echo(notice, err=True)
+        common.echo(notice, err=True)
     common.show_result(document, [*comparison_lines(document), f"comparison -> {out / 'comparison.json'}"], as_json)
 
 

@@ -117,7 +117,7 @@ def _stated_contact(settings: "Spec") -> "Contact | None":
         return None
     contact = read_contact(settings)
     if notice := describe_large_strain(contact):
-        click.echo(notice, err=True)
+        common.echo(notice, err=True)
     return contact
 
 

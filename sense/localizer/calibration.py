@@ -19,7 +19,7 @@ from padforge.design.common.validation import InputError, check_float, check_typ
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
-from padforge.sense.localizer.evaluation import Evaluation, conformal, evaluate, held_back_presses
+from padforge.sense.localizer.evaluation import PRIOR_PRESSES, Evaluation, conformal, evaluate, held_back_presses
 from padforge.sense.localizer.features import MODULATED, FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import complete_at, count_complete
@@ -241,7 +241,8 @@ def calibrate_uncertainty(
         pairs = zip(predictions, priors, strict=True)
         factors.append([conformal(each, positions_mm, measures, prior) for each, prior in pairs])
     factors = factors[:1] * (len(moments) > 1) + factors  # before any window is complete, nothing is predicted
-    return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6))
+    counted = len(positions_mm) + (PRIOR_PRESSES if n_trained else 0)
+    return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6), radii_presses=counted)
 
 
 def _n_levels(options: LocalizerSettings, fibres: int) -> int:

@@ -1,8 +1,8 @@
 """Evaluation of a localizer: errors for every set of failed fibres and by position, and coverage of its radii."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isnan
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,10 @@ CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # sets of failed fibres of a size that each moment is evaluated with, at most
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
 TRAINED_OUT = 0.5  # share of the steps of a training from which errors are within a twentieth of those of a whole one
-PRIOR_PRESSES, RATIO_SHAPE, N_PRIOR = 80, 2.1, 200
+PRIOR_PRESSES, RATIO_SHAPE, N_PRIOR = 100, 2.3, 200
 """Presses that what other pads have shown counts as in radii; the shape of the gamma distribution that the ratio of
 distance to expected radius had there, whatever the pad, the moment and the fibres lost; and the quantiles of it."""
-FEW_PRESSES = 100  # radii that rest on fewer are said to
+UNSURE = 0.043  # share of presses by which that within r90 may differ before it is said
 ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 _NO_PRIOR = np.empty(0)
@@ -52,6 +52,7 @@ class Evaluation:
         training_presses: their number, after a calibration.
         settings: of the training, after a calibration.
         trained_share: of the localizer: share of the usual steps of a training that it had.
+        radii_presses: of the localizer: presses on which its radii rest; 0 if that is not known.
         doubts: what makes the evaluation doubtful, each in a line.
     """
 
@@ -68,6 +69,7 @@ class Evaluation:
     training_presses: int | None = None
     settings: dict[str, Any] | None = None
     trained_share: float = 1.0
+    radii_presses: int = 0
     doubts: Sequence[str] = ()
 
     def to_dict(self) -> dict[str, Any]:
@@ -138,7 +140,7 @@ def evaluate(
             "r90_mm": prediction.r90_mm.tolist(),
             **{
                 name: {
-                    "pressed": [None if isnan(value) else value for value in measures[name].tolist()],
+                    "pressed": [None if math.isnan(value) else value for value in measures[name].tolist()],
                     "predicted": estimate.values.tolist(),
                     "r90": estimate.r90.tolist(),
                 }
@@ -147,6 +149,7 @@ def evaluate(
         },
         provenance={**model.provenance, "recording_kind": recording.source.get("kind")},
         trained_share=model.trained_share,
+        radii_presses=model.radii_presses,
         doubts=doubts,
     )
 
@@ -343,7 +346,8 @@ def _conformal_quantile(share: float, ratios: Array, prior: Array = _NO_PRIOR) -
     weights = np.repeat([effective / ratios.size, PRIOR_PRESSES / max(len(prior), 1)], [ratios.size, len(prior)])
     order = np.argsort(values)
     below = np.cumsum(weights[order])
-    rank = np.searchsorted(below, share * (below[-1] + 1) - 1e-9)
+    one_more = 0 if len(prior) else 1  # the prior is no less sure at its ends
+    rank = np.searchsorted(below, share * (below[-1] + one_more) - 1e-9)
     return float(values[order[min(rank, len(order) - 1)]])
 
 
@@ -392,13 +396,27 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
     doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
-    return [*lines, *([BUILT_PAD] if is_simulated else []), *untrained_lines(document), *doubts]
+    return [
+        *lines,
+        *([BUILT_PAD] if is_simulated else []),
+        *untrained_lines(document),
+        *sureness_lines(document),
+        *doubts,
+    ]
 
 
 def untrained_lines(document: Mapping[str, Any]) -> list[str]:
     """Say in a line that a localizer of a calibration document is not trained out, if so."""
     share = document.get("trained_share", 1.0)
     return [f"not trained out: {share:.0%} of the usual steps; errors fall with more time"] * (share < TRAINED_OUT)
+
+
+def sureness_lines(document: Mapping[str, Any]) -> list[str]:
+    """Say in a line how sure the radii of a calibration document are, if they rest on few presses."""
+    presses = document.get("radii_presses", 0)
+    slack = 2 * math.sqrt(0.9 * 0.1 / presses) if presses else 0.0
+    line = f"radii rest on few presses: of many others {0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%} may lie in r90"
+    return [line] * (slack > UNSURE)
 
 
 def moment_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -120,6 +120,7 @@ class LocalizerDocument:
     fibre_names: tuple[str, ...] = ()  # of the recording of the training, if that was imported
     pad_sha256: Digest | Literal[""] = ""  # of its `pad_digest`
     trained_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the usual steps of a training
+    radii_presses: Annotated[int, Field(ge=0)] = 0  # on which the factors rest
     errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
 

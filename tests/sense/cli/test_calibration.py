@@ -110,8 +110,8 @@ def test_evaluate_lists_errors_of_depth_and_force(padforge_sense, deep_localizer
     depth = lines.index("error of depth in mm")
     means = [float(line.split()[2]) for line in lines[depth + 2 : depth + 4]]
     assert means == [round(row["depth_mean_mm"], 2) for row in rows]
-    # two lines, a row for each number of failed fibres, one on what a simulated error is, and those by moment
-    assert lines.index("error of force in N") == depth + 4 == len(lines) - 5 - 2 - len(MOMENTS)
+    # two lines, a row for each number of failed fibres, two on what errors and radii are, and those by moment
+    assert lines.index("error of force in N") == depth + 4 == len(lines) - 6 - 2 - len(MOMENTS)
 
 
 @pytest.mark.usefixtures("blank")
