@@ -2,11 +2,9 @@
 
 import csv
 import hashlib
-import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -98,58 +96,34 @@ def run(
         The document: "format", "title", "text", "rows", "settings", "provenance" and the result's `extra`.
 
     Raises:
-        InputError: tasks to resume from belong to other settings, the folder cannot be written, or the same study is
-            running in it.
+        InputError: tasks to resume from belong to other settings, or the folder cannot be written.
     """
     files.check_writable(out)
     # kept results go by the number of a task, so the tasks and their order count as much as the settings
     order = hashlib.sha256("\n".join(task.name for task in study.tasks).encode()).hexdigest()[:16]
-    with _locked(out, study.name):
-        checkpoints = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
-        tasks = dict(enumerate(study.tasks))
-        states = compute_states(tasks, checkpoints, on_progress, resume=resume, jobs=jobs, executor=executor)
-        result = study.conclude([states[number] for number in tasks])
-        document = {
-            "format": f"padforge-study-{study.name}/2",
-            "title": study.title,
-            "text": result.text,
-            "rows": result.rows,
-            **result.extra,
-            "settings": study.settings,
-            "provenance": files.provenance(
-                f"padforge study {study.name}", study.settings.get("seed"), packages=("torch",)
-            ),
-        }
-        with files.atomic_files(out) as folder:
-            save_figure(study.draw(document), folder / f"{study.name}.png")
-            files.write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
-            with (folder / f"{study.name}.csv").open(
-                "w", encoding="utf-8", errors="backslashreplace", newline=""
-            ) as file:
-                writer = csv.DictWriter(file, list(result.rows[0]), lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(result.rows)
-            files.write_json(folder / f"{study.name}.json", document)
-        checkpoints.clear()
+    checkpoints = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
+    tasks = dict(enumerate(study.tasks))
+    states = compute_states(tasks, checkpoints, on_progress, resume=resume, jobs=jobs, executor=executor)
+    result = study.conclude([states[number] for number in tasks])
+    document = {
+        "format": f"padforge-study-{study.name}/2",
+        "title": study.title,
+        "text": result.text,
+        "rows": result.rows,
+        **result.extra,
+        "settings": study.settings,
+        "provenance": files.provenance(f"padforge study {study.name}", study.settings.get("seed"), packages=("torch",)),
+    }
+    with files.atomic_files(out) as folder:
+        save_figure(study.draw(document), folder / f"{study.name}.png")
+        files.write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
+        with (folder / f"{study.name}.csv").open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
+            writer = csv.DictWriter(file, list(result.rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(result.rows)
+        files.write_json(folder / f"{study.name}.json", document)
+    checkpoints.clear()
     return document
-
-
-@contextmanager
-def _locked(out: Path, name: str) -> Iterator[None]:
-    """Keep other runs of a study out of its folder; other studies may run there."""
-    files.make_folder(out)
-    path, busy = out / f".{name}.lock", f"{out}: a {name} study is running there; wait for it or choose another --out"
-    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        raise InputError(f"{path}: is no file, expected one or nothing; remove it, or choose another --out")
-    with path.open("a") as file:
-        files.lock(file, busy)
-        if not (path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())):
-            raise InputError(busy)  # the run that held it ended meanwhile, and removed it
-        try:
-            yield
-        finally:
-            with suppress(PermissionError):  # Windows, where an open file stays
-                path.unlink(missing_ok=True)
 
 
 def compute_states(

@@ -15,7 +15,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from tests.design.common.damage import damages, read_damaged
-from tools.kills import killed
+from tests.helpers.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
 

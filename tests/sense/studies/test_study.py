@@ -1,7 +1,6 @@
 """The frame of all studies: pads by name, one run at a time in a folder, resumed work, all results or none."""
 
 import json
-import os
 import re
 import signal
 import subprocess
@@ -109,27 +108,13 @@ def tiny(seed: int = 0, compute: Callable[[], dict] = lambda: {"a": np.ones(1)},
     return Study("x", "X", {"seed": seed}, [Task(task, compute) for task in tasks], conclude, lambda document: Figure())
 
 
-def test_run_rejects_a_folder_of_a_running_study_or_of_other_settings(tmp_path: Path) -> None:
-    def run_again() -> dict:
-        with pytest.raises(InputError, match="a x study is running there"):
-            run(tiny(), tmp_path)
-        return {}
-
-    run(tiny(compute=run_again), tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.csv", "x.json", "x.md", "x.png"]
+def test_run_rejects_a_folder_of_other_settings(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tiny(tasks="abc"), tmp_path, jobs=1, on_progress=stop)
     others = ((tiny(seed=1, tasks="abc"), "begun with x seed 0, now 1"), (tiny(tasks="bac"), "begun with x tasks"))
     for other, message in others:
         with pytest.raises(InputError, match=message):
             run(other, tmp_path, resume=True)
-
-
-def test_run_rejects_a_lock_that_is_removed_while_it_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run that held it may end between the opening of its file and the lock on that."""
-    monkeypatch.setattr("padforge.design.common.files.lock", lambda file, busy: (tmp_path / ".x.lock").unlink())
-    with pytest.raises(InputError, match="a x study is running there"):
-        run(tiny(), tmp_path)
 
 
 def test_run_leaves_nothing_if_the_figure_or_the_document_fails(tmp_path: Path) -> None:
@@ -142,16 +127,6 @@ def test_run_leaves_nothing_if_the_figure_or_the_document_fails(tmp_path: Path) 
     with pytest.raises(TypeError, match="JSON"):
         run(replace(tiny(tasks=""), conclude=lambda states: unwritable), tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
-def test_run_rejects_a_lock_that_is_no_file(tmp_path: Path) -> None:
-    (tmp_path / "mine").touch()
-    for make in (os.mkfifo, lambda lock: lock.symlink_to(tmp_path / "mine")):
-        make(tmp_path / ".x.lock")
-        with pytest.raises(InputError, match=r"\.x\.lock: is no file"):
-            run(tiny(), tmp_path)
-        (tmp_path / ".x.lock").unlink()
 
 
 @pytest.mark.parametrize(
