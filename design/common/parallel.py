@@ -130,7 +130,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
             yield executor
         except (CancelledError, KilledWorker) as error:
             reason = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
-            advice = "what was finished is kept: see why, and go on with --resume"
+            advice = "see why, and start again; a search goes on with --resume"
             raise Fault(f"the cluster at {address} {reason}; {advice}") from error
 
 
