@@ -36,7 +36,6 @@ PARTS = "held", "onset", "creep", "after"
 """Parts of a press."""
 MAX_CHANNELS = 1024
 MAX_ELEMENT_LENGTH = 0.02  # length of the elements that an as-built fibre is summed over, grid units
-MAX_ELEMENTS = 2**23  # elements of all fibres: 256 + 256 fibres, the most that a recording may have, take 6.6 million
 UNIFORM_SENSITIVITY_STD = 0.02  # of the log-sensitivity along a fibre: up to there it counts as uniform
 
 
@@ -234,10 +233,6 @@ class Twin:
         paths = tuple(None if path is None else check_array("as_built_mm", path, MAX_MM) for path in self.as_built_mm)
         if len(paths) != fibres or any(path is not None and path.shape[1:] != (2,) for path in paths):
             raise InputError(f"as_built_mm must have a row of points or null for each of the {fibres} fibres")
-        length_mm = sum(float(np.hypot(*np.diff(path, axis=0).T).sum()) for path in paths if path is not None)
-        limit_mm = MAX_ELEMENTS * MAX_ELEMENT_LENGTH * self.morphology.unit_mm
-        if length_mm > limit_mm:
-            raise InputError(f"as_built_mm are {length_mm:.3g} mm long in all, allowed are {limit_mm:.3g}")
         object.__setattr__(self, "as_built_mm", paths)
         self._check_sensitivity(self)
 

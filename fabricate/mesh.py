@@ -3,11 +3,9 @@
 import logging
 import zipfile
 from collections.abc import Iterable
-from functools import cache
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -29,12 +27,6 @@ SEPARATION_MM = 1e-4
 """Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
 MAX_COORDINATE_MM = 1e6
 """Maximum magnitude of a coordinate."""
-MAX_BYTES = 2**27
-"""Maximum unpacked size of a 3MF; a model of a million triangles takes half of it."""
-MAX_COPIES = 1000
-"""Maximum number of objects that a 3MF builds, copies included."""
-MAX_DEPTH = 16
-"""Maximum nesting of components in a 3MF."""
 
 
 def build_mesh(body: Body) -> Manifold:
@@ -178,8 +170,6 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it logs on top of raising
     try:
-        if path.suffix.lower() == ".3mf":
-            _check_3mf_size(path)
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(path, process=False)  # processing would drop triangles with NaN
             if scene.units:
@@ -190,40 +180,3 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
         missing = isinstance(error, KeyError)
         reason = f"{error} is missing in it" if missing else " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
-
-
-def _check_3mf_size(path: Path) -> None:
-    """Raise ValueError for a 3MF that unpacks to too much, or whose components are too many or nested too deep."""
-    built: list[str] = []  # objects that a model builds
-    components: dict[str, list[str]] = {}  # objects that each object consists of
-    parent = ""
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal parent
-        match tag.rpartition(":")[2]:
-            case "object":
-                parent = attributes.get("id", "")
-            case "component":
-                components.setdefault(parent, []).append(attributes.get("objectid", ""))
-            case "item":
-                built.append(attributes.get("objectid", ""))
-
-    with zipfile.ZipFile(path) as archive:
-        size = sum(entry.file_size for entry in archive.infolist())
-        if size > MAX_BYTES:
-            raise ValueError(f"it unpacks to {size} bytes, allowed are {MAX_BYTES}")
-        for name in archive.namelist():
-            if name.lower().endswith(".model"):
-                parser = expat.ParserCreate()
-                parser.StartElementHandler = start
-                parser.Parse(archive.read(name), True)
-
-    @cache
-    def count_copies(name: str, depth: int) -> int:
-        if depth > MAX_DEPTH:
-            raise ValueError(f"its objects are made of others more than {MAX_DEPTH} deep, or of themselves")
-        return 1 + sum(count_copies(part, depth + 1) for part in components.get(name, []))
-
-    count = sum(count_copies(name, 0) for name in built)
-    if count > MAX_COPIES:
-        raise ValueError(f"it is built of {count} objects, allowed are {MAX_COPIES}")

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import find_unchanged, read_json, recover, reraise_as_input_error, write_text
+from padforge.design.common.files import find_unchanged, read_json, reraise_as_input_error, write_text
 from padforge.design.common.validation import Fault, InputError, check_path
 
 PAD = "morphology.json"
@@ -35,7 +35,6 @@ def write_report(folder: Path) -> Path:
         return [*design_sections(folder, document), *press_sections(document, _max_strain(folder))]
 
     folder = check_path("folder", folder)
-    recover(folder)
     recording = cache(lambda: sense.recording_digest(folder))
     sections: list[PageSection] = []
     provenance: list[list[object]] = []

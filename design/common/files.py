@@ -1,14 +1,8 @@
 """Files of every stage: atomic writes, sets of files replaced together, locks, self-describing JSON and provenance.
 
-A set of files (a pad, a mould, a localizer) is replaced by a write-ahead protocol:
-
-1. The files are written into a temporary folder beside their destinations.
-2. That folder is renamed to `EXCHANGE`. This single rename is the commit: from here on readers get the new files.
-3. The files move to their destinations, and the folder is removed.
-
-A run that is killed before step 2 leaves a temporary folder, which the next run removes; one that is killed after it
-leaves `EXCHANGE`, from which readers take the files that have not moved yet, and which the next writer completes.
-Each step is synchronised to the disk before the next one, so that a power cut ends a run as a kill does.
+A set of files (a pad, a mould, a localizer) is written into a temporary folder beside its destination. Then the JSON
+documents of the old set go, the other files take the places of the old ones, and the new documents come last. A run
+that is killed meanwhile leaves files without a document, which readers refuse, and never those of two sets.
 """
 
 import errno
@@ -16,35 +10,27 @@ import hashlib
 import json
 import os
 import platform
-import re
-import secrets
 import shutil
 import stat
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from functools import cache, partial
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
 from importlib import metadata
-from itertools import count
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from filelock import FileLock, Timeout
 
 from padforge.design.common.validation import InputError, short_repr
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
 UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folders
-EXCHANGE = f"{UNFINISHED}exchange"  # folder of a committed set of files that are moving to their destinations
+LOCK = ".lock"  # name of the file by which a run has a folder for itself
 MAX_BYTES = 2**28  # size limit of a file; of what padforge writes only recordings are larger
-PATIENCE_S = 10.0  # how long to wait for another run that moves its files, which takes milliseconds
 
-_NOTE, _MAX_NOTE_BYTES = f"{UNFINISHED}note", 2**20  # the file in `EXCHANGE` that says what it does
-_MAX_ATTEMPTS = 100
-_LOCK_OFFSET = 2**40  # byte of a file that is locked on Windows, beyond the end of any
+_LEFTOVER_S = 86400.0  # a temporary folder untouched for so long is that of a killed run
 _PACKAGES = ("padforge", "numpy", "scipy")
 _MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads: one derived from another stands on its own
 
@@ -79,74 +65,31 @@ def check_writable(folder: Path) -> None:
             raise InputError(f"{folder}: cannot be written, {existing} does not allow it; choose another folder")
 
 
-class BusyError(InputError):
-    """Another process holds the lock."""
-
-
-def _try_lock(handle: int) -> bool | None:
-    """Lock an open file or folder without waiting: whether that was possible, None on a disk without locks.
-
-    The lock is on the file or folder itself: it ends with the process however that is killed, and leaves no file.
-    """
-    try:
-        if fcntl is not None:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        import msvcrt
-
-        position = os.lseek(handle, 0, os.SEEK_CUR)
-        os.lseek(handle, _LOCK_OFFSET, os.SEEK_SET)  # Windows lets nobody read a locked byte
-        try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]  Windows only
-        finally:
-            os.lseek(handle, position, os.SEEK_SET)
-    except OSError as error:
-        return False if fcntl is None or isinstance(error, BlockingIOError) else None
-    return True
-
-
-def _is_at(handle: int, path: Path) -> bool:
-    """Whether `path` is that of an open file or folder still."""
-    try:
-        return os.path.samestat(os.fstat(handle), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def lock(file: IO[Any] | int, busy: str) -> None:
-    """Lock an open file until it is closed, or raise BusyError(busy); do nothing on a disk without locks."""
-    if _try_lock(file if isinstance(file, int) else file.fileno()) is False:
-        raise BusyError(busy)
-
-
 @contextmanager
-def locked(path: Path, busy: str) -> Iterator[None]:
-    """Lock a file or folder in the body; do nothing on Windows, where nothing open can be renamed.
+def locked(folder: Path, busy: str) -> Iterator[None]:
+    """Keep other processes that lock a folder out of it in the body.
 
     Raises:
-        BusyError: with the message `busy`: another process has locked it, or has removed it meanwhile.
-        InputError: it cannot be opened.
+        InputError: with the message `busy`: another one has locked it; or it cannot be written.
     """
-    if fcntl is None:
-        yield
-        return
-    with reraise_write_error(path):
-        try:
-            handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        except FileNotFoundError as error:
-            raise BusyError(busy) from error
+    lock = FileLock(folder / LOCK, thread_local=False)
     try:
-        lock(handle, busy)
-        if not _is_at(handle, path):
-            raise BusyError(busy)
+        with reraise_write_error(folder):
+            try:
+                lock.acquire(blocking=False)
+            except Timeout as error:
+                raise InputError(busy) from error
         yield
     finally:
-        os.close(handle)
+        if lock.is_locked:
+            with suppress(OSError):  # while it is locked, so that nobody else has it; Windows removes it by itself
+                (folder / LOCK).unlink()
+            lock.release()
 
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Keep other runs out of `folder` while results are made for it, and complete or remove what a killed run left.
+    """Keep other runs out of `folder` while results are made for it, and remove what killed ones left long ago.
 
     A folder that did not exist is created, and removed again if it stays empty.
 
@@ -154,14 +97,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
         InputError: another run has locked it, or it cannot be written.
     """
     check_writable(folder)
-    busy = f"{folder}: another run is writing there; wait for its end, or choose another folder"
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     with reraise_write_error(folder):
         make_folder(folder)
     try:
-        with locked(folder, busy) if fcntl is not None else _lock_file(folder / f"{UNFINISHED}lock", busy):
-            recover(folder)
-            remove_leftovers(folder)
+        with locked(folder, f"{folder}: another run is writing there; wait for its end, or choose another folder"):
+            remove_leftovers(folder, _LEFTOVER_S)
             yield
     finally:
         with suppress(OSError):  # not empty
@@ -169,91 +110,38 @@ def locked_folder(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
+def remove_leftovers(folder: Path, min_age_s: float = 0.0) -> None:
+    """Remove the temporary folders of killed runs that nobody has written into for so long; no links are followed."""
+    for path in folder.glob(f"{UNFINISHED}*"):
+        with suppress(OSError):  # of another user, or gone meanwhile
+            if path.is_dir() and not path.is_symlink() and time.time() - path.stat().st_mtime >= min_age_s:
+                shutil.rmtree(path)
+
+
 @contextmanager
-def _lock_file(path: Path, busy: str) -> Iterator[None]:
-    """Lock a file that stands for its folder, since Windows locks no folders."""
-    try:
-        with path.open("ab") as file:
-            lock(file, busy)
-            yield
-    finally:
-        with suppress(OSError):  # another run has it open
-            path.unlink()
-
-
-def remove_leftovers(folder: Path, prefix: str = UNFINISHED) -> None:
-    """Remove temporary files and folders of this user's killed runs; symbolic links are not followed."""
-    if fcntl is None:  # whether their run is at work cannot be known
-        return
-    names = re.compile(rf"{re.escape(prefix)}[0-9a-f]{{16}}(\.[^.]+)?")
-    with suppress(OSError):
-        for path in [path for path in folder.iterdir() if names.fullmatch(path.name)]:
-            with suppress(OSError), ExitStack() as stack:
-                handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-                stack.callback(os.close, handle)
-                status = os.fstat(handle)
-                if status.st_uid != os.geteuid() or not _try_lock(handle) or not _is_at(handle, path):
-                    continue
-                if stat.S_ISDIR(status.st_mode):
-                    shutil.rmtree(path, ignore_errors=True)
-                elif stat.S_ISREG(status.st_mode):
-                    path.unlink()
-
-
-def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> AbstractContextManager[Path]:
+def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> Iterator[Path]:
     """Create an empty folder in `folder`, its name with `prefix`; remove it with its content at the end."""
-    return _temporary(folder, prefix, "", Path.mkdir, lambda path: shutil.rmtree(path, ignore_errors=True))
-
-
-def temporary_file(folder: Path, suffix: str = "", prefix: str = UNFINISHED) -> AbstractContextManager[Path]:
-    """Create an empty file in `folder`, its name with `prefix` and `suffix`; remove it at the end unless renamed."""
-    create, remove = partial(Path.touch, exist_ok=False), partial(Path.unlink, missing_ok=True)
-    return _temporary(folder, prefix, suffix, create, remove)
-
-
-@contextmanager
-def _temporary(
-    folder: Path, prefix: str, suffix: str, create: Callable[[Path], object], remove: Callable[[Path], object]
-) -> Iterator[Path]:
-    """Create a temporary file or folder, locked so that other runs do not take it for a leftover."""
-    remove_leftovers(folder, prefix)
-    while True:
-        path = folder / f"{prefix}{secrets.token_hex(8)}{suffix}"
-        with ExitStack() as stack:
-            for _ in range(2):  # before it exists, so that no interrupt leaves it; twice, where one interrupts removal
-                stack.callback(remove, path)
-            create(path)
-            if fcntl is not None:
-                try:
-                    handle = os.open(path, os.O_RDONLY)
-                except FileNotFoundError:  # another run removed it before it was locked
-                    continue
-                stack.callback(os.close, handle)
-                if _try_lock(handle) is False or not _is_at(handle, path):
-                    continue
-            yield path
-            return
+    with TemporaryDirectory(prefix=prefix, dir=folder, ignore_cleanup_errors=True) as path:
+        yield Path(path)
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path beside it, with its suffix, which replaces it on success.
+    """Write a file atomically: yield a temporary path of its name, which replaces it on success.
 
-    The temporary file exists, is empty and locked; write into it rather than replace it. A path that is temporary
-    itself is yielded as it is.
+    A path that is temporary itself is yielded as it is.
     """
-    if path.name.startswith(UNFINISHED):
+    if path.parent.name.startswith(UNFINISHED) or path.name.startswith(UNFINISHED):
         yield path
         return
     with reraise_write_error(path):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: cannot be written (it exists and is no file)")
         make_folder(path.parent)
-        recover(path.parent)  # else a later recovery would replace the new file by an older one
-        with temporary_file(path.parent, path.suffix) as temporary:
-            yield temporary
-            sync(temporary)
-            temporary.replace(path)
+        with temporary_folder(path.parent) as folder:
+            yield folder / path.name
+            sync(folder / path.name)
+            (folder / path.name).replace(path)
         sync(path.parent)
 
 
@@ -294,145 +182,45 @@ def sync(path: Path) -> None:
 
 def to_disk(handle: int) -> None:
     """Synchronise an open file to the disk; on macOS out of the drive's own cache too, where `os.fsync` leaves it."""
-    try:
-        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
-    except (AttributeError, OSError):  # another system, or a disk without that operation
-        os.fsync(handle)
+    if sys.platform == "darwin":
+        import fcntl
 
-
-class _Note(NamedTuple):
-    """What an exchange does."""
-
-    inodes: list[int]  # of its destination and itself; no copy preserves these: it is carried out only where it began
-    names: list[str]
-    removed: list[str]
+        with suppress(OSError):  # a disk without that operation
+            fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
+            return
+    os.fsync(handle)
 
 
 @contextmanager
 def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Replace a set of files together: yield an empty folder, whose files move to `folder` on success.
 
-    On failure `folder` is as it was before. If the run is killed while the files move, or one of them cannot be moved,
-    all functions of this module read the new files, and the next run completes the move. Files named in `without` are
-    removed as the others come.
+    If the body fails `folder` is as it was before. A kill while files move leaves no JSON document of either set.
+    Files named in `without` are removed as the others come.
     """
     with reraise_write_error(folder):
         make_folder(folder)
-        recover(folder)
         with temporary_folder(folder) as stage:
             yield stage
-            _commit(stage, folder, without)
-    try:
-        recover(folder)
-    except KeyboardInterrupt:
-        recover(folder)
-        raise
-
-
-def _commit(stage: Path, folder: Path, without: Collection[str]) -> None:
-    """Turn a temporary folder into an exchange, once all of its files can be expected to move."""
-    files = [path for path in stage.iterdir() if path.is_file() and not path.is_symlink()]
-    names = [path.name for path in files if not path.name.startswith(UNFINISHED)]
-    names.sort(key=lambda name: (name.endswith(".json"), name))  # JSON documents, which hold digests, move last
-    for path in (folder / name for name in names):
-        with suppress(OSError):  # nothing there, or a link that leads nowhere
-            if not stat.S_ISREG(mode := path.stat().st_mode):
-                kind = "a folder" if stat.S_ISDIR(mode) else "no file"
-                raise InputError(f"{path}: is {kind}, expected a file or nothing")
-            protected = folder.stat().st_mode & stat.S_ISVTX  # as /tmp, where nobody may replace files of others
-            if protected and os.geteuid() not in (0, path.lstat().st_uid, folder.stat().st_uid):
-                raise InputError(f"{path}: cannot be written, it belongs to another user")
-    inodes = [folder.stat().st_ino, stage.stat().st_ino]
-    note = _Note(inodes, names, sorted({*without} - {*names}))
-    (stage / _NOTE).write_text(json.dumps(note), encoding="utf-8")
-    for path in (*(stage / name for name in (*names, _NOTE)), stage):
-        sync(path)
-    for attempt in count(1):
-        try:
-            stage.rename(folder / EXCHANGE)
+            names = sorted(path.name for path in stage.iterdir() if path.is_file())
+            documents = [name for name in names if name.endswith(".json")]
+            for name in names:
+                if (folder / name).is_dir():
+                    raise InputError(f"{folder / name}: is a folder, expected a file or nothing")
+                sync(stage / name)
+            for name in (*documents, *without):
+                (folder / name).unlink(missing_ok=True)
             sync(folder)
-            return
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or attempt == _MAX_ATTEMPTS:
-                raise
-        recover(folder)  # another run has committed meanwhile
-
-
-def recover(folder: Path) -> None:
-    """Complete the exchange of this user in a folder, such as a killed run left, so that its files belong together.
-
-    Raises:
-        InputError: it cannot be completed, or is of another user or folder.
-    """
-    exchange, deadline = folder / EXCHANGE, time.monotonic() + PATIENCE_S
-    while _read_note(folder) is not None:
-        try:
-            with reraise_write_error(folder), locked(exchange, f"{folder}: another run is moving its files there"):
-                if (note := _read_note(folder)) is None:  # read again under the lock, without which it may change
-                    return
-                user = getattr(os, "geteuid", int)()  # on Windows all files are of user 0
-                if {exchange.lstat().st_uid, (exchange / _NOTE).lstat().st_uid} != {user}:
-                    raise InputError(f"{exchange}: left by a run of another user, who completes it by another run")
-                for name in note.removed:
-                    (folder / name).unlink(missing_ok=True)
-                for name in note.names:
-                    with suppress(FileNotFoundError):  # it has moved
-                        (exchange / name).replace(folder / name)
+            for part in ([name for name in names if name not in documents], documents):
+                for name in part:
+                    (stage / name).replace(folder / name)
                 sync(folder)
-                # One rename ends the exchange: if its folder is not removed then, it is a leftover like any other.
-                with suppress(FileNotFoundError):  # on Windows, where another run may have ended it
-                    leftover = exchange.rename(folder / f"{UNFINISHED}{secrets.token_hex(8)}")
-                    shutil.rmtree(leftover, ignore_errors=True)
-        except BusyError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.01)
-
-
-def resolve_exchange(path: Path) -> Path:
-    """Return where the valid content of a file is: in an exchange that has not moved it yet, or at `path`.
-
-    For a file that the exchange removes, it is a path where nothing is.
-    """
-    note, pending = _read_note(path.parent), path.parent / EXCHANGE / path.name
-    if note is not None and (path.name in note.removed or (path.name in note.names and pending.exists())):
-        return pending
-    return path
-
-
-def _read_note(folder: Path) -> _Note | None:
-    """Read what the exchange in a folder does; None if there is none.
-
-    Raises:
-        InputError: it was begun in another folder, by another program, or torn by a power cut.
-    """
-    exchange = folder / EXCHANGE
-    try:
-        status, destination = exchange.lstat(), folder.stat()
-        if not stat.S_ISDIR(status.st_mode):
-            return None
-        if destination.st_mode & stat.S_ISVTX and status.st_uid not in (os.geteuid(), destination.st_uid):
-            return None  # of anybody who may create files there, as in /tmp
-        file = (exchange / _NOTE).lstat()
-        if stat.S_ISREG(file.st_mode) and file.st_size <= _MAX_NOTE_BYTES:
-            note = _Note(*json.loads((exchange / _NOTE).read_text(encoding="utf-8")))
-            if note.inodes == [destination.st_ino, status.st_ino]:
-                return note
-    except (OSError, ValueError, TypeError, RecursionError):
-        if not os.path.lexists(exchange):  # there is none, or its run has completed it meanwhile
-            return None
-    raise InputError(
-        f"{exchange}: begun in another folder, or torn, so files here may be of two runs; remove it, and make them anew"
-    )
 
 
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
-    """Return where to read a file of limited size (`resolve_exchange`); refuse a pipe or device, which may not end."""
+    """Return the path of a file of limited size; refuse a pipe or device, which may not end."""
     try:
-        valid = resolve_exchange(path)
-        status = valid.stat()
-    except InputError:
-        raise
+        status = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
     if not stat.S_ISREG(status.st_mode):
@@ -440,17 +228,14 @@ def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
         raise InputError(f"{path}: cannot be read ({kind})")
     if status.st_size > max_bytes:
         raise InputError(f"{path}: cannot be read (it has {status.st_size} bytes, allowed are {max_bytes})")
-    return valid
+    return path
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """Read the content of a file of at most `max_bytes`, as `check_file`."""
-    valid = check_file(path, max_bytes)
     try:
-        return valid.read_bytes()
+        return check_file(path, max_bytes).read_bytes()
     except OSError as error:
-        if isinstance(error, FileNotFoundError) and valid != path:  # it has moved to its destination meanwhile
-            return read_bytes(path, max_bytes)
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
@@ -474,7 +259,8 @@ def read_json(path: Path, *formats: str) -> dict[str, Any]:
 def sha256(path: Path) -> str:
     """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal."""
     if path.is_dir():
-        lines = [f"{sha256(child)}  {child.name}" for child in sorted(path.iterdir()) if child.is_file()]
+        children = [child for child in sorted(path.iterdir()) if child.is_file() and child.name != LOCK]
+        lines = [f"{sha256(child)}  {child.name}" for child in children]
         return hashlib.sha256("\n".join(lines).encode(errors="surrogateescape")).hexdigest()
     with check_file(path, sys.maxsize).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -130,7 +130,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
             yield executor
         except (CancelledError, KilledWorker) as error:
             reason = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
-            advice = "what was finished is kept: see why, and go on with --resume"
+            advice = "see why, and start again; a search goes on with --resume"
             raise Fault(f"the cluster at {address} {reason}; {advice}") from error
 
 
@@ -225,8 +225,6 @@ class Checkpoints:
     def _read(self, path: Path, number: int) -> State:
         try:
             with np.load(io.BytesIO(files.read_bytes(path)), allow_pickle=False) as arrays:
-                if sum(entry.file_size for entry in arrays.zip.infolist()) > files.MAX_BYTES:
-                    raise ValueError(f"it unpacks to more than {files.MAX_BYTES} bytes")
                 state = {name: arrays[name] for name in arrays.files}
             if str(state.pop(_DIGEST, "")) != self._digest(number, state):
                 raise ValueError("it is not as it was written")

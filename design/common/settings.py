@@ -1,7 +1,6 @@
 """Reading, validating and writing of `pad.toml`; the packages that own its sections define their models."""
 
 import json
-import math
 import sys
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from pydantic_core import CoreSchema
 
 MAX_BYTES = 2**18  # of a settings file
-MAX_DOTS = 200  # in a line: the time to parse a dotted key grows with the square of its parts
-MAX_ITEMS = 2**17  # of an array: a broadcast one may not fit into memory as a list
 
 
 class Settings(BaseModel):
@@ -68,11 +65,10 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
-    """Replace NumPy scalars and arrays by Python numbers and lists, but no array that is too large for a model."""
+    """Replace NumPy scalars and arrays by Python numbers and lists."""
     numpy = sys.modules.get("numpy")  # without importing it: a caller who has such values has done so
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
-        # an axis of length 0 counts as 1, since lists are made for the others all the same
-        return value if math.prod(max(length, 1) for length in value.shape) > MAX_ITEMS else value.tolist()
+        return value.tolist()
     if depth and isinstance(value, list | tuple):
         items = [to_builtins(item, depth - 1) for item in value]
         return items if isinstance(value, list) else tuple(items)
@@ -154,8 +150,6 @@ class Spec:
             return cls({})
         path = check_path("path", path)
         content = read_bytes(path, MAX_BYTES)
-        if any(line.count(b".") > MAX_DOTS for line in content.splitlines()):
-            raise InputError(f"{path}: not a settings file (a line has more than {MAX_DOTS} dots)")
         try:
             tables = tomllib.loads(content.decode("utf-8-sig"))
         except (ValueError, RecursionError) as error:

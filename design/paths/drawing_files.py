@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from ezdxf.path import Path as BezierPath
 
 MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
-MAX_POINTS = 200_000
-MAX_PARTS = 20_000  # elements of a drawing, drawn or not
-MAX_CURVES = 5000  # curves of a drawing before they are joined
 MAX_COORDINATE = 1e6  # largest absolute coordinate, in units of the drawing
 FLATNESS = 1e-5  # largest distance of curve and polyline, relative to the size of the curve
 
@@ -47,20 +44,9 @@ class DrawnPlan:
     unit_mm: float = 1.0  # of the drawing
     note: str = ""  # assumptions that were made
     curves: list[DrawnCurve] = field(default_factory=list)
-    _parts: int = 0
-    _points: int = 0
-
-    def count_part(self) -> None:
-        """Count an element, and refuse more than MAX_PARTS."""
-        self._parts += 1
-        if self._parts > MAX_PARTS:
-            raise InputError(f"more than {MAX_PARTS} elements, which is more than a drawing of fibres has")
 
     def add(self, name: str, points: Array, groups: Sequence[str] = (), closed: bool = False) -> None:
-        """Add a `DrawnCurve` unless it is a single point; refuse coordinates beyond MAX_COORDINATE, too many points."""
-        self._points += len(points)
-        if self._points > MAX_POINTS:
-            raise InputError(f"more than {MAX_POINTS} points, which is more than a drawing of fibres has")
+        """Add a `DrawnCurve` unless it is a single point; refuse coordinates beyond MAX_COORDINATE."""
         if not (np.abs(points) <= MAX_COORDINATE).all():
             raise InputError(f"{name}: coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
         points = points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
@@ -85,8 +71,6 @@ class DrawnPlan:
             if curve.closed:
                 raise InputError(f"{curve.name}: closed, expected a curve from one border of the pad to the other")
         chosen = named or [curve for curve in self.curves if not curve.closed and not _is_pad(curve)]
-        if len(chosen) > MAX_CURVES:
-            raise InputError(f"{len(chosen)} open curves, which is more than a drawing of fibres has")
         return list(_join(chosen))
 
 
@@ -156,7 +140,7 @@ _TRANSFORM = re.compile(r"\s*+,?\s*+([a-zA-Z]++)\s*+\(([^()]*+)\)\s*+")
 _NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "pattern", "marker", "metadata", "style", "title", "desc", "text"}
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _LINK = "{http://www.w3.org/1999/xlink}href"
-_MAX_USES = 8
+_MAX_USES = 8  # of symbols within symbols, which may be a circle
 
 
 def read_svg(path: Path) -> DrawnPlan:
@@ -178,19 +162,16 @@ def read_svg(path: Path) -> DrawnPlan:
     flip = np.diag([1.0, -1.0, 1.0])  # y of an SVG points down
     ids = {element.get("id"): element for element in root.iter() if element.get("id")}
     with np.errstate(all="ignore"):  # overflow is refused where curves are added
-        for element, matrix, groups in _iterate_shapes(drawing, ids, root, flip @ _viewport(root)):
+        for element, matrix, groups in _iterate_shapes(ids, root, flip @ _viewport(root)):
             _draw_shape(drawing, element, matrix, groups)
     return drawing
 
 
-def _iterate_shapes(
-    drawing: DrawnPlan, ids: Mapping[str, Any], root: Any, matrix: Array
-) -> Iterator[tuple[Any, Array, tuple[str, ...]]]:
+def _iterate_shapes(ids: Mapping[str, Any], root: Any, matrix: Array) -> Iterator[tuple[Any, Array, tuple[str, ...]]]:
     """Iterate over what is drawn, in order, with its matrix and the names of all that contains it."""
     stack: list[tuple[Any, Array, tuple[str, ...], int]] = [(child, matrix, (), 0) for child in reversed(root)]
     while stack:
         element, matrix, groups, uses = stack.pop()
-        drawing.count_part()
         kind = _kind(element)
         style = element.get("style", "").replace(" ", "")
         if kind in _NOT_DRAWN or element.get("display") == "none" or "display:none" in style:
@@ -243,8 +224,6 @@ def _parse_path(description: str, name: str) -> list[tuple[Array, bool]]:
     pen = RecordingPen()
     try:
         parse_path(description, pen)
-        if len(pen.value) > MAX_POINTS:
-            raise InputError(f"more than {MAX_POINTS} points, which is more than a drawing of fibres has")
         path, lines = BezierPath(), []
         for command, points in pen.value:
             match command, points:
@@ -343,7 +322,6 @@ def _elementary_transform(kind: str, values: list[float], name: str) -> Array:
 
 
 _KINDS = ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE")
-_MAX_DEGREE = 9
 
 
 def read_dxf(path: Path) -> DrawnPlan:
@@ -363,7 +341,6 @@ def read_dxf(path: Path) -> DrawnPlan:
         raise InputError(f"{path}: not a DXF file that can be read ({_shorten(error)})") from error
     drawing = DrawnPlan(unit_mm, note="" if unit else "the file says no unit: mm")
     for number, entity in enumerate(document.modelspace(), 1):
-        drawing.count_part()
         if entity.dxftype() not in _KINDS:
             continue
         name = f"{entity.dxftype()} {number} of layer {short_repr(entity.dxf.layer)}"
@@ -380,7 +357,7 @@ def read_dxf(path: Path) -> DrawnPlan:
 
 
 def _check_bounds(entity: Any) -> None:
-    """Refuse an entity that would take long to flatten; `_flatten` refuses the coordinates of others."""
+    """Refuse coordinates of what ezdxf makes a path of; `_flatten` refuses those of others."""
     points: Any = []
     match entity.dxftype():
         case "LWPOLYLINE":
@@ -388,10 +365,6 @@ def _check_bounds(entity: Any) -> None:
         case "POLYLINE":
             points = [vertex.dxf.location for vertex in entity.vertices]
         case "SPLINE":
-            if entity.dxf.degree > _MAX_DEGREE:
-                raise InputError(f"of degree {entity.dxf.degree}, allowed are up to {_MAX_DEGREE}")
             points = [*entity.control_points, *entity.fit_points]
-    if len(points) > MAX_POINTS // 10:
-        raise InputError(f"it has {len(points)} points, allowed are {MAX_POINTS // 10}")
     if not all((np.abs(np.array(list(point), dtype=float)) <= MAX_COORDINATE).all() for point in points):
         raise InputError(f"coordinates that are no numbers or beyond {MAX_COORDINATE:g}")

@@ -302,31 +302,25 @@ def fibre_loss(
     padforge sense fibre-loss para5_long.mat --retrain --failed 4,5,6
 
     Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
-    worst set of each size, and without the fibres of --failed. Finished networks are kept after an interruption, and
-    the same command continues with them.
+    worst set of each size, and without the fibres of --failed.
     """
     from padforge.design.common.files import check_writable
-    from padforge.design.common.parallel import Checkpoints
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies.fibre_loss import draw_fibre_loss, fibre_loss_lines, fibre_loss_study
 
-    retrain = options["retrain"]
-    if not (model or retrain):
+    if not (model or options["retrain"]):
         raise InputError("neither --model nor --retrain is given, expected one of them or both")
     target = out or common.pad_folder(recording)
-    unfinished = target / "unfinished"
     check_writable(target)
     localizer = LocalizerModel.load(model) if model else None
     settings = common.load_spec(options.pop("spec")).section(LocalizerSettings, seed=options.pop("seed"))
     opened = open_recording(recording)
-    options |= {"failed": fibre_indices(failed, opened.fibres), "checkpoints": unfinished}
+    options |= {"failed": fibre_indices(failed, opened.fibres)}
     with common.progress_bar("networks") as show:
         result = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
     _write_study(target / "fibre_loss", result.to_dict(), partial(draw_fibre_loss, result))
-    if retrain:
-        Checkpoints(unfinished, {}).clear()
     common.show_result(result.to_dict(), fibre_loss_lines(result), as_json)
 
 

@@ -1,7 +1,6 @@
 """`padforge study ...`: the paper's figures and tables for any pads, and beyond."""
 
 import math
-import os
 from collections.abc import Callable
 from functools import wraps
 from importlib import import_module
@@ -38,7 +37,7 @@ def study() -> None:
     A PAD is a morphology.json, a published .mat, `square`, `random-N` (N knots a fibre), `optimised` or `optimised-N`
     (result of a short search) or `genetic-N` (of the published search), as large as [pad] says; `square@8` has a grid
     of 8.
-    Each study writes NAME.json, NAME.csv, NAME.png and NAME.md. After an interruption, --resume continues it.
+    Each study writes NAME.json, NAME.csv, NAME.png and NAME.md.
     """
 
 
@@ -52,7 +51,6 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
             seed: int | None,
             jobs: int | None,
             scheduler: str | None,
-            resume: bool,
             out: Path,
             as_json: bool,
             **options: Any,
@@ -67,11 +65,9 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
                     show(0, 0, "pads")
                     study = make(names, seed=seed or 0, **options)
                     with cluster(scheduler) as executor:
-                        document = run(study, out, jobs=jobs, executor=executor, resume=resume, on_progress=show)
-            except KeyboardInterrupt:
-                common.echo("padforge: interrupted; --resume continues with the finished tasks", err=True)
-                # at once: threads in the middle of their arithmetic can neither be stopped nor waited for
-                os._exit(common.INTERRUPTED)
+                        document = run(study, out, jobs=jobs, executor=executor, on_progress=show)
+            except KeyboardInterrupt as error:
+                raise KeyboardInterrupt("nothing is written") from error
             common.show_result(document, [*study_lines(document), "", f"{name} -> {out / name}.png"], as_json)
 
         options = (
@@ -79,7 +75,6 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
             common.seed_option,
             click.option("--jobs", type=click.IntRange(1, 256), help="Parallel tasks (default: one a core)."),
             common.scheduler_option,
-            click.option("--resume", is_flag=True, help="Continue an interrupted study in the same folder."),
             common.out_option("out/study"),
             common.json_option,
         )

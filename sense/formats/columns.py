@@ -43,7 +43,6 @@ NOTE = "note"
 MAX_GAP = 3  # readings without a position that are bridged within a press
 PRESSES_DETECTED = {"presses": "detected"}
 """Entry of the source of a recording whose presses were detected in its readings."""
-MAX_CHARACTERS = 10_000
 _MAX_LISTED = 12
 _NUMBER = re.compile(r"\d{1,9}")
 
@@ -72,8 +71,6 @@ def check_import(path: object, columns: object) -> tuple[Path, str]:
 
 def parse_columns(text: str, quantities: Sequence[str] = tuple(UNITS)) -> list[ColumnEntry]:
     """Return the entries of a mapping of these quantities, in its order; `fibres` may have several."""
-    if len(text) > MAX_CHARACTERS:
-        raise InputError(f"columns have {len(text)} characters, allowed are {MAX_CHARACTERS}")
     entries = [_parse_entry(entry.strip(), quantities) for entry in text.split(",")]
     named = [entry.quantity for entry in entries]
     for quantity in named:

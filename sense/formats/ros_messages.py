@@ -35,10 +35,6 @@ UNKNOWN_VARIANCE = -1.0
 """Variance of an unknown quantity, as in `sensor_msgs/msg/Imu`."""
 Z90 = 1.6449
 """Standard deviations that hold 90 % of a normal distribution, two-sided."""
-MAX_MESSAGE_BYTES = 2**16
-"""Size of a message of numbers; decoded, it takes a multiple of it."""
-MAX_TEXT, MAX_TEXT_PARTS = 2**26, 2**21
-"""Length of the text of RECORDING, and brackets, braces and quotes in it: each becomes an object in memory."""
 _MAX_STAMP_S = 2**31
 _INDICES = ("down_command", "up_command")
 _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
@@ -232,8 +228,6 @@ def decode(store: "Typestore", raw: RawMessages, paths: Sequence[str]) -> TopicS
 
     getters, rows, width = [attrgetter(path) for path in paths], bytearray(), 0
     for index, content in enumerate(raw.messages):
-        if len(content) > MAX_MESSAGE_BYTES:
-            raise InputError(f"a message of {raw.msgtype} has {len(content)} bytes, allowed are {MAX_MESSAGE_BYTES}")
         try:
             message = store.deserialize_cdr(content, raw.msgtype)
         except (SerdeError, IndexError) as error:
@@ -290,22 +284,11 @@ def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, t
         **{name: np.where(np.isnan(values), np.array(None), values).tolist() for name, values in arrays.items()},
     }
     text = json.dumps(document, allow_nan=False)
-    if not _is_readable(text):
-        raise InputError(
-            f"recording is too long for a bag: {len(text)} characters of times, presses and source, "
-            f"allowed are {MAX_TEXT}, with {MAX_TEXT_PARTS} brackets and quotes"
-        )
     return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
-
-
-def _is_readable(text: str) -> bool:
-    return len(text) <= MAX_TEXT and sum(map(text.count, '[{"')) <= MAX_TEXT_PARTS
 
 
 def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None:
     """Return the recording of a text, its epoch and its digest; None if the text does not fit the readings (R, C)."""
-    if not _is_readable(text):
-        return None
     try:
         document = json.loads(text)
         if document["format"] != FORMAT:

@@ -3,16 +3,14 @@
 An MCAP file that lacks its end, since its recorder was killed or a copy broken off, is read as far as its messages are
 whole, and the recording says so. Otherwise damage is an error.
 
-MCAP is read by the library rosbags, SQLite by the standard library, and neither is trusted: a file may claim anything.
-Messages are read in sequence, whatever an index says; chunks are unpacked to no more than they claim and than
-MAX_CHUNK_BYTES; of a folder only the storage files directly in it are opened; SQLite files are opened read-only, and
-must consist of plain tables that hold no more than the file does.
+MCAP is read by the library rosbags, in sequence, whatever an index says; SQLite, read-only, by the standard library. Of
+a folder only the storage files directly in it are opened.
 """
 
 import re
 import sqlite3
 import struct
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from heapq import merge
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 
 from padforge.design.common.files import UNFINISHED, atomic_files, check_file, read_bytes, reraise_write_error
 from padforge.design.common.validation import InputError, short_repr
-from padforge.sense.arrays import Array, Indices, check_numbers
+from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
 from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.columns import (
@@ -64,14 +62,6 @@ from padforge.sense.recording.run_directory import STATE_COLUMNS
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-MAX_FILE_BYTES, MAX_METADATA_BYTES = 2**33, 2**24
-MAX_CHUNK_BYTES = 2**26
-"""Unpacked size of a chunk; recorders make them of 1 to 4 MiB."""
-FREE_CHUNK_BYTES, MAX_COMPRESSION = 2**22, 64
-"""Unpacked size that is always allowed, and compression ratio that a larger chunk may have."""
-MAX_MESSAGES, MAX_BYTES = 2**22, 2**28
-"""Messages, and their bytes, of all topics that are asked for."""
-MAX_TOPICS = 10_000
 SUFFIXES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
 """The file that makes a folder a rosbag2 bag."""
@@ -131,17 +121,13 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> BagContent:
         is_wanted: whether a topic is asked for, by its name.
     """
     topics, types, notes = dict[str, RawMessages](), dict[str, str](), list[str]()
-    n_messages = n_bytes = 0
     for file in _storage_files(path):
-        file = check_file(file, MAX_FILE_BYTES)
+        check_file(file, MAX_BYTES)
         with _one_line_errors(file), closing(_read_storage(file, types, notes, is_wanted)) as messages:
             for name, stamp, message in messages:
                 topic = topics.setdefault(name, RawMessages(types[name], [], []))
                 topic.stamps.append(stamp)
                 topic.messages.append(message)
-                n_messages, n_bytes = n_messages + 1, n_bytes + len(message)
-                if n_bytes > MAX_BYTES or n_messages > MAX_MESSAGES:
-                    raise InputError(f"the topics read have more than {MAX_MESSAGES} messages or {MAX_BYTES} bytes")
     return BagContent(topics, types, {NOTE: "; ".join(notes)} if notes else {})
 
 
@@ -149,7 +135,7 @@ def _storage_files(path: Path) -> list[Path]:
     """Return the files of a bag in the order in which they were recorded."""
     if not path.is_dir():
         return [path]
-    metadata = read_bytes(path / METADATA, MAX_METADATA_BYTES).decode(errors="replace")
+    metadata = read_bytes(path / METADATA).decode(errors="replace")
     mode = re.search(r"^[ \t]*compression_mode:[ \t]*[\"']?(file|message)\b", metadata, re.IGNORECASE | re.MULTILINE)
     if mode:
         raise InputError(f"{path}: is compressed by {mode[1]}, expected none or by chunk (ros2 bag convert)")
@@ -186,8 +172,6 @@ def _read_storage(
         msgtype = msgtype if msgtype.count("/") == 2 else msgtype.replace("/", "/msg/")  # the short form of ROS 1
         if types.setdefault(name, msgtype) != msgtype:
             raise InputError(f"topic {short_repr(name)} is of {short_repr(types[name])} and of {short_repr(msgtype)}")
-        if len(types) > MAX_TOPICS:
-            raise InputError(f"it has more than {MAX_TOPICS} topics")
         if is_wanted(name) and encoding != "cdr":
             raise InputError(f"topic {short_repr(name)} is written as {short_repr(encoding)}, expected 'cdr'")
         return is_wanted(name)
@@ -198,29 +182,28 @@ def _read_storage(
 def _read_mcap(
     path: Path, is_selected: Callable[[str, str, str], bool], notes: list[str]
 ) -> Generator[tuple[str, int, bytes], None, None]:
-    from rosbags.rosbag2 import storage_mcap
+    from rosbags.rosbag2.storage_mcap import McapReader
 
-    storage = storage_mcap.McapReader(path)
-    with _guarded(storage_mcap):
-        if lacks_end := _lacks_end(path):
-            storage.bio = path.open("rb")
-        else:
-            storage.open()
-        with closing(storage):
-            parts = [(storage.data_start, storage.data_end)]
-            if lacks_end:
-                parts, note = _recover(storage, path.stat().st_size)
-                notes.append(note)
-            selected = [
-                connection
-                for connection in storage.connections
-                if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
-            ]
-            n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
-            for storage.data_start, storage.data_end in parts:
-                for connection, stamp, message in storage.messages_scan(selected):
-                    n_messages += 1
-                    yield connection.topic, stamp, message
+    storage = McapReader(path)
+    if lacks_end := _lacks_end(path):
+        storage.bio = path.open("rb")
+    else:
+        storage.open()
+    with closing(storage):
+        parts = [(storage.data_start, storage.data_end)]
+        if lacks_end:
+            parts, note = _recover(storage, path.stat().st_size)
+            notes.append(note)
+        selected = [
+            connection
+            for connection in storage.connections
+            if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
+        ]
+        n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
+        for storage.data_start, storage.data_end in parts:
+            for connection, stamp, message in storage.messages_scan(selected):
+                n_messages += 1
+                yield connection.topic, stamp, message
     if n_messages < n_expected:  # rosbags ends without an error at a record that is longer than its chunk
         raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
 
@@ -278,44 +261,10 @@ def _read_at(file: BinaryIO, position: int, size: int) -> bytes:
     return file.read(size)
 
 
-@contextmanager
-def _guarded(storage_mcap: Any) -> Iterator[None]:
-    """Have rosbags unpack no more than is allowed, and leave out the YAML of QoS, which may be long."""
-    decompressors, get_qos = storage_mcap.DECOMPRESSORS, storage_mcap.get_qos
-    storage_mcap.DECOMPRESSORS = {name: _bounded(name) for name in decompressors}
-    storage_mcap.get_qos = lambda metadata: []
-    try:
-        yield
-    finally:
-        storage_mcap.DECOMPRESSORS, storage_mcap.get_qos = decompressors, get_qos
-
-
-def _bounded(compression: str) -> Callable[[bytes, int], bytes]:
-    """Return a decompressor for rosbags that stops at the size that a chunk claims, and refuses large claims."""
-
-    def decompress(packed: bytes, size: int) -> bytes:
-        limit = min(MAX_CHUNK_BYTES, max(FREE_CHUNK_BYTES, MAX_COMPRESSION * len(packed)))
-        if size > limit:
-            raise InputError(f"a chunk claims {size} bytes in {len(packed)} of the file, allowed are {limit}")
-        if compression == "lz4":
-            from lz4.frame import LZ4FrameDecompressor as Decompressor
-        elif compression == "zstd":
-            try:
-                from compression.zstd import ZstdDecompressor as Decompressor  # pyright: ignore  from Python 3.14 on
-            except ImportError:
-                from backports.zstd import ZstdDecompressor as Decompressor
-        else:
-            return packed
-        return Decompressor().decompress(packed, size + 1)
-
-    return decompress
-
-
 def _read_sqlite(
     path: Path, is_selected: Callable[[str, str, str], bool]
 ) -> Generator[tuple[str, int, bytes], None, None]:
     with closing(sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)) as database:
-        _check_tables(database, path.stat().st_size)
         topics = {
             number: str(name)
             for number, name, *types in database.execute("SELECT id, name, type, serialization_format FROM topics")
@@ -327,21 +276,6 @@ def _read_sqlite(
                 if not isinstance(stamp, int) or not isinstance(message, bytes):
                     raise InputError(f"a message has a {type(message).__name__} where rosbag2 has bytes")
                 yield topics[number], stamp, message
-
-
-def _check_tables(database: sqlite3.Connection, file_bytes: int) -> None:
-    """Check that a database has plain tables only: views and computed columns may take any time and memory."""
-    database.execute("PRAGMA trusted_schema = OFF")
-    for kind, name, sql in database.execute(
-        "SELECT type, name, sql FROM sqlite_master WHERE type != 'index'"
-    ).fetchall():
-        is_plain = kind == "table" and str(sql).upper().startswith("CREATE TABLE")
-        columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)).fetchall() if is_plain else []
-        if not is_plain or any(hidden for (hidden,) in columns):
-            raise InputError(f"has {short_repr(name)}, which is computed, expected the plain tables of rosbag2")
-    (size,) = database.execute("SELECT total(length(data)) FROM messages NOT INDEXED").fetchone()
-    if size > file_bytes:  # rows that lack a column have its default, which may be long
-        raise InputError(f"its messages claim {size:.0f} bytes in {file_bytes} of the file")
 
 
 def import_bag(path: str | Path, columns: str = "") -> Recording:
@@ -523,21 +457,9 @@ def export_bag(
         stamps[HEALTH], messages[HEALTH] = ros_messages.encode_health(store, recording, annotations, stamps[READINGS])
     stamps[RECORDING] = stamps[READINGS][:1]
     messages = {RECORDING: [ros_messages.encode_recording(store, recording, epoch_s, messages)], **messages}
-    _check_readable(messages)
     in_order = merge(
         *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in messages), key=itemgetter(1)
     )
     with reraise_write_error(path), atomic_files(path.parent) as folder:
         bag = write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
         bag.replace(folder / path.name)
-
-
-def _check_readable(messages: Mapping[str, Sequence[memoryview]]) -> None:
-    """Check that `import_bag` would read the messages back; it skips those of a model or an arm."""
-    read = [message for topic in messages.keys() - {ARM, TOUCHES, HEALTH} for message in messages[topic]]
-    size = sum(map(len, read))
-    if len(read) > MAX_MESSAGES or size > MAX_BYTES:
-        raise InputError(
-            f"recording would be {len(read)} messages of {size} bytes, "
-            f"allowed in a bag are {MAX_MESSAGES} of {MAX_BYTES}"
-        )

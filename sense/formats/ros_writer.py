@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common.files import recover, sync, temporary_folder, to_disk
+from padforge.design.common.files import sync, temporary_folder, to_disk
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.formats import ros_messages
@@ -142,7 +142,6 @@ class McapFollower:
             return
         try:
             if self._file is None:
-                recover(self.path.parent)  # else a later recovery would replace the file by an older one
                 self._epoch_s = ros_messages.choose_epoch(np.concatenate(self._rows)[:, 0])
                 self._file = _GrowingMcap(self._stack.enter_context(temporary_folder(self.path.parent)), self.path)
             self._file.write(self._store, self._messages())

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.files import resolve_exchange
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.validation import InputError, check_float, check_int, check_type, short_repr
 from padforge.sense.arrays import MAX_VOLTS, Array, Floats, Mask, check_magnitude, check_numbers
@@ -446,7 +445,7 @@ class FaultDetector:
 
 def has_health(folder: Path) -> bool:
     """Return whether the folder of a model has a fault detector."""
-    return any(resolve_exchange(files_of(folder, name).document).exists() for name in (COMMANDED, DETECTED))
+    return any(files_of(folder, name).document.exists() for name in (COMMANDED, DETECTED))
 
 
 HEALTH_FILES = frozenset(file.name for name in (COMMANDED, DETECTED) for file in files_of(Path(), name))

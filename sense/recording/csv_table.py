@@ -16,12 +16,12 @@ from typing import TextIO
 import numpy as np
 
 from padforge.design.common.files import check_file
-from padforge.design.common.validation import MAX_VALUES, InputError
+from padforge.design.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, Array
 
 UNKNOWN = -1.7e308
 """Stands for `?` among numbers, far from all others."""
-_BATCH, _MAX_LINE = 2**23, 2**20  # characters that are read at a time, and of a line
+_BATCH = 2**23  # characters that are read at a time
 
 
 class CsvTable:
@@ -37,17 +37,14 @@ class CsvTable:
 
     def read_columns(self, columns: Sequence[int], may_be_unknown: Sequence[int] = ()) -> Array:
         """Return columns by their indices (R, n), NaN where a cell is empty; `?` is UNKNOWN where it is allowed."""
-        parts, size = [np.empty((0, len(columns)))], 0
+        parts = [np.empty((0, len(columns)))]
         self._skipped = []
         with _open_csv(self.path) as file:
             for _ in range(self._n_header):
-                file.readline(_MAX_LINE)
+                file.readline()
             for number, text in self._read_batches(file):
                 part = self._parse_plain(text, columns, may_be_unknown)
                 parts.append(self._parse_lines(number, text, columns, may_be_unknown) if part is None else part)
-                size += parts[-1].size
-                if size > MAX_VALUES:
-                    raise InputError(f"{self.path}: holds more than {MAX_VALUES} values")
         return np.concatenate(parts)
 
     def line_number(self, row: int) -> int:
@@ -64,10 +61,7 @@ class CsvTable:
         """Yield complete lines, and the number of the first of them; empty lines at the end are left out."""
         number, newlines = self._n_header + 1, ""
         while batch := file.read(_BATCH):
-            end = file.readline(_MAX_LINE)
-            if len(end) == _MAX_LINE:
-                raise InputError(f"{self.path}: a line has more than {_MAX_LINE} characters")
-            batch = newlines + batch + end
+            batch = newlines + batch + file.readline()
             text = batch.rstrip("\n")
             newlines = batch[len(text) + bool(text) :]
             if text:
@@ -137,7 +131,7 @@ def _open_csv(path: Path) -> Iterator[TextIO]:
 def _read_header(file: TextIO) -> tuple[int, str]:
     """Return the number of lines before those of numbers, and the header among them."""
     comment = ""
-    for index, line in enumerate(iter(lambda: file.readline(_MAX_LINE), "")):
+    for index, line in enumerate(file):
         if line.startswith("#"):
             comment = line.lstrip("#")
         elif line.strip():

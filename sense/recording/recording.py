@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import locked, make_folder, read_json, reraise_write_error, sync, temporary_folder
+from padforge.design.common.files import (
+    LOCK,
+    locked,
+    make_folder,
+    read_json,
+    reraise_write_error,
+    sync,
+    temporary_folder,
+)
 from padforge.design.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import (
     MAX_FIBRES,
@@ -252,16 +260,15 @@ def check_replaceable(path: Path) -> None:
         raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {advice}")
     if not is_uncommitted(path):
         for file in sorted(path.iterdir()):
-            if file.name not in FILES or file.is_symlink() or not file.is_file():
+            if file.name not in (*FILES, LOCK) or file.is_symlink() or not file.is_file():
                 raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {advice}")
     if (path / START).exists() or not is_uncommitted(path):
         source = read_json(path / START, FORMAT).get("source")
         kind = source.get("kind") if isinstance(source, dict) else None
         if kind != "simulated":
             raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; {advice}")
-    if (path / JOURNAL).exists():
-        with locked(path / JOURNAL, busy_message(path)):
-            pass
+    with locked(path, busy_message(path)):
+        pass
 
 
 def _check_source(source: object) -> None:

@@ -10,7 +10,6 @@ when a recording is created: a folder without it holds nothing, and a recording 
 import contextlib
 import io
 import json
-import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,9 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.design.common.files import (
+    LOCK,
     UNFINISHED,
     check_writable,
-    lock,
+    locked,
     read_bytes,
     read_json,
     reraise_write_error,
@@ -163,22 +163,23 @@ class Recorder:
         for key, value in (("source", source), ("provenance", provenance)):
             document[key] = dict(check_mapping(key, value))
         check_new_recording(path)
-        with reraise_write_error(path):
+        with reraise_write_error(path), contextlib.ExitStack() as lock:
             path.mkdir(parents=True, exist_ok=True)
+            lock.enter_context(locked(path, busy_message(path)))
+            check_new_recording(path)  # another one may have come first
             present = {file.name for file in path.iterdir()}
-            self._journal: BinaryIO = _lock_new_journal(path)
             with contextlib.ExitStack() as undo:
-                undo.callback(self._journal.close)  # last, as it lets others in
                 for name in {*_BEFORE_START, START} - present:
                     undo.callback((path / name).unlink, missing_ok=True)
-                self._stream: BinaryIO = _create(path / READINGS)
-                undo.callback(self._stream.close)
+                self._journal: BinaryIO = undo.enter_context(_create(path / JOURNAL))
+                self._stream: BinaryIO = undo.enter_context(_create(path / READINGS))
                 write_json(path / _NEW_START, document)
                 sync(path / _NEW_START)
                 (path / _NEW_START).replace(path / START)
                 sync(path)
                 sync(path.parent)
                 undo.pop_all()
+            self._lock = lock.pop_all()
         self._set_state(path, BlockWriter(self._stream, fibres), journal_bytes=0)
 
     def _set_state(self, path: Path, blocks: BlockWriter, journal_bytes: int) -> None:
@@ -205,13 +206,13 @@ class Recorder:
         """
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
-        with reraise_write_error(path):
+        with reraise_write_error(path), contextlib.ExitStack() as lock:
+            lock.enter_context(locked(path, busy_message(path)))
             if is_uncommitted(path):  # broken off before the first reading
                 for name in (JOURNAL, READINGS):
                     (path / name).touch()
             self._journal = open_in_place(path / JOURNAL)
             try:
-                lock(self._journal, busy_message(path))
                 journal = read_journal(path / JOURNAL)
                 times_s, _, _ = read_blocks(path / READINGS, fibres)
                 if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
@@ -230,6 +231,7 @@ class Recorder:
                 states, file, state_times_s = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
                 self._states = (states, file)
                 self._update_last_time(state_times_s)
+            self._lock = lock.pop_all()
         self.n_readings = len(times_s)
         self.done = {number for number, press in journal.items() if press.up_command <= len(times_s)}
         for number in sorted(journal.keys() - self.done):  # or they would count again as soon as enough rows follow
@@ -364,7 +366,7 @@ class Recorder:
         return self
 
     def __exit__(self, kind: object, *error: object) -> None:
-        with contextlib.ExitStack() as files:
+        with self._lock, contextlib.ExitStack() as files:
             for file in (self._journal, self._stream, *(self._states or ())[1:]):
                 files.enter_context(file)
             if self._follower is not None:
@@ -405,6 +407,7 @@ def is_uncommitted(path: Path) -> bool:
         stat.S_ISREG(file.lstat().st_mode)
         and (file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0))
         for file in path.iterdir()
+        if file.name != LOCK
     )
 
 
@@ -416,17 +419,3 @@ def busy_message(path: Path) -> str:
 def _create(path: Path) -> BinaryIO:
     path.touch()
     return path.open("r+b", buffering=0)
-
-
-def _lock_new_journal(path: Path) -> BinaryIO:
-    """Open the journal of a recording that is created, and lock it; of several programs one gets it."""
-    journal = _create(path / JOURNAL)
-    try:
-        lock(journal, busy_message(path))
-        if not os.path.samestat(os.fstat(journal.fileno()), (path / JOURNAL).stat()):
-            raise InputError(busy_message(path))  # the first one gave up and deleted it
-        check_new_recording(path)
-    except BaseException:
-        journal.close()
-        raise
-    return journal

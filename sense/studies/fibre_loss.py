@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from padforge.design.common.command_line import text_table
 from padforge.design.common.files import provenance
-from padforge.design.common.parallel import Checkpoints, State
+from padforge.design.common.parallel import State
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
@@ -82,7 +82,6 @@ def fibre_loss_study(
     options: settings.LocalizerSettings | None = None,
     max_failures: int = 3,
     failed: Sequence[int] = (),
-    checkpoints: Path | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> FibreLoss:
     """Evaluate every set of failed fibres, by one localizer, by networks retrained for each set, or by both.
@@ -95,13 +94,11 @@ def fibre_loss_study(
         options: split, share and seed; the defaults if None.
         max_failures: most fibres that fail at once; at least one is left.
         failed: indices of fibres without which errors are mapped too, however many; none if empty.
-        checkpoints: folder for finished networks, from which an interrupted run resumes; `Checkpoints.clear` removes
-            them once the result is written.
         on_progress: called with (networks done, total, "").
 
     Raises:
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
-            that does not suit the localizer, a localizer without fibre dropout, or checkpoints of other settings.
+            that does not suit the localizer, or a localizer without fibre dropout.
     """
     check_type("retrain", retrain, bool)
     if localizer is not None:
@@ -126,7 +123,7 @@ def fibre_loss_study(
     if retrain:
         subsets = [subset for level in levels for subset in failure_subsets(fibres, level)]
         subsets += [chosen] if chosen and chosen not in subsets else []
-        predictions = _retrain(recording, training, test, options, subsets, checkpoints, on_progress)
+        predictions = _retrain(recording, training, test, options, subsets, on_progress)
         methods[RETRAINED] = evaluate(predictions.__getitem__)
     origin = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     origin["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
@@ -156,19 +153,13 @@ def _retrain(
     test: Indices,
     options: settings.LocalizerSettings,
     subsets: Sequence[Failed],
-    folder: Path | None,
     on_progress: OnProgress,
 ) -> dict[Failed, Localization]:
-    """Predict the test presses by a network of each set of failed fibres; finished ones are not trained again."""
-    about = {"recording": recording.digest, "test": test.tolist(), "seed": options.seed, "split": options.split}
+    """Predict the test presses by a network of each set of failed fibres."""
     options = options.model_copy(update={"method": "published", "features": "published"})
-    tasks = {
-        _bit_mask(failed): Task("", partial(train_without, failed, recording, training, test, options))
-        for failed in subsets
-    }
-    checkpoints = Checkpoints(folder, {"fibre-loss": about}) if folder else None
-    states: Mapping[int, Mapping[str, Any]] = compute_states(tasks, checkpoints, on_progress)
-    return {failed: Localization(**states[_bit_mask(failed)]) for failed in subsets}
+    tasks = [Task("", partial(train_without, failed, recording, training, test, options)) for failed in subsets]
+    states: list[Any] = compute_states(tasks, on_progress)
+    return {failed: Localization(**state) for failed, state in zip(subsets, states, strict=True)}
 
 
 def train_without(

@@ -1,12 +1,10 @@
-"""Frame of all studies: tasks that resume after an interruption, results as table, figure and text, pads by name."""
+"""Frame of all studies: tasks in parallel, results as table, figure and text, pads by name."""
 
 import csv
 import hashlib
-import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 
 from padforge.design.common import files, plotting
 from padforge.design.common.command_line import text_table
-from padforge.design.common.parallel import Checkpoints, State, one_torch_thread, run_tasks
+from padforge.design.common.parallel import State, one_torch_thread, run_tasks
 from padforge.design.common.plotting import FAINT, INK, save_figure, style_axes
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import validate
@@ -69,7 +67,7 @@ class Study:
 
     name: str  # stem of its files
     title: str
-    settings: dict[str, Any]  # all that its results depend on, as JSON; only a run with the same settings is resumed
+    settings: dict[str, Any]  # all that its results depend on, as JSON
     tasks: Sequence[Task]
     conclude: Callable[[list[State]], StudyResult]  # from the results of the tasks, in their order
     draw: Callable[[Mapping[str, Any]], "Figure"]  # from the document
@@ -81,97 +79,56 @@ def run(
     *,
     jobs: int | None = None,
     executor: Executor | None = None,
-    resume: bool = False,
     on_progress: OnProgress = ignore_progress,
 ) -> dict[str, Any]:
-    """Run a study, and write NAME.json, NAME.csv, NAME.png and NAME.md; results of tasks are kept until all are done.
+    """Run a study, and write NAME.json, NAME.csv, NAME.png and NAME.md.
 
     Args:
         study: tasks and what is made of them.
         out: folder.
         jobs: parallel tasks; one a core, or as many as the executor has, if None.
         executor: such as a cluster's; the threads of this machine if None.
-        resume: whether to resume from the tasks that an earlier run into the folder has done; else they are removed.
         on_progress: called with (tasks done, total, name of the last one).
 
     Returns:
         The document: "format", "title", "text", "rows", "settings", "provenance" and the result's `extra`.
 
     Raises:
-        InputError: tasks to resume from belong to other settings, the folder cannot be written, or the same study is
-            running in it.
+        InputError: the folder cannot be written.
     """
     files.check_writable(out)
-    # kept results go by the number of a task, so the tasks and their order count as much as the settings
-    order = hashlib.sha256("\n".join(task.name for task in study.tasks).encode()).hexdigest()[:16]
-    with _locked(out, study.name):
-        checkpoints = Checkpoints(out / f"{study.name}-unfinished", {study.name: study.settings | {"tasks": order}})
-        tasks = dict(enumerate(study.tasks))
-        states = compute_states(tasks, checkpoints, on_progress, resume=resume, jobs=jobs, executor=executor)
-        result = study.conclude([states[number] for number in tasks])
-        document = {
-            "format": f"padforge-study-{study.name}/2",
-            "title": study.title,
-            "text": result.text,
-            "rows": result.rows,
-            **result.extra,
-            "settings": study.settings,
-            "provenance": files.provenance(
-                f"padforge study {study.name}", study.settings.get("seed"), packages=("torch",)
-            ),
-        }
-        with files.atomic_files(out) as folder:
-            save_figure(study.draw(document), folder / f"{study.name}.png")
-            files.write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
-            with (folder / f"{study.name}.csv").open(
-                "w", encoding="utf-8", errors="backslashreplace", newline=""
-            ) as file:
-                writer = csv.DictWriter(file, list(result.rows[0]), lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(result.rows)
-            files.write_json(folder / f"{study.name}.json", document)
-        checkpoints.clear()
+    result = study.conclude(compute_states(study.tasks, on_progress, jobs=jobs, executor=executor))
+    document = {
+        "format": f"padforge-study-{study.name}/2",
+        "title": study.title,
+        "text": result.text,
+        "rows": result.rows,
+        **result.extra,
+        "settings": study.settings,
+        "provenance": files.provenance(f"padforge study {study.name}", study.settings.get("seed"), packages=("torch",)),
+    }
+    with files.atomic_files(out) as folder:
+        save_figure(study.draw(document), folder / f"{study.name}.png")
+        files.write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
+        with (folder / f"{study.name}.csv").open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
+            writer = csv.DictWriter(file, list(result.rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(result.rows)
+        files.write_json(folder / f"{study.name}.json", document)
     return document
 
 
-@contextmanager
-def _locked(out: Path, name: str) -> Iterator[None]:
-    """Keep other runs of a study out of its folder; other studies may run there."""
-    files.make_folder(out)
-    path, busy = out / f".{name}.lock", f"{out}: a {name} study is running there; wait for it or choose another --out"
-    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        raise InputError(f"{path}: is no file, expected one or nothing; remove it, or choose another --out")
-    with path.open("a") as file:
-        files.lock(file, busy)
-        if not (path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())):
-            raise InputError(busy)  # the run that held it ended meanwhile, and removed it
-        try:
-            yield
-        finally:
-            with suppress(PermissionError):  # Windows, where an open file stays
-                path.unlink(missing_ok=True)
-
-
 def compute_states(
-    tasks: Mapping[int, Task],
-    checkpoints: Checkpoints | None,
-    on_progress: OnProgress,
-    *,
-    resume: bool = True,
-    jobs: int | None = None,
-    executor: Executor | None = None,
-) -> dict[int, State]:
-    """Return the states of tasks by number: from checkpoints where they are, else computed in parallel and saved."""
-    saved = checkpoints.begin(resume) if checkpoints else {}
-    states = {number: saved[number] for number in tasks if number in saved}
-    on_progress(len(states), len(tasks), "")
-    missing = [(number, partial(_compute, task)) for number, task in tasks.items() if number not in states]
-    for number, state in run_tasks(missing, executor, max_parallel=jobs):
+    tasks: Sequence[Task], on_progress: OnProgress, *, jobs: int | None = None, executor: Executor | None = None
+) -> list[State]:
+    """Return the results of tasks, in their order, computed in parallel."""
+    states = dict[int, State]()
+    on_progress(0, len(tasks), "")
+    work = [(number, partial(_compute, task)) for number, task in enumerate(tasks)]
+    for number, state in run_tasks(work, executor, max_parallel=jobs):
         states[number] = state
-        if checkpoints:
-            checkpoints.save(number, state)
         on_progress(len(states), len(tasks), tasks[number].name)
-    return states
+    return [states[number] for number in range(len(tasks))]
 
 
 def _compute(task: Task) -> State:
@@ -228,9 +185,9 @@ def _label(parts: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     labelled: dict[str, Any] = {}
     for name, label, part in parts:
         # File names may hold what no page or table can. Matplotlib typesets mathematics between $, and leaves labels
-        # that begin with _ out of legends; a spreadsheet evaluates what begins with = + - or @.
+        # that begin with _ out of legends.
         printable = label.encode("utf-8", "backslashreplace").decode().replace("$", "")
-        label = " ".join(printable.split()).lstrip("_=+-@ ") or "pad"
+        label = " ".join(printable.split()).lstrip("_ ") or "pad"
         if label in labelled:
             raise InputError(f"{name}: another one is called {label}, expected each label once")
         labelled[label] = part

@@ -145,38 +145,3 @@ def test_run_does_not_replace_measured_recording(folder: Path) -> None:
     recording.touch()
     assert "is no folder" in refused("run", cwd=folder)
     assert (folder / "recording" / "readings.bin").read_bytes() == kept["readings.bin"]
-
-
-EXCHANGE = ".unfinished-exchange"
-
-
-@pytest.fixture(scope="module")
-def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that somebody else has packed, with `pad`, in which files were about to be exchanged elsewhere."""
-    folder = tmp_path_factory.mktemp("unpacked")
-    for name in ("pad", f"pad/{EXCHANGE}", "other"):
-        (folder / name).mkdir()
-        Morphology.straight(2).save(folder / name / "morphology.json")
-    (folder / "pad" / "recording.csv").write_text("time_s,fibre_1_v\n0,0\n1,0\n")
-    (folder / "pad" / "thesis.txt").write_text("mine")
-    (folder / "pad" / EXCHANGE / ".unfinished-note").write_text('[[1, 2], ["morphology.json"], ["thesis.txt"]]')
-    return folder
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        *(f"design {name} pad/morphology.json" for name in ("show", "check", "score", "edit")),
-        "design --start-from pad/morphology.json --out other",
-        "fabricate check pad/morphology.json",
-        "fabricate pad/morphology.json --out other",
-        *(f"sense {name} --model pad pad/recording.csv" for name in ("locate", "evaluate", "health")),
-        "sense import pad/recording.csv --out other/recording",
-        "sense identify other/recording --morphology pad/morphology.json",
-        *("run --out pad", "design --out pad", "report pad"),
-        "fabricate other/morphology.json --out pad",
-        "design show other/morphology.json --out pad/plan.svg",
-    ],
-)
-def test_commands_ignore_unfinished_writes_of_others(unpacked: Path, words: str) -> None:
-    assert f"{EXCHANGE}: begun in another folder" in refused(*words.split(), cwd=unpacked)

@@ -76,7 +76,6 @@ def test_damaged_settings_are_refused_in_one_line(path: Path, at: int, less: int
     "content",
     [
         b"a = " + b"[" * 200_000,
-        b"a" + b".a" * 100_000 + b" = 1",
         b"a = " + b"{a = " * 50_000,
         b"[[pad]]\n" * 30_000,
         b"[pad]\n" + b"".join(b"a%d = 1\n" % i for i in range(20_000)),
@@ -87,9 +86,9 @@ def test_damaged_settings_are_refused_in_one_line(path: Path, at: int, less: int
         "[pad]\ngrid = 2\n".encode("utf-16"),
         b"\0" * 1000,
     ],
-    ids=range(11),
+    ids=range(10),
 )
-def test_hostile_settings_are_refused(path: Path, content: bytes) -> None:
+def test_broken_settings_are_refused(path: Path, content: bytes) -> None:
     assert isinstance(read(path, content), str)
 
 

@@ -1,7 +1,6 @@
 """Checkpoints of a search: resuming, damage, and removal."""
 
 import os
-import zipfile
 from itertools import count
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.optimize.search import SearchOptions, SearchResult, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from tests.design.common.damage import damages, read_damaged
-from tools.kills import killed
+from tests.helpers.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
 
@@ -43,21 +42,6 @@ def test_checkpoints_resume_after_a_kill_at_any_operation(tmp_path: Path) -> Non
         if ended:
             break
     assert left >= {".unfinished", "search.json", "start_0000.npz"}
-
-
-def test_checkpoints_limit_the_unpacked_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = Checkpoints(tmp_path, {"search": {}})
-    kept.save(0, {"state": np.zeros(10_000)})
-    path = tmp_path / "start_0000.npz"
-    with zipfile.ZipFile(path) as plain:
-        content = {name: plain.read(name) for name in plain.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
-        for name, each in content.items():
-            packed.writestr(name, each)
-    assert path.stat().st_size < 2000
-    monkeypatch.setattr("padforge.design.common.files.MAX_BYTES", 50_000)
-    with pytest.raises(InputError, match=r"start_0000\.npz: .*unpacks to more than 50000 bytes"):
-        kept.begin(resume=True)
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,11 @@ import subprocess
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from padforge.design.common import files
-from padforge.design.common.files import EXCHANGE
 from padforge.design.common.validation import InputError
 from tests.helpers.power_cut import ON_LINUX, Disk
 
@@ -70,7 +68,7 @@ def test_errors_of_reading_and_writing_name_the_file(tmp_path):
 def test_nested_atomic_file_is_renamed_once_with_ordinary_permissions(tmp_path):
     with files.atomic_file(tmp_path / "a.txt") as outer, files.atomic_file(outer) as inner:
         inner.write_text("whole")
-        assert list(tmp_path.iterdir()) == [outer]
+        assert outer == inner
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     mask = os.umask(0o022)
     try:
@@ -102,8 +100,10 @@ def test_locked_folder_admits_one_run_and_is_removed_again_if_created_and_empty(
             pass
     code = LOCK + "import os\nwith locked_folder(Path(sys.argv[1])): os._exit(9)"
     assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
+    assert {path.name for path in folder.iterdir()} == {".lock"}
     with files.locked_folder(folder), files.locked_folder(tmp_path / "out" / "other"):
         pass
+    assert list(folder.iterdir()) == []
 
 
 def replaced(folder, *names, without=(), text="new"):
@@ -114,60 +114,51 @@ def replaced(folder, *names, without=(), text="new"):
                 raise KeyError
 
 
-def contents(folder):
-    return {path.name: path.read_text() for path in folder.iterdir()}
+def texts(folder):
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
 
 
 def test_atomic_files_moves_and_removes_all_or_none(tmp_path):
     with pytest.raises(KeyError):
         replaced(tmp_path / "out", "one", "fails")
-    assert contents(tmp_path / "out") == {}
+    assert texts(tmp_path / "out") == {}
     replaced(tmp_path / "out", "one", "two", "mine", text="old")
     replaced(tmp_path / "out", "one", without=["two", "three"])
-    assert contents(tmp_path / "out") == {"one": "new", "mine": "old"}
+    assert texts(tmp_path / "out") == {"one": "new", "mine": "old"}
     (tmp_path / "out" / "two").mkdir()
     with pytest.raises(InputError, match="two: is a folder, expected a file or nothing"):
         replaced(tmp_path / "out", "mine", "two")
     assert (tmp_path / "out" / "mine").read_text() == "old"
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError])
-def test_interrupted_move_reads_as_the_new_set_and_the_next_run_completes_it(tmp_path, monkeypatch, stop):
-    for name in ("b", "d", "mine", "removed"):
-        (tmp_path / name).write_text("old")
-    replace = Path.replace
-    stops = iter([stop])
-
-    def stopped(self, target):
-        if self.name == "d" and (error := next(stops, None)):
-            raise error
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", stopped)
-    with pytest.raises(KeyboardInterrupt if stop is KeyboardInterrupt else InputError):
-        replaced(tmp_path, "a", "b", "c", "d", without=["removed"])
-    assert {files.read_bytes(tmp_path / name) for name in "abcd"} == {b"new"}
-    assert (tmp_path / EXCHANGE).exists() == (stop is PermissionError)  # an interrupt waits for the end of the move
-    with files.locked_folder(tmp_path):
-        assert contents(tmp_path) == dict.fromkeys("abcd", "new") | {"mine": "old"}
-
-
-def test_documents_that_hold_digests_move_last(tmp_path, monkeypatch):
+def test_documents_of_a_set_leave_first_and_come_last(tmp_path, monkeypatch):
     """Whoever reads one finds the files that it names."""
-    moved, replace = [], Path.replace
+    replaced(tmp_path, "a.json", "b.png", "c.json", "gone.json", "z.stl", text="old")
+    states, replace = [], Path.replace
 
-    def noted(self, target):
-        moved.append(self.name)
+    def watched(self, target):
+        states.append({name: text for name, text in texts(tmp_path).items() if name.endswith(".json")})
         return replace(self, target)
 
-    monkeypatch.setattr(Path, "replace", noted)
-    replaced(tmp_path, "a.json", "z.stl", "c.json", "b.png")
-    assert moved == ["b.png", "z.stl", "a.json", "c.json"]
+    monkeypatch.setattr(Path, "replace", watched)
+    replaced(tmp_path, "a.json", "z.stl", "c.json", "b.png", without=["gone.json"])
+    assert states == [{}, {}, {}, {"a.json": "new"}]
 
 
-LINUX = pytest.mark.skipif(
-    sys.platform != "linux", reason="files are named by their descriptors, synchronised by fsync"
-)
+def test_files_that_cannot_be_moved_leave_no_document(tmp_path, monkeypatch):
+    replaced(tmp_path, "a.json", "b.png", "c.png", text="old")
+    replace = Path.replace
+
+    def fails(self, target):
+        if self.name == "c.png":
+            raise PermissionError(13, "Permission denied")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", fails)
+    with pytest.raises(InputError, match="cannot be written"):
+        replaced(tmp_path, "a.json", "b.png", "c.png")
+    with pytest.raises(InputError, match=r"a\.json: cannot be read"):
+        files.read_json(tmp_path / "a.json", "x/1")
 
 
 @ON_LINUX
@@ -182,26 +173,13 @@ def test_atomic_file_outlasts_a_power_cut(tmp_path, monkeypatch):
 
 
 @ON_LINUX
-def test_atomic_files_are_all_old_or_all_new_after_a_power_cut_at_any_rename(tmp_path, monkeypatch):
+def test_atomic_files_outlast_a_power_cut(tmp_path, monkeypatch):
     disk, folder = Disk(monkeypatch), tmp_path / "pad"
-    names, renamed = ("a.json", "b.csv"), []
-
-    def check(source: Path) -> None:
-        renamed.append(source.name)
-        if source.parent.name == EXCHANGE:  # a file moves: the exchange that says so lasts, with all of them
-            assert disk.has_name(folder / EXCHANGE)
-        if source.name == EXCHANGE:  # it ends: all of them have arrived
-            assert [disk.read(folder / name) for name in names] == [text, text]
-        elif source.parent == folder:  # it begins
-            assert [disk.read(source / name) for name in names] == [text, text]
-
-    disk.on_rename = check
     for text in (b"old", b"new"):
         with files.atomic_files(folder) as stage:
-            for name in names:
+            for name in ("a.json", "b.csv"):
                 (stage / name).write_bytes(text)
-        assert [disk.read(folder / name) for name in names] == [text, text]
-    assert len(renamed) == 2 * 4
+        assert [disk.read(folder / name) for name in ("a.json", "b.csv")] == [text, text]
     assert disk.has_name(folder)
     assert disk.torn == []
 
@@ -222,36 +200,6 @@ def test_folder_is_written_on_disks_that_synchronise_no_folders(tmp_path, monkey
     assert (tmp_path / "file.txt").read_text(encoding="utf-8") == "new"
 
 
-def test_commit_waits_for_the_exchange_of_another_run(tmp_path, monkeypatch):
-    rename = Path.rename
-    busy = iter([OSError(errno.ENOTEMPTY, "Directory not empty")])
-
-    def late(self, target):
-        if target.name == EXCHANGE and (error := next(busy, None)):
-            replaced(tmp_path, "b", "e", text="another's")
-            raise error
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", late)
-    replaced(tmp_path, "a", "b")
-    assert contents(tmp_path) == {"a": "new", "b": "new", "e": "another's"}
-
-
-@pytest.mark.skipif(getattr(os, "geteuid", int)() != 0, reason="root alone may give files away")
-def test_atomic_files_moves_nothing_over_a_protected_file_of_another_user(tmp_path, monkeypatch):
-    folder = tmp_path / "shared"
-    folder.mkdir()
-    (folder / "b").write_text("another's")
-    os.chown(folder, 12346, 12346)
-    os.chown(folder / "b", 12345, 12345)
-    folder.chmod(0o1777)
-    monkeypatch.setattr(os, "geteuid", lambda: 12347)
-    with pytest.raises(InputError, match="b: cannot be written, it belongs to another user"):
-        replaced(folder, "a", "b")
-    assert (folder / "b").read_text() == "another's"
-    assert not (folder / "a").exists()
-
-
 def test_find_unchanged_compares_digests_in_one_folder_and_sha256_covers_folders(tmp_path):
     for path in (tmp_path / "a", tmp_path / "b", tmp_path / "in" / "c"):
         files.write_json(path, {})
@@ -269,43 +217,19 @@ def test_find_unchanged_compares_digests_in_one_folder_and_sha256_covers_folders
     assert files.sha256(tmp_path) != before
 
 
-@pytest.fixture
-def windows(monkeypatch):
-    """Bytes are locked by the file they are of, until that is closed; a file may go with its last descriptor."""
-    taken: dict[int, tuple[int, int]] = {}
-
-    def locking(handle, mode, count):
-        about = os.fstat(handle)
-        for other, inode in list(taken.items()):
-            try:
-                alive = (os.fstat(other).st_dev, os.fstat(other).st_ino) == inode
-            except OSError:
-                alive = False
-            if alive and other != handle and inode == (about.st_dev, about.st_ino):
-                raise PermissionError(13, "in use")
-        taken[handle] = (about.st_dev, about.st_ino)
-
-    monkeypatch.setattr(files, "fcntl", None)
-    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))  # pyright: ignore
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="it is no stand-in there")
-def test_locks_on_windows_exclude_writers_but_not_readers(windows, tmp_path):
-    for _ in range(2):
-        with (
-            files.locked_folder(tmp_path),
-            pytest.raises(InputError, match="another run is writing there"),
-            files.locked_folder(tmp_path),
-        ):
-            pass
-    (tmp_path / "journal").write_bytes(b"line\n")
-    with (tmp_path / "journal").open("r+b", buffering=0) as first, (tmp_path / "journal").open("rb") as second:
-        first.seek(3)
-        files.lock(first, "busy")
-        assert first.tell() == 3
-        with pytest.raises(InputError, match="busy"):
-            files.lock(second, "busy")
-        assert second.read() == b"line\n"
+def test_leftovers_of_killed_runs_go_after_a_day_and_links_are_not_followed(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (folder := tmp_path / "out").mkdir()
+    for name in (".unfinished-old", ".unfinished-new", "unfinished-mine"):
+        (folder / name / "deeper").mkdir(parents=True)
+    (folder / ".unfinished-link").symlink_to(tmp_path / "mine")
+    for name in (".unfinished-old", "unfinished-mine"):
+        os.utime(folder / name, (0, 0))
+    os.utime(tmp_path / "mine", (0, 0))
+    with files.locked_folder(folder):
+        names = {path.name for path in folder.iterdir()}
+    assert names == {".lock", ".unfinished-new", ".unfinished-link", "unfinished-mine"}
+    assert (tmp_path / "mine").is_dir()
 
 
 PAD = "morphology.json"

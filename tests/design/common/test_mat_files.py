@@ -1,11 +1,8 @@
-"""MATLAB files of every version: what they hold, and what they only claim to."""
+"""MATLAB files of every version, and none of them with values from another file."""
 
 import re
-import struct
 import warnings
-import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,6 @@ from hypothesis import strategies as st
 
 from padforge.design import InputError, Morphology
 from padforge.design.common.mat_files import load_mat
-from padforge.sense import import_mat
 from tests.design.common.damage import damages, read_damaged
 
 
@@ -56,9 +52,6 @@ def test_load_mat_reads_every_version_and_refuses_torn_files(tmp_path: Path) -> 
             load_mat(tmp_path / "torn.mat", ())
     scipy.io.savemat(tmp_path / "old.mat", {"para": CONTENT["para"]}, format="4")
     assert np.array_equal(load_mat(tmp_path / "old.mat", ("para",))["para"], CONTENT["para"])
-    (tmp_path / "bomb.mat").write_bytes(struct.pack("<5i", 0, MUCH, MUCH, 0, 5) + b"para\0" + bytes(8))
-    with pytest.raises(InputError, match=r"bomb\.mat: .*para claims more values than there are"):
-        load_mat(tmp_path / "bomb.mat", ())
 
 
 @pytest.mark.parametrize(("name", "knots"), [("1para", 1), ("5para_dis", 5), ("20para", 20), ("square_grid_cir", 0)])
@@ -130,103 +123,13 @@ def linked(file: h5py.File) -> None:
     file["para"] = h5py.ExternalLink("other.h5", "para")
 
 
-def boasting(file: h5py.File) -> None:
-    file.create_dataset("para", (2**13, 2**13), "f8", chunks=(2**10, 2**10))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (external, "has no variable para"),
-        (virtual, "has no variable para"),
-        (linked, "has no variable para"),
-        (boasting, "para claims 536870912 bytes of float64 in 0 of the file"),
-    ],
-)
-def test_load_mat_refuses_external_and_virtual_values(tmp_path: Path, spoil: Callable, message: str) -> None:
+@pytest.mark.parametrize("spoil", [external, virtual, linked])
+def test_load_mat_refuses_external_and_virtual_values(tmp_path: Path, spoil: Callable) -> None:
     newer(tmp_path / "other.h5", {"para": CONTENT["para"]})
     with h5py.File(newer(tmp_path / "new.mat", {"K": {"object_size": 0.6}}), "a") as file:
         spoil(file)
-    with pytest.raises(InputError, match=rf"new\.mat: {message}"):
+    with pytest.raises(InputError, match=r"new\.mat: has no variable para"):
         Morphology.load(tmp_path / "new.mat")
-
-
-HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
-MUCH = 2**29
-
-
-def element(kind: int, content: bytes) -> bytes:
-    return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
-
-
-def variable(kind: int, shape: tuple[int, ...], *parts: bytes, name: bytes = b"voltage") -> bytes:
-    """A variable of a class that claims to have a shape."""
-    head = element(6, struct.pack("<II", kind, 0)), element(5, struct.pack(f"<{len(shape)}i", *shape)), element(1, name)
-    return element(14, b"".join((*head, *parts)))
-
-
-def packed(content: bytes) -> bytes:
-    content = zlib.compress(content)
-    return struct.pack("<II", 15, len(content)) + content
-
-
-def zeros(count: int) -> bytes:
-    """A variable of so many zeros, packed: a thousandth of them."""
-    whole = variable(9, (count, 1), struct.pack("<II", 2, count))
-    head, some = whole[:4] + struct.pack("<I", len(whole) - 8 + count) + whole[8:], bytes(2**20)
-    packer, check = zlib.compressobj(), zlib.adler32(head)
-    packed_head = packer.compress(head) + packer.flush(zlib.Z_FULL_FLUSH)
-    packed_some = packer.compress(some) + packer.flush(zlib.Z_FULL_FLUSH)  # without what lies before it
-    for _ in range(count >> 20):
-        check = zlib.adler32(some, check)
-    content = packed_head + packed_some * (count >> 20) + packer.flush()[:-4] + struct.pack(">I", check)
-    return struct.pack("<II", 15, len(content)) + content
-
-
-FIELDS = element(5, struct.pack("<i", 8)), element(1, b"field\0\0\0")
-BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
-    "cells": (lambda: variable(1, (MUCH, 1)), "voltage is a cell array, expected a full matrix"),
-    "packed structures": (
-        lambda: packed(variable(2, (MUCH, 1), *FIELDS)),
-        "voltage is a structure, expected a full matrix",
-    ),
-    "packed numbers": (
-        lambda: packed(variable(6, (MUCH, MUCH), element(9, bytes(8)))),
-        f"voltage claims {MUCH**2} values in 8 bytes",
-    ),
-    "dimensions": (lambda: packed(variable(6, (MUCH,) * 2**17, element(9, bytes(8)))), "voltage has shape"),
-    "a long element": (lambda: struct.pack("<II", 14, 2**31), "it ends early"),
-    "zeros": (lambda: zeros(2**28), "unpacks to more than 67108864 bytes"),
-    "bytes that are numbers": (lambda: zeros(2**25), "it holds more than 8388608 values"),
-}
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say how much memory is taken")
-@pytest.mark.parametrize("name", BOMBS)
-def test_load_mat_bounds_memory(tmp_path: Path, name: str) -> None:
-    """In a process that has but 256 MiB left; what else is in the file is read where that one is not needed."""
-    bomb, message = BOMBS[name]
-    time = variable(6, (2, 1), element(9, bytes(16)), name=b"tim")
-    (tmp_path / "bomb.mat").write_bytes(HEADER + time + bomb())
-    with most_memory(2**28):
-        with pytest.raises(InputError, match=rf"bomb\.mat: .*{message}"):
-            import_mat(tmp_path / "bomb.mat")
-        if "expected a full matrix" in message:
-            assert load_mat(tmp_path / "bomb.mat", ("tim",))["tim"].shape == (2, 1)
-
-
-@contextmanager
-def most_memory(more: int) -> Iterator[None]:
-    """Let this process take so many bytes more than it has."""
-    import resource
-
-    limits = resource.getrlimit(resource.RLIMIT_AS)
-    has = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (has + more, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 CORPUS = Path(scipy.io.matlab.__file__).parent / "tests" / "data"

@@ -159,14 +159,11 @@ REFUSED = [
     (f'<path id="x" d="M 0 0 C {"9" * 300} 1 2 2 1e300 3 A 1e200 1 9 0 1 1e9 2"/>', "x: (coord|no path)"),
     ('<line id="x" x1="5%" x2="1" y2="2"/>', "x: x1 is '5%', expected a length"),
     ('<use id="x" href="#x"/>', "x: <use> of <use>"),
-    ('<g id="a"><use href="#b"/></g><g id="b"><use href="#a"/><use href="#a"/></g>', "<use>|elements"),
-    ('<path d="M0 0' + "L1 1L2 1" * 101_000 + '"/>', "points"),
+    ('<g id="a"><use href="#b"/></g><g id="b"><use href="#a"/><use href="#a"/></g>', "<use>"),
     ("<g>" * 5000 + "</g>" * 5000, "not an SVG file that can be read"),
-    ("<g/>" * 21_000, "elements"),
     (f'<rect x="1{" " * 200_000}!"/>', "x is .* expected a length"),
     (f'<g transform="{" " * 200_000}!"/>', "transform is .* expected such as"),
     (f'<g transform="{"scale(1)" * 20_000} "/>', "no open curve"),
-    ('<path d="M0 0L1 1"/>' * 5100, "5100 open curves"),
     (PATHS + "".join(f'<path d="M{k} 0L{k + 0.5} 1"/>' for k in range(50)), "55 open curves, expected 5, one a fibre"),
 ]
 
@@ -265,7 +262,6 @@ def test_import_reads_all_kinds_of_dxf_entities(tmp_path: Path, draw, middle_mm:
         lambda space: space.add_line((float("nan"), 0), (1, 1)),
         lambda space: space.add_arc((0, 0), 1e200, 0, 90),
         lambda space: space.add_spline([(0, 0), (1e18, 1), (3, 3)]),
-        pytest.param(lambda space: space.add_lwpolyline([(k, k % 7) for k in range(21_000)]), marks=pytest.mark.slow),
         lambda space: space.add_lwpolyline([(0, 0, 1e300), (1, 1, 0)], format="xyb"),
         lambda space: space.doc.header.__setitem__("$INSUNITS", 99),
     ],
@@ -274,14 +270,6 @@ def test_import_refuses_hostile_dxf_in_one_line(tmp_path: Path, draw) -> None:
     with pytest.raises(InputError) as refused:
         import_plan(dxf(tmp_path, draw), LAYOUT, 0.05)
     assert len(str(refused.value)) < 500
-
-
-def test_import_refuses_dxf_of_many_elements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many of an SVG are refused by the true limit."""
-    monkeypatch.setattr("padforge.design.paths.drawing_files.MAX_PARTS", 100)
-    path = dxf(tmp_path, lambda space: [space.add_line((k, 0), (k, 1)) for k in range(101)])
-    with pytest.raises(InputError, match="more than 100 elements"):
-        import_plan(path, LAYOUT, 0.05)
 
 
 def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:

@@ -1,62 +1,34 @@
-"""Bags that are torn, lie, or were made to do harm: one line each, in little memory."""
+"""Bags that are torn or not as rosbag2 writes them: one line each."""
 
 import json
 import resource
 import sqlite3
 import struct
-import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 
-import lz4.frame
 import numpy as np
 import pytest
-import zstandard
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording, import_bag
-from padforge.sense.formats import ros_recording
 from padforge.sense.formats.ros_writer import McapFollower
 
 from .foreign import STORE, array, channel, chunk, make, mcap_file, message, write_bag
 
 FLOATS = "std_msgs/msg/Float64MultiArray"
-MAX_PEAK_BYTES = 2**30
 
 
 def refusal_of(path: Path, columns: str = "fibres=/f") -> str:
-    """Return the one line that a bag is refused with, within a GiB."""
-    before = peak_bytes()
+    """Return the one line that a bag is refused with."""
     with pytest.raises(InputError) as refusal:
         import_bag(path, columns)
     line = str(refusal.value)
     assert path.name in line
     assert "\n" not in line
     assert len(line) < 400 + len(str(path))
-    assert peak_bytes() - before < MAX_PEAK_BYTES
     return line
-
-
-def peak_bytes() -> int:
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-@pytest.mark.parametrize("compression", ["lz4", "zstd"])
-@pytest.mark.parametrize("claim", ["true", "less", "an exabyte"])
-def test_import_bag_does_not_unpack_a_bomb(tmp_path: Path, compression: str, claim: str) -> None:
-    compressors: dict[str, Callable[[bytes], bytes]] = {
-        "lz4": lz4.frame.compress,
-        "zstd": zstandard.ZstdCompressor(1).compress,
-    }
-    packed = compressors[compression](bytes(2**27))
-    size = {"true": 2**27, "less": 1000, "an exabyte": 2**60}[claim]
-    path = mcap_file(tmp_path / "bomb.mcap", [chunk(packed, compression, size)] * 3)
-    tracemalloc.start()
-    assert ("expected 1000 bytes, got 1001" if claim == "less" else "a chunk claims") in refusal_of(path)
-    assert tracemalloc.get_traced_memory()[1] < 2**25
-    tracemalloc.stop()
 
 
 def test_import_bag_refuses_chunks_that_lie(tmp_path: Path) -> None:
@@ -89,7 +61,6 @@ def cdr(*parts: bytes) -> bytes:
     ("body", "reason"),
     [
         (cdr(struct.pack("<III", 0, 0, 2**32 - 1), bytes(8)), "message 0 of .* is damaged"),
-        (cdr(struct.pack("<I", 10**5), bytes(2**20)), "1048584 bytes, allowed are 65536"),
         (cdr(struct.pack("<III", 0, 0, 1), bytes(4), struct.pack("<d", np.inf)), "readings hold infinity"),
         (cdr(struct.pack("<III", 0, 0, 600), bytes(4), bytes(4800)), r"expected \(R, C\), R >= 2, C = 1 to 512"),
     ],
@@ -102,27 +73,15 @@ def test_import_bag_refuses_messages_that_lie(tmp_path: Path, body: bytes, reaso
     refusal_of(path)
 
 
-def test_import_bag_refuses_stamps_and_counts_beyond_the_limits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_import_bag_refuses_stamps_beyond_the_limits(tmp_path: Path) -> None:
     body = bytes(STORE.serialize_cdr(array("Float64MultiArray", np.ones(2)), FLOATS))
     for stamps, reason in (([1, 2**64 - 1], "1 of 2 messages"), ([5, 5, 5], "do not ascend"), ([1, 2**62], "")):
         path = mcap_file(tmp_path / "r.mcap", [channel(1, "/f", FLOATS), *(message(1, each, body) for each in stamps)])
         assert reason in refusal_of(path)
-    many = mcap_file(tmp_path / "many.mcap", [chunk(channel(1, "/f", FLOATS) + message(1, 1, body) * 300)])
-    for name, limit, reason in (
-        ("MAX_MESSAGES", 200, "more than 200 messages"),
-        ("MAX_BYTES", 5000, "or 5000 bytes"),
-        ("MAX_TOPICS", 0, "more than 0 topics"),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(ros_recording, name, limit)
-            assert reason in refusal_of(many)
 
 
 DOCUMENTS = {
     "deep": "[" * 10**5,
-    "wide": "[" + "[]," * 2**22 + "[]]",
     "bare": '{"format": "padforge-ros/2"}',
     "wrong": json.dumps(
         {"format": "padforge-ros/2", "digest": "", "epoch_s": float("nan"), "source": {}, "times_s": [1e400]}
@@ -144,9 +103,7 @@ def test_import_bag_ignores_a_text_that_does_not_fit_the_messages(
         ("/pad/pressed", 2.0, make("Bool", True)),
         ("/pad/pressed", 4.0, make("Bool", False)),
     ]
-    before = peak_bytes()
     recording = import_bag(write_bag(tmp_path / "bag", messages))
-    assert peak_bytes() - before < 2**28
     assert len(recording.down_command) == 1
     assert "was changed" in recording.source["note"]
 
@@ -154,33 +111,14 @@ def test_import_bag_ignores_a_text_that_does_not_fit_the_messages(
 TOPICS = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);"
 ROW = f"INSERT INTO topics VALUES (1, '/f', '{FLOATS}', 'cdr');"
 PLAIN = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
-ENDLESS = (
-    "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
-    "SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
-)
 
 
-def test_import_bag_refuses_sqlite_that_computes_or_lies(tmp_path: Path) -> None:
-    computed = PLAIN.replace("data BLOB", "data BLOB AS (zeroblob(1000000000))")
-    values = "INSERT INTO messages VALUES (1, 1,"
-    long_default = f"ALTER TABLE messages ADD COLUMN data BLOB DEFAULT x'{'00' * 480_000}'"
-    for name, script, reason in (
-        ("view", TOPICS + ROW + ENDLESS, "has 'messages', which is computed"),
-        ("computed", TOPICS + ROW + computed, "has 'messages', which is computed"),
-        ("text", f"{TOPICS}{ROW}{PLAIN}{values} 5, 'text')", "has a str where rosbag2 has bytes"),
-        (
-            "long",
-            f"{TOPICS}{ROW}CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER);"
-            + "INSERT INTO messages VALUES (1, 1, 5);" * 600
-            + long_default,
-            "its messages claim 288000000 bytes in",
-        ),
-    ):
-        path = tmp_path / f"{name}.db3"
-        with sqlite3.connect(path) as file:
-            file.executescript(script)
-        file.close()
-        assert reason in refusal_of(path)
+def test_import_bag_refuses_sqlite_messages_that_are_no_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "text.db3"
+    with sqlite3.connect(path) as file:
+        file.executescript(f"{TOPICS}{ROW}{PLAIN}INSERT INTO messages VALUES (1, 1, 5, 'text')")
+    file.close()
+    assert "has a str where rosbag2 has bytes" in refusal_of(path)
 
 
 def test_import_bag_writes_nothing_beside_sqlite_without_an_index(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from padforge.sense import Recorder, Recording
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 from padforge.sense.formats.ros_writer import McapFollower
 from padforge.sense.recording.run_directory import read_journal
+from tests.helpers.kills import killed
 from tests.helpers.power_cut import ON_LINUX, Disk
-from tools.kills import killed
 
 FIBRES = 3
 SOURCE = {"kind": "made", "rig": {"mirrored": True}}

@@ -16,11 +16,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from padforge.design.common.files import locked
 from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording
 from padforge.sense.recording.block_file import block_dtype
+from tests.helpers.kills import killed
 from tests.helpers.power_cut import ON_LINUX, Disk
-from tools.kills import killed
 
 START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
 FIBRES = 3
@@ -59,8 +60,8 @@ def test_files_outlast_a_power_cut_after_every_press(tmp_path, monkeypatch):
     with Recorder(run, FIBRES, {"kind": "made"}, {}) as recorder:
         for press in range(2):
             record(recorder, range(press, press + 1), 2.0 * press)
-            assert {path.name: disk.read(path) for path in run.iterdir()} == {
-                path.name: path.read_bytes() for path in run.iterdir()
+            assert {path.name: disk.read(path) for path in run.glob("[!.]*")} == {
+                path.name: path.read_bytes() for path in run.glob("[!.]*")
             }
     assert disk.has_name(run)
     assert disk.torn == []
@@ -324,7 +325,7 @@ def test_recorder_and_save_sync_files_before_folders(tmp_path, monkeypatch):
 @pytest.mark.skipif(os.name != "posix", reason="kills and locks of POSIX")
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
 def test_save_replaces_all_or_nothing(tmp_path, step):
-    """Killed before any file operation (slow), or every third; the next save cleans up."""
+    """Killed before any file operation (slow), or every third."""
     new = replace(Recording.open(record_presses(tmp_path, presses=2)), source={"kind": "simulated"})
     with Recorder(tmp_path / "old", FIBRES, {"kind": "simulated"}, {}) as recorder:
         record(recorder, range(3), 0.0)
@@ -337,7 +338,7 @@ def test_save_replaces_all_or_nothing(tmp_path, step):
         n_presses.append(len(Recording.open(folder / "run").presses_mm) if (folder / "run").exists() else 0)
         if not ended:
             new.save(folder / "run", {}, replacing=True)
-        assert {path.name for path in folder.iterdir()} == {"run", ".run-mine"}
+        assert {path.name for path in folder.iterdir() if not path.match(".unfinished-*")} == {"run", ".run-mine"}
         if ended:
             break
     assert set(n_presses) <= {3, 0, 2}
@@ -415,15 +416,16 @@ def test_resume_refuses_damage_and_changes_nothing(folder: Path, name: str, chan
 def test_resume_reads_the_journal_after_the_lock(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another program may finish a press before the lock."""
 
-    def finish_before_lock(file: object, busy: str) -> None:
+    def finish_before_lock(path: Path, busy: str):
         monkeypatch.undo()
         with Recorder.resume(folder) as another:
             another.append([another.last_s + 1], np.zeros((1, another.fibres)))
             another.begin((0, 0), another.n_readings, press=9999)
             another.append([another.last_s + 1], np.zeros((1, another.fibres)))
             another.finish(another.n_readings)
+        return locked(path, busy)
 
-    monkeypatch.setattr("padforge.sense.recording.run_directory.lock", finish_before_lock)
+    monkeypatch.setattr("padforge.sense.recording.run_directory.locked", finish_before_lock)
     with Recorder.resume(folder) as recorder:
         assert 9999 in recorder.done
 

@@ -1,6 +1,5 @@
-"""Fibre loss: one test for both methods, and resumed work is the same work."""
+"""Fibre loss: one test for both methods."""
 
-import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ from matplotlib.figure import Figure
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.settings import LocalizerSettings as Options
 from padforge.sense.studies import fibre_loss
 from padforge.sense.studies.fibre_loss import ONE, RETRAINED, FibreLoss, MethodErrors, fibre_loss_study
 from tests.helpers.door import Ended, call
@@ -77,40 +75,6 @@ def test_retraining_ignores_failed_fibres_and_test_positions(recording: Recordin
     assert moved.errors[0]["mean_mm"] == pytest.approx(centre, abs=30)
 
 
-def interrupt(done: int, total: int, what: str) -> None:
-    if done == 2:
-        raise KeyboardInterrupt
-
-
-@pytest.fixture
-def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
-    """The sets of failed fibres that networks are trained for."""
-    train_without, trained = fibre_loss.train_without, []
-
-    def record(failed: tuple[int, ...], *arguments: object) -> object:
-        trained.append(failed)
-        return train_without(failed, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(fibre_loss, "train_without", record)
-    return trained
-
-
-def test_study_resumes_with_the_same_result(recording: Recording, tmp_path: Path, trained: list) -> None:
-    options = {"retrain": True, "max_failures": 1, "failed": (0, 1)}
-    complete = fibre_loss_study(recording, **options)
-    checkpoints = tmp_path / "unfinished"
-    with pytest.raises(KeyboardInterrupt):
-        fibre_loss_study(recording, **options, checkpoints=checkpoints, on_progress=interrupt)
-    finished = len(list(checkpoints.glob("start_*.npz")))
-    assert finished >= 2
-    with pytest.raises(InputError, match="begun with fibre-loss"):
-        fibre_loss_study(recording, retrain=True, max_failures=1, options=Options(seed=1), checkpoints=checkpoints)
-    trained.clear()
-    for _ in range(2):
-        assert fibre_loss_study(recording, **options, checkpoints=checkpoints) == complete
-        assert len(trained) == 6 - finished
-
-
 @pytest.fixture
 def here(localizer: LocalizerModel, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The current folder holds a `model` and a recording `rec`."""
@@ -129,25 +93,6 @@ def test_fibre_loss_command_writes_document_and_figure() -> None:
     ended = call_fibre_loss(*options.split())
     assert (ended.code, json.loads(ended.out)["methods"][ONE]["maps"][-1]["failed"]) == (0, [1, 3])
     assert json.loads(ended.out) == json.loads(Path("out", "fibre_loss.json").read_text())
-    assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
-
-
-@pytest.mark.usefixtures("here", "blank")
-def test_fibre_loss_command_keeps_networks_until_the_result_is_written(
-    trained: list, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    command = ("--retrain", "--max-failures", "1", "--out", "out")
-    with monkeypatch.context() as broken:
-        broken.setattr("padforge.sense.studies.fibre_loss.draw_fibre_loss", full)
-        ended = call_fibre_loss(*command)
-    assert (ended.code, len(trained)) == (2, 5), ended
-    assert len(list(Path("out", "unfinished").glob("start_*.npz"))) == 5
-    assert not Path("out", "fibre_loss.json").exists()
-    ended = call_fibre_loss(*command)
-    assert (ended.code, len(trained)) == (0, 5), ended
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
 
 

@@ -1,5 +1,6 @@
 """Releases: what is unreleased becomes the section of a version, everywhere or nowhere."""
 
+import importlib.util
 import re
 import subprocess
 import tomllib
@@ -8,7 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from tools import release
+ROOT = Path(__file__).parents[2]
+_SPEC = importlib.util.spec_from_file_location("release", ROOT / ".github" / "release.py")
+assert _SPEC
+assert _SPEC.loader
+release = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(release)
 
 DAY = date(2030, 1, 2)
 OLDER = "# Changelog\n\nIntroduction.\n\n## Unreleased\n\n### Added\n\n- Pads.\n\n## 0.1.0 - 2029-12-31\n\n- Moulds.\n"
@@ -95,9 +101,8 @@ def test_cut_is_refused_with_uncommitted_changes(checkout: Path) -> None:
 
 def test_files_of_the_project_agree_on_its_version(tmp_path: Path) -> None:
     """Apart from placeholders, what was cut of them would have notes."""
-    root = Path(release.__file__).parents[1]
     for name in FILES:
-        text = re.sub("|".join(release.PLACEHOLDERS), "true", (root / name).read_text(encoding="utf-8"))
+        text = re.sub("|".join(release.PLACEHOLDERS), "true", (ROOT / name).read_text(encoding="utf-8"))
         (tmp_path / name).write_text(text, encoding="utf-8")
     version = tomllib.loads((tmp_path / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     changelog = (tmp_path / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -1,7 +1,8 @@
 """How often presses lie within the radii that a localizer tells, on test presses of many simulated recordings.
 
-`python -m tools.radii_coverage RECORDINGS SEED` prints a line per recording, and at the end the means over all
-recordings with their standard errors: the share of presses within the radii of 50 and 90 %, by number of lost fibres.
+`python -m padforge.benchmarks.radii_coverage RECORDINGS SEED` prints a line per recording, and at the end the means
+over all recordings with their standard errors: the share of presses within the radii of 50 and 90 %, by number of lost
+fibres.
 """
 
 import math
@@ -12,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.design import Morphology
+from padforge.design.common.parallel import one_torch_thread
 from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
-from tools.kills import on_one_thread
 
 PRESSES = (300, 3000)
 GRIDS = (2, 3, 4, 5)
@@ -86,5 +87,5 @@ def main(recordings: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    on_one_thread()
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    with one_torch_thread():
+        main(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,8 +1,8 @@
 """Releases, cut from the changelog.
 
-`python -m tools.release cut VERSION` makes a section of VERSION and today of what is unreleased in `CHANGELOG.md`,
+`python .github/release.py cut VERSION` makes a section of VERSION and today of what is unreleased in `CHANGELOG.md`,
 writes the version into `pyproject.toml` and `CITATION.cff`, and prints the release notes, which are that section.
-`python -m tools.release notes VERSION` prints them again, if all three files agree that VERSION is what they release.
+`python .github/release.py notes VERSION` prints them again, if all three files agree that VERSION is what they release.
 """
 
 import re
