@@ -19,7 +19,14 @@ from padforge.design.common.validation import InputError, check_float, check_typ
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
-from padforge.sense.localizer.evaluation import PRIOR_PRESSES, Evaluation, conformal, evaluate, held_back_presses
+from padforge.sense.localizer.evaluation import (
+    PRIOR_PRESSES,
+    RATIO_SHAPE,
+    Evaluation,
+    conformal,
+    evaluate,
+    held_back_presses,
+)
 from padforge.sense.localizer.features import MODULATED, FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import complete_at, count_complete
@@ -50,6 +57,7 @@ HALF_KNOWN, MEAN_RATIO, LOST_SHARE = 165.0, 0.67, 0.15
 presses of training after which those never trained on err twice as much as expected, the excess being as 1 / presses;
 the mean ratio of a distance to the radius that is expected then, and by how much it falls with the share of fibres
 lost. It differs by 5 % between pads, and by less between parts of a recording."""
+CONTRADICTION = 2.5  # standard errors by which the mean ratio of presses held back may differ from what is known
 INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 4
 """Sets of failed fibres of a size that intervals are calibrated on, at most: of one moment, or of each of several."""
 
@@ -224,9 +232,9 @@ def calibrate_uncertainty(
     the presses of the training, if what other pads have shown after as many says how wide radii are. Other arguments
     are as in `evaluation.conformal`.
     """
+    typical = False
     if model.method == "ensemble":
-        known = 1 + HALF_KNOWN / n_trained if n_trained else None
-        model = _calibrate_scales(model, moments, positions_mm, levels, on_progress, known)
+        model, typical = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
     plain, n_sets = replace(model, interval_factors=np.ones_like(model.interval_factors)), INTERVAL_SUBSETS
     if len(moments) > 1:
         n_sets = MOMENT_SUBSETS
@@ -237,11 +245,11 @@ def calibrate_uncertainty(
             [plain.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)]
             for level in range(levels)
         )
-        priors = (n_trained and MEAN_RATIO * (1 - LOST_SHARE * level / model.fibres) for level in range(levels))
-        pairs = zip(predictions, priors, strict=True)
+        ratios = (MEAN_RATIO * (1 - LOST_SHARE * level / model.fibres) if typical else None for level in range(levels))
+        pairs = zip(predictions, ratios, strict=True)
         factors.append([conformal(each, positions_mm, measures, prior) for each, prior in pairs])
     factors = factors[:1] * (len(moments) > 1) + factors  # before any window is complete, nothing is predicted
-    counted = len(positions_mm) + (PRIOR_PRESSES if n_trained else 0)
+    counted = len(positions_mm) + PRIOR_PRESSES * typical
     return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6), radii_presses=counted)
 
 
@@ -255,37 +263,46 @@ def _calibrate_scales(
     positions_mm: Array,
     levels: int,
     on_progress: OnProgress,
-    known: float | None,
-) -> LocalizerModel:
+    n_trained: int | None,
+) -> tuple[LocalizerModel, bool]:
     """Scale the expected errors of the positions of members to those on presses never trained on.
 
     Then the weights of the members are right. The Bayesian localizer is overconfident of few or badly placed presses:
-    those of training are augmented by the same response that it predicts them by. If it is `known` by how much all of
-    them err more than they expect, these presses say only which member does so more than another.
+    those of training are augmented by the same response that it predicts them by. After `n_trained` presses it is known
+    by how much members err more than they expect, and these presses say only which member does so more than another;
+    unless they contradict it, as where a training was short. Also returned is whether this knowledge was used.
     """
     targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
-    ratios: dict[str, list[Array]] = {}
+    found: list[tuple[list[str], Array]] = []  # members that answer together, and the ratio of error to expected error
     first = int(len(moments) > 1)
     for n_complete, presses in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
         rows = np.flatnonzero(count_complete(presses.seen) == n_complete)  # not those that the next press cuts off
+        names = answering(model.networks, n_complete, presses.seen.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
             fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
             inputs = presses.inputs[rows], fibre_mask, presses.seen[rows]
             outputs = predict_members(model.networks, *inputs, *model.corrected)
             predicted, log_error = (each[:, :, :2] for each in np.split(outputs, 2, axis=2))
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
-            ratio = (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)
-            ratio *= known / ratio.mean() if known else 1.0
-            names = answering(model.networks, n_complete, presses.seen.shape[1], bool(model.bayes))
-            for name in names:
-                members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
-                ratios.setdefault(name, []).append(ratio[:members])
-                ratio = ratio[members:]
-    presses = len(positions_mm)
+            found.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
+    presses, usual = len(positions_mm), 1.0
+    typical = False
+    if n_trained:
+        growth = 1 + HALF_KNOWN / n_trained
+        excess = np.mean([ratio.mean() for _, ratio in found]) / growth - 1
+        typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
+    if typical:
+        usual, found = growth, [(names, growth * ratio / ratio.mean()) for names, ratio in found]
+    ratios: dict[str, list[Array]] = {}
+    for names, ratio in found:
+        for name in names:
+            members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
+            ratios.setdefault(name, []).append(ratio[:members])
+            ratio = ratio[members:]
     log_scales = {
-        name: np.log((PRIOR_COUNT * (known or 1.0) + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
+        name: np.log((PRIOR_COUNT * usual + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
         for name, ratio in ratios.items()
     }
 
@@ -298,7 +315,7 @@ def _calibrate_scales(
         return {**weights, "last.b": bias}
 
     networks = {name: scaled(name, weights) for name, weights in model.networks.items()}
-    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network))
+    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network)), typical
 
 
 def check_trained(
