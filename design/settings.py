@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from padforge.design.common.settings import Settings, Spec, as_tuple, null_as, to_builtins, validate
-from padforge.design.common.units import to_unit
 from padforge.design.common.validation import InputError, check_float, check_int, short_repr
 
 if TYPE_CHECKING:
@@ -396,8 +394,6 @@ def _fibre_radius_mm(spec: Spec) -> float:
 def _stated_mm(spec: Spec, section: str, key: str, default: float) -> float:
     """Return a length that a section states; the default if it is none: those who own the section refuse it."""
     value = spec.stated(section).get(key, default)
-    with suppress(ValueError):
-        value = to_unit(key, value)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
 
 

@@ -64,7 +64,7 @@ def commands() -> str:
 def settings() -> str:
     """Write the page of all settings with defaults and units."""
     lines = ["# Settings", "", "Keys of `pad.toml`; every key is optional. `padforge init` writes them all."]
-    lines += ['Numbers are in the stated units; text may have another one, such as `"0.5 cm"` or `"20 um"`.']
+    lines += ["Numbers are in the stated units."]
     for name, model in section_models().items():
         lines += ["", f"## [{name}]", "", "| key | default | meaning |", "|---|---|---|"]
         values = model().model_dump()

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import platform
+import secrets
 import shutil
 import stat
 import sys
@@ -19,7 +20,6 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -121,8 +121,12 @@ def remove_leftovers(folder: Path, min_age_s: float = 0.0) -> None:
 @contextmanager
 def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> Iterator[Path]:
     """Create an empty folder in `folder`, its name with `prefix`; remove it with its content at the end."""
-    with TemporaryDirectory(prefix=prefix, dir=folder, ignore_cleanup_errors=True) as path:
-        yield Path(path)
+    path = folder / f"{prefix}{secrets.token_hex(8)}"
+    try:  # before it exists, so that no interrupt leaves it
+        path.mkdir()
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager

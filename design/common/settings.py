@@ -15,13 +15,10 @@ from pydantic import (
     ConfigDict,
     PlainSerializer,
     ValidationError,
-    ValidationInfo,
-    field_validator,
     model_validator,
 )
 
 from padforge.design.common.files import read_bytes
-from padforge.design.common.units import MAX_DEPTH, quantity_pattern, to_unit, units_of
 from padforge.design.common.validation import InputError, check_mapping, check_path, check_type, short_repr
 
 if TYPE_CHECKING:
@@ -47,11 +44,6 @@ class Settings(BaseModel):
     def _without_numpy(cls, values: object) -> object:
         return to_builtins(values)
 
-    @field_validator("*", mode="before")
-    @classmethod
-    def _convert_units(cls, value: object, info: ValidationInfo) -> object:
-        return to_unit(info.field_name or "", value)
-
     @classmethod
     def section(cls) -> str:
         """Return the name of the table: that of the model, without `Settings`."""
@@ -64,16 +56,16 @@ class Settings(BaseModel):
 AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
-def to_builtins(value: Any, depth: int = MAX_DEPTH) -> object:
+def to_builtins(value: Any) -> object:
     """Replace NumPy scalars and arrays by Python numbers and lists."""
     numpy = sys.modules.get("numpy")  # without importing it: a caller who has such values has done so
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
         return value.tolist()
-    if depth and isinstance(value, list | tuple):
-        items = [to_builtins(item, depth - 1) for item in value]
-        return items if isinstance(value, list) else tuple(items)
-    if depth and isinstance(value, Mapping):
-        return {key: to_builtins(item, depth - 1) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        items = map(to_builtins, value)
+        return list(items) if isinstance(value, list) else tuple(items)
+    if isinstance(value, Mapping):
+        return {key: to_builtins(item) for key, item in value.items()}
     return value
 
 
@@ -258,7 +250,7 @@ def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Se
     """Write a `pad.toml` that states every key of `models`, by section, with the descriptions as comments."""
     head = "# padforge settings. Every key is optional; what stands here is the default"
     lines = [f"{head}, or of the preset." if preset else f"{head}."]
-    lines += ['# Numbers are in the units of the comments; text may have another one, such as "0.5 cm" or "20 um".']
+    lines += ["# Numbers are in the units of the comments."]
     for name, model in models.items():
         lines += ["", f"[{name}]"]
         values = ((preset or {}).get(name) or model()).model_dump()
@@ -284,7 +276,7 @@ def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
         table["description"] = table["description"].partition("\n\n")[0]
         for key, default in model().model_dump(mode="json").items():
             described = {"description": model.model_fields[key].description, "default": default}
-            table["properties"][key] = described | _as_in_files(table["properties"][key], key)
+            table["properties"][key] = described | _as_in_files(table["properties"][key])
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "padforge settings",
@@ -295,14 +287,11 @@ def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
     }
 
 
-def _as_in_files(schema: Any, key: str) -> Any:
-    """Return the schema of a key in which a number may have a unit, and a tuple is that of draft 7."""
+def _as_in_files(schema: Any) -> Any:
+    """Return the schema of a key in which a tuple is that of draft 7."""
     if isinstance(schema, list):
-        return [_as_in_files(item, key) for item in schema]
+        return [_as_in_files(item) for item in schema]
     if not isinstance(schema, dict):
         return schema
     dropped, renamed = {"title", "description", "default"}, {"prefixItems": "items"}
-    items = {renamed.get(name, name): _as_in_files(item, key) for name, item in schema.items() if name not in dropped}
-    if items.get("type") == "number" and units_of(key):
-        return {"anyOf": [items, {"type": "string", "pattern": quantity_pattern(key)}]}
-    return items
+    return {renamed.get(name, name): _as_in_files(item) for name, item in schema.items() if name not in dropped}

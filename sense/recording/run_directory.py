@@ -390,7 +390,7 @@ def read_fibres(path: Path) -> int:
 def check_new_folder(path: Path) -> None:
     """Raise InputError unless a path is absent or an empty folder, and can be written."""
     check_writable(path)
-    if path.exists() and any(path.iterdir()):
+    if path.exists() and any(file.name != LOCK for file in path.iterdir()):
         raise InputError(f"{path}: exists and is not empty, recordings are never written over; choose another folder")
 
 
