@@ -22,6 +22,7 @@ from padforge.sense.localizer.bayes import N_SUMMARY
 from padforge.sense.localizer.evaluation import (
     PRIOR_PRESSES,
     RATIO_SHAPE,
+    TRAINED_OUT,
     Evaluation,
     conformal,
     evaluate,
@@ -52,11 +53,12 @@ MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
 PRIOR_COUNT, SCALE_SUBSETS = 2, 6
 """Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
+TRAINING_KEYS = "members", "hidden", "layers", "epochs"
 HALF_KNOWN, MEAN_RATIO, LOST_SHARE = 165.0, 0.67, 0.15
-"""What localizers of other pads have shown, of 255 to 4000 presses of simulated pads and of the published recording:
-presses of training after which those never trained on err twice as much as expected, the excess being as 1 / presses;
-the mean ratio of a distance to the radius that is expected then, and by how much it falls with the share of fibres
-lost. It differs by 5 % between pads, and by less between parts of a recording."""
+"""What localizers of other pads have shown, with the defaults of TRAINING_KEYS and of 255 to 4000 presses of simulated
+pads and of the published recording: presses of training after which those never trained on err twice as much as
+expected, the excess being as 1 / presses; the mean ratio of a distance to the radius that is expected then, and by how
+much it falls with the share of fibres lost. It differs by 5 % between pads, by less between splits."""
 CONTRADICTION = 2.5  # standard errors by which the mean ratio of presses held back may differ from what is known
 INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 4
 """Sets of failed fibres of a size that intervals are calibrated on, at most: of one moment, or of each of several."""
@@ -212,7 +214,9 @@ def fit_model(
         moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
     positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
-    n_trained = len(train) if is_ensemble and n_timed and not measures else None
+    is_usual = all(getattr(options, name) == getattr(LocalizerSettings(), name) for name in TRAINING_KEYS)
+    is_known = is_usual and is_ensemble and n_timed and not measures and trained_share >= TRAINED_OUT
+    n_trained = len(train) if is_known else None
     levels = _n_levels(options, model.fibres)
     return calibrate_uncertainty(model, moments, positions_mm, levels, measures, on_progress, n_trained)
 
@@ -270,7 +274,7 @@ def _calibrate_scales(
     Then the weights of the members are right. The Bayesian localizer is overconfident of few or badly placed presses:
     those of training are augmented by the same response that it predicts them by. After `n_trained` presses it is known
     by how much members err more than they expect, and these presses say only which member does so more than another;
-    unless they contradict it, as where a training was short. Also returned is whether this knowledge was used.
+    unless they contradict it. Also returned is whether this knowledge was used.
     """
     targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]

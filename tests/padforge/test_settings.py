@@ -111,7 +111,7 @@ def test_studies_press_the_pad_as_it_will_be_cast(tmp_path: Path, monkeypatch: p
 
 def test_mould_follows_contact_where_it_leaves_the_pad_open() -> None:
     contact = {"thickness_mm": 8.0, "fibre_depths_mm": [6.45, 7.65]}  # pressed on the face without tracks
-    spec = Spec({"contact": contact, "mould": {"floor_mm": 3.0, "deep_ridge_height_mm": "1.7 mm"}})
+    spec = Spec({"contact": contact, "mould": {"floor_mm": 3.0, "deep_ridge_height_mm": 1.7}})
     check_settings(spec)
     cast = FabricationSettings.from_spec(spec)
     heights_mm = cast.mould.deep_ridge_height_mm, cast.mould.shallow_ridge_height_mm

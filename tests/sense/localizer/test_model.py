@@ -323,7 +323,7 @@ def read(files: ModelFiles) -> tuple[float, float]:
 
 @pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
 def test_kill_while_writing_leaves_the_old_or_the_new_model_or_none(tmp_path: Path) -> None:
-    results = []
+    results, number = [], 0
     for number in count():
         folder = tmp_path / str(number)
         files = written(folder, 1.0)
