@@ -153,7 +153,9 @@ def _train_masked(presses: TrainingPresses, table: Floats, steps: int) -> Predic
     def positions(x: Array) -> Array:
         features = x.reshape(len(x), *presses.inputs.shape[1:]).astype(np.float32)
         fibre_mask, seen = (np.ones((len(x), each.shape[1]), bool) for each in (presses.fibre_mask, presses.seen))
-        return predict(trained.networks, features, fibre_mask, seen, *trained[1:])[0].astype(np.float64)
+        return predict(trained.networks, features, fibre_mask, seen, trained.bayes, trained.residual_network)[0].astype(
+            np.float64
+        )
 
     return positions
 

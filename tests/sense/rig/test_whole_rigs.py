@@ -19,6 +19,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from padforge.design import Morphology
+from padforge.design.common.files import UNFINISHED
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.formats.ros_recording import import_bag
@@ -353,4 +354,5 @@ def test_killed_recording_resumes_to_complete_plan(tmp_path: Path, monkeypatch: 
     assert len(recording.presses_mm) == 7
     assert read_journal(journal).items() >= presses_before_kill.items()
     assert import_bag("run.mcap") == recording
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pad.json", "pad.toml", "run", "run.mcap"]
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith(UNFINISHED)}  # those go a day later
+    assert left == {"pad.json", "pad.toml", "run", "run.mcap"}
