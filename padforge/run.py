@@ -170,7 +170,7 @@ def check_run(run: Run) -> None:
 
     check_settings(run.spec)
     require_formats(run.formats)
-    metadata.version("torch")  # a missing one is refused here, not when contacts are compared
+    metadata.version("torch")  # a missing one is refused here, not after the search
     pad, rig = run.spec.section(PadSettings), read_rig(run.spec, seed=run.seed)
     FabricationSettings.from_spec(run.spec).require_consistent(pad.layout)
     rig.inputs(pad.layout.fibres)

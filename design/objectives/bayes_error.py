@@ -44,8 +44,6 @@ PRESSES, MIN_PRESSES, MAX_SETS, MIN_SETS = 8192, 64, 64, 8
 least; sets of failed fibres of a size, fewer for each of several windows."""
 LEAST_NOISE = 5e-3
 """Floor of the scatter, full scales, that lesser ones are taken for: the grid would not resolve the posterior."""
-
-
 Mask = NDArray[np.bool_]
 
 

@@ -181,9 +181,7 @@ def _gaps(fibres: FibreSamples, by: Gradient) -> float | None:
 def _folds(fibres: FibreSamples, by: Gradient) -> float | None:
     """Penalise a fibre that comes nearer than the gap to a part of itself FOLD gaps or more away along it."""
     gap = fibres.scale(fibres.rules.min_gap_mm)
-    if gap <= fibres.scale(
-        fibres.rules.min_mean_bend_radius_mm
-    ):  # fibres that keep the bend radius keep their folds apart
+    if gap <= fibres.scale(fibres.rules.min_mean_bend_radius_mm):  # fibres that keep that radius keep folds apart
         return None
     check_comparisons(*fibres.arc.shape)
     return _closeness(fibres, [(fibre, fibre) for fibre in range(len(fibres.arc))], gap, by)

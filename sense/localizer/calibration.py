@@ -214,7 +214,8 @@ def fit_model(
         moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
     positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
-    is_usual = all(getattr(options, name) == getattr(LocalizerSettings(), name) for name in TRAINING_KEYS)
+    usual = LocalizerSettings()
+    is_usual = all(getattr(options, name) == getattr(usual, name) for name in TRAINING_KEYS)
     is_known = is_usual and is_ensemble and n_timed and not measures and trained_share >= TRAINED_OUT
     n_trained = len(train) if is_known else None
     levels = _n_levels(options, model.fibres)
@@ -291,14 +292,13 @@ def _calibrate_scales(
             predicted, log_error = (each[:, :, :2] for each in np.split(outputs, 2, axis=2))
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
             found.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
-    presses, usual = len(positions_mm), 1.0
-    typical = False
+    presses, expected_ratio, is_typical = len(positions_mm), 1.0, False
     if n_trained:
         growth = 1 + HALF_KNOWN / n_trained
         excess = np.mean([ratio.mean() for _, ratio in found]) / growth - 1
-        typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
-    if typical:
-        usual, found = growth, [(names, growth * ratio / ratio.mean()) for names, ratio in found]
+        is_typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
+        if is_typical:
+            expected_ratio, found = growth, [(names, growth * ratio / ratio.mean()) for names, ratio in found]
     ratios: dict[str, list[Array]] = {}
     for names, ratio in found:
         for name in names:
@@ -306,7 +306,7 @@ def _calibrate_scales(
             ratios.setdefault(name, []).append(ratio[:members])
             ratio = ratio[members:]
     log_scales = {
-        name: np.log((PRIOR_COUNT * usual + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
+        name: np.log((PRIOR_COUNT * expected_ratio + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
         for name, ratio in ratios.items()
     }
 
@@ -319,7 +319,7 @@ def _calibrate_scales(
         return {**weights, "last.b": bias}
 
     networks = {name: scaled(name, weights) for name, weights in model.networks.items()}
-    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network)), typical
+    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network)), is_typical
 
 
 def check_trained(
