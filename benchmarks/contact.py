@@ -16,7 +16,7 @@ from padforge.design.common.profiling import profiled
 from padforge.design.contact import signals, signals_quantized, signals_sparse
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives import published
+from padforge.design.published import objective as published
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
 
 SAMPLES = (250, 500, 1000, 2000, 4000, 8000, 16000)

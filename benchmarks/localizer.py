@@ -15,7 +15,7 @@ from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design import Morphology
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.progress import ignore_progress
-from padforge.design.networks import fit_batch, initial_weights
+from padforge.design.published.networks import fit_batch, initial_weights
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.features import compute_features

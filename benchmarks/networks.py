@@ -10,7 +10,8 @@ from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
-from padforge.design.networks import (
+from padforge.design.objectives.fibre_loss import failure_subsets
+from padforge.design.published.networks import (
     TRAINING_SHARE,
     VALIDATION_SHARE,
     FailureSet,
@@ -19,7 +20,6 @@ from padforge.design.networks import (
     SimulatedPresses,
     initial_weights,
 )
-from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.settings import PUBLISHED_CONTACT
 
 HIDDEN = 50

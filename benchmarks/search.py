@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.networks import localisation_error
 from padforge.design.objectives.rules import check_rules
 from padforge.design.optimize.search import SearchResult, search
+from padforge.design.published.networks import localisation_error
 from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
 
 KNOTS = (5, 20)

@@ -7,9 +7,6 @@ from .contact import signals as signals
 from .contact import signals_quantized as signals_quantized
 from .contact import signals_sparse as signals_sparse
 from .morphology import Morphology as Morphology
-from .networks import FailureError as FailureError
-from .networks import localisation_error as localisation_error
-from .objectives.published import published_objective as published_objective
 from .objectives.rules import Violation as Violation
 from .objectives.rules import check_rules as check_rules
 from .objectives.score import score as score
@@ -18,6 +15,9 @@ from .optimize.search import SearchResult as SearchResult
 from .optimize.search import search as search
 from .paths.curves import crossings as crossings
 from .paths.curves import flatten as flatten
+from .published.networks import FailureError as FailureError
+from .published.networks import localisation_error as localisation_error
+from .published.objective import published_objective as published_objective
 from .report import draw_plan as draw_plan
 from .settings import Contact as Contact
 from .settings import PadSettings as PadSettings

@@ -19,7 +19,6 @@ from padforge.design.common.validation import MAX_VALUES, InputError, check_arra
 from padforge.design.kernels import geometry, measured_signals
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
-from padforge.design.kernels.published import quantized_signals
 from padforge.design.layer import REDUCED_MODULUS_KPA, LayerPress, solve_press
 from padforge.design.morphology import (
     MAX_COORDINATE,
@@ -33,6 +32,7 @@ from padforge.design.morphology import (
     split_axes,
 )
 from padforge.design.paths.curves import lengths
+from padforge.design.published.kernels import quantized_signals
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
 if TYPE_CHECKING:

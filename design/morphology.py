@@ -20,7 +20,7 @@ from padforge.design.common.mat_files import load_mat
 from padforge.design.common.validation import InputError, check_array, check_int, check_mapping, check_type, short_repr
 from padforge.design.common.validation import check_path as as_path
 from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frame_shape
-from padforge.design.kernels.published import quantized_signals
+from padforge.design.published.kernels import quantized_signals
 from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Counts, Layout, Pitch
 
 Array = NDArray[np.float64]

@@ -18,12 +18,12 @@ from padforge.design.common.settings import or_default
 from padforge.design.common.validation import check_type
 from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_presses
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives import published as formula
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.bayes_error import expected_errors
 from padforge.design.objectives.expected_error import SEARCH_SIDE, criterion_errors
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
+from padforge.design.published import objective as formula
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
 from padforge.design.signal_gradients import FibreCurves
 

@@ -14,9 +14,9 @@ from pymoo.operators.sampling.rnd import FloatRandomSampling
 
 from padforge.design.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
-from padforge.design.objectives.published import published_presses, published_terms
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
+from padforge.design.published.objective import published_presses, published_terms
 
 LEVEL_STD, ORIGIN_STD = 1.0, 0.3
 """Standard deviations of the first knots about a fibre's own level, and about those of an origin; grid units."""

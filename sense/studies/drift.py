@@ -20,8 +20,8 @@ from padforge.design.common.plotting import ALARM, CURVES, INK, add_title
 from padforge.design.common.validation import InputError, check_int
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
-from padforge.design.networks import fit_batch, training_presses
-from padforge.design.objectives.published import idle_share
+from padforge.design.published.networks import fit_batch, training_presses
+from padforge.design.published.objective import idle_share
 from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices
 from padforge.sense.localizer.calibration import split_presses

@@ -15,7 +15,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.contact import indented_signals, press_forces_n, signals
 from padforge.design.layer import REDUCED_MODULUS_KPA, solve_press
 from padforge.design.morphology import Morphology
-from padforge.design.networks import fresh_presses
+from padforge.design.published.networks import fresh_presses
 from padforge.design.settings import Contact, between_fibres
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.studies.study import (

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, INK, add_title
 from padforge.design.morphology import Morphology
-from padforge.design.networks import fit_batch, fresh_presses
+from padforge.design.published.networks import fit_batch, fresh_presses
 from padforge.design.settings import between_fibres
 from padforge.sense.arrays import Array
 from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel

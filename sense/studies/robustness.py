@@ -13,8 +13,8 @@ from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.contact import grid_positions, signals, signals_quantized
 from padforge.design.morphology import Morphology
-from padforge.design.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.objectives.fibre_loss import failure_subsets
+from padforge.design.published.networks import FailureSet, SimulatedPresses, split_batches
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, between_fibres
 from padforge.sense.arrays import Array
 from padforge.sense.studies.study import (

@@ -21,7 +21,7 @@ from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.design.networks import fit_batch, fresh_presses, training_presses
+from padforge.design.published.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import Rectangle, between_fibres
 from padforge.sense.arrays import Array
 from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel

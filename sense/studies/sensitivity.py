@@ -19,8 +19,8 @@ from padforge.design.common.plotting import CURVES, INK
 from padforge.design.common.validation import InputError
 from padforge.design.contact import relative_stretch, signals
 from padforge.design.morphology import Morphology
-from padforge.design.networks import SimulatedPresses, fit_batch
 from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
+from padforge.design.published.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact, SearchSettings
 from padforge.sense.arrays import Array
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes

@@ -248,7 +248,7 @@ def quantize(signals: Array, training: int, noise_counts: float, rng: np.random.
 
 def fit_and_predict(inputs: Array, targets: Array, rng: np.random.Generator, sizes: Sizes) -> Array:
     """Fit networks to the training presses of inputs (Q, D) and targets (Q, O); return their mean for the others."""
-    from padforge.design.networks import fit_batch
+    from padforge.design.published.networks import fit_batch
 
     n = sizes.presses
     networks = fit_batch(inputs[:n], targets[:n], rng.spawn(sizes.members), sizes.hidden, sizes.epochs)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized
 from padforge.design.contact import signals_sparse
 from padforge.design.objectives.ambiguity import ambiguities
-from padforge.design.objectives.published import information
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths
+from padforge.design.published.objective import information
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 ROUND = Contact(radius=0.6, sides=None)

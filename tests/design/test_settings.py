@@ -9,7 +9,7 @@ import pytest
 from padforge import design
 from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
 from padforge.design.common.settings import commented_toml
-from padforge.design.objectives.published import information
+from padforge.design.published.objective import information
 from padforge.design.settings import (
     BUILT_CONTACT,
     MEASURED_PROFILE,

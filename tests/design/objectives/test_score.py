@@ -8,8 +8,8 @@ import pytest
 from padforge.design import Contact, InputError, Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.expected_error import criterion_errors
-from padforge.design.objectives.published import published_terms
 from padforge.design.objectives.score import TERMS, ScoredPad, score, sharpness
+from padforge.design.published.objective import published_terms
 from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
 from padforge.design.signal_gradients import FibreCurves
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from padforge.design.objectives.published import published_objective, published_presses, published_terms
 from padforge.design.optimize.genetic import GeneticSearch
 from padforge.design.optimize.problem import SearchProblem
+from padforge.design.published.objective import published_objective, published_presses, published_terms
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT

@@ -7,13 +7,13 @@ import pytest
 
 from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, InputError, Morphology
-from padforge.design.networks import localisation_error
 from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import describe_terms, score
 from padforge.design.optimize.gradient import GENTLE
 from padforge.design.optimize.search import SearchOptions, better_half, search
 from padforge.design.paths.curves import refine
+from padforge.design.published.networks import localisation_error
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)

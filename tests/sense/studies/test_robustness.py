@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, InputError, Morphology
-from padforge.design.networks import SimulatedPresses
+from padforge.design.published.networks import SimulatedPresses
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import MIN_NETWORKS, robustness_study
 from padforge.sense.studies.study import load_pads, run

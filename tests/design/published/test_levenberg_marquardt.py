@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from padforge.benchmarks import networks as benchmark
-from padforge.design.levenberg_marquardt import (
+from padforge.design.published.levenberg_marquardt import (
     RIDGE,
     ProjectedFit,
     activations,
@@ -14,7 +14,7 @@ from padforge.design.levenberg_marquardt import (
     gauss_newton_matrix,
     jacobian_product,
 )
-from padforge.design.networks import Network, RangeScaler, fit_batch, initial_weights
+from padforge.design.published.networks import Network, RangeScaler, fit_batch, initial_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,7 +8,7 @@ import torch
 
 from padforge.design import Contact, Morphology, signals
 from padforge.design.common.validation import InputError
-from padforge.design.networks import (
+from padforge.design.published.networks import (
     SimulatedPresses,
     fresh_presses,
     localisation_error,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from padforge.benchmarks import contact as objective
 from padforge.design import Contact, InputError, Morphology, published_objective, signals
 from padforge.design.contact import serpentine_presses
-from padforge.design.objectives.published import (
+from padforge.design.published.objective import (
     idle_share,
     information,
     joint_entropy,

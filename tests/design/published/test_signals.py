@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.contact import serpentine_presses
-from padforge.design.objectives.published import published_terms
+from padforge.design.published.objective import published_terms
 from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.wild_pads import SEEDS, contacts
 

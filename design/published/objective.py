@@ -19,8 +19,8 @@ from padforge.design.contact import (
     press_shape,
     serpentine_presses,
 )
-from padforge.design.kernels import published as kernels
 from padforge.design.morphology import Array, Morphology
+from padforge.design.published import kernels
 from padforge.design.settings import (
     LEVELS,
     MAX_LEVELS,

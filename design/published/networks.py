@@ -14,10 +14,10 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
 from padforge.design.common.validation import InputError, check_int, check_type, short_repr
 from padforge.design.contact import serpentine_presses, signals
-from padforge.design.levenberg_marquardt import train_batch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.paths.keep_outs import is_outside
+from padforge.design.published.levenberg_marquardt import train_batch
 from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, PadSettings, Rectangle, between_fibres
 
 EPOCHS = 1000
