@@ -295,7 +295,7 @@ def import_(
     settings = common.load_spec(spec)
     pad_settings, rules = settings.section(PadSettings), settings.section(RulesSettings)
     result = import_plan(plan, pad_settings.layout, tolerance_mm)
-    origin = provenance("padforge design import", None, [plan], packages=("ezdxf", "lxml", "fonttools"))
+    origin = provenance("padforge design import", None, [plan], packages=("ezdxf", "svgelements"))
     origin["settings"] = {"pad": pad_settings.model_dump(mode="json"), "tolerance_mm": tolerance_mm}
     path = (out or common.pad_folder(plan)) / "morphology.json"
     with atomic_files(path.parent) as folder:

@@ -27,27 +27,20 @@ from padforge.design.common.page import TEMPLATES, read_resource
 from padforge.design.common.validation import InputError
 
 HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
-MIN_TOKEN, MAX_TOKEN = 16, 256  # characters
-MAX_CONNECTIONS = 64  # at once of admitted clients, and of others; far fewer than the files that a process may open
+MIN_TOKEN = 16  # characters
 POLL_S = 0.05  # interval at which a server checks whether it is to end
-ADMIT_S = 10.0  # time limit for a connection to send a valid request, however slowly it sends
 END_S = 1.0  # time limit for sending the last message at the end
 MIN_INTERVAL_S = 0.04  # between two messages to a browser
 KEEP_ALIVE_S = 5.0  # after this time without a message an empty one is sent, which fails if the browser has gone
 RETRY_MS = 1000  # after this time a browser that lost its connection tries again
 HTTP_PORT = 80  # which browsers omit from the Host header
-_MAX_DISCARDED = 2**20  # bytes of a too long request that are read before it is refused: a sender reads no answer
 
 # takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use
 Handler = Callable[[bytes], Mapping[str, Any] | None]
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):
-    """A TCP server that runs in the `with` block, with limits for the connections and their time to authenticate.
-
-    Connections that have not authenticated themselves take no place of those that have, and of each kind the oldest
-    gives way to a new one: however many there are, a client that authenticates itself at once is served.
-    """
+    """A TCP server that runs in the `with` block; connections that are still open at its end are cut off."""
 
     daemon_threads = True
     request_queue_size = socket.SOMAXCONN  # waiting to be accepted; one that finds no room there comes a second late
@@ -63,16 +56,14 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
             InputError: the address cannot be used, or other machines can connect without a token of some length.
         """
         host, port = address
-        if token and not (MIN_TOKEN <= len(token) <= MAX_TOKEN and token.isascii() and token.isprintable()):
-            limits = f"{MIN_TOKEN} to {MAX_TOKEN}, those of plain text"
-            raise InputError(f"token has {len(token)} characters, allowed are {limits}")
+        if token and not (len(token) >= MIN_TOKEN and token.isascii() and token.isprintable()):
+            raise InputError(f"token has {len(token)} characters, allowed are {MIN_TOKEN} or more of plain text")
         if host not in (HOST, "localhost") and not token:
             example = f"--token {secrets.token_urlsafe(MIN_TOKEN)}"
             raise InputError(f"host is {host!r}, which other machines reach: state a token, such as {example}")
         self.token = token
         self._lock = threading.Lock()  # of the connections: threads add and remove them
-        self._strangers = dict[Any, float]()  # not admitted, oldest first, and when they are cut off
-        self._admitted = dict[Any, None]()  # oldest first
+        self._connections = set[Any]()
         reasons = {errno.EADDRINUSE: "another program uses it", errno.EACCES: "this user may not use it"}
         try:
             super().__init__(address, handler)
@@ -98,51 +89,23 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         """Send no more, and wait until every client has got the last message, `timeout_s` at most."""
         raise NotImplementedError
 
-    def admit(self, request: Any) -> None:
-        """Lift the time limit of a connection, which has authenticated itself; beyond MAX_CONNECTIONS the oldest ends.
-
-        Raises:
-            ConnectionAbortedError: it was cut off meanwhile.
-        """
-        with self._lock:
-            if self._strangers.pop(request, None) is None:
-                raise ConnectionAbortedError
-            self._admitted[request] = None
-            if len(self._admitted) > MAX_CONNECTIONS:
-                oldest = next(iter(self._admitted))
-                del self._admitted[oldest]
-                _cut_off(oldest)
-
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Register a connection; beyond MAX_CONNECTIONS the oldest that is not admitted is cut off."""
+        """Register a connection."""
         with self._lock:
-            self._strangers[request] = time.monotonic() + ADMIT_S
-            if len(self._strangers) > MAX_CONNECTIONS:
-                oldest = next(iter(self._strangers))
-                del self._strangers[oldest]
-                _cut_off(oldest)
+            self._connections.add(request)
         return True
 
     def close_request(self, request: Any) -> None:
         """Unregister and close a connection."""
         with self._lock:
-            self._strangers.pop(request, None)
-            self._admitted.pop(request, None)
+            self._connections.discard(request)
         super().close_request(request)
-
-    def service_actions(self) -> None:
-        """Cut off connections that have not authenticated themselves in time; called every POLL_S."""
-        time_s = time.monotonic()
-        with self._lock:
-            for connection, deadline_s in self._strangers.items():
-                if deadline_s <= time_s:
-                    _cut_off(connection)
 
     def server_close(self) -> None:
         """Stop listening, and cut off all connections."""
         super().server_close()
         with self._lock:
-            for connection in (*self._strangers, *self._admitted):
+            for connection in self._connections:
                 _cut_off(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -269,16 +232,13 @@ class _PageHandler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.FORBIDDEN)
         elif (handler := self.server.handlers.get(self._url.path)) is None:
             self.send_error(HTTPStatus.NOT_FOUND)
-        elif not (length.isascii() and length.isdigit() and len(length) < 10):
+        elif not (length.isascii() and length.isdigit()):
             self.send_error(HTTPStatus.LENGTH_REQUIRED)
         elif int(length) > self.server.max_post_bytes:
-            self.rfile.read(min(int(length), _MAX_DISCARDED))
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        elif len(body := self.rfile.read(int(length))) < int(length):
-            self.send_error(HTTPStatus.BAD_REQUEST)
         else:
             try:
-                result = handler(body)
+                result = handler(self.rfile.read(int(length)))
             except InputError as error:
                 self._send(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
                 return
@@ -289,20 +249,14 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def _is_authorised(self) -> bool:
         """Whether the request has the token, or without one names this machine, and is not of another page."""
-        try:
-            self._url = urlsplit(self.path)
-        except ValueError:  # a malformed address
-            return False
+        self._url = urlsplit(self.path)
         if self.server.token:
             token = parse_qs(self._url.query).get("token", [""])[0]
             token = token or self.headers.get("Authorization", "").removeprefix("Bearer ")
             is_authorised = hmac.compare_digest(token.encode(), self.server.token.encode())
         else:
             is_authorised = is_this_machine(self.headers.get("Host", ""), self.server.server_address[1])
-        if not is_authorised or self._is_foreign():
-            return False
-        self.server.admit(self.request)
-        return True
+        return is_authorised and not self._is_foreign()
 
     def _is_foreign(self) -> bool:
         """Whether another page makes the request; links to the page itself are no requests of that kind.

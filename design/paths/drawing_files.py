@@ -1,15 +1,16 @@
 """Curves of SVG and DXF drawings, as polylines."""
 
 # pyright: reportPrivateImportUsage=false  ezdxf does not mark as exported what its manual imports
-import math
+import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
-from lxml import etree
 
 from padforge.design.common.files import check_file, read_bytes
 from padforge.design.common.validation import InputError, short_repr
@@ -129,196 +130,92 @@ def _flatten(path: "BezierPath") -> Array:
     return np.array([vertex.xyz[:2] for vertex in path.flattening(distance, segments=16)])
 
 
-_UNITS_MM = {
-    **{"": 25.4 / 96, "px": 25.4 / 96, "mm": 1.0, "cm": 10.0, "q": 0.25, "in": 25.4},
-    **{"pt": 25.4 / 72, "pc": 25.4 / 6},
-}
-# possessive quantifiers (++) do not backtrack: a text of a million blanks is scanned once, not a million times
-_NUMBER = re.compile(r"[-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?")
-_LENGTH = re.compile(rf"\s*+({_NUMBER.pattern})\s*+([a-zA-Z]*+)\s*+")
-_TRANSFORM = re.compile(r"\s*+,?\s*+([a-zA-Z]++)\s*+\(([^()]*+)\)\s*+")
-_NOT_DRAWN = {"defs", "symbol", "clipPath", "mask", "pattern", "marker", "metadata", "style", "title", "desc", "text"}
+_MM_PER_PIXEL = 25.4 / 96
+_TEMPLATES = {"symbol", "mask", "marker"}  # drawn only where they are used
+_CONTAINERS = {"a", "switch"}
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
-_LINK = "{http://www.w3.org/1999/xlink}href"
-_MAX_USES = 8  # of symbols within symbols, which may be a circle
 
 
 def read_svg(path: Path) -> DrawnPlan:
     """Read the curves of an SVG; lengths without a unit are pixels of 1/96 inch."""
+    from svgelements import SVG, Matrix
+
     content = read_bytes(path, MAX_BYTES)
-    parser = etree.XMLParser(
-        resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False, remove_comments=True, remove_pis=True
-    )
-    if b"<!ENTITY" in content:
-        raise InputError(f"{path}: declares entities, which no drawing of fibres needs")
-    try:
-        root = etree.fromstring(content, parser)
-    except (etree.XMLSyntaxError, ValueError) as error:
-        raise InputError(f"{path}: not an SVG file that can be read ({_shorten(error)})") from error
-    etree.strip_tags(root, etree.Entity)  # declared in an external DTD, which is not read
-    if _kind(root) != "svg":
-        raise InputError(f"{path}: the root is <{_kind(root)}>, expected <svg>")
     drawing = DrawnPlan()
-    flip = np.diag([1.0, -1.0, 1.0])  # y of an SVG points down
-    ids = {element.get("id"): element for element in root.iter() if element.get("id")}
-    with np.errstate(all="ignore"):  # overflow is refused where curves are added
-        for element, matrix, groups in _iterate_shapes(ids, root, flip @ _viewport(root)):
-            _draw_shape(drawing, element, matrix, groups)
+    try:
+        tree = ElementTree.fromstring(content)
+        if _kind(tree) != "svg":
+            raise InputError(f"{path}: the root is <{_kind(tree)}>, expected <svg>")
+        _adapt_tree(tree)
+        root: Any = SVG.parse(io.BytesIO(ElementTree.tostring(tree)), on_error="raise")
+        # the drawing's own origin is the one that was drawn from, not the corner of the viewBox
+        origin = Matrix(root.viewbox_transform).point_in_matrix_space((0, 0))
+        for shape, groups in _iterate_shapes(root, ()):
+            number = f"{shape.values['tag']} {len(drawing.curves) + 1}"
+            name = next((group for group in reversed(groups) if group), number)
+            for points, closed in _flatten_shape(shape):
+                drawing.add(name, (points - origin) * [_MM_PER_PIXEL, -_MM_PER_PIXEL], groups, closed)  # y points down
+    except InputError:
+        raise
+    except (ElementTree.ParseError, ValueError, ArithmeticError, LookupError, RecursionError, TypeError) as error:
+        raise InputError(f"{path}: not an SVG file that can be read ({_shorten(error)})") from error
     return drawing
 
 
-def _iterate_shapes(ids: Mapping[str, Any], root: Any, matrix: Array) -> Iterator[tuple[Any, Array, tuple[str, ...]]]:
-    """Iterate over what is drawn, in order, with its matrix and the names of all that contains it."""
-    stack: list[tuple[Any, Array, tuple[str, ...], int]] = [(child, matrix, (), 0) for child in reversed(root)]
-    while stack:
-        element, matrix, groups, uses = stack.pop()
-        kind = _kind(element)
-        style = element.get("style", "").replace(" ", "")
-        if kind in _NOT_DRAWN or element.get("display") == "none" or "display:none" in style:
-            continue
-        name = element.get("id") or kind
-        matrix = matrix @ _transform(element, name)
-        groups = (*groups, element.get("id", ""), element.get(_LABEL, ""))
-        if kind == "use":
-            target = ids.get((element.get("href") or element.get(_LINK) or "").removeprefix("#"))
-            if target is None:
-                continue
-            if uses == _MAX_USES:
-                raise InputError(f"{name}: <use> of <use>, deeper than {_MAX_USES}")
-            matrix = matrix @ _shift(*_lengths(element, name, "x", "y"))
-            children = list(target) if _kind(target) == "symbol" else [target]
-            stack += [(child, matrix, groups, uses + 1) for child in reversed(children)]
-        elif kind in ("g", "a", "svg", "switch"):
-            inner = matrix @ _viewport(element, nested=True) if kind == "svg" else matrix
-            stack += [(child, inner, groups, uses) for child in reversed(element)]
-        else:
-            yield element, matrix, groups
+def _kind(element: Element) -> str:
+    return element.tag.rpartition("}")[2]
 
 
-def _draw_shape(drawing: DrawnPlan, element: Any, matrix: Array, groups: tuple[str, ...]) -> None:
-    """Add the curves of an element, none if it is no curve."""
-    kind, lines = _kind(element), list[tuple[Array, bool]]()
-    name = next((group for group in reversed(groups) if group), f"{kind} {len(drawing.curves) + 1}")
-    if kind == "path":
-        lines = _parse_path(element.get("d", ""), name)
-    elif kind == "line":
-        lines = [(np.reshape(_lengths(element, name, "x1", "y1", "x2", "y2"), (2, 2)), False)]
-    elif kind in ("polyline", "polygon"):
-        numbers = [float(number) for number in _NUMBER.findall(element.get("points", ""))]
-        lines = [(np.reshape(numbers[: len(numbers) // 2 * 2], (-1, 2)), kind == "polygon")]
-    elif kind == "rect":
-        x, y, width, height = _lengths(element, name, "x", "y", "width", "height")
-        lines = [(np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]]), True)]
-    for points, closed in lines:
-        if len(points):
-            points = np.vstack([points, points[:1]]) if closed else points
-            drawing.add(name, points @ matrix[:2, :2].T + matrix[:2, 2], groups, closed)
+def _adapt_tree(tree: Element) -> None:
+    """Make groups of containers that svgelements does not know, those of templates within <defs>: not drawn.
+
+    A path without data, such as that of a blank, gets empty ones.
+    """
+    for parent in list(tree.iter()):
+        namespace = tree.tag.removesuffix("svg")
+        for number, child in enumerate(parent):
+            if _kind(child) in _TEMPLATES | _CONTAINERS:
+                if _kind(child) in _TEMPLATES:
+                    parent[number] = Element(f"{namespace}defs")
+                    parent[number].append(child)
+                child.tag = f"{namespace}g"
+            elif _kind(child) == "path" and "d" not in child.attrib:
+                child.set("d", "")
 
 
-def _parse_path(description: str, name: str) -> list[tuple[Array, bool]]:
-    """Return the polylines of an SVG path, and whether each is closed."""
+def _iterate_shapes(container: Any, groups: tuple[str, ...]) -> Iterator[tuple[Any, tuple[str, ...]]]:
+    """Iterate over the lines that are drawn, in order, with the names of all that contains each."""
+    from svgelements import Group, Path, Polygon, Polyline, Rect, SimpleLine, Use
+
+    for element in container:
+        attributes = element.values["attributes"]
+        names = (*groups, attributes.get("id", ""), attributes.get(_LABEL, ""))
+        if isinstance(element, Group | Use):
+            yield from _iterate_shapes(element, names)
+        elif isinstance(element, Path | Polygon | Polyline | Rect | SimpleLine):
+            yield element, names
+
+
+def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
+    """Flatten every part of a shape to a polyline, and say whether it is closed."""
     from ezdxf.path import Path as BezierPath
-    from fontTools.pens.recordingPen import RecordingPen
-    from fontTools.svgLib.path.parser import parse_path
+    from svgelements import Close, CubicBezier, Move, Path, QuadraticBezier
 
-    pen = RecordingPen()
-    try:
-        parse_path(description, pen)
-        path, lines = BezierPath(), []
-        for command, points in pen.value:
-            match command, points:
-                case "moveTo", [start]:
-                    path = BezierPath(start)
-                case "lineTo", [end]:
-                    path.line_to(end)
-                case "qCurveTo", [control, end]:
-                    path.curve3_to(end, control)
-                case "curveTo", [first, second, end]:
-                    path.curve4_to(end, first, second)
-                case "closePath" | "endPath", _:
-                    lines.append((_flatten(path) if len(path) else np.empty((0, 2)), command == "closePath"))
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
-    except (ValueError, ArithmeticError, LookupError, AssertionError) as error:
-        raise InputError(f"{name}: no path that can be read ({_shorten(error)})") from error
-    return lines
-
-
-def _kind(element: Any) -> str:
-    return etree.QName(element).localname if isinstance(element.tag, str) else ""
-
-
-def _lengths(element: Any, name: str, *attributes: str) -> list[float]:
-    """Return lengths in user units, 0 where an attribute is missing; percentages have no meaning here."""
-    lengths = []
-    for attribute in attributes:
-        text = element.get(attribute, "0")
-        match = _LENGTH.fullmatch(text)
-        if not match or match[2].lower() not in _UNITS_MM:
-            raise InputError(f"{name}: {attribute} is {short_repr(text)}, expected a length")
-        lengths.append(float(match[1]) * (_UNITS_MM[match[2].lower()] / _UNITS_MM[""] if match[2] else 1))
-    return lengths
-
-
-def _shift(x: float, y: float) -> Array:
-    return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
-
-
-def _viewport(element: Any, nested: bool = False) -> Array:
-    """Return the matrix from inside an <svg> to mm, or to the surrounding units if it is nested in another."""
-    name = element.get("id") or "svg"
-    origin = _shift(*_lengths(element, name, "x", "y")) if nested else np.eye(3)
-    unit = np.eye(3) if nested else np.diag([_UNITS_MM[""], _UNITS_MM[""], 1.0])
-    box = [float(number) for number in _NUMBER.findall(element.get("viewBox", ""))]
-    if len(box) != 4:
-        return unit @ origin
-    if not (box[2] > 0 and box[3] > 0):
-        text = short_repr(element.get("viewBox"))
-        raise InputError(f"{name}: viewBox is {text}, expected x, y, width, height above 0")
-    sides = [
-        inner if element.get(side, "100%").strip().endswith("%") else _lengths(element, name, side)[0]
-        for side, inner in zip(("width", "height"), box[2:], strict=True)
-    ]
-    scale = np.divide(sides, box[2:])
-    if element.get("preserveAspectRatio", "").strip() != "none":
-        scale[:] = scale.min()
-    if not nested:  # the drawing's own origin is the one that was drawn from
-        return unit @ np.diag([*scale, 1.0])
-    x, y = (sides - box[2:] * scale) / 2
-    return origin @ _shift(x, y) @ np.diag([*scale, 1.0]) @ _shift(-box[0], -box[1])
-
-
-def _transform(element: Any, name: str) -> Array:
-    """Return the matrix of the attribute `transform`."""
-    text, matrix, at = element.get("transform", "").rstrip(), np.eye(3), 0
-    while at < len(text):
-        match = _TRANSFORM.match(text, at)
-        if not match:
-            raise InputError(f"{name}: transform is {short_repr(text)}, expected such as translate(1 2)")
-        values = [float(number) for number in _NUMBER.findall(match[2])]
-        if not all(map(math.isfinite, values)):
-            raise InputError(f"{name}: transform is {short_repr(text)}, expected finite numbers")
-        matrix, at = matrix @ _elementary_transform(match[1], values, name), match.end()
-    return matrix
-
-
-def _elementary_transform(kind: str, values: list[float], name: str) -> Array:
-    match kind, values:
-        case "matrix", [a, b, c, d, e, f]:
-            return np.array([[a, c, e], [b, d, f], [0, 0, 1]])
-        case "translate", [x, *y] if len(y) < 2:
-            return _shift(x, *(y or [0.0]))
-        case "scale", [x, *y] if len(y) < 2:
-            return np.diag([x, *(y or [x]), 1.0])
-        case "rotate", [degrees, *centre] if len(centre) in (0, 2):
-            cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-            x, y = centre or (0.0, 0.0)
-            return _shift(x, y) @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ _shift(-x, -y)
-        case "skewX" | "skewY", [degrees]:
-            skew = np.eye(3)
-            skew[(0, 1) if kind == "skewX" else (1, 0)] = math.tan(math.radians(degrees))
-            return skew
-    raise InputError(f"{name}: transform {short_repr(kind)} of {len(values)} numbers is not defined")
+    whole = abs(Path(shape))
+    whole.approximate_arcs_with_cubics()
+    for part in whole.as_subpaths():
+        segments = [segment for segment in part if not isinstance(segment, Move)]
+        if not segments:
+            continue
+        path = BezierPath(tuple(part[0].end))
+        for segment in segments:
+            if isinstance(segment, CubicBezier):
+                path.curve4_to(tuple(segment.end), tuple(segment.control1), tuple(segment.control2))
+            elif isinstance(segment, QuadraticBezier):
+                path.curve3_to(tuple(segment.end), tuple(segment.control))
+            elif segment.end is not None:
+                path.line_to(tuple(segment.end))
+        yield _flatten(path), isinstance(segments[-1], Close)
 
 
 _KINDS = ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE")
@@ -345,7 +242,6 @@ def read_dxf(path: Path) -> DrawnPlan:
             continue
         name = f"{entity.dxftype()} {number} of layer {short_repr(entity.dxf.layer)}"
         try:
-            _check_bounds(entity)
             lines = [_flatten(part) for part in paths.make_path(entity).sub_paths()]
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
@@ -354,17 +250,3 @@ def read_dxf(path: Path) -> DrawnPlan:
         for points in lines:
             drawing.add(name, points, (str(entity.dxf.layer),))
     return drawing
-
-
-def _check_bounds(entity: Any) -> None:
-    """Refuse coordinates of what ezdxf makes a path of; `_flatten` refuses those of others."""
-    points: Any = []
-    match entity.dxftype():
-        case "LWPOLYLINE":
-            points = list(entity.get_points("xyb"))
-        case "POLYLINE":
-            points = [vertex.dxf.location for vertex in entity.vertices]
-        case "SPLINE":
-            points = [*entity.control_points, *entity.fit_points]
-    if not all((np.abs(np.array(list(point), dtype=float)) <= MAX_COORDINATE).all() for point in points):
-        raise InputError(f"coordinates that are no numbers or beyond {MAX_COORDINATE:g}")

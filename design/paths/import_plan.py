@@ -1,7 +1,7 @@
 """Import of a drawing as a pad: matching curves to fibres, and fitting knots to them.
 
-Knots are inserted where a curve turns and where the misfit is largest, then all are moved along and across by damped
-least squares (Levenberg 1944, Marquardt 1963), and removed one by one while the others suffice.
+Knots are inserted where a curve turns and where the misfit is largest, then all are moved along and across by
+non-linear least squares (SciPy's), and removed one by one while the others suffice.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,9 @@ _ASPECT_TOLERANCE = 2e-3  # largest relative difference in aspect ratio of the d
 _FIT_SHARE = 0.8  # tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
 SAMPLES = 700  # samples of a polyline
-_MAX_ITERATIONS = 40  # iterations of Levenberg-Marquardt
-_MAX_STEP = 0.4  # largest step of a knot, as a share of the way to its neighbour
+_MAX_STEP = 0.4  # largest shift of a knot along the axis in one fit, as a share of the way to its neighbour
 _MAX_CANDIDATES = 4  # knots whose removal is tried, those with the smallest misfit first
-_MAX_DAMPINGS = 15  # increases of the damping in one iteration
-_SUPPORT = 4  # spans that depend on a knot, from two before it
+_SUPPORT = 3  # spans on either side of a knot that may depend on it, while it moves within one
 _MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
 
 
@@ -326,58 +324,32 @@ def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float,
 
 
 def _optimise(samples: Array, weight: Array, knots: Array) -> Array:
-    """Move the inner knots along and across by the Levenberg-Marquardt algorithm."""
+    """Move the inner knots along and across by non-linear least squares."""
+    from scipy.optimize import least_squares
+
     if len(knots) == 2:
         return knots
     along, across = samples.T
+
+    def residual(inner: Array) -> Array:
+        return (_evaluate(np.vstack([knots[:1], inner.reshape(-1, 2), knots[-1:]]), along) - across) * weight
+
     min_span = _MIN_SPAN * (knots[-1, 0] - knots[0, 0])
-
-    def residual(trial: Array) -> Array:
-        return (_evaluate(trial, along) - across) * weight
-
-    damping, current = 1e-2, residual(knots)
-    for _ in range(_MAX_ITERATIONS):
-        jacobian = _jacobian(along, weight, knots, current + across * weight)
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
-        room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0)
-        scale = np.diag(normal) + 1e-12 * max(np.trace(normal), 1e-300)
-        for _ in range(_MAX_DAMPINGS):
-            step = np.linalg.solve(normal + damping * np.diag(scale), -gradient).reshape(-1, 2)
-            step[:, 0] = np.clip(step[:, 0], -room[:-1], room[1:])
-            trial = knots.copy()
-            trial[1:-1] += step
-            if ((new := residual(trial)) ** 2).sum() < (current**2).sum():
-                break
-            damping *= 5
-        else:
-            return knots
-        gain = 1 - (new**2).sum() / (current**2).sum()
-        knots, current, damping = trial, new, damping / 5
-        if gain < 1e-3:
-            break
-    return knots
-
-
-def _jacobian(along: Array, weight: Array, knots: Array, values: Array) -> Array:
-    """Compute the Jacobian (m, 2 (n - 2)) of weighted values by along and across of each inner knot, by differences.
-
-    Knots so far apart that no span depends on two of them are perturbed at once.
-    """
-    count = len(knots)
-    out = np.zeros((len(along), count - 2, 2))
-    span = np.clip(np.searchsorted(knots[:, 0], along, side="right") - 1, 0, count - 2)
-    step = 1e-4 * np.diff(knots[:, 0]).min()
-    for first in range(1, min(_SUPPORT + 1, count - 1)):
-        group = np.arange(first, count - 1, _SUPPORT)
-        owner = (span + 2 - first) // _SUPPORT  # a knot owns the spans from two before to one behind it
-        is_owned = (owner >= 0) & (owner < len(group))
-        rows = np.flatnonzero(is_owned)
-        for axis in (0, 1):
-            trial = knots.copy()
-            trial[group, axis] += step
-            change = (_evaluate(trial, along) * weight - values) / step
-            out[rows, group[owner[rows]] - 1, axis] = change[rows]
-    return out.reshape(len(along), -1)
+    room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0) + 1e-12  # neighbours keep their order
+    bounds = np.full((2, len(knots) - 2, 2), np.inf) * [[[-1]], [[1]]]
+    bounds[:, :, 0] = knots[1:-1, 0] - room[:-1], knots[1:-1, 0] + room[1:]
+    span = np.clip(np.searchsorted(knots[:, 0], along, side="right") - 1, 0, len(knots) - 2)
+    # a span depends on the knots at its ends and on one beyond either; knots move by less than one span
+    depends = np.abs(2 * span[:, None] + 1 - 2 * np.arange(1, len(knots) - 1)) <= 2 * _SUPPORT - 1
+    fit = least_squares(
+        residual,
+        knots[1:-1].ravel(),
+        bounds=bounds.reshape(2, -1),
+        jac_sparsity=np.repeat(depends, 2, axis=1),
+        x_scale="jac",
+        ftol=1e-3,
+    )
+    return np.vstack([knots[:1], fit.x.reshape(-1, 2), knots[-1:]])
 
 
 def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:

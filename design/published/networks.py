@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_type, short_repr
+from padforge.design.common.validation import InputError, check_int
 from padforge.design.contact import serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -25,7 +25,6 @@ TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
 """Shares of the samples; the rest is the test set of the published split."""
 JITTER = 5 / 49
 """Greatest shift of a press off its serpentine, grid units, as published."""
-MAX_PRESSES, MAX_NETWORKS = 2**20, 2**20
 BATCH = 14
 """Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
 _FIRST_CALL = Lock()
@@ -188,22 +187,14 @@ def localisation_error(
         subsets: most sets of a number of failed fibres, always the same; all if None.
 
     Raises:
-        InputError: `presses` is no square of a number from 2, there is nothing to test on, or too much to do.
+        InputError: `presses` is no square of a number from 2, or a number of failed fibres is out of range.
     """
-    side = math.isqrt(check_int("presses", presses, 4, MAX_PRESSES))
+    side = math.isqrt(check_int("presses", presses, 4, 2**20))
     if side**2 != presses:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
-    test, hidden = check_int("test", test, 1, MAX_PRESSES), check_int("hidden", hidden, 1, 1000)
-    seed, contact = check_int("seed", seed, 0, 2**64 - 1), or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    fibres = len(check_type("pad", pad, Morphology).knots)
-    if not isinstance(n_failed, Sequence) or isinstance(n_failed, str):
-        raise InputError(f"n_failed is {short_repr(n_failed)}, expected numbers of failed fibres")
+    contact, fibres = or_default("contact", contact, Contact, PUBLISHED_CONTACT), len(pad.knots)
     levels = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MAX_FIBRES) < fibres]
-    counts = [math.comb(fibres, number) for number in levels]
-    if subsets is not None:
-        counts = [min(count, check_int("subsets", subsets, 1, MAX_NETWORKS)) for count in counts]
-    if sum(counts) > MAX_NETWORKS:
-        raise InputError(f"subsets is {subsets}: that takes {sum(counts)} networks, allowed are {MAX_NETWORKS}")
+    counts = [math.comb(fibres, number) if subsets is None else subsets for number in levels]
     failures = [failure_subsets(fibres, number, count) for number, count in zip(levels, counts, strict=True)]
     simulated = SimulatedPresses.simulate(pad, side, test, seed, lambda positions: signals(pad, positions, contact))
     return simulated.failure_errors(failures, hidden)

@@ -76,7 +76,6 @@ class _Visitor(socketserver.StreamRequestHandler):
         if not is_welcome(parse_headers(BytesIO(head.partition(b"\r\n")[2])), self.server.server_address[1]):
             self.wfile.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             return
-        self.server.admit(self.request)
         with socket.create_connection(self.server.target) as server:
             server.sendall(head)
             back = Thread(target=_pass_on, args=(lambda: server.recv(CHUNK), self.request), daemon=True)

@@ -188,7 +188,6 @@ class _Subscriber(socketserver.StreamRequestHandler):
         token = self.server.token.encode()
         if token and not hmac.compare_digest(self.rfile.readline(len(token) + 2).rstrip(b"\r\n"), token):
             return
-        self.server.admit(self.request)
         if not self.server.subscribe(self):
             return
         try:

@@ -56,7 +56,7 @@ def test_flat_on_thick_layer_is_sneddon():
     np.testing.assert_allclose(solved.deflection(r), 2 * depth / np.pi * np.arcsin(radius / r), atol=0.02 * depth)
 
 
-@pytest.mark.parametrize("thickness", [20.0, 100.0, 1000.0])
+@pytest.mark.parametrize("thickness", [20.0, 1000.0])
 @pytest.mark.parametrize("below", [0.25, 1.05])
 def test_strains_near_the_face_of_a_thick_layer_are_those_of_a_half_space(thickness, below):
     solved = solve_press("dome", 0.84, 0.5, thickness)
@@ -68,7 +68,7 @@ def test_strains_near_the_face_of_a_thick_layer_are_those_of_a_half_space(thickn
     assert solved.strains([0.0], thickness - below).compressive[0] == pytest.approx(strain, rel=0.05)
 
 
-@pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0])
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0])
 def test_contact_radius_of_a_bonded_layer_follows_chi(ratio):
     thickness = 3.0
     chi = 1 / 4 + 3 / 4 / (1 + 1.3 * ratio)
@@ -132,10 +132,7 @@ def test_strains_are_differences_of_displacements(base):
     ("thickness", "radius", "depth", "widths", "strain"),
     [  # by scikit-fem on a coarser mesh, Poisson's ratio 0.49, at 0.5, 0.75 and 0.9 of the thickness
         (8, 8.4, 4, (5.7, 6.1, 6.6), 0.62),
-        (8, 8.4, 5, (6.3, 6.8, 7.4), None),
-        (6, 8.4, 4, (5.8, 6.1, 6.4), 0.80),
         (10, 8.4, 4, (5.7, 5.9, 6.4), 0.49),
-        (6, 8.4, 2, (4.1, 4.3, 4.7), None),
         (6, 4.2, 2, (3.0, 2.9, 3.1), None),
     ],
 )
@@ -151,9 +148,7 @@ def test_half_widths_of_squeeze_are_those_of_finite_elements(thickness, radius, 
     ("tool", "thickness", "depth", "base"),
     [
         ("dome", 6, 5, "bonded"),
-        ("dome", 6, 1, "slipping"),
         ("ball", 8, 4, "slipping"),
-        ("ball", 3, 2, "bonded"),
         ("flat", 6, 2, "bonded"),
     ],
 )
@@ -198,7 +193,7 @@ def test_half_of_every_length_has_the_same_strains_at_half_the_distance(tool):
     np.testing.assert_allclose(half.strains(r / 2, 2.5, 0.1), whole.strains(r, 5.0, 0.2), atol=1e-9)
 
 
-@pytest.mark.parametrize("thickness", [2.0, 6.0, 20.0])
+@pytest.mark.parametrize("thickness", [2.0, 20.0])
 def test_slipping_base_lies_between_half_space_and_bonded_base(thickness):
     half_space, slipping, bonded = (
         solve_press("dome", 8.4, 1.5, t, base)
@@ -214,13 +209,8 @@ def test_slipping_base_lies_between_half_space_and_bonded_base(thickness):
     ("tool", "radius", "depth", "thickness"),
     [
         ("dome", 1000, 0.09, 0.4),
-        ("dome", 0.1, 0.01, 1000),
-        ("dome", 8.4, 1e-4, 6),
         ("dome", 0.1, 99, 1000),
-        ("ball", 1000, 0.02, 0.1),
         ("ball", 1, 5, 6),  # deeper than its radius
-        ("ball", 0.1, 99, 100),
-        ("flat", 100, 0.4, 1.0),
         ("flat", 0.1, 5, 1000),
         ("finger", 1000, 0.05, 0.1),
     ],

@@ -1,16 +1,13 @@
 """Morphologies: construction, files, refusals."""
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design import Contact, InputError, Morphology, signals
-from padforge.design.morphology import MAX_KNOTS, assemble_knots
+from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT
-from tests.design.common.damage import damages, read_damaged
 from tests.design.wild_pads import SEEDS, wild_pads
 
 
@@ -66,24 +63,14 @@ def test_morphology_refuses_invalid_arguments_in_one_line():
         Morphology.straight(2, 1e9)
     with pytest.raises(InputError, match=r"times is .*, allowed is a whole number from 1 to"):
         Morphology.straight(4).tiled(10**4)
-    with pytest.raises(InputError, match=r"provenance is .*, expected JSON"):
-        Morphology(knots, provenance={"noise": np.nan})
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"format": "padforge-morphology/1"}', "\x00\xff", "[" * 100_000])
+@pytest.mark.parametrize("text", ["", "[]", '{"format": "padforge-morphology/1"}'])
 def test_load_refuses_other_files_in_one_line(tmp_path, text):
     path = tmp_path / "pad.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match=r"pad\.json"):
         Morphology.load(path)
-
-
-@given(damages)
-@settings(max_examples=40)
-def test_load_reads_or_refuses_damaged_files(tmp_path_factory, damage):
-    content = json.dumps(Morphology.random((1, 2), 2, seed=0).to_dict()).encode()
-    pad = read_damaged(tmp_path_factory.getbasetemp() / "damaged_pad.json", content, damage, Morphology.load)
-    assert pad is None or np.isfinite(pad.knots).all()
 
 
 def test_tiled_pads_respond_alike_in_every_tile():
@@ -102,9 +89,3 @@ def test_tiled_pads_respond_alike_in_every_tile():
         found = signals(tiled, places, contact)
         # by other spans, of which quadrature sees the edge of the contact more or less finely
         np.testing.assert_allclose(found, signals(straight, places, contact), rtol=0, atol=3e-7)
-
-
-def test_knots_are_limited_with_the_ends_of_fibres_counted():
-    most = MAX_KNOTS // 8 - 2
-    with pytest.raises(InputError, match=rf"^knots is {most + 1}, .*{most}"):
-        Morphology.random(4, most + 1)

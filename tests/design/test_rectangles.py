@@ -17,11 +17,9 @@ from padforge.design.settings import Layout, PadSettings, RulesSettings
 
 ROUND = Contact(radius=0.6, sides=None)
 CONTACTS = [
-    ROUND,
     Contact(radius=0.5, sides=4, length="euclidean"),
     Contact(),
     Contact(model="profile"),
-    Contact(weight="inverse", sides=None),
 ]
 
 
@@ -58,9 +56,9 @@ def places_on(pad, seed=0, count=40):
     return np.random.default_rng(seed).uniform(-0.3, 0.3 + np.array(pad.layout.extent), (count, 2))
 
 
-@pytest.mark.parametrize("contact", CONTACTS, ids=["disc", "square", "layer", "profile", "inverse"])
+@pytest.mark.parametrize("contact", CONTACTS, ids=["square", "layer", "profile"])
 @given(pad=rectangles())
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_signals_of_a_transposed_rectangle(contact, pad):
     places, other, exchanged = places_on(pad), turned(pad), with_exchanged_depths(contact)
     found = signals(pad, places, contact)[:, order(pad)]

@@ -280,10 +280,3 @@ def test_gains_scatter_by_their_share_and_have_the_common_part_of_its_variance()
     assert gains.std(axis=0) == pytest.approx([0.2] * 3, rel=0.02)
     expected = 0.36 + 0.64 * np.eye(3)
     np.testing.assert_allclose(np.corrcoef(gains.T), expected, atol=0.02)
-
-
-def test_a_spec_names_what_is_no_section_and_no_source():
-    with pytest.raises(InputError, match="model is 'pad', expected a section such as Pad"):
-        Spec({"pad": {"grid": 2}}).section("pad")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="source is"):
-        Spec({}).replaced({}, np.array([]))  # pyright: ignore[reportArgumentType]

@@ -40,7 +40,7 @@ def compute(responses: np.ndarray, scatter: tuple[float, float, float]) -> tuple
     return float(bound[0]), gradient[0]
 
 
-@pytest.mark.parametrize("noise", [1e-2, 1e-6, 1e-9])
+@pytest.mark.parametrize("noise", [1e-2, 1e-9])
 @pytest.mark.parametrize("scatter", [(0.0, 0.0), (0.18, 0.36)])
 @pytest.mark.parametrize("fibres", [1, 3])
 def test_bound_of_one_direction_holds_under_faint_noise(
@@ -53,8 +53,8 @@ def test_bound_of_one_direction_holds_under_faint_noise(
 
 
 @pytest.mark.skipif(not WHOLE, reason="differences need extended precision")
-@pytest.mark.parametrize("scatter", [(1e-2, 0.18, 0.36), (1e-5, 0.0, 0.0), (1e-5, 0.18, 0.36)])
-@pytest.mark.parametrize("fibres", [1, 2, 5])
+@pytest.mark.parametrize("scatter", [(1e-2, 0.18, 0.36), (1e-5, 0.0, 0.0)])
+@pytest.mark.parametrize("fibres", [1, 5])
 def test_gradient_matches_differences(scatter: tuple[float, float, float], fibres: int) -> None:
     rng = np.random.default_rng(fibres)
     responses, way = 0.2 + rng.random((fibres, SIDE**2)), rng.standard_normal((fibres, SIDE**2))

@@ -15,15 +15,11 @@ PROFILE = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.
 CONTACTS = [
     PUBLISHED_CONTACT,
     Contact(sides=None),
-    Contact(sides=3),
-    Contact(sides=4, length="euclidean"),
+    Contact(sides=3, length="euclidean"),
     Contact(weight="inverse_square"),
     Contact(sides=None, weight="inverse_square", length="euclidean"),
-    Contact(weight="inverse"),
     Contact(sides=None, weight="inverse", length="euclidean"),
-    Contact(sensitivity_profile=PROFILE),
     Contact(sensitivity_profile=PROFILE, length="euclidean"),
-    Contact(sensitivity_profile=((0.0, -0.3), (2.3, -0.5), (4.0, -0.35), (5.6, 0.1), (6.8, 0.2), (10.1, 0.0))),
 ]
 
 
@@ -66,10 +62,8 @@ def test_signal_gradient_passes_the_taylor_test(contact):
     assert np.median([taylor_ratio(contact, seed) for seed in range(5)]) == pytest.approx(4, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    "contact", [CONTACTS[0], CONTACTS[5], CONTACTS[9]], ids=["polygon", "inverse square", "profile"]
-)
-@pytest.mark.parametrize("counts", [(2, 3), (3, 1), (0, 2)])
+@pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[-1]], ids=["polygon", "profile"])
+@pytest.mark.parametrize("counts", [(2, 3), (0, 2)])
 def test_signals_and_gradients_match_exact_ones_on_rectangles(contact, counts):
     pad, rng = Morphology.random(Layout.create(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0, pad.layout.extent, (20, 2))

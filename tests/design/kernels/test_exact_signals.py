@@ -74,7 +74,7 @@ def oracle(pad, press, contact, fibre):
 
 @pytest.mark.parametrize("weight", wild.WEIGHTS)
 @pytest.mark.parametrize("length", wild.LENGTHS)
-@pytest.mark.parametrize("sides", [None, 3, 30, *(pytest.param(sides, marks=pytest.mark.slow) for sides in (4, 7, 64))])
+@pytest.mark.parametrize("sides", [None, 3, 30])
 def test_exact_signals_equal_the_oracle(weight, length, sides):
     contact = Contact(radius=0.7, sides=sides, weight=weight, length=length)
     plain = weight == "uniform" and length == "manhattan"
@@ -143,8 +143,8 @@ def test_signals_do_not_depend_on_batching_or_sparsity(kind, grid, count, popula
         np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), alone)
 
 
-@pytest.mark.parametrize("radius", [1e-9, 1e-6, 1e-3, 0.4])
-@pytest.mark.parametrize("sides", [None, 4, 30])
+@pytest.mark.parametrize("radius", [1e-9, 0.4])
+@pytest.mark.parametrize("sides", [None, 30])
 def test_signal_of_a_centred_press_is_its_diameter_at_every_size(radius, sides):
     """A 30-gon has vertices left and right, but edges at top and bottom."""
     found = signals(Morphology.straight(3), [[2, 2]], Contact(radius=radius, sides=sides))
@@ -179,10 +179,10 @@ def test_signals_at_corners_and_along_edges(sides, press, fibre, expected):
     assert found == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("sides", [3, 4, 5, 6, 8, 12, 30])
+@pytest.mark.parametrize("sides", [3, 4, 30])
 def test_signal_along_an_edge_is_robust_to_rounding(sides):
     normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
-    for radius in np.random.default_rng(sides).uniform(0.1, 1, 50):
+    for radius in np.random.default_rng(sides).uniform(0.1, 1, 10):
         apothem, edge = radius * np.cos(np.pi / sides), 2 * radius * np.sin(np.pi / sides)
         for nx, ny in zip(np.cos(normal), np.sin(normal), strict=True):
             if min(abs(nx), abs(ny)) < 1e-9:
@@ -191,7 +191,7 @@ def test_signal_along_an_edge_is_robust_to_rounding(sides):
                 assert found[0, fibre] == pytest.approx(edge, rel=1e-6)
 
 
-@pytest.mark.parametrize("radius", [1e-9, 0.25, 0.4, 1.0])
+@pytest.mark.parametrize("radius", [1e-9, 0.4])
 @pytest.mark.parametrize("weight", wild.WEIGHTS)
 def test_signal_of_a_tangent_circle_is_0(radius, weight):
     """From both sides, and exactly at the radius, where the crossing is a double root."""
@@ -200,7 +200,7 @@ def test_signal_of_a_tangent_circle_is_0(radius, weight):
     assert (signals(Morphology.straight(2), presses, contact)[:, 0] <= 1e-6 / radius).all()
 
 
-@pytest.mark.parametrize("gap", [1e-12, 1e-9, 1e-6])
+@pytest.mark.parametrize("gap", [1e-12, 1e-6])
 def test_signals_of_nearly_coincident_knots_are_those_of_a_step(gap):
     """A rise of 1 within `gap`, slope up to 1e12: the Manhattan signal is run plus rise."""
     inner = np.array([[[1.0, 0.5], [1.0 + gap, 1.5]], [[1.0, 0.5], [1.0, 1.5]]])
@@ -234,9 +234,9 @@ def test_signals_beyond_the_pad_and_on_many_threads():
     found = signals(out, [[1.0, 40], [1, 1], [-30, 0.6]], Contact(sides=None))
     assert found[0, 0] > 1
     assert found[2, 3] > 1
-    pad, presses = Morphology.random(4, 5, seed=2), np.random.default_rng(2).uniform(0.5, 4.5, (10_000, 2))
+    pad, presses = Morphology.random(4, 5, seed=2), np.random.default_rng(2).uniform(0.5, 4.5, (4000, 2))
     whole = signals(pad, presses, PUBLISHED_CONTACT)
-    for part in (slice(10), slice(1995, 2005), slice(5000, 5010)):
+    for part in (slice(10), slice(1995, 2005)):
         np.testing.assert_array_equal(whole[part], signals(pad, presses[part], PUBLISHED_CONTACT))
 
 
@@ -267,7 +267,7 @@ def test_signals_refuse_invalid_presses_and_knots():
 
 
 @given(st.lists(st.floats(-1, 1), min_size=6, max_size=6), st.integers(-12, 0))
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_single_crossings_are_exact_to_rounding(drawn, exponent):
     """Also of nearly straight curves, on which a step of Newton's method may leave the bracket by rounding."""
     cubic = np.array([*drawn[:2], *(10.0**exponent * np.array(drawn[2:4]))])  # v = e0 + e1 s + e2 s^2 + e3 s^3

@@ -17,7 +17,6 @@ from padforge.design.signal_gradients import FibreCurves
 CONTACTS = {
     "default": Contact(),
     "built pad": BUILT_CONTACT,
-    "squeezed": Contact(stretch=0.0),
     "stretched": Contact(squeeze=0.0),
     "flat, shallow": Contact(tool="flat", tool_radius_mm=4.0, depth_mm=1.0, fibre_depths_mm=(3.0, 1.0)),
     "wider": Contact(tool="finger", thickness_mm=10.0, scale=1.3),
@@ -90,10 +89,8 @@ def test_layer_signals_equal_the_oracle(contact):
     ("contact", "seed", "press", "fibre"),
     [
         (Contact(model="profile"), 41, 2, 3),
-        (Contact(model="profile"), 51, 2, 2),
         (CONTACTS["default"], 40, 1, 2),
         (CONTACTS["flat, shallow"], 38, 2, 0),
-        (CONTACTS["flat, shallow"], 57, 2, 1),
     ],
 )
 def test_signals_are_precise_where_a_bend_may_be_missed(contact, seed, press, fibre):
@@ -131,20 +128,6 @@ def test_layer_gradient_equals_differences_of_search_signals(contact):
     fibres = curves(pad)
     expected = (fibres.by_knots(fibres.signals(presses, contact)[1](upstream)) * move).sum()
     assert (value(1e-6) - value(-1e-6)) / 2e-6 == pytest.approx(expected, rel=1e-4, abs=1e-4)
-
-
-def test_layer_gradient_equals_differences_by_every_knot():
-    pad = Morphology.random((1, 1), 2, seed=4)
-    presses, step = np.random.default_rng(4).uniform(0, 2, (3, 2)), 1e-6
-    fibres, moves = curves(pad), np.eye(16).reshape(16, 2, 2, 4)
-    for upstream in np.eye(6).reshape(6, 2, 3):
-        gradient = fibres.by_knots(fibres.signals(presses, Contact())[1](upstream))
-        ahead, behind = (
-            [(upstream * curves(pad, way * move).signals(presses, Contact())[0]).sum() for move in moves]
-            for way in (step, -step)
-        )
-        differences = (np.array(ahead) - behind) / (2 * step)
-        np.testing.assert_allclose(gradient.reshape(16), differences, atol=1e-5, rtol=1e-3)
 
 
 def test_families_at_other_depths_respond_differently():

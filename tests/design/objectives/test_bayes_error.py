@@ -25,16 +25,15 @@ def positions(responses: np.ndarray, blur: float = 0.0) -> Positions:
 def test_readings_linear_in_the_position_are_located_by_their_noise():
     """Of two fibres that say x and y with noise s, the mean distance is that of a Rayleigh distribution."""
     rng, noise = np.random.default_rng(0), 0.2
-    pressed = 2 + rng.uniform(-0.5, 0.5, (4000, 2))
+    pressed = 2 + rng.uniform(-0.5, 0.5, (2000, 2))
     readings = pressed + noise * rng.standard_normal(pressed.shape)
     found = bayes_positions(readings, positions(PLACES), Scatter(noise), np.array([True, True]))
     error = np.hypot(*(found - pressed).T).mean()
-    assert error == pytest.approx(noise * np.sqrt(np.pi / 2), rel=0.02)
+    assert error == pytest.approx(noise * np.sqrt(np.pi / 2), rel=0.03)
 
 
-@pytest.mark.parametrize("working", [[True, True, True], [True, False, True]])
-def test_posteriors_match_explicit_covariances(working):
-    rng, scatter, working = np.random.default_rng(1), Scatter(0.1, 0.3, 0.4), np.array(working)
+def test_posteriors_match_explicit_covariances():
+    rng, scatter, working = np.random.default_rng(1), Scatter(0.1, 0.3, 0.4), np.array([True, False, True])
     responses = np.sin(PLACES @ rng.standard_normal((2, 3)))
     readings = scatter.sample(responses[rng.integers(len(PLACES), size=6)], rng)
     found = bayes_positions(readings, positions(responses, 0.01), scatter, working)
@@ -66,7 +65,7 @@ def test_huge_pads_are_sampled():
     assert len(possible.places) < module.MAX_FAR + 5000
 
 
-@pytest.mark.parametrize("counts", [(4, 4), (3, 12), pytest.param((8, 8), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("counts", [(2, 5), pytest.param((8, 8), marks=pytest.mark.slow)])
 def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
     monkeypatch.setattr(module, "PRESSES", 1024)
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
@@ -77,9 +76,9 @@ def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
 
 
 def test_expected_errors_hardly_depend_on_the_presses(monkeypatch):
-    size, pad = PadSettings(grid=4), Morphology.random(4, 5, seed=1)
-    errors = expected_errors(pad, Contact(), SearchSettings(), size)
-    assert errors == expected_errors(pad, Contact(), SearchSettings(), size)
+    size, pad, asked = PadSettings(grid=2), Morphology.random(2, 5, seed=1), SearchSettings(max_failures=1)
+    errors = expected_errors(pad, Contact(), asked, size)
+    assert errors == expected_errors(pad, Contact(), asked, size)
     monkeypatch.setattr(module, "PRESSES", 4 * module.PRESSES)
     monkeypatch.setattr(module, "STEP", 0.7 * module.STEP)
-    assert errors == pytest.approx(expected_errors(pad, Contact(), SearchSettings(), size), rel=0.06)
+    assert errors == pytest.approx(expected_errors(pad, Contact(), asked, size), rel=0.06)

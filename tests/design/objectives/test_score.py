@@ -17,14 +17,11 @@ from padforge.design.signal_gradients import FibreCurves
 def test_score_evaluates_the_sensed_area():
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
     # a layer leaves no fibre idle anywhere
-    pad, disc = Morphology.random(3, 4, seed=1), Contact(radius=0.9, sides=None)
-    beyond, between, wide = (
-        score(pad, disc, max_failures=1, size=PadSettings(sensed_mm=where)) for where in ("beyond", "fibres", (40, 20))
-    )
+    pad, disc = Morphology.random(2, 4, seed=1), Contact(radius=0.9, sides=None)
+    beyond, wide = (score(pad, disc, max_failures=0, size=PadSettings(sensed_mm=size)) for size in ("beyond", (40, 20)))
     for name in beyond:
-        same = name.startswith(("published", "information", "penalty"))
-        assert (beyond[name] == between[name] == wide[name]) == same
-    assert score(pad, disc, max_failures=1) == beyond
+        assert (beyond[name] == wide[name]) == name.startswith(("published", "information", "penalty"))
+    assert score(pad, disc, max_failures=0) == beyond
     layer = score(pad, max_failures=0)
     assert beyond["published_objective"] == published_terms(pad, disc)[0].objective != layer["published_objective"]
     assert layer["published_objective"] == published_terms(pad)[0].objective  # a layer has none of its own
@@ -39,7 +36,7 @@ def test_score_joint_entropy_saturates_before_those_of_families():
     assert one["published_joint_entropy"] == one["published_entropy"]
 
 
-@pytest.mark.parametrize(("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [1 / 2, 1 / 2]), ((2, 2), [1 / 4] * 4)])
+@pytest.mark.parametrize(("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [1 / 2, 1 / 2])])
 def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fibres, weights):
     """Each number of failures weighs the same, also where fewer can fail."""
     pad = Morphology.straight(fibres)

@@ -9,17 +9,12 @@ import pytest
 import shapely
 from click.testing import CliRunner
 from ezdxf import new, units  # pyright: ignore[reportPrivateImportUsage]
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from padforge.design import Contact, InputError, Morphology, PadSettings, draw_plan, flatten
 from padforge.design.cli import design
 from padforge.design.common.plotting import save_figure
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.settings import Layout
-from padforge.fabricate import Plan
-from padforge.fabricate.outputs.drawings import tracks_dxf
-from tests.design.common.damage import damages, read_damaged
 
 LAYOUT = Layout.create((2, 3), (10.0, 12.0))
 """40 by 36 mm: ends of horizontals at y = -6 and 6, of verticals at x = -10, 0 and 10."""
@@ -53,7 +48,7 @@ def plain(tmp_path_factory) -> Morphology:
     return import_plan(svg(tmp_path_factory.mktemp("plain"), PATHS), LAYOUT, 0.4).pad
 
 
-def apart(one: Morphology, other: Morphology) -> float:
+def max_distance_mm(one: Morphology, other: Morphology) -> float:
     """Greatest distance of fibres, mm."""
     lines = ([shapely.LineString(pad.to_mm(line)) for line in flatten(pad, 1e-5)] for pad in (one, other))
     return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
@@ -69,72 +64,47 @@ def test_import_moves_ends_within_the_tolerance(tmp_path: Path) -> None:
     assert shapely.distance(shapely.points(drawn), upper).max() < 0.06
     ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
     found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
-    assert found.fibres[1].end_shift_mm == pytest.approx(0.03)
+    assert found.fibres[1].end_shift_mm == pytest.approx(0.03, abs=1e-4)
     with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
         import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
     assert "--tolerance-mm" in str(told.value)
 
 
 @pytest.mark.parametrize(
-    ("drawn", "head"),
+    ("drawn", "head", "placement"),
     [
-        (PATHS, 'viewBox="-20 -18 40 36" width="4cm" height="3.6cm"'),
-        (f'<g transform="translate(7 3) rotate(90) rotate(-90) matrix(1 0 0 1 -7 -3)">{PATHS}</g>', HEAD),
-        (f'<g transform="scale(2)"><g transform="matrix(.5 0 0 .5 0 0)">{PATHS}</g></g>', HEAD),
-        (f'<defs><g id="all">{PATHS}</g></defs><use href="#all"/>', HEAD),
-        (f'<symbol id="all">{PATHS}</symbol><use xlink:href="#all" x="0" y="0"/>', HEAD),
-        (f'<g transform="translate(20 18)">{PATHS}</g>', FIRST),
-        (f'<g transform="translate(500 80)">{PATHS}</g>', FIRST),
-        (f'<rect id="pad" x="-20" y="-18" width="40" height="36"/>{PATHS}', 'viewBox="0 0 9 9"'),
-        (f'<path d="M -20 0 H 20"/><g id="fibres">{PATHS}</g>', HEAD),
-        (f'<svg x="-20" y="-18" width="40" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
-        (PATHS, 'viewBox="-20 -18 40 36" width="113.38583pt" height="102.04724pt"'),  # of 1/72 inch
-        (PATHS, 'viewBox="-20 -18 40 36" width="9.448819pc" height="8.503937pc"'),  # of 1/6 inch
-        (PATHS, 'viewBox="-20 -18 40 36" width="1.5748031in" height="144q"'),
-        # what has another shape than its viewBox is scaled alike both ways, and lies in the middle
-        (PATHS, 'viewBox="-20 -18 40 36" width="60mm" height="36mm"'),
-        (f'<svg x="-30" y="-18" width="60" height="36" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
-        (f'<svg x="-20" y="-28" width="40" height="56" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD),
-        (
-            f'<g transform="scale(2 1)">{PATHS}</g>',
-            'viewBox="-40 -18 80 36" width="40mm" height="36mm" preserveAspectRatio="none"',
-        ),
-        (f'{PATHS}<text>no fibre</text><path d="M0 0L1 0L1 1Z"/><path style="display: none" d="M0 0L1 1"/>', HEAD),
-        (paths(*(re.sub("M -20 (-?6)", r"M -25 \1 L -20 \1", way) for way in WAYS)), HEAD),  # they begin outside
+        (PATHS, 'viewBox="-20 -18 40 36" width="113.38583pt" height="3.6cm"', "middle"),
+        (f'<g transform="translate(7 3) rotate(90) rotate(-90) matrix(1 0 0 1 -7 -3)">{PATHS}</g>', HEAD, "middle"),
+        (f'<defs><g id="all">{PATHS}</g></defs><use href="#all"/>', HEAD, "middle"),
+        (f'<symbol id="all">{PATHS}</symbol><use xlink:href="#all" x="0" y="0"/>', HEAD, "middle"),
+        (f'<g transform="translate(20 18)">{PATHS}</g>', FIRST, "upper left corner"),
+        (f'<g transform="translate(20 -18)">{PATHS}</g>', FIRST, "lower left corner"),  # y of an SVG goes down
+        (f'<a transform="translate(500 80)">{PATHS}</a>', FIRST, "the middle of its curves"),
+        (f'<rect id="pad" x="-20" y="-18" width="40" height="36"/>{PATHS}', 'viewBox="0 0 9 9"', "named pad"),
+        (f'<path d="M -20 0 H 20"/><g id="fibres">{PATHS}</g>', HEAD, "middle"),
+        (f'<svg x="-20" y="-28" width="40" height="56" viewBox="-20 -18 40 36">{PATHS}</svg>', HEAD, "middle"),
+        (f'{PATHS}<text>no fibre</text><path d="M0 0L1 0L1 1Z"/><path style="display: none" d="M0 0L1 1"/>', HEAD, ""),
+        (f'<style>.no {{display: none}}</style><g class="no"><path d="M0 0L1 1"/></g>{PATHS}', HEAD, "middle"),
+        (paths(*(re.sub("M -20 (-?6)", r"M -25 \1 L -20 \1", way) for way in WAYS)), HEAD, ""),  # they begin outside
     ],
 )
 def test_import_follows_units_transforms_and_visibility(
-    tmp_path: Path, plain: Morphology, drawn: str, head: str
+    tmp_path: Path, plain: Morphology, drawn: str, head: str, placement: str
 ) -> None:
-    assert apart(import_plan(svg(tmp_path, drawn, head=head), LAYOUT, 0.4).pad, plain) < 0.02
+    imported = import_plan(svg(tmp_path, drawn, head=head), LAYOUT, 0.4)
+    assert max_distance_mm(imported.pad, plain) < 0.02
+    assert placement in imported.placement
 
 
-@pytest.mark.parametrize(
-    ("moved", "placement"),
-    [
-        ("0 0", "its origin is the middle of the pad"),
-        ("20 -18", "its origin is the lower left corner of the pad"),  # y of an SVG goes down
-        ("20 18", "its origin is the upper left corner of the pad"),
-        ("500 80", "the middle of its curves is that of the pad"),
-    ],
-)
-def test_import_states_where_the_origin_was_found(tmp_path: Path, moved: str, placement: str) -> None:
-    drawn = svg(tmp_path, f'<g transform="translate({moved})">{PATHS}</g>')
-    assert import_plan(drawn, LAYOUT, 0.4).placement == placement
-
-
-def test_import_joins_pieces_and_ignores_external_entities(tmp_path: Path) -> None:
+def test_import_joins_pieces(tmp_path: Path) -> None:
     parts = [
         '<polyline points="-20,-6 -5,-8"/><line x1="5" y1="-4" x2="-5" y2="-8"/><path d="M5-4 20-6"/>',
         '<line x1="-20" y1="6" x2="20" y2="6"/>',
         *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
     ]
-    found = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
-    assert found.fibres[1].max_error_mm < 0.05
-    assert "to" in found.fibres[1].name
-    path = svg(tmp_path, f"&a;{PATHS[:-2]}/>&b;")
-    path.write_text('<!DOCTYPE svg SYSTEM "svg11.dtd">' + path.read_text())
-    assert len(import_plan(path, LAYOUT, 0.05).fibres) == 5
+    imported = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
+    assert imported.fibres[1].max_error_mm < 0.05
+    assert "to" in imported.fibres[1].name
 
 
 def instead(way: str) -> str:
@@ -148,75 +118,38 @@ REFUSED = [
     (instead("M -20 -6 C 30 0 -30 0 20 -6"), r"w0: turns back at \(.*\) mm, expected .* along x"),
     # from (-9, 9) down to (-8, 0) mm, where y points up
     (paths(*WAYS[:2], "M-10 18L-9-9-8 0-10-18", *WAYS[3:]), r"w2: turns back at \(-8.5, 4.5\) mm, .* along y"),
-    (instead("M -20 -6 L 0 -40 L 20 -6"), r"w0: leaves the pad at"),
+    (instead("M -20 -6 L -10 -6 L 0 -20 L 10 -6 L 20 -6"), r"w0: leaves the pad at"),
     (instead("M -20 -6 L 10 -6"), r"w0: runs from .*, 10 mm from where horizontal 2 ends"),
     (paths(*WAYS[:4], "M 13 18 L 13 -18"), r"w4: runs from \(13.0, -18.0\) mm to \(13.0, 18.0\) mm, 3 mm from"),
     (instead("M -20 -3 L 20 -3"), r"w0: runs from \(-20.0, 3.0\) mm to \(20.0, 3.0\) mm, 3 mm from"),
     ('<rect id="pad" width="1" height="7"/>' + PATHS, "pad is drawn 1 by 7, expected the shape of 40 by 36"),
     (PATHS + "".join(f'<line x1="-20" y1="-6" x2="{x}" y2="0"/>' for x in (-18, -17)), "more than two"),
-    *((f'<path id="x" transform="{no}" d="M0 0L1 1"/>', "x: tran") for no in ("turn(3)", "scale(", "rotate(1e999)")),
-    ('<g transform="scale(1e200)"><path id="x" transform="scale(1e200)" d="M 0 0C1 1 2 2 3 3"/></g>', "x: coord"),
-    (f'<path id="x" d="M 0 0 C {"9" * 300} 1 2 2 1e300 3 A 1e200 1 9 0 1 1e9 2"/>', "x: (coord|no path)"),
-    ('<line id="x" x1="5%" x2="1" y2="2"/>', "x: x1 is '5%', expected a length"),
-    ('<use id="x" href="#x"/>', "x: <use> of <use>"),
-    ('<g id="a"><use href="#b"/></g><g id="b"><use href="#a"/><use href="#a"/></g>', "<use>"),
-    ("<g>" * 5000 + "</g>" * 5000, "not an SVG file that can be read"),
-    (f'<rect x="1{" " * 200_000}!"/>', "x is .* expected a length"),
-    (f'<g transform="{" " * 200_000}!"/>', "transform is .* expected such as"),
-    (f'<g transform="{"scale(1)" * 20_000} "/>', "no open curve"),
+    (
+        '<g transform="scale(1e200)"><path id="x" d="M 0 0C1 1 2 2 3 3"/></g>',
+        "coordinates that are no numbers or beyond",
+    ),
+    ('<path id="x" d="M 0 0 L 1"/>', "not an SVG file that can be read"),
+    ('<use id="x" href="#x"/>', "not an SVG file that can be read"),
     (PATHS + "".join(f'<path d="M{k} 0L{k + 0.5} 1"/>' for k in range(50)), "55 open curves, expected 5, one a fibre"),
 ]
 
 
 @pytest.mark.parametrize(("drawn", "message"), REFUSED, ids=range(len(REFUSED)))
 def test_import_refuses_other_drawings_in_one_line(tmp_path: Path, drawn: str, message: str) -> None:
-    """The large ones are so large that what takes time by the square of their size would not end."""
     with pytest.raises(InputError, match=message) as refused:
         import_plan(svg(tmp_path, drawn), LAYOUT, 0.05)
     assert str(refused.value).startswith(str(tmp_path / "plan.svg"))
     assert len(str(refused.value)) < 500
 
 
-BOMB = """<?xml version="1.0"?><!DOCTYPE svg [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>
-<svg xmlns="http://www.w3.org/2000/svg"><text>&b;</text></svg>"""
-FETCH = """<?xml version="1.0"?><!DOCTYPE svg SYSTEM "http://127.0.0.1:1/x.dtd" [<!ENTITY a SYSTEM "file:///etc/passwd">]>
-<svg xmlns="http://www.w3.org/2000/svg"><path id="&a;" d="M0 0L1 1"/></svg>"""
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        *(b"nonsense", b"<html/>", b"  0\nSECTION\n  2\nHEADER\n"),
-        *(BOMB.encode(), FETCH.encode(), BOMB.encode("utf-16")),
-    ],
-    ids=lambda content: repr(content[:20]),
-)
-def test_import_refuses_hostile_files_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_import_refuses_other_files_in_one_line(tmp_path: Path) -> None:
     for name in ("plan.svg", "plan.dxf"):
-        path = tmp_path / name
-        path.write_bytes(content)
-        with pytest.raises(InputError, match=re.escape(str(path))) as refused:
-            import_plan(path, LAYOUT, 0.05)
-        assert "root:" not in str(refused.value)
-        assert b"<!ENTITY" not in content or name == "plan.dxf" or "declares entities" in str(refused.value)
+        for content in (b"nonsense", b"<html/>", b"  0\nSECTION\n  2\nHEADER\n"):
+            (tmp_path / name).write_bytes(content)
+            with pytest.raises(InputError, match=name):
+                import_plan(tmp_path / name, LAYOUT, 0.05)
     with pytest.raises(InputError, match=r"allowed are \.svg and \.dxf"):
         import_plan(tmp_path / "plan.pdf", LAYOUT, 0.05)
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    folder, pad = tmp_path_factory.mktemp("drawn"), Morphology.random(1, 2, seed=0)
-    save_figure(draw_plan(pad, Contact()), folder / "damaged.svg")
-    (folder / "damaged.dxf").write_text(tracks_dxf(Plan(pad)), encoding="utf-8")
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-@given(st.sampled_from(["damaged.svg", "damaged.dxf"]), damages)
-@settings(max_examples=20)
-def test_import_reads_or_refuses_damaged_drawings(drawn, tmp_path_factory, name, damage) -> None:
-    layout, path = Layout.create(1), tmp_path_factory.getbasetemp() / name
-    found = read_damaged(path, drawn[name], damage, lambda path: import_plan(path, layout, 0.5))
-    assert found is None or np.isfinite(found.pad.knots).all()
 
 
 def dxf(tmp_path: Path, draw) -> Path:
@@ -256,22 +189,6 @@ def test_import_reads_all_kinds_of_dxf_entities(tmp_path: Path, draw, middle_mm:
     assert np.interp(0, *line.T) == pytest.approx(middle_mm, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    "draw",
-    [
-        lambda space: space.add_line((float("nan"), 0), (1, 1)),
-        lambda space: space.add_arc((0, 0), 1e200, 0, 90),
-        lambda space: space.add_spline([(0, 0), (1e18, 1), (3, 3)]),
-        lambda space: space.add_lwpolyline([(0, 0, 1e300), (1, 1, 0)], format="xyb"),
-        lambda space: space.doc.header.__setitem__("$INSUNITS", 99),
-    ],
-)
-def test_import_refuses_hostile_dxf_in_one_line(tmp_path: Path, draw) -> None:
-    with pytest.raises(InputError) as refused:
-        import_plan(dxf(tmp_path, draw), LAYOUT, 0.05)
-    assert len(str(refused.value)) < 500
-
-
 def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     courses = Morphology.random(LAYOUT, 4, rng).knots.copy()
@@ -282,7 +199,7 @@ def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:
     pad = Morphology.from_layout(courses, LAYOUT)
     save_figure(draw_plan(pad, Contact(), (), PadSettings().for_layout(LAYOUT).keep_out_mm), tmp_path / "plan.svg")
     found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
-    assert apart(found.pad, pad) < 0.08
+    assert max_distance_mm(found.pad, pad) < 0.08
     assert found.pad.knots.shape[1] <= 6 + 3
     assert found.placement == "the border is that named pad"
 
@@ -291,29 +208,16 @@ def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     stated = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_mean_bend_radius_mm = 0\n"
     Path("pad.toml").write_text(stated)
-    svg(tmp_path, PATHS)
-    ended = CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
-    lines = ended.output.splitlines()
-    assert (ended.exit_code, lines[-1]) == (0, "  all rules hold")
+    svg(tmp_path, paths(*(way.replace("20 -6", "20 -6.03") for way in WAYS)))
+    result = CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
+    lines = result.output.splitlines()
+    assert (result.exit_code, lines[-1]) == (0, "  all rules hold")
     assert re.fullmatch(r"  fibre 1: w1, within 0\.0\d+ mm", lines[2])
+    assert re.fullmatch(r"  fibre 2: w0, within 0\.0\d+ mm, ends moved by 0\.030 mm", lines[3])
     pad = Morphology.load(tmp_path / "out/plan/morphology.json")
     assert pad.provenance["command"] == "padforge design import"
     assert list(pad.provenance["inputs"]) == ["plan.svg"]
     Path("pad.toml").write_text(stated + "max_length_mm = 38\n")
-    assert CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False).exit_code == 1
-
-
-def test_import_command_states_error_and_shift_of_every_fibre(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("pad.toml").write_text("[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n")
-    svg(tmp_path, paths(*(way.replace("20 -6", "20 -6.03") for way in WAYS)))
-    said, document = (
-        CliRunner().invoke(design, ["import", "plan.svg", *more], catch_exceptions=False).output
-        for more in ((), ("--json",))
-    )
-    fibres = json.loads(document)["fibres"]
-    shifts = ["", ", ends moved by 0.030 mm", "", "", ""]
-    assert said.splitlines()[2:7] == [
-        f"  fibre {number}: {fibre['name']}, within {fibre['max_error_mm']:.3f} mm{shift}"
-        for number, (fibre, shift) in enumerate(zip(fibres, shifts, strict=True), 1)
-    ]
+    broken = CliRunner().invoke(design, ["import", "plan.svg", "--json"], catch_exceptions=False)
+    assert broken.exit_code == 1
+    assert json.loads(broken.output)["fibres"][1]["end_shift_mm"] == pytest.approx(0.03, abs=1e-4)

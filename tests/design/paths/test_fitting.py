@@ -61,7 +61,7 @@ def moved(course, count):
 
 
 @given(st.lists(st.integers(1, 29), min_size=5, max_size=12), st.integers(1, 40))
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_spare_knots_preserve_paths_that_turn_inside(heights, count):
     x = np.linspace(0, 3, len(heights) + 2)
     course = np.stack([x, [1, *(height / 10 for height in heights), 1]], axis=1)
@@ -72,8 +72,8 @@ def test_spare_knots_preserve_paths_that_turn_inside(heights, count):
     assert found == pytest.approx(course)
 
 
-@pytest.mark.parametrize("heights", [[], [1.0] * 3, [2.0], [0.5, 1.8], [1.2, 2.0], [1.8, 1.5, 1.2], [1.2, 1.5, 1.8]])
-@pytest.mark.parametrize("count", [1, 2, 3, 9])
+@pytest.mark.parametrize("heights", [[], [1.0] * 3, [2.0], [0.5, 1.8], [1.8, 1.5, 1.2]])
+@pytest.mark.parametrize("count", [1, 9])
 def test_spare_knots_preserve_straight_paths_and_nearly_turns_at_ends(heights, count):
     course = np.stack([np.linspace(0, 3, len(heights) + 2), [1.0, *heights, 1.0]], axis=1)
     off, found = moved(course, count)
